@@ -222,11 +222,11 @@ def intervene(
         "sites": sites, "roles": roles, "direction": direction, "controls": controls,
         "coefficients": coefficients, "target_side": target_side, "seed": seed or None,
     }  # fmt: skip
-    given = {name: value for name, value in inside.items() if value is not None}
-    check_options(kind, given)
-    intervention = kind_of(kind).from_options(opened, **of_every_kind, **given)
+    kind_options = {name: value for name, value in inside.items() if value is not None}
+    check_options(kind, kind_options)
+    intervention = kind_of(kind).from_options(opened, **of_every_kind, **kind_options)
     intervention.check_run(opened)
-    files = {name: Path(str(place)) for name, place in read_options(scene_files or []).items()}
+    files = {name: Path(str(path)) for name, path in read_options(scene_files or []).items()}
     source = ReplaySource(
         suite, checkpoint, read_options(model_options or []), weights_seed, device, files, dataset,
         read_options(env_options or []),
@@ -244,15 +244,15 @@ def check_options(name: str, options: Mapping[str, Any]) -> None:
     """Raise UsageError for an option that does not apply to a kind. options: by name, of the command line."""
     for option in options:
         if option not in kind_of(name).options:
-            others = [kind.kind for kind in every_kind() if option in kind.options]
+            kinds = [kind.kind for kind in every_kind() if option in kind.options]
             raise UsageError(
                 f"--{option.replace('_', '-')} does not apply to --kind {name}; remove it or choose another "
-                f"kind: {', '.join(others)}"
+                f"kind: {', '.join(kinds)}"
             )
 
 
 def _run(run: "Run", intervention: "Intervention", source: "ReplaySource") -> "InterventionResult":
-    """With progress. Says so if the result was stored before."""
+    """Run an intervention with progress; print a line if its result was stored before."""
     from probe_kit.intervene import run_intervention
     from probe_kit.intervene.outcomes import is_stored
     from probe_kit.intervene.places import unread_note

@@ -76,8 +76,8 @@ def read_direction(text: str) -> FileDirection:
         return _of_autoencoder(path, name)
     if not path.is_file():
         raise UsageError(f"--direction {text}: there is no file {path}; expected safetensors or npz")
-    arrays, said = _contents(path)
-    names = [own for own in arrays if not own.endswith(".scale")]
+    arrays, entries = _contents(path)
+    names = [array for array in arrays if not array.endswith(".scale")]
     if name not in names:
         if name or len(names) != 1:
             raise UsageError(
@@ -85,7 +85,7 @@ def read_direction(text: str) -> FileDirection:
                 f"one of them behind #"
             )
         (name,) = names
-    about = said.get(name, {})
+    about = entries.get(name, {})
     space = about.get("space", "raw")
     if space not in ("raw", "standardised"):
         raise UsageError(f"--direction {text}: the space is {space!r}; expected raw or standardised")
@@ -120,14 +120,14 @@ def _contents(path: Path) -> tuple[dict[str, NDArray[Any]], Mapping[str, Mapping
         if path.suffix == ".npz":
             with open_arrays(path) as opened:
                 arrays = {name: np.asarray(opened[name]) for name in opened}
-            said = str(arrays.pop(ENTRY, "{}"))
+            entry_text = str(arrays.pop(ENTRY, "{}"))
         else:
             with safe_open(path, "np") as opened:
                 arrays = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118 - no mapping
-                said = (opened.metadata() or {}).get(ENTRY, "{}")
-        entry = parse_json(said)
+                entry_text = (opened.metadata() or {}).get(ENTRY, "{}")
+        entry = parse_json(entry_text)
         if not isinstance(entry, dict) or not all(isinstance(about, dict) for about in entry.values()):
-            raise ValueError(f"its entry {ENTRY!r} is {said[:50]!r}; expected an object of objects")
+            raise ValueError(f"its entry {ENTRY!r} is {entry_text[:50]!r}; expected an object of objects")
         return arrays, entry
     except SafetensorError as error:
         raise UsageError(f"{path} is no safetensors file: {str(error)[:200]}") from error
@@ -147,7 +147,11 @@ def _of_autoencoder(folder: Path, name: str) -> FileDirection:
     metadata = stored.get("metadata") or {}
     if not isinstance(metadata, dict):
         raise UsageError(f"{settings} has the metadata {str(metadata)[:50]!r}; expected an object. {remedy}")
-    about = {"site": next((str(own[key]) for own in (stored, metadata) for key in _SITE_KEYS if own.get(key)), "")}
+    about = {
+        "site": next(
+            (str(record[key]) for record in (stored, metadata) for key in _SITE_KEYS if record.get(key)), ""
+        )
+    }
     about["weights"] = str(metadata.get("weights") or "")
     return _direction(f"feature-{name}", _rows(arrays[DECODER][int(name)], folder.name), about)
 
@@ -164,5 +168,5 @@ def _rows(values: NDArray[Any], text: str) -> NDArray[np.float64]:
 def _direction(name: str, vectors: NDArray[np.float64], about: Mapping[str, Any]) -> FileDirection:
     digest = hashlib.sha256(np.ascontiguousarray(vectors).tobytes()).hexdigest()[:8]
     plain = "".join(letter if letter.isalnum() or letter in "-." else "-" for letter in name)
-    said = {part: str(about.get(part) or "") for part in ("site", "role", "weights")}
-    return FileDirection(f"{plain}-{digest}", vectors, **said)
+    parts = {part: str(about.get(part) or "") for part in ("site", "role", "weights")}
+    return FileDirection(f"{plain}-{digest}", vectors, **parts)

@@ -70,23 +70,23 @@ class Directed(Protocol):
 
     @property
     def categories(self) -> tuple[str, ...] | None:
-        """Of the run; None for all."""
+        """Return the categories of the run; None for all."""
 
     @property
     def direction(self) -> str:
-        """Its name, see `check_direction`."""
+        """Return its name, see `check_direction`."""
 
     @property
     def controls(self) -> int:
-        """Number of random ones."""
+        """Return the number of random ones."""
 
     @property
     def seed(self) -> int:
-        """Of controls and folds."""
+        """Return the seed of controls and folds."""
 
     @property
     def vector(self) -> FileDirection | None:
-        """Of a file."""
+        """Return the direction of a file; None for one that is found here."""
 
 
 def check_direction(direction: str, vector: FileDirection | None = None) -> None:
@@ -129,7 +129,7 @@ def fit_token_directions(
         for cell in cells:
             with passed_over.fitting(cell):
                 pooled[cell] = fit_directions(
-                    session.run, cell.place.only_site, cell.role, direction, controls, seed, categories
+                    session.run, cell.site_group.only_site, cell.role, direction, controls, seed, categories
                 )
         return passed_over.left(pooled)
     bases: dict[Cell, dict[tuple[str, str], Vector]] = {}
@@ -168,18 +168,18 @@ class FixedDirections:
         return np.float32(strength) * self.vectors[name]
 
 
-def _of_file(session: ReplaySession, cell: Cell, vector: FileDirection, asked: Directed) -> FixedDirections:
+def _of_file(session: ReplaySession, cell: Cell, vector: FileDirection, intervention: Directed) -> FixedDirections:
     """Return a file's direction in a cell. Raises UsageError for another site, width or model."""
-    run, site = session.run, cell.place.only_site
-    vector.check(cell.place.name, run.streams[site.stream].width, run.weights_sha256)
+    run, site = session.run, cell.site_group.only_site
+    vector.check(cell.site_group.name, run.streams[site.stream].width, run.weights_sha256)
     basis, total = vector.basis.astype(np.float64), vector.vectors.sum(axis=0)
     bases, vectors = {vector.name: vector.basis}, {vector.name: total.astype(np.float32)}
-    names = control_names(asked.controls)
+    names = control_names(intervention.controls)
     if names:
         view = resolve_view(view_of(cell.role), run.views(site.stream))
         features = run.column(site, view).astype(np.float64)
     for name in names:
-        draw = np.random.default_rng(derive_seed("control", asked.seed, str(site), cell.role, name))
+        draw = np.random.default_rng(derive_seed("control", intervention.seed, str(site), cell.role, name))
         rows = list[NDArray[np.float64]]()
         for _ in basis:
             rows.append(_control(features, [*basis, *rows], draw))
@@ -203,7 +203,7 @@ class PassedOver:
         try:
             yield
         except NoDirectionError as error:
-            if cell.place.name in self._required:
+            if cell.site_group.name in self._required:
                 raise
             self._cells.add(cell)
             self._last = error
@@ -214,10 +214,10 @@ class PassedOver:
 
         Raises the last NoDirectionError if no cell is left.
         """
-        left = {cell: fit for cell, fit in fitted.items() if cell not in self._cells}
-        if not left and self._last is not None:
+        remaining = {cell: fit for cell, fit in fitted.items() if cell not in self._cells}
+        if not remaining and self._last is not None:
             raise self._last
-        return left
+        return remaining
 
 
 # -- of a mean over tokens -----------------------------------------------------------------------------------
@@ -282,16 +282,16 @@ def fit_directions(
     fold_of: dict[str, int] = {}
     for category in categories or dict.fromkeys(episodes["category"].astype(str)):
         rows = np.flatnonzero((episodes["category"] == category).to_numpy())
-        left = (episodes["side_correct"].to_numpy()[rows] == "left").astype(int)
+        is_left = (episodes["side_correct"].to_numpy()[rows] == "left").astype(int)
         groups = episodes["group_id"].to_numpy(dtype=str)[rows]
         folds = grouped_folds(
-            left, groups, min(FOLDS, np.unique(groups).size), derive_seed("axes", seed, category)
+            is_left, groups, min(FOLDS, np.unique(groups).size), derive_seed("axes", seed, category)
         )
         of_fold: dict[str, list[NDArray[np.float64]]] = {name: [] for name in (direction, *names)}
         widths = []
         for number, fold in enumerate(folds):
             fold_of |= {str(name): number for name in episodes["episode_id"].to_numpy()[rows[fold.test]]}
-            training, labels = features[rows[fold.train]], left[fold.train].astype(bool)
+            training, labels = features[rows[fold.train]], is_left[fold.train].astype(bool)
             difference = training[labels].mean(axis=0) - training[~labels].mean(axis=0)
             if (np.abs(difference) <= _ROUNDING * np.abs(training).max(axis=0)).all():
                 raise NoDirectionError(
@@ -303,31 +303,31 @@ def fit_directions(
             draw = np.random.default_rng(derive_seed("control", seed, category, str(site), role, number))
             for name in names:
                 of_fold[name].append(_control(training, [unit, _unit(difference)], draw))
-        units |= {(name, category): np.array(found, np.float32) for name, found in of_fold.items()}
+        units |= {(name, category): np.array(vectors, np.float32) for name, vectors in of_fold.items()}
         gaps[category] = np.array(widths)
     return PooledDirections(units, gaps, fold_of, names)
 
 
-def _direction(training: NDArray[np.float64], left: NDArray[np.bool_], direction: str) -> NDArray[np.float64]:
+def _direction(training: NDArray[np.float64], is_left: NDArray[np.bool_], direction: str) -> NDArray[np.float64]:
     """(D,) of length 1, toward `left`."""
     if direction == MEAN_DIFFERENCE:
-        return _unit(training[left].mean(axis=0) - training[~left].mean(axis=0))
+        return _unit(training[is_left].mean(axis=0) - training[~is_left].mean(axis=0))
     from sklearn.linear_model import LogisticRegression
     from sklearn.preprocessing import StandardScaler
 
     scaler = StandardScaler().fit(training)
-    fitted = LogisticRegression(C=0.01, max_iter=1000).fit(scaler.transform(training), left)
+    fitted = LogisticRegression(C=0.01, max_iter=1000).fit(scaler.transform(training), is_left)
     return _unit(fitted.coef_[0] / scaler.scale_)
 
 
 def _control(
-    training: NDArray[np.float64], others: list[NDArray[np.float64]], draw: np.random.Generator
+    training: NDArray[np.float64], directions: list[NDArray[np.float64]], draw: np.random.Generator
 ) -> NDArray[np.float64]:
     """(D,) of length 1, drawn from the training data's covariance and orthogonal to `others`."""
     centred = training - training.mean(axis=0)
-    found = centred.T @ draw.normal(size=len(centred))
-    basis, _ = np.linalg.qr(np.stack(others, axis=1))
-    return _unit(found - basis @ (basis.T @ found))
+    drawn = centred.T @ draw.normal(size=len(centred))
+    basis, _ = np.linalg.qr(np.stack(directions, axis=1))
+    return _unit(drawn - basis @ (basis.T @ drawn))
 
 
 def _unit(vector: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -345,7 +345,7 @@ _Row = tuple[Pair, NDArray[np.float64]]
 
 @dataclass(frozen=True)
 class TokenDirections:
-    """Of one site and role.
+    """The directions of one site and role, found in its tokens.
 
     bases: by name and episode, (K, D) float32. half_differences: by episode (T, K), half the differences of the
     class means at the role's positions along the directions that were asked for.
@@ -370,13 +370,13 @@ class TokenDirections:
 class TokenFeatures:
     """The tokens of one category in one cell, of N episodes.
 
-    episodes, groups: (N,). left: (N,) whether the correct picture lies left. tokens: at position t the role's
+    episodes, groups: (N,). is_left: (N,) whether the correct picture lies left. tokens: at position t the role's
     t-th token, see `erasers.PaddedTokens`.
     """
 
     episodes: tuple[str, ...]
     groups: NDArray[np.str_]
-    left: NDArray[np.bool_]
+    is_left: NDArray[np.bool_]
     tokens: PaddedTokens
 
 
@@ -390,21 +390,21 @@ def collect_token_features(
     """
     by_place: dict[SiteGroup, list[Cell]] = {}
     for cell in cells:
-        by_place.setdefault(cell.place, []).append(cell)
-    sites = {place: place.only_site for place in by_place}
+        by_place.setdefault(cell.site_group, []).append(cell)
+    sites = {site_group: site_group.only_site for site_group in by_place}
     of_category: dict[str, list[str]] = {}
     for item, category in zip(items, session.categories_of(items), strict=True):
         of_category.setdefault(category, []).append(item)
-    done = 0
-    for place, site in sites.items():
+    count = 0
+    for site_group, site in sites.items():
         for category, members in of_category.items():
-            rows: dict[Cell, list[_Row]] = {cell: [] for cell in by_place[place]}
+            rows: dict[Cell, list[_Row]] = {cell: [] for cell in by_place[site_group]}
             for item in members:
                 for pair in session.pairs(item):
                     _infer(session, pair, site, rows)
-                done += 1
+                count += 1
                 if session.on_fit_progress is not None:
-                    session.on_fit_progress(done, len(sites) * len(items), item)
+                    session.on_fit_progress(count, len(sites) * len(items), item)
             for cell in list(rows):
                 yield cell, category, _pad(rows.pop(cell))
 
@@ -444,9 +444,9 @@ def fit_by_fold(
     Raises as `fit_eraser` does, where there is nothing to learn from, and names category, site and role.
     """
     groups = min(FOLDS, np.unique(features.groups).size)
-    site = cell.place.only_site
+    site = cell.site_group.only_site
     seeds = derive_seed("erase", seed, category), derive_seed("control", seed, category, str(site), cell.role)
-    folds = grouped_folds(features.left.astype(int), features.groups, groups, seeds[0])
+    folds = grouped_folds(features.is_left.astype(int), features.groups, groups, seeds[0])
     draw = np.random.default_rng(seeds[1])
     try:
         return [(fold, _fitted(features, fold, method, controls, draw)) for fold in folds]
@@ -466,9 +466,9 @@ def by_episode(features: TokenFeatures, fits: Fits) -> dict[str, dict[str, Erase
 def _fitted(
     features: TokenFeatures, fold: Fold, method: Method, controls: int, draw: np.random.Generator
 ) -> dict[str, Eraser]:
-    training, left = features.tokens.only(fold.train), features.left[fold.train]
-    eraser = fit_eraser(training, left, method)
-    drawn = {name: fit_control(training, left, method, eraser, draw) for name in control_names(controls)}
+    training, is_left = features.tokens.only(fold.train), features.is_left[fold.train]
+    eraser = fit_eraser(training, is_left, method)
+    drawn = {name: fit_control(training, is_left, method, eraser, draw) for name in control_names(controls)}
     return {str(method): eraser, **drawn}
 
 
@@ -476,6 +476,8 @@ def half_differences_of(features: TokenFeatures, fits: Fits, direction: str) -> 
     """Return by episode (T, K) half the differences of the class means, of the folds that it is not in."""
     by_name: dict[str, NDArray[np.float64]] = {}
     for fold, fitted in fits:
-        halves = half_differences(features.tokens.only(fold.train), features.left[fold.train], fitted[direction])
+        halves = half_differences(
+            features.tokens.only(fold.train), features.is_left[fold.train], fitted[direction]
+        )
         by_name |= dict.fromkeys((features.episodes[row] for row in fold.test), halves)
     return by_name

@@ -31,14 +31,14 @@ NO_DIRECTION = (
 
 @dataclass(frozen=True)
 class Method:
-    """How an answer is erased. rank: directions per token, always 1 for `leace`, which needs no more."""
+    """A way to erase an answer. rank: directions per token, always 1 for `leace`, which needs no more."""
 
     way: Way = "leace"
     rank: int = 1
 
     @classmethod
     def of(cls, text: str) -> "Method":
-        """From its name: `leace`, `mean-difference:K` or `inlp:K`. Raises UsageError for any other."""
+        """Return the method of a name: `leace`, `mean-difference:K` or `inlp:K`. Raises UsageError."""
         way, _, rank = text.partition(":")
         if way not in WAYS:
             raise UsageError(
@@ -67,17 +67,17 @@ class PaddedTokens:
         """Some of the episodes."""
         return PaddedTokens(self.values[rows], self.present[rows])
 
-    def usable(self, left: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def usable(self, is_left: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """(T,) positions at which either answer has `FEWEST` episodes."""
-        counts = [self.present[left == side].sum(axis=0) for side in (True, False)]
+        counts = [self.present[is_left == side].sum(axis=0) for side in (True, False)]
         return np.asarray(np.minimum(*counts) >= FEWEST)
 
     def centred(self) -> "tuple[Array, Array]":
         """(N, T, D) minus the means (T, D) over the samples that have the position; zero where none has."""
-        here = self.present[..., None]
-        counts = np.maximum(here.sum(axis=0), 1)
-        means = np.where(here, self.values, 0).sum(axis=0) / counts
-        return np.where(here, self.values - means, 0), means
+        mask = self.present[..., None]
+        counts = np.maximum(mask.sum(axis=0), 1)
+        means = np.where(mask, self.values, 0).sum(axis=0) / counts
+        return np.where(mask, self.values - means, 0), means
 
 
 @dataclass(frozen=True)
@@ -100,74 +100,77 @@ class Eraser:
         count = values.shape[-2]
         apart = np.where(self.fitted[:count, None], values - self.means[:count], 0.0)
         removed, read = (
-            np.broadcast_to(own, (self.fitted.size, *own.shape[1:]))[:count] for own in (self.removed, self.read)
+            np.broadcast_to(directions, (self.fitted.size, *directions.shape[1:]))[:count]
+            for directions in (self.removed, self.read)
         )
-        found: Array = np.einsum("...tk,tkd->...td", np.einsum("...td,tkd->...tk", apart, read), removed)
-        return np.asarray(values - found)
+        change: Array = np.einsum("...tk,tkd->...td", np.einsum("...td,tkd->...tk", apart, read), removed)
+        return np.asarray(values - change)
 
 
-def fit_eraser(tokens: PaddedTokens, left: NDArray[np.bool_], method: Method) -> Eraser:
-    """What erases the answer from such tokens. left: (N,) the answer.
+def fit_eraser(tokens: PaddedTokens, is_left: NDArray[np.bool_], method: Method) -> Eraser:
+    """Return the eraser of the answer from such tokens. is_left: (N,) the answer.
 
     Raises NoDirectionError if no position has a direction, and UsageError if none has episodes enough of either
     answer, or if there are fewer directions than the method's name says.
     """
-    _check(tokens, left)
+    _check(tokens, is_left)
     centred, means = tokens.centred()
-    usable = tokens.usable(left)
-    _check_more(method, min(centred.shape[2], len(left)))
+    usable = tokens.usable(is_left)
+    _check_more(method, min(centred.shape[2], len(is_left)))
     if method.way == "leace":
-        removed, read = _leace(centred, tokens.present, _answer(tokens, left), usable)
+        removed, read = _leace(centred, tokens.present, _answer(tokens, is_left), usable)
     elif method.way == "inlp":
-        removed = read = _inlp(centred, tokens.present, left, usable, method.rank)
+        removed = read = _inlp(centred, tokens.present, is_left, usable, method.rank)
     else:
         size = float(np.abs(tokens.values[tokens.present]).max())
-        removed = read = _shared(_differences(centred, tokens.present, left)[usable], method.rank, size)
-    there = (np.linalg.norm(removed, axis=-1) > 0).sum(axis=1)
-    if not there.any():
+        removed = read = _shared(_differences(centred, tokens.present, is_left)[usable], method.rank, size)
+    ranks = (np.linalg.norm(removed, axis=-1) > 0).sum(axis=1)
+    if not ranks.any():
         raise NoDirectionError(f"no direction for {method}: {NO_DIRECTION}")
-    _check_more(method, int(there[there > 0].min()))
-    return Eraser(means, removed, read, usable & (there > 0))
+    _check_more(method, int(ranks[ranks > 0].min()))
+    return Eraser(means, removed, read, usable & (ranks > 0))
 
 
 def fit_control(
-    tokens: PaddedTokens, left: NDArray[np.bool_], method: Method, own: Eraser, draw: np.random.Generator
+    tokens: PaddedTokens, is_left: NDArray[np.bool_], method: Method, eraser: Eraser, draw: np.random.Generator
 ) -> Eraser:
-    """The same taken away for no answer: as many random directions of the data's own covariance, beside `own`.
+    """Return an eraser of no answer: as many random directions of the data's covariance, orthogonal to `eraser`.
 
     For `leace` a label drawn at random, uncorrelated with the answer, is erased in the same way. Raises UsageError
-    if beside `own` no room is left for as many.
+    if orthogonal to `eraser` no room is left for as many.
     """
-    _check(tokens, left)
+    _check(tokens, is_left)
     centred, means = tokens.centred()
-    usable = own.fitted
+    usable = eraser.fitted
     if method.way == "leace":
-        answer = _answer(tokens, left)
-        label = np.where(tokens.present, draw.normal(size=len(left))[:, None], 0.0)
+        answer = _answer(tokens, is_left)
+        label = np.where(tokens.present, draw.normal(size=len(is_left))[:, None], 0.0)
         share = (label * answer).sum(axis=0) / np.maximum((answer**2).sum(axis=0), _TINY)
         label = np.where(tokens.present, label - share * answer, 0.0)
         counts = np.maximum(tokens.present.sum(axis=0), 1)
         label = np.where(tokens.present, label - label.sum(axis=0) / counts, 0.0)
         return Eraser(means, *_leace(centred, tokens.present, label, usable), usable)
     if method.way == "inlp":
-        weights = draw.normal(size=(method.rank, len(left)))
+        weights = draw.normal(size=(method.rank, len(is_left)))
         drawn = np.einsum("kn,ntd->tkd", weights, centred)
     else:
         weights = draw.normal(size=(method.rank, *centred.shape[:2]))
         drawn = np.einsum("knt,ntd->kd", weights, centred)[None]
-    beside = np.stack([_basis(one, past=taken) for one, taken in zip(drawn, own.removed, strict=True)])
-    fitted = usable if len(beside) == usable.size else slice(None)
-    room = int((np.linalg.norm(beside[fitted], axis=-1) > 0).sum(axis=1).min())
+    controls = np.stack(
+        [_basis(directions, past=erased) for directions, erased in zip(drawn, eraser.removed, strict=True)]
+    )
+    fitted = usable if len(controls) == usable.size else slice(None)
+    room = int((np.linalg.norm(controls[fitted], axis=-1) > 0).sum(axis=1).min())
     if room < method.rank:
         raise UsageError(
             f"{method} leaves room for {room} random directions beside it, of {centred.shape[2]} dimensions and "
-            f"{len(left)} episodes; expected {method.rank}. Ask for fewer directions, or for --controls 0"
+            f"{len(is_left)} episodes; expected {method.rank}. Ask for fewer directions, or for --controls 0"
         )
-    return Eraser(means, beside, beside, usable)
+    return Eraser(means, controls, controls, usable)
 
 
 def ledoit_wolf(centred: Array) -> float:
-    """How far Ledoit and Wolf (2004) shrink the covariance of centred data (N, D) toward a sphere, in [0, 1].
+    """Return in [0, 1] how far Ledoit and Wolf (2004) shrink the covariance of data (N, D) toward a sphere.
 
     By the (N, N) products of episodes: dimensions are many and episodes few.
     """
@@ -181,7 +184,7 @@ def ledoit_wolf(centred: Array) -> float:
 
 
 def leace_direction(centred: Array, label: Array, shrinkage: float | None = None) -> tuple[Array, Array]:
-    """What LEACE takes away of one label, and what it reads it by, both (D,): P = removed · readᵀ.
+    """Return what LEACE removes of one label, and what it reads it by, both (D,): P = removed · readᵀ.
 
     centred: (N, D). label: (N,), its mean 0. P = Σ_xz (Σ_xzᵀ Σ⁻¹ Σ_xz)⁻¹ Σ_xzᵀ Σ⁻¹ of the covariances: whatever
     the shrinkage, nothing correlated with the label is left in the data it was fitted on; without any, no other
@@ -193,34 +196,34 @@ def leace_direction(centred: Array, label: Array, shrinkage: float | None = None
     _, values, axes = np.linalg.svd(centred, full_matrices=False)
     variances = values**2 / count
     shrunk = (1 - amount) * variances + amount * variances.sum() / width
-    kept = variances > _TINY * max(variances.max(initial=0.0), _TINY)
-    read = axes[kept].T @ ((axes[kept] @ along) / shrunk[kept])
+    varies = variances > _TINY * max(variances.max(initial=0.0), _TINY)
+    read = axes[varies].T @ ((axes[varies] @ along) / shrunk[varies])
     if np.linalg.norm(along) <= _TINY * np.sqrt(variances.sum() * (label @ label) / count):
         return np.zeros(width), np.zeros(width)
     strength = float(along @ read)
     return (along, read / strength) if strength > 0 else (np.zeros(width), np.zeros(width))
 
 
-def _check(tokens: PaddedTokens, left: NDArray[np.bool_]) -> None:
-    if not tokens.usable(left).any():
+def _check(tokens: PaddedTokens, is_left: NDArray[np.bool_]) -> None:
+    if not tokens.usable(is_left).any():
         raise UsageError(
-            f"no position has {FEWEST} episodes of either answer among {len(left)} to learn from; expected more "
-            "items (leave --items out, or extract more)"
+            f"no position has {FEWEST} episodes of either answer among {len(is_left)} to learn from; expected "
+            "more items (leave --items out, or extract more)"
         )
 
 
-def _check_more(method: Method, there: int) -> None:
+def _check_more(method: Method, available: int) -> None:
     """A name says how many directions there are: it is not kept for fewer."""
-    if method.rank > there:
+    if method.rank > available:
         raise UsageError(
-            f"{method} asks for {method.rank} directions, and these tokens have {there} to find; expected "
-            f"{method.way}:{there} or fewer"
+            f"{method} asks for {method.rank} directions, and these tokens have {available} to find; expected "
+            f"{method.way}:{available} or fewer"
         )
 
 
-def _answer(tokens: PaddedTokens, left: NDArray[np.bool_]) -> Array:
+def _answer(tokens: PaddedTokens, is_left: NDArray[np.bool_]) -> Array:
     """(N, T) the answer as ±½, centred at every position over who is present there."""
-    values = np.where(tokens.present, left[:, None] - 0.5, 0.0)
+    values = np.where(tokens.present, is_left[:, None] - 0.5, 0.0)
     means = values.sum(axis=0) / np.maximum(tokens.present.sum(axis=0), 1)
     return np.where(tokens.present, values - means, 0.0)
 
@@ -241,41 +244,41 @@ def _leace(
 
 
 def _inlp(
-    centred: Array, present: NDArray[np.bool_], left: NDArray[np.bool_], usable: NDArray[np.bool_], rank: int
+    centred: Array, present: NDArray[np.bool_], is_left: NDArray[np.bool_], usable: NDArray[np.bool_], rank: int
 ) -> Array:
     """(T, K, D): at every position, what a probe finds, then what one finds without it, and so on."""
     from sklearn.linear_model import LogisticRegression
 
-    found = np.zeros((usable.size, rank, centred.shape[2]))
+    directions = np.zeros((usable.size, rank, centred.shape[2]))
     for position, rows in _rows(present, usable):
         values = centred[rows, position]
         scale = float(values.std()) or 1.0
         for number in range(rank):
-            past = found[position, :number]
-            rest = (values - (values @ past.T) @ past) / scale
-            weights = LogisticRegression(C=1.0, max_iter=200).fit(rest, left[rows]).coef_
+            past = directions[position, :number]
+            residual = (values - (values @ past.T) @ past) / scale
+            weights = LogisticRegression(C=1.0, max_iter=200).fit(residual, is_left[rows]).coef_
             if np.linalg.norm(weights) <= _TINY:
                 break
-            found[position, number] = _basis(weights, past=past)[0]
-    return found
+            directions[position, number] = _basis(weights, past=past)[0]
+    return directions
 
 
-def _differences(centred: Array, present: NDArray[np.bool_], left: NDArray[np.bool_]) -> Array:
+def _differences(centred: Array, present: NDArray[np.bool_], is_left: NDArray[np.bool_]) -> Array:
     """(T, D) between the means of either answer."""
     sums = [
-        centred[left == side].sum(axis=0) / np.maximum(present[left == side].sum(axis=0), 1)[:, None]
+        centred[is_left == side].sum(axis=0) / np.maximum(present[is_left == side].sum(axis=0), 1)[:, None]
         for side in (True, False)
     ]
     return np.asarray(sums[0] - sums[1])
 
 
-def half_differences(tokens: PaddedTokens, left: NDArray[np.bool_], eraser: Eraser) -> Array:
+def half_differences(tokens: PaddedTokens, is_left: NDArray[np.bool_], eraser: Eraser) -> Array:
     """(T, K) halves of the differences of class means along an eraser's shared directions, toward `left`.
 
     Zero at the positions at which nothing was fitted.
     """
     centred, _ = tokens.centred()
-    halves = _differences(centred, tokens.present, left) @ eraser.removed[0].T / 2
+    halves = _differences(centred, tokens.present, is_left) @ eraser.removed[0].T / 2
     return np.where(eraser.fitted[:, None], halves, 0.0)
 
 
@@ -285,19 +288,19 @@ def _shared(differences: Array, rank: int, size: float) -> Array:
     size: of the largest number whose differences these are.
     """
     _, values, axes = np.linalg.svd(differences, full_matrices=False)
-    chosen = axes[: min(rank, int((values > _TINY * max(values[0], size)).sum()))]
-    return np.asarray(chosen[None])
+    directions = axes[: min(rank, int((values > _TINY * max(values[0], size)).sum()))]
+    return np.asarray(directions[None])
 
 
 def _basis(directions: Array, past: Array) -> Array:
     """(K, D) orthonormal: directions (K, D) without what `past` (J, D) spans; zero where nothing is left."""
-    taken = [own / np.linalg.norm(own) for own in past if np.linalg.norm(own) > 0]
-    found: list[Array] = []
-    for own in directions:
-        length = float(np.linalg.norm(own))
+    past_units = [direction / np.linalg.norm(direction) for direction in past if np.linalg.norm(direction) > 0]
+    units: list[Array] = []
+    for direction in directions:
+        length = float(np.linalg.norm(direction))
         for _ in range(2):  # once more for rounding
-            for other in [*taken, *found]:
-                own = own - other * (other @ own)
-        left = float(np.linalg.norm(own))
-        found.append(own / left if left > 1e-6 * length else np.zeros_like(own))
-    return np.array(found)
+            for other in [*past_units, *units]:
+                direction = direction - other * (other @ direction)
+        remainder = float(np.linalg.norm(direction))
+        units.append(direction / remainder if remainder > 1e-6 * length else np.zeros_like(direction))
+    return np.array(units)

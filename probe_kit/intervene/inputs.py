@@ -1,4 +1,4 @@
-"""Whether an input decides the action of a run without sides. Reads stored outcomes; needs no model."""
+"""The effect of one input on the action of a run without sides. Reads stored outcomes; needs no model."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -59,9 +59,11 @@ def _input_effect(
     assert outcomes.size is not None
     at, control, full = (outcomes.conditions.index(name) for name in (swapped, CONTROL_INPUT, DONOR))
     size, control_size, full_size = outcomes.size[[at, control, full]]
-    clean, whole = outcomes.of(CLEAN), outcomes.of(DONOR) - outcomes.of(CLEAN)
+    clean, exchange = outcomes.of(CLEAN), outcomes.of(DONOR) - outcomes.of(CLEAN)
     share = (
-        share_of_whole(outcomes.of(swapped) - clean, whole, outcomes.groups, seed_text) if whole.any() else None
+        share_of_whole(outcomes.of(swapped) - clean, exchange, outcomes.groups, seed_text)
+        if exchange.any()
+        else None
     )
     p = paired_greater_p(size - control_size, outcomes.items, outcomes.groups)
     ratio = float(size.sum() / full_size.sum()) if full_size.any() else 0.0

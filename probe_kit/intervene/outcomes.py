@@ -1,4 +1,4 @@
-"""Where interventions live: `RUN/interventions/<key>/`, complete or not there. Reading them needs no model.
+"""The store of interventions: `RUN/interventions/<key>/`, complete or not there. Reading needs no model.
 
 settings.json      the head: what was asked, of which commits, and the hashes of the rest; written last
 episodes.npz       per condition and episode where the action would go, and how far it changed
@@ -53,7 +53,7 @@ BY_CONDITION = ("displacement", "max_action_change", "edit_log", "episode_outcom
 
 @dataclass(frozen=True)
 class ConditionOutcomes:
-    """What K conditions gave for E episodes of a run; see `replay.ReplayBatch`.
+    """The numbers of K conditions in E episodes of a run; see `replay.ReplayBatch`.
 
     conditions: names of the K, the clean one first. episodes, items, groups, categories, sides: (E,), `sides`
     those of the correct picture. displacement: (K, E) metres from the middle, left positive. max_action_change:
@@ -95,11 +95,11 @@ class ConditionOutcomes:
         """The episodes of one category."""
         return self.of_episodes(self.categories == category)
 
-    def of_episodes(self, chosen: NDArray[np.bool_]) -> "ConditionOutcomes":
+    def of_episodes(self, selected: NDArray[np.bool_]) -> "ConditionOutcomes":
         """Some of the episodes. chosen: (E,)."""
         axes = dict.fromkeys(BY_CONDITION, 1)
         cut: dict[str, Any] = {
-            name: np.compress(chosen, value, axes.get(name, 0))
+            name: np.compress(selected, value, axes.get(name, 0))
             for name, value in vars(self).items()
             if name != "conditions" and value is not None
         }
@@ -110,7 +110,7 @@ class ConditionOutcomes:
         return [(name, self.only(name)) for name in dict.fromkeys(map(str, self.categories))]
 
     def to_bytes(self) -> bytes:
-        """As a `.npz`; the same answers give the same bytes."""
+        """Return a `.npz`; the same numbers give the same bytes."""
         file = BytesIO()
         arrays = {name: value for name, value in vars(self).items() if value is not None}
         arrays["conditions"] = np.array(self.conditions)
@@ -121,8 +121,8 @@ class ConditionOutcomes:
     def from_bytes(cls, content: bytes) -> "ConditionOutcomes":
         """Load what `to_bytes` gave."""
         with open_arrays(content) as arrays:
-            found: dict[str, Any] = dict(arrays)
-        return cls(**{**found, "conditions": tuple(map(str, found["conditions"]))})
+            values: dict[str, Any] = dict(arrays)
+        return cls(**{**values, "conditions": tuple(map(str, values["conditions"]))})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,7 +149,7 @@ class StoredIntervention:
 
     @property
     def settings(self) -> Mapping[str, Any]:
-        """What decided its numbers."""
+        """Return what decided its numbers."""
         settings: Mapping[str, Any] = self.bundle.head["settings"]
         return settings
 
@@ -159,11 +159,11 @@ class StoredIntervention:
         return self.bundle.times.get("created", "")
 
     def outcomes(self) -> ConditionOutcomes:
-        """What was measured. Raises RunDamagedError if it was changed."""
+        """Read what was measured. Raises RunDamagedError if it was changed."""
         return ConditionOutcomes.from_bytes(self.bundle.read(EPISODES))
 
     def certificate(self) -> dict[str, Any]:
-        """What was loaded and checked. Raises RunDamagedError if it was changed."""
+        """Read what was loaded and checked. Raises RunDamagedError if it was changed."""
         return self.bundle.read_json(CERTIFICATE)
 
 
@@ -174,14 +174,14 @@ def save(
     outcomes: ConditionOutcomes,
     effects: str,
     certificate: Mapping[str, Any],
-    further: Mapping[str, bytes] = MappingProxyType({}),
+    extra_files: Mapping[str, bytes] = MappingProxyType({}),
 ) -> None:
     """Write `interventions/<key>/`, all or nothing; what is there is kept. further: other files, by name."""
     if is_stored(run, key):
         tidy_bundle(run, INTERVENTIONS, key)
         return
     files = {
-        EPISODES: outcomes.to_bytes(), EFFECTS: effects.encode(), CERTIFICATE: as_json(certificate), **further,
+        EPISODES: outcomes.to_bytes(), EFFECTS: effects.encode(), CERTIFICATE: as_json(certificate), **extra_files,
     }  # fmt: skip
     now = datetime.now(UTC).isoformat(timespec="microseconds")
     write_bundle(run, INTERVENTIONS, key, {"settings": dict(settings)}, files, {"created": now})
@@ -203,18 +203,22 @@ def read_interventions(run: Location) -> dict[str, Bundle]:
 
 
 def stored_interventions(run: RunReader, kind: str | None = None) -> list[StoredIntervention]:
-    """Those of the episodes that the run has now, in the wording it is in, oldest first.
+    """Return those of the episodes that the run has now, in the wording it is in, oldest first.
 
     kind: only these. Raises RunDamagedError if any of the run was changed, lost its settings or has another
     format.
     """
-    found = [StoredIntervention(bundle) for bundle in read_interventions(run.location).values()]
-    wanted = {
+    interventions = [StoredIntervention(bundle) for bundle in read_interventions(run.location).values()]
+    required = {
         "stamp": stamp_of_run(run), "run_settings": run.settings_sha256,
         "wording": getattr(run, "wording", None), **({} if kind is None else {"kind": kind}),
     }  # fmt: skip
-    fitting = [one for one in found if all(one.settings.get(name) == value for name, value in wanted.items())]
-    return sorted(fitting, key=lambda one: (one.created, one.key))
+    fitting = [
+        intervention
+        for intervention in interventions
+        if all(intervention.settings.get(name) == value for name, value in required.items())
+    ]
+    return sorted(fitting, key=lambda intervention: (intervention.created, intervention.key))
 
 
 def find_stored(run: RunReader, key: str | None = None, kind: str | None = None) -> StoredIntervention:
@@ -222,13 +226,13 @@ def find_stored(run: RunReader, key: str | None = None, kind: str | None = None)
 
     Raises NoInterventionsError if there is none, UsageError for a key that is not there or not the only one.
     """
-    there = stored_interventions(run, kind)
+    candidates = stored_interventions(run, kind)
     if key is None:
-        if not there:
+        if not candidates:
             raise NoInterventionsError(
                 f"{run.location} has no stored intervention{'' if kind is None else f' of kind {kind}'} on its "
                 f"episodes. Run `probe-kit intervene {run.location}`"
             )
-        return there[-1]
-    by_key = {one.key: one for one in there}
+        return candidates[-1]
+    by_key = {intervention.key: intervention for intervention in candidates}
     return by_key[complete_key(key, by_key, run.location, "interventions")]

@@ -75,7 +75,7 @@ class PlaceName:
 
     @property
     def depth(self) -> tuple[object, ...]:
-        """For sorting places of one stream: shallow before deep, a layer before its parts."""
+        """Return a key that sorts places of one stream: shallow before deep, a layer before its parts."""
         return self.layer, self.iterations or (0, 0), self.quantity, -1 if self.head is None else self.head
 
 
@@ -86,18 +86,18 @@ def list_places(names: Sequence[str]) -> str:
     """
     ranges: list[list[tuple[PlaceName, str]]] = []
     for name in names:
-        place, _, role = name.partition(" ")
-        parsed = PlaceName.parse(place)
+        site, _, role = name.partition(" ")
+        parsed = PlaceName.parse(site)
         before = ranges[-1][-1] if ranges else None
         if before is not None and (replace(before[0], layer=before[0].layer + 1), before[1]) == (parsed, role):
             ranges[-1].append((parsed, role))
         else:
             ranges.append([(parsed, role)])
     return ", ".join(
-        f"{own[0][0]} to {' '.join(filter(None, map(str, own[-1])))}"
-        if len(own) >= SHORTEST_RANGE
-        else ", ".join(" ".join(filter(None, map(str, one))) for one in own)
-        for own in ranges
+        f"{parts[0][0]} to {' '.join(filter(None, map(str, parts[-1])))}"
+        if len(parts) >= SHORTEST_RANGE
+        else ", ".join(" ".join(filter(None, map(str, part))) for part in parts)
+        for parts in ranges
     )
 
 
@@ -131,7 +131,7 @@ class SiteGroup:
 
     @property
     def stream(self) -> str:
-        """Of all its sites."""
+        """Return the stream of all its sites."""
         return self.sites[0].stream
 
     @property
@@ -172,15 +172,15 @@ def resolve_sites(pattern: str, policy: "Model") -> list[SiteGroup]:
     first, last = match["first"], match["last"]
     iterations = None if first is None else (int(first), int(last or first))
     return [
-        _place(stream, PlaceName(stream.name, layer, quantity, one, iterations))
+        _place(stream, PlaceName(stream.name, layer, quantity, number, iterations))
         for layer in layers
-        for one in heads
+        for number in heads
     ]
 
 
 def resolve_all(patterns: Sequence[str], policy: "Model") -> dict[str, SiteGroup]:
     """The places of several patterns by name, each once. Raises as `resolve_sites` does."""
-    return {place.name: place for pattern in patterns for place in resolve_sites(pattern, policy)}
+    return {site_group.name: site_group for pattern in patterns for site_group in resolve_sites(pattern, policy)}
 
 
 def parse_pattern(pattern: str) -> dict[str, str | None] | None:
@@ -213,8 +213,10 @@ def _place(stream: "Stream", name: PlaceName) -> SiteGroup:
     expected = 1 if stream.iterations is None else high - low + 1 if name.iterations else stream.iterations
     expected *= len(quantities)
     if len(sites) != expected or (stream.iterations is None and name.iterations is not None):
-        there = f"{stream.layers} layers" + (f" and {stream.iterations} iterations" if stream.iterations else "")
-        raise UnknownSiteError(f"{name} is no place; the stream {stream.name} has {there}, counted from 0")
+        available = f"{stream.layers} layers" + (
+            f" and {stream.iterations} iterations" if stream.iterations else ""
+        )
+        raise UnknownSiteError(f"{name} is no place; the stream {stream.name} has {available}, counted from 0")
     if name.head is not None and name.head >= stream.heads:
         raise UnknownSiteError(f"{name} is no place; a block of {stream.name} has {stream.heads} heads, from 0 on")
     return SiteGroup(str(name), sites, name.head, stream.heads if name.quantity == HEADS else 0)
@@ -226,28 +228,28 @@ def positions_of(role: str) -> tuple[int, int] | None:
     return None if match is None else (int(match["first"]), int(match["last"] or match["first"]))
 
 
-def roles_of(policy: "Policy", stream: str, wanted: Sequence[str]) -> list[str]:
-    """Those of the wanted roles that tokens of a stream play, `all` included, tiles where it has a picture."""
-    named = policy.role_names.get(policy.tokens_of(stream), ())
-    tiles = TILE_ROLES if any(plays(name, "image") for name in named) else ()
-    return [role for role in wanted if role == ALL or role in tiles or any(plays(name, role) for name in named)]
+def roles_of(policy: "Policy", stream: str, roles: Sequence[str]) -> list[str]:
+    """Return the roles that tokens of a stream play, of some; `all` included, tiles where it has a picture."""
+    declared = policy.role_names.get(policy.tokens_of(stream), ())
+    tiles = TILE_ROLES if any(plays(name, "image") for name in declared) else ()
+    return [role for role in roles if role == ALL or role in tiles or any(plays(name, role) for name in declared)]
 
 
 def check_roles_have_tokens(
-    policy: "Policy", streams: Sequence[str], wanted: Sequence[str], usual: Sequence[str]
+    policy: "Policy", streams: Sequence[str], roles: Sequence[str], usual: Sequence[str]
 ) -> None:
     """Raise UsageError for a wanted role that no token of these streams plays.
 
     usual: the roles that are tried if nothing is said, of which one that is there will do.
     """
-    there = {role for stream in streams for role in roles_of(policy, stream, wanted)}
-    missing = [role for role in wanted if role not in there]
-    if not missing or (there and tuple(wanted) == tuple(usual)):
+    present = {role for stream in streams for role in roles_of(policy, stream, roles)}
+    missing = [role for role in roles if role not in present]
+    if not missing or (present and tuple(roles) == tuple(usual)):
         return
-    named = [name for stream in streams for name in policy.role_names.get(policy.tokens_of(stream), ())]
+    declared = [name for stream in streams for name in policy.role_names.get(policy.tokens_of(stream), ())]
     raise UsageError(
         f"no token of {', '.join(streams)} has the role {missing[0]!r}; expected one of "
-        f"{', '.join(dict.fromkeys((ALL, *named)))}"
+        f"{', '.join(dict.fromkeys((ALL, *declared)))}"
     )
 
 

@@ -65,9 +65,9 @@ def roll_out(session: SceneSession, pair: Pair, condition: Condition, swapping: 
     """
     edit_logs: list[EditLog] = []
 
-    def act(here: Pair, past: Sequence[Chunk]) -> Chunk:
+    def act(current: Pair, past: Sequence[Chunk]) -> Chunk:
         del past
-        played = condition.play(ConditionContext(session, here))
+        played = condition.play(ConditionContext(session, current))
         edit_logs.extend([] if played.edit_log is None else [played.edit_log])
         return played.chunk
 
@@ -103,19 +103,19 @@ def _evaluate(
     start = _offset(session, pair.clean)
     batch.displacement[:, column] = start
 
-    def act(here: Pair, past: Sequence[Chunk]) -> Chunk:
-        context = ConditionContext(session, here)
+    def act(current: Pair, past: Sequence[Chunk]) -> Chunk:
+        context = ConditionContext(session, current)
         clean = conditions[0].play(context)
         for number, condition in enumerate(conditions):
             played = condition.play(context) if number else clean
             actions = executed(session, [*past, played.chunk])
-            batch.displacement[number, column] += session.displacement(actions, here) - _offset(
-                session, here.clean
+            batch.displacement[number, column] += session.displacement(actions, current) - _offset(
+                session, current.clean
             )
             change = float(np.abs(played.chunk - clean.chunk).max())
             batch.max_action_change[number, column] = max(batch.max_action_change[number, column], change)
             edit_logs[number] += [] if played.edit_log is None else [played.edit_log]
-            attention_records.extend([] if played.mass is None else [(here.row, here.step, played.mass)])
+            attention_records.extend([] if played.mass is None else [(current.row, current.step, played.mass)])
         return clean.chunk
 
     batch.replay_error[column] = apart_from_stored(session, pair, _step_through(session, pair, act, True))
@@ -133,8 +133,8 @@ def _step_through(
         assert isinstance(answer, Observation)
         other = stage.look_swapped().observation if swapping else answer
         seed = derive_seed(planned.policy_seed, "inference", call)
-        here = replace(pair, clean=answer, source=other, seed=seed, tiles=stage.tile_masks(), step=call)
-        past.append(act(here, past))
+        current = replace(pair, clean=answer, source=other, seed=seed, tiles=stage.tile_masks(), step=call)
+        past.append(act(current, past))
         answer = stage.advance(executed(session, past))
         if isinstance(answer, Ending):
             break
@@ -181,10 +181,10 @@ def apart_from_stored(session: SceneSession, pair: Pair, clean: RolloutResult) -
     return _largest(clean.frames, frames)
 
 
-def _largest(one: NDArray[np.float32], other: NDArray[np.float32]) -> float:
+def _largest(first: NDArray[np.float32], second: NDArray[np.float32]) -> float:
     """Return the largest difference over the frames that both have; 0 only if they are the same bit for bit."""
-    if np.array_equal(one, other, equal_nan=True):
+    if np.array_equal(first, second, equal_nan=True):
         return 0.0
-    both = min(len(one), len(other))
-    apart = np.abs(one[:both].astype(np.float64) - other[:both])
+    both = min(len(first), len(second))
+    apart = np.abs(first[:both].astype(np.float64) - second[:both])
     return max(float(np.nanmax(apart)), float(np.finfo(np.float32).tiny))

@@ -129,19 +129,19 @@ def show(
         show_action_errors(run, partial, as_json)
         return
     opened = open_run(run, allow_partial=True)
-    found, interventions = inventory(opened), listed_interventions(opened)
+    facts, interventions = inventory(opened), listed_interventions(opened)
     unfinished = unfinished_interventions(opened.location)
     if as_json:
-        listed = [asdict(one) for one in interventions]
-        print_json({**asdict(found), "interventions": listed, "unfinished_interventions": unfinished})
+        listed = [asdict(intervention) for intervention in interventions]
+        print_json({**asdict(facts), "interventions": listed, "unfinished_interventions": unfinished})
         return
-    further = {f"intervention {one.key}": one.words for one in interventions}
-    further |= {
+    rows = {f"intervention {intervention.key}": intervention.words for intervention in interventions}
+    rows |= {
         f"unfinished {key}": f"an intervention, {counted(items, 'item')} so far; "
         "the same `probe-kit intervene` continues it"
         for key, items in unfinished.items()
     }
-    out.print(facts_table(found, further))
-    if not found.probes:
-        why = f". {how_to_probe(opened)}" if found.streams else ": a policy without streams has none"
+    out.print(facts_table(facts, rows))
+    if not facts.probes:
+        why = f". {how_to_probe(opened)}" if facts.streams else ": a policy without streams has none"
         out.print(f"no probes{why}", soft_wrap=True)

@@ -71,11 +71,11 @@ def _execute(
     on_fit_progress: Progress | None,
 ) -> None:
     pieces = Pieces.of(run.location, INTERVENTIONS, key, run.stamp, REDO)
-    wanted, patterns = intervention.items_in(run), _patterns(settings)
+    requested, patterns = intervention.items_in(run), _patterns(settings)
     with open_session(run, source, load, intervention) as session, session.ready():
         session.on_fit_progress = on_fit_progress or notebook_progress("items learnt from")
         _check_roles(session, settings, getattr(type(intervention), "roles", Interchange.roles))
-        items = intervention.eligible_items(session, wanted)
+        items = intervention.eligible_items(session, requested)
         conditions = intervention.conditions(session)
         parts = _replay_items(
             session, intervention, items, conditions, pieces, progress or notebook_progress("items replayed")
@@ -84,7 +84,7 @@ def _execute(
             "policy": session.policy.card.to_json(),
             "provenance": _provenance(session),
             "replay": _replay_check(parts),
-            "items": {"asked": len(wanted), "played": len(items)},
+            "items": {"asked": len(requested), "played": len(items)},
             "supported": session.policy.interventions.to_json(),
             "edits": _ledgers(conditions, parts),
             "unread": list(unread_places(patterns, session.policy.every_stream(), session.policy.interventions)),
@@ -92,12 +92,12 @@ def _execute(
             **intervention.certificate_entries(conditions, parts),
         }
     outcomes = outcomes_of(run, [condition.name for condition in conditions], parts)
-    further = intervention.extra_files(run, conditions, parts)
+    extra_files = intervention.extra_files(run, conditions, parts)
     measurement = Measurement(
-        outcomes, run.seed_text, settings, certificate, further.__getitem__, tiles_apart=tiles_apart(run)
+        outcomes, run.seed_text, settings, certificate, extra_files.__getitem__, tiles_apart=tiles_apart(run)
     )
     effects = effects_csv(measurement)
-    save(run.location, settings, key, outcomes, effects, certificate, further)
+    save(run.location, settings, key, outcomes, effects, certificate, extra_files)
     pieces.discard()
 
 
@@ -108,15 +108,17 @@ def _check_roles(session: ReplaySession, settings: Mapping[str, Any], usual: Seq
     """
     roles, sites = settings.get("roles"), settings.get("sites")
     intervention = [(sites, roles)] if roles and sites else []
-    intervention += [([name.place], [name.role]) for name in map(ConditionName.parse, settings.get("targets", ()))]
-    for patterns, wanted in intervention:
-        found = [place.stream for pattern in patterns for place in resolve_sites(pattern, session.policy)]
-        check_roles_have_tokens(session.policy, tuple(dict.fromkeys(found)), wanted, usual)
+    intervention += [([name.site], [name.role]) for name in map(ConditionName.parse, settings.get("targets", ()))]
+    for patterns, requested in intervention:
+        streams = [
+            site_group.stream for pattern in patterns for site_group in resolve_sites(pattern, session.policy)
+        ]
+        check_roles_have_tokens(session.policy, tuple(dict.fromkeys(streams)), requested, usual)
 
 
 def _patterns(settings: Mapping[str, Any]) -> list[str]:
     """The patterns of places that an intervention changes."""
-    targets = [ConditionName.parse(target).place for target in settings.get("targets", ())]
+    targets = [ConditionName.parse(target).site for target in settings.get("targets", ())]
     return [*settings.get("sites", ()), *targets]
 
 
@@ -136,14 +138,14 @@ def check_supported(run: Run, intervention: Intervention) -> None:
 
 
 def too_few_groups(run: Run, intervention: Intervention) -> dict[str, int]:
-    """By category, the number of groups of items, where it is too small for an image swap to find *not used*.
+    """Return by category the number of groups of items, where an image swap cannot find *not used* in so few.
 
     Empty for other kinds; see `groups_for_not_used`.
     """
     if not isinstance(intervention, ImageSwap) or not has_sides(run):
         return {}
-    asked = run.episodes[run.episodes["item_id"].isin(intervention.items_in(run))]
-    counts = asked.groupby("category", sort=False)["group_id"].nunique()
+    episodes = run.episodes[run.episodes["item_id"].isin(intervention.items_in(run))]
+    counts = episodes.groupby("category", sort=False)["group_id"].nunique()
     return {str(name): int(count) for name, count in counts.items() if count < groups_for_not_used()}
 
 
@@ -179,9 +181,9 @@ def _replay_item(
     return intervention.play(session, item, conditions)
 
 
-def outcomes_of(run: Run, conditions: Sequence[str], found: ReplayBatch) -> ConditionOutcomes:
-    """What K conditions gave, and for which episodes. conditions: names of the K, the clean one first."""
-    rows = run.episodes.iloc[found.rows]
+def outcomes_of(run: Run, conditions: Sequence[str], batch: ReplayBatch) -> ConditionOutcomes:
+    """Return the numbers of K conditions with their episodes. conditions: names of the K, the clean one first."""
+    rows = run.episodes.iloc[batch.rows]
     columns: dict[str, Any] = {
         field: rows[name].to_numpy(dtype=str)
         for field, name in (
@@ -190,20 +192,20 @@ def outcomes_of(run: Run, conditions: Sequence[str], found: ReplayBatch) -> Cond
     }  # fmt: skip
     columns["sides"] = rows["side_correct"].to_numpy(dtype=str) if has_sides(run) else np.full(len(rows), "")
     if run.recorded:
-        names = zip(columns["episodes"], found.steps, strict=True)
+        names = zip(columns["episodes"], batch.steps, strict=True)
         columns["episodes"] = np.array([f"{episode}@{frame}" for episode, frame in names])
-    toward, size = _toward(conditions, found)
+    toward, size = _toward(conditions, batch)
     sided = has_sides(run) or toward is None
     return ConditionOutcomes(
         conditions=tuple(conditions),
         **columns,
-        displacement=found.displacement if sided else toward,
+        displacement=batch.displacement if sided else toward,
         toward=toward,
         size=size,
-        max_action_change=found.max_action_change,
-        edit_log=found.edit_log,
-        replay_error=found.replay_error,
-        episode_outcomes=found.episode_outcomes,
+        max_action_change=batch.max_action_change,
+        edit_log=batch.edit_log,
+        replay_error=batch.replay_error,
+        episode_outcomes=batch.episode_outcomes,
     )
 
 
@@ -215,44 +217,44 @@ def _toward(conditions: Sequence[str], batch: ReplayBatch) -> tuple[Any, Any]:
     return displacements_toward(batch.chunks, list(conditions).index(references[0])), sizes(batch.chunks)
 
 
-def _replay_check(found: ReplayBatch) -> dict[str, Any]:
-    """Whether the clean inferences are the run's, bit for bit."""
-    known = found.replay_error[~np.isnan(found.replay_error)]
+def _replay_check(batch: ReplayBatch) -> dict[str, Any]:
+    """Return how many clean inferences are the run's, bit for bit."""
+    errors = batch.replay_error[~np.isnan(batch.replay_error)]
     return {
-        "episodes": int(found.replay_error.size),
-        "compared": int(known.size),
-        "equal": int((known == 0).sum()),
-        "largest_difference": float(known.max(initial=0.0)),
+        "episodes": int(batch.replay_error.size),
+        "compared": int(errors.size),
+        "equal": int((errors == 0).sum()),
+        "largest_difference": float(errors.max(initial=0.0)),
         # One that differs stops an intervention before anything is stored.
-        **({} if found.episode_outcomes is None else {"outcomes_equal": int(found.replay_error.size)}),
+        **({} if batch.episode_outcomes is None else {"outcomes_equal": int(batch.replay_error.size)}),
     }
 
 
-def _ledgers(conditions: Sequence[Condition], found: ReplayBatch) -> dict[str, dict[str, float]]:
+def _ledgers(conditions: Sequence[Condition], batch: ReplayBatch) -> dict[str, dict[str, float]]:
     """Per condition that changed streams: fires, fires that moved nothing, and norms as means over fires.
 
     Raises CaptureChangedActionError if coefficient 0 changed an action.
     """
-    said = {}
+    ledgers = {}
     for number, condition in enumerate(conditions):
-        rows = dict(zip(LOG_FIELDS, found.edit_log[number].T, strict=True))
+        rows = dict(zip(LOG_FIELDS, batch.edit_log[number].T, strict=True))
         fires = float(rows["fires"].sum())
         if not fires:
             continue
         means = {name: float((rows[name] * rows["fires"]).sum() / fires) for name in ("norm", "change")}
-        said[condition.name] = {
+        ledgers[condition.name] = {
             "fires": fires, "no_op_fires": float(rows["no_op_fires"].sum()), **means,
             "largest_change": float(rows["largest_change"].max()),
-            "max_action_change": float(found.max_action_change[number].max()),
+            "max_action_change": float(batch.max_action_change[number].max()),
         }  # fmt: skip
-        if ConditionName.parse(condition.name).coefficient == "0" and found.max_action_change[number].any():
+        if ConditionName.parse(condition.name).coefficient == "0" and batch.max_action_change[number].any():
             raise CaptureChangedActionError(
                 f"{condition.name} adds nothing and changed an action by "
-                f"{found.max_action_change[number].max():.3g}; "
+                f"{batch.max_action_change[number].max():.3g}; "
                 "expected the same bit for bit. The adapter's tap does not write what it reads, or the model is "
                 "not deterministic"
             )
-    return said
+    return ledgers
 
 
 def _provenance(session: ReplaySession) -> dict[str, Any]:

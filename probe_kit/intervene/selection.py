@@ -1,4 +1,4 @@
-"""Which of a run's stored interventions is preferred: by what each is about, never by when it was made.
+"""The choice among a run's stored interventions: by what each is about, never by when it was made.
 
 Another map, role, direction, coefficient, or a try on fewer episodes replaces nothing. Conditions that were played
 on the same episodes are pooled, whichever intervention they came with. Reads what is stored; needs no model.
@@ -27,7 +27,7 @@ Rank = tuple[bool, int, bool]
 
 @dataclass(frozen=True)
 class StoredResult:
-    """What one stored intervention says of one category. outcomes: of its episodes alone.
+    """The part of one stored intervention that is of one category. outcomes: of its episodes alone.
 
     own_readout: whether it was read as its family says it should be. wrong_readout: whether it was not, and the
     family is one whose first inference says little (`per-step`).
@@ -61,27 +61,30 @@ class StoredResult:
 
     @property
     def made(self) -> tuple[str, str]:
-        """When; decides between what says as much."""
+        """Return the time, which decides between what says as much."""
         return self.stored.created, self.stored.key
 
 
 def stored_results(run: RunReader, kind: str) -> list[StoredResult]:
-    """By category as the run has them; of each what says most last, and of what says as much the newest.
+    """Return results by category as the run has them; of each what says most comes last.
 
-    Raises RunDamagedError.
+    Of what says as much the newest. Raises RunDamagedError.
     """
     order = {name: at for at, name in enumerate(dict.fromkeys(run.episodes["category"].astype(str)))}
-    every = [own for stored in stored_interventions(run, kind) for own in StoredResult.all_of(stored)]
-    return sorted(every, key=lambda own: (order.get(own.category, len(order)), own.category, own.rank, own.made))
+    every = [result for stored in stored_interventions(run, kind) for result in StoredResult.all_of(stored)]
+    return sorted(
+        every,
+        key=lambda result: (order.get(result.category, len(order)), result.category, result.rank, result.made),
+    )
 
 
 def preferred_by_category(run: RunReader, kind: str, readout: str | None = None) -> dict[str, StoredResult]:
-    """By category, of all that is stored of a kind the one that says most. Raises RunDamagedError.
+    """Return by category, of all that is stored of a kind, the result that says most. Raises RunDamagedError.
 
     readout: of those alone; None for any.
     """
-    found = stored_results(run, kind)
-    return {own.category: own for own in found if readout in (None, own.readout)}
+    results = stored_results(run, kind)
+    return {result.category: result for result in results if readout in (None, result.readout)}
 
 
 @dataclass(frozen=True)
@@ -98,8 +101,8 @@ class PooledConditions:
         """Some of the conditions, in the order that is asked for, behind what was unchanged."""
         base = self.like.outcomes
         unchanged = [name for name in (CLEAN, IMAGE_SWAP) if name in base.conditions]
-        every = [(base, name) for name in unchanged] + [(self.sources[own].outcomes, own) for own in conditions]
-        rows = [(own, own.conditions.index(name)) for own, name in every]
+        every = [(base, name) for name in unchanged] + [(self.sources[name].outcomes, name) for name in conditions]
+        rows = [(outcomes, outcomes.conditions.index(name)) for outcomes, name in every]
         stacked = {field: _stacked(field, rows) for field in BY_CONDITION}
         return replace(base, conditions=tuple(name for _, name in every), **stacked)
 
@@ -113,16 +116,16 @@ def _stacked(field: str, rows: Sequence[tuple[ConditionOutcomes, int]]) -> Any:
 
 
 def pool_conditions(results: Iterable[StoredResult], setting: Sequence[str] = ()) -> list[PooledConditions]:
-    """What was played on the same episodes, with the same actions where nothing was changed, together.
+    """Pool what was played on the same episodes, with the same actions where nothing was changed.
 
     results: as `stored_results` orders them. setting: names of settings in which they must agree as well.
     """
-    found: dict[tuple[object, ...], PooledConditions] = {}
-    for own in results:
-        outcomes = own.outcomes
-        agreed = tuple(str(own.stored.settings.get(name)) for name in ("readout", *setting))
+    pooled: dict[tuple[object, ...], PooledConditions] = {}
+    for result in results:
+        outcomes = result.outcomes
+        agreed = tuple(str(result.stored.settings.get(name)) for name in ("readout", *setting))
         unchanged = [outcomes.of(name).tobytes() for name in (CLEAN, IMAGE_SWAP) if name in outcomes.conditions]
-        same = (own.category, *agreed, tuple(outcomes.episodes.tolist()), *unchanged)
-        sources = found.setdefault(same, PooledConditions(own, {})).sources
-        sources.update({name: own for name in outcomes.conditions if name not in UNCHANGED})
-    return list(found.values())
+        same = (result.category, *agreed, tuple(outcomes.episodes.tolist()), *unchanged)
+        sources = pooled.setdefault(same, PooledConditions(result, {})).sources
+        sources.update({name: result for name in outcomes.conditions if name not in UNCHANGED})
+    return list(pooled.values())

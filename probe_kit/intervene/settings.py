@@ -23,15 +23,15 @@ class PairChoice(Protocol):
 
     @property
     def varied(self) -> str:
-        """The input that the source has of its donor."""
+        """Return the input that the source has of its donor."""
 
     @property
     def frames(self) -> int | None:
-        """So many frames of each episode, evenly spaced."""
+        """Return the number of frames of each episode, evenly spaced; None for the default."""
 
     @property
     def pairs(self) -> tuple[PairRow, ...]:
-        """Pairs of the user's own; empty for donors that are chosen here."""
+        """Return pairs of the user's own; empty for donors that are drawn."""
 
     def items_in(self, run: Run) -> list[str]:
         """Return the items of a run that are replayed."""
@@ -44,40 +44,42 @@ class Asked(PairChoice, Protocol):
 
     @property
     def categories(self) -> tuple[str, ...] | None:
-        """Of the run; None for all."""
+        """Return the categories of the run; None for all."""
 
     @property
     def items(self) -> int | None:
-        """So many of each category, the first ones; None for all."""
+        """Return the number of items of each category, the first ones; None for all."""
 
     @property
     def readout(self) -> Readout:
-        """The part of the policy's answer that is read."""
+        """Return the part of the policy's answer that is read."""
 
     def parameters(self) -> dict[str, Any]:
-        """All else that decides its numbers, as plain JSON."""
+        """Return all else that decides its numbers, as plain JSON."""
 
 
 def categories_in(run: Run, categories: Sequence[str] | None) -> tuple[str, ...]:
     """Return some categories, by default all of a run. Raises UnknownCategoryError for one that it lacks."""
-    known = list(dict.fromkeys(run.episodes["category"].astype(str)))
+    available = list(dict.fromkeys(run.episodes["category"].astype(str)))
     for category in categories or ():
-        if category not in known:
-            raise UnknownCategoryError(f"{run.location} has no category {category!r}; it has: {', '.join(known)}")
-    return tuple(categories or known)
+        if category not in available:
+            raise UnknownCategoryError(
+                f"{run.location} has no category {category!r}; it has: {', '.join(available)}"
+            )
+    return tuple(categories or available)
 
 
 def items_of(run: Run, categories: Sequence[str] | None, items: int | None) -> list[str]:
     """Return the items that are replayed, category by category. Raises UsageError if there is none."""
     if items is not None and items < 1:
         raise UsageError(f"items is {items}; expected at least 1")
-    episodes, chosen = run.episodes, list[str]()
+    episodes, selected = run.episodes, list[str]()
     for category in categories_in(run, categories):
         names = episodes.loc[episodes["category"] == category, "item_id"].astype(str)
-        chosen += list(dict.fromkeys(names))[:items]
-    if not chosen:
+        selected += list(dict.fromkeys(names))[:items]
+    if not selected:
         raise UsageError(f"{run.location} has no episode yet; extract some first")
-    return chosen
+    return selected
 
 
 def settings_of(intervention: Asked, run: Run) -> dict[str, Any]:

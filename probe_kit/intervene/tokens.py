@@ -1,4 +1,4 @@
-"""Which tokens play a role in one inference; tiles are roles of a pair's picture.
+"""The tokens that play a role in one inference; tiles are roles of a pair's picture.
 
 Halves of the picture are not tiles: the camera looks from aside. The renderer says where a tile is seen. The
 policy itself says which patches see it, by its own crop and resize: the embeddings that change when just those
@@ -29,14 +29,14 @@ ENOUGH = 0.1
 ANSWERS_NOTHING = "{} answers no questions: give it an observation"
 
 
-def roles_of_tokens(model: "Model", given: Given) -> "dict[str, Roles]":
+def roles_of_tokens(model: "Model", model_input: Given) -> "dict[str, Roles]":
     """Return by stream the roles of its tokens in one inference, those of `kv` among them."""
     from probe_kit.hooks import AnswerModel
 
-    if isinstance(given, Observation):
-        rows = model.token_roles([given])
+    if isinstance(model_input, Observation):
+        rows = model.token_roles([model_input])
     elif isinstance(model, AnswerModel):
-        rows = model.asked_roles([given])
+        rows = model.asked_roles([model_input])
     else:
         raise UsageError(ANSWERS_NOTHING.format(model.card.family))
     return {name: roles[0] for name, roles in rows.items()}
@@ -56,9 +56,9 @@ def mask_of(roles: "Roles", stream: str, role: str) -> NDArray[np.bool_]:
     return np.asarray(mask, bool)
 
 
-def token_mask(model: "Model", given: Given, stream: str, role: str) -> NDArray[np.bool_]:
+def token_mask(model: "Model", model_input: Given, stream: str, role: str) -> NDArray[np.bool_]:
     """Return (T,) the tokens of a stream that play `role`. Raises EmptyRoleError if none does."""
-    return mask_of(roles_of_tokens(model, given)[stream], stream, role)
+    return mask_of(roles_of_tokens(model, model_input)[stream], stream, role)
 
 
 def role_token_mask(
@@ -104,18 +104,23 @@ def role_tokens(
 
 
 def tokens_overlapping(
-    policy: "Policy", seen: Observation, pixels: NDArray[np.bool_], before: NDArray[np.float32] | None = None
+    policy: "Policy",
+    observation: Observation,
+    pixels: NDArray[np.bool_],
+    before: NDArray[np.float32] | None = None,
 ) -> NDArray[np.bool_]:
     """Return (tokens of the picture,) which of them come of patches that see any of some pixels (H, W).
 
-    before: what `patch_embeddings` gives of `seen`, if it is known.
+    before: what `patch_embeddings` gives of `observation`, if it is known.
     """
     if not pixels.any():
         return np.zeros(int(policy.patch_order().max()) + 1, bool)
     # Every pixel changes by at least half of what it can.
-    turned = np.where(pixels[..., None], np.where(seen.image < 128, 255, 0), seen.image).astype(np.uint8)
-    before = patch_embeddings(policy, seen) if before is None else before
-    after = patch_embeddings(policy, replace(seen, image=turned))
+    turned = np.where(pixels[..., None], np.where(observation.image < 128, 255, 0), observation.image).astype(
+        np.uint8
+    )
+    before = patch_embeddings(policy, observation) if before is None else before
+    after = patch_embeddings(policy, replace(observation, image=turned))
     moved = np.linalg.norm(after - before, axis=-1)
     order = policy.patch_order()
     overlapping = np.zeros(int(order.max()) + 1, bool)
@@ -123,12 +128,12 @@ def tokens_overlapping(
     return overlapping
 
 
-def patch_embeddings(policy: "Policy", seen: Observation) -> NDArray[np.float32]:
+def patch_embeddings(policy: "Policy", observation: Observation) -> NDArray[np.float32]:
     """Return (V, D) the first camera's patches as they enter the first block of the vision tower."""
     from probe_kit.hooks import capture
 
     site = policy.every_stream()["vision"].sites()[0]
     with capture(policy, [site]) as tape:
-        policy.act([seen], [0])
+        policy.act([observation], [0])
     embeddings: NDArray[np.float32] = tape[site][0].float().cpu().numpy()
     return embeddings

@@ -46,15 +46,15 @@ class Catalogue:
         yield INDEX_PAYLOAD
         for key, viewed in self.runs.items():
             yield from (f"{key}/run", f"{key}/episodes")
-            chosen = [name for name in viewed.probed_categories if categories is None or name in categories]
-            yield from (f"{key}/map/{category}" for category in chosen)
+            probed = [name for name in viewed.probed_categories if categories is None or name in categories]
+            yield from (f"{key}/map/{category}" for category in probed)
             yield from (f"{key}/e/{number:05d}" for number in self.numbers(key, categories))
 
     def numbers(self, key: str, categories: Collection[str] | None = None) -> list[int]:
         """Numbers of the episodes of a run."""
         viewed = self.runs[key]
-        named = zip(viewed.position_of, viewed.run.episodes["category"], strict=True)
-        return [number for number, category in named if categories is None or category in categories]
+        episodes = zip(viewed.position_of, viewed.run.episodes["category"], strict=True)
+        return [number for number, category in episodes if categories is None or category in categories]
 
     def script(self, name: str) -> bytes:
         """The payload of this name as a script. Raises KeyError for any other name."""
@@ -66,7 +66,7 @@ class Catalogue:
 
     @property
     def _places(self) -> tuple[str, ...]:
-        return tuple(place for viewed in self.runs.values() for place in viewed.places)
+        return tuple(location for viewed in self.runs.values() for location in viewed.places)
 
     def stamp(self, name: str) -> str:
         """A hash that changes with the commits and probes that a payload is made of. Raises KeyError.
@@ -75,7 +75,7 @@ class Catalogue:
         """
         parts = name.split("/")
         if parts[0] not in self.runs:
-            return sha256_json([SCHEMA, name, [[key, one.run.stamp] for key, one in self.runs.items()]])
+            return sha256_json([SCHEMA, name, [[key, run.run.stamp] for key, run in self.runs.items()]])
         viewed = self.runs[parts[0]]
         refitted = sorted(other.key for other in viewed.refitted.values())
         probes = None if viewed.results is None else viewed.results.key
@@ -112,7 +112,7 @@ class Catalogue:
 
 @dataclass(frozen=True)
 class Growth:
-    """How far a run is. run: its key. failed: episodes that were given up."""
+    """The progress of a run. run: its key. failed: episodes that were given up."""
 
     run: str
     committed: int
@@ -138,8 +138,8 @@ class Follower:
 
     def _poll(self, key: str) -> Growth:
         run = self._catalogue.runs[key].run
-        known = {COMMITS: len(run.commits()), FAILED: len(run.failed)}
-        if not self._is_finished(key) and any(len(run.location.keys(where)) != n for where, n in known.items()):
+        counts = {COMMITS: len(run.commits()), FAILED: len(run.failed)}
+        if not self._is_finished(key) and any(len(run.location.keys(where)) != n for where, n in counts.items()):
             run = run.grown()
             self._catalogue.replace(key, run)
         return Growth(key, len(run.commits()), run.planned, len(run.failed))

@@ -78,14 +78,14 @@ def _opened(names: list[str], partial: bool) -> "list[Run]":
     from probe_kit.runs import open_run
     from probe_kit.runs.run_folders import find_runs, is_run
 
-    found: list[Run] = []
+    opened: list[Run] = []
     for name in names:
         if Path(name).is_dir() and not is_run(Path(name)):
-            found += [open_run(path, allow_partial=partial) for path in find_runs(Path(name))]
+            opened += [open_run(path, allow_partial=partial) for path in find_runs(Path(name))]
             continue
         several = next((runs for find in RUNS_BY_NAME if (runs := find(name)) is not None), None)
-        found += [open_run(name, allow_partial=partial)] if several is None else several
-    return found
+        opened += [open_run(name, allow_partial=partial)] if several is None else several
+    return opened
 
 
 def _serve(runs: "list[Run]", lender: "Run | None", port: int, no_browser: bool) -> None:

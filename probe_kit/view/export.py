@@ -47,9 +47,9 @@ def write_viewer(
     folder = Path(folder)
     _check_folder(folder)
     catalogue = Catalogue(runs, probes_of)
-    known = {name: None for viewed in catalogue.runs.values() for name in viewed.categories}
-    if strange := [name for name in categories or () if name not in known]:
-        raise UnknownCategoryError(f"no run has the category {strange[0]!r}; they have {', '.join(known)}")
+    available = {name: None for viewed in catalogue.runs.values() for name in viewed.categories}
+    if strange := [name for name in categories or () if name not in available]:
+        raise UnknownCategoryError(f"no run has the category {strange[0]!r}; they have {', '.join(available)}")
     with draft_of(folder) as draft:
         draft.mkdir()
         _write(catalogue, draft, frames, categories)

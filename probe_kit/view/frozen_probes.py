@@ -50,18 +50,18 @@ class FrozenProbes:
 
     An episode takes the probe of the fold that tests its item. One whose item no fold tests takes the mean of the
     folds' log-odds, and is then not held out in the sense of the scores. results: of `run`, or of another run of
-    the same model. kept: None for probes of `run` itself, whose stored log-odds are taken. Those of another run
-    are of its own activations; then the first log-odds that were computed so far, by number of the episode.
+    the same model. readings: None for probes of `run` itself, whose stored log-odds are taken.
+    Of another run the first log-odds that were computed so far, by number of the episode.
     """
 
     def __init__(
-        self, run: Run, results: ProbeResults, category: str, view: str, kept: dict[int, Values] | None = None
+        self, run: Run, results: ProbeResults, category: str, view: str, readings: dict[int, Values] | None = None
     ) -> None:
         self.run, self.curve = run, results.curves[category, view]
-        self._kept = kept
+        self._kept = readings
         self._results, self._category, self._view = results, category, view
         self._fold_of = dict(zip(self.curve.items.tolist(), self.curve.fold_of.tolist(), strict=True))
-        self._place_of = {name: place for place, name in enumerate(self.curve.episodes.tolist())}
+        self._place_of = {name: column for column, name in enumerate(self.curve.episodes.tolist())}
 
     @property
     def sites(self) -> Sequence[Site]:
@@ -83,30 +83,30 @@ class FrozenProbes:
         return self._kept[number]
 
     def _stored(self, episode: str, side_correct: str) -> Values:
-        place = self._place_of.get(episode)
-        if place is None:
+        column = self._place_of.get(episode)
+        if column is None:
             return np.full(len(self.sites), np.nan)
-        return np.asarray(self.curve.decisions[:, place] * toward(side_correct))
+        return np.asarray(self.curve.decisions[:, column] * toward(side_correct))
 
     def log_odds(self, position: int) -> EpisodeLogOdds:
-        """Of the episode in row `position` of `run.episodes`, at every captured inference that it reached."""
+        """Return the log-odds of the episode in row `position`, at every captured inference that it reached."""
         row = self.run.episodes.iloc[position]
         side, item = str(row["side_correct"]), str(row["item_id"])
         calls = int(self._calls[position])
-        found = np.full((calls, len(self.sites)), np.nan)
+        log_odds = np.full((calls, len(self.sites)), np.nan)
         fold = self._fold_of.get(item)
         if not self._reads_activations:
             if self._kept is None:
-                found[:1] = self._stored(str(row["episode_id"]), side)
-            return EpisodeLogOdds(found, fold is not None)
+                log_odds[:1] = self._stored(str(row["episode_id"]), side)
+            return EpisodeLogOdds(log_odds, fold is not None)
         for stream, probes in self._streams.items():
-            own = self._features(stream, probes, position, calls)
+            features = self._features(stream, probes, position, calls)
             if fold is None:
-                values = (np.einsum("ksd,sfd->ksf", own, probes.weights) + probes.intercepts).mean(axis=-1)
+                values = (np.einsum("ksd,sfd->ksf", features, probes.weights) + probes.intercepts).mean(axis=-1)
             else:
-                values = np.einsum("ksd,sd->ks", own, probes.weights[:, fold]) + probes.intercepts[:, fold]
-            found[:, probes.places] = values * toward(side)
-        return EpisodeLogOdds(found, fold is not None)
+                values = np.einsum("ksd,sd->ks", features, probes.weights[:, fold]) + probes.intercepts[:, fold]
+            log_odds[:, probes.places] = values * toward(side)
+        return EpisodeLogOdds(log_odds, fold is not None)
 
     def _features(self, stream: str, probes: _StreamProbes, position: int, calls: int) -> Values:
         """(K, S, D) of the view at every captured inference; NaN where the view is not stored of it."""
@@ -114,11 +114,11 @@ class FrozenProbes:
         first: Values = self._rows[stream][position][:calls][(*sites, probes.view)].astype(np.float64)
         if len(first) == calls:
             return first
-        further = np.full((calls - 1, *first.shape[1:]), np.nan)
+        later = np.full((calls - 1, *first.shape[1:]), np.nan)
         if self._view == MEAN_VIEW:
-            kept = decode_bfloat16(self.run.rows(stream, "later")[position][: calls - 1])
-            further = kept[sites].astype(np.float64)
-        return np.concatenate([first, further])
+            stored = decode_bfloat16(self.run.rows(stream, "later")[position][: calls - 1])
+            later = stored[sites].astype(np.float64)
+        return np.concatenate([first, later])
 
     @property
     def _reads_activations(self) -> bool:
@@ -137,16 +137,16 @@ class FrozenProbes:
     def _streams(self) -> dict[str, _StreamProbes]:
         names = [(self._category, self._view, site) for site in self.sites]
         directions = read_directions(self._results.directions, names)
-        found = {}
+        streams = {}
         for stream in dict.fromkeys(site.stream for site in self.sites):
-            places = [place for place, site in enumerate(self.sites) if site.stream == stream]
-            own = [directions[names[place]] for place in places]
-            found[stream] = self._stacked(stream, places, own)
-        return found
+            places = [index for index, site in enumerate(self.sites) if site.stream == stream]
+            stream_directions = [directions[names[index]] for index in places]
+            streams[stream] = self._stacked(stream, places, stream_directions)
+        return streams
 
     def _stacked(self, stream: str, places: list[int], directions: list[Direction]) -> _StreamProbes:
         stored = self.run.stored(stream)
-        indices = [stored.at(self.sites[place]) for place in places]
+        indices = [stored.at(self.sites[index]) for index in places]
         return _StreamProbes(
             places,
             tuple(list(axis) for axis in zip(*indices, strict=True)),
@@ -165,7 +165,7 @@ def count_inferences(run: Run) -> NDArray[np.intp]:
 
 
 def toward(side_correct: str) -> float:
-    """What turns a log-odds of `left` into one of the correct side."""
+    """Return the sign that turns a log-odds of `left` into one of the correct side."""
     return 1.0 if side_correct == "left" else -1.0
 
 

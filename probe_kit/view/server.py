@@ -68,8 +68,8 @@ class _Guard:
 
         async def send_guarded(message: Message) -> None:
             if message["type"] == "http.response.start":
-                own = [(name.encode(), value.encode()) for name, value in _HEADERS.items()]
-                message = {**message, "headers": [*message["headers"], *own]}
+                headers = [(name.encode(), value.encode()) for name, value in _HEADERS.items()]
+                message = {**message, "headers": [*message["headers"], *headers]}
             await send(message)
 
         answer = self._answer(Request(scope)) or self._app
@@ -140,15 +140,15 @@ class _Pages:
             return self._payload(request, INDEX_PAYLOAD)
         try:
             with self._lock:
-                if found := _PICTURE.fullmatch(name):
-                    picture = self._catalogue.picture(found[1], int(found[2]))
+                if match := _PICTURE.fullmatch(name):
+                    picture = self._catalogue.picture(match[1], int(match[2]))
                     if picture is None:
                         return _missing()
                     return _tagged(request, picture, hashlib.sha256(picture).hexdigest(), "image/webp")
-                own = name.removesuffix(".js")
-                if own == name:
+                payload = name.removesuffix(".js")
+                if payload == name:
                     return _missing()
-                return self._payload(request, own)
+                return self._payload(request, payload)
         except KeyError:
             return _missing()
         except (ProbeKitError, OSError) as error:
@@ -158,9 +158,9 @@ class _Pages:
         """The payload, or a script that says why it cannot be made: the page cannot read the text of an error."""
         # Of this server alone: behind the same port, a later one may have other runs, interventions or labels.
         tag = f"{self._session}-{self._catalogue.stamp(name)}"
-        known = request.headers.get("if-none-match") == f'"{tag}"'
+        is_current = request.headers.get("if-none-match") == f'"{tag}"'
         try:
-            script = b"" if known else self._catalogue.script(name)
+            script = b"" if is_current else self._catalogue.script(name)
         except (ProbeKitError, OSError) as error:
             script = self._catalogue.failure(name, error)
             return Response(script, headers={"cache-control": "no-store"}, media_type=_KINDS["js"])
@@ -206,7 +206,7 @@ def _tagged(request: Request, content: bytes, tag: str, kind: str) -> Response:
 
 
 def _application(pages: _Pages, port: int, token: str) -> Starlette:
-    """What serves the pages at `127.0.0.1:port` to who knows `token`."""
+    """Return the application that serves the pages at `127.0.0.1:port` to a browser with the token."""
     return Starlette(
         routes=[
             Route("/", pages.file),
@@ -224,15 +224,15 @@ def _application(pages: _Pages, port: int, token: str) -> Starlette:
 
 def _opened(port: int) -> socket.socket:
     """An open socket at a port of the loopback address."""
-    found = socket.socket()
-    found.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    listener = socket.socket()
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
-        found.bind((HOST, port))
-        found.listen()
+        listener.bind((HOST, port))
+        listener.listen()
     except OSError as error:
-        found.close()
+        listener.close()
         raise UsageError(f"port {port} of {HOST}: {error.strerror}. Give another one, or none") from error
-    return found
+    return listener
 
 
 class ViewerServer:

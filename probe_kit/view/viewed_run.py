@@ -45,7 +45,7 @@ class ViewedRun:
 
     @property
     def places(self) -> tuple[str, str]:
-        """What the run is called on this machine, which no page shows."""
+        """Return the run's names on this machine, which no page shows."""
         return self.run.location.address, str(self.run.location)
 
     @property
@@ -99,12 +99,12 @@ class ViewedRun:
 
     @property
     def categories(self) -> tuple[str, ...]:
-        """In the order of the episodes."""
+        """Return the categories in the order of the episodes."""
         return tuple(dict.fromkeys(self.run.episodes["category"].astype(str)))
 
     @property
     def probed_categories(self) -> tuple[str, ...]:
-        """Those that have probes in the view that is shown."""
+        """Return the categories that have probes in the view that is shown."""
         return tuple(category for category in self.categories if self.curve(category) is not None)
 
     def curve(self, category: str) -> ProbeCurve | None:
@@ -120,12 +120,12 @@ class ViewedRun:
 
     @cached_property
     def refitted(self) -> Mapping[int, ProbeResults]:
-        """By captured inference, the probes that were fitted to that inference with otherwise equal settings."""
+        """Return by captured inference the probes that were fitted to it with otherwise equal settings."""
         return {} if self.own_results is None else load_results_by_call(self.run, self.own_results)
 
     @cached_property
     def probes(self) -> dict[str, FrozenProbes]:
-        """By category, the probes of the table's inference."""
+        """Return by category the probes of the table's inference."""
         results, view = self.results, self.view
         if results is None or view is None:
             return {}
@@ -153,7 +153,7 @@ def view_runs(runs: Sequence[Run], probes_of: Run | None = None) -> list[ViewedR
     for run in runs:
         check_scene_run(run, "the viewer")
     places = [run.location.address for run in runs]
-    if doubles := [place for at, place in enumerate(places) if place in places[:at]]:
+    if doubles := [address for at, address in enumerate(places) if address in places[:at]]:
         raise UsageError(f"{doubles[0]} is given twice. Leave one out")
     keys: list[str] = []
     for run in runs:
@@ -166,14 +166,14 @@ def _with_lender(viewed: Sequence[ViewedRun], probes_of: Run) -> list[ViewedRun]
     lender = ViewedRun("probes", probes_of.in_wording())
     if lender.own_results is None:
         raise UsageError(f"{probes_of.location} has no probes. {how_to_probe(probes_of)}")
-    bare = [one for one in viewed if one.own_results is None and one.run.streams]
-    fitting = {one.key for one in bare if _difference(one.run, lender) is None}
+    bare = [candidate for candidate in viewed if candidate.own_results is None and candidate.run.streams]
+    fitting = {candidate.key for candidate in bare if _difference(candidate.run, lender) is None}
     if bare and not fitting:
         raise UsageError(
             f"the probes of {probes_of.location} cannot read {bare[0].run.location}: "
             f"{_difference(bare[0].run, lender)}"
         )
-    return [replace(one, lender=lender) if one.key in fitting else one for one in viewed]
+    return [replace(candidate, lender=lender) if candidate.key in fitting else candidate for candidate in viewed]
 
 
 def _difference(run: Run, lender: ViewedRun) -> str | None:
@@ -187,7 +187,7 @@ def _difference(run: Run, lender: ViewedRun) -> str | None:
     return None
 
 
-def _key(name: str, others: Sequence[str]) -> str:
+def _key(name: str, used: Sequence[str]) -> str:
     plain = _UNSAFE.sub("-", name).strip(".-") or "run"
-    numbered = (plain if count == 1 else f"{plain}-{count}" for count in range(1, len(others) + 2))
-    return next(key for key in numbered if key.lower() not in {other.lower() for other in others})
+    numbered = (plain if count == 1 else f"{plain}-{count}" for count in range(1, len(used) + 2))
+    return next(key for key in numbered if key.lower() not in {other.lower() for other in used})

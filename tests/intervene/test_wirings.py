@@ -120,7 +120,7 @@ def test_what_is_decided_after_the_first_chunk_shows_in_the_episode(wired: Wired
         "late": "used", "constant": "not used", "copied": "used",
     }  # fmt: skip
     first = {row.category: row for row in image_swap_effects(outcomes_of(wired, names), SUITE)}
-    both = classify_all(first, {}, others=found)
+    both = classify_all(first, {}, other_readouts=found)
     assert {name: one.verdict for name, one in both.items()} == {
         "late": "first chunk not used; episode used", "constant": "not used", "copied": "used",
     }  # fmt: skip

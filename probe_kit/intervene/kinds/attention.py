@@ -71,8 +71,8 @@ class AttentionReadout(Intervention):
         return CleanRun(), AttentionRecorded(backbone_of(session.policy), self._roles(session.policy))
 
     def certificate_entries(self, conditions: Sequence[Condition], batch: ReplayBatch) -> dict[str, Any]:
-        """What the axes of the stored array are. Raises CaptureChangedActionError if noting changed an action."""
-        (recording,) = (one for one in conditions if isinstance(one, AttentionRecorded))
+        """Return the axes of the stored array. Raises CaptureChangedActionError if recording changed an action."""
+        (recording,) = (condition for condition in conditions if isinstance(condition, AttentionRecorded))
         largest = float(batch.max_action_change.max(initial=0.0))
         if largest:
             raise CaptureChangedActionError(
@@ -90,13 +90,13 @@ class AttentionReadout(Intervention):
 
     def extra_files(self, run: Run, conditions: Sequence[Condition], batch: ReplayBatch) -> dict[str, bytes]:
         """The attention of every inference."""
-        (recording,) = (one for one in conditions if isinstance(one, AttentionRecorded))
+        (recording,) = (condition for condition in conditions if isinstance(condition, AttentionRecorded))
         assert batch.mass is not None
         assert batch.inferences is not None
         rows = run.episodes.iloc[batch.inferences[:, 0]]
         columns = {
-            own: rows[name].to_numpy(dtype=str)
-            for own, name in (
+            field: rows[name].to_numpy(dtype=str)
+            for field, name in (
                 ("episodes", "episode_id"), ("groups", "group_id"), ("categories", "category"),
             )
         }  # fmt: skip
@@ -147,14 +147,14 @@ class AttentionReadout(Intervention):
     def _roles(self, policy: "Policy") -> tuple[str, ...]:
         stream = backbone_of(policy)
         has_tiles = policy.interventions.supports("tiles")
-        wanted = self.roles or tuple(role for role in ROLES if has_tiles or role not in TILES)
-        there = roles_of(policy, stream, wanted)
-        if missing := [role for role in self.roles if role not in there]:
+        roles = self.roles or tuple(role for role in ROLES if has_tiles or role not in TILES)
+        present = roles_of(policy, stream, roles)
+        if missing := [role for role in self.roles if role not in present]:
             raise UsageError(
                 f"no token of {stream} has the role {missing[0]!r}; there are "
                 f"{', '.join(policy.role_names[policy.tokens_of(stream)])}"
             )
-        return tuple(dict.fromkeys((ALL, *there)))
+        return tuple(dict.fromkeys((ALL, *present)))
 
 
 @dataclass(frozen=True)
@@ -189,10 +189,10 @@ def shares_by_role(mass: "AttentionMass", masks: Sequence[NDArray[np.bool_] | No
     NaN where a block is not read in an iteration, and of a role that no token has. Of one observation. masks: (T,)
     each, None for no token. Raises CaptureError for blocks with different numbers of heads.
     """
-    shapes = {found.shape[:2] for found in mass.by_head.values()}
+    shapes = {weights.shape[:2] for weights in mass.by_head.values()}
     if len(shapes) != 1 or next(iter(shapes))[0] != 1:
         raise CaptureError(f"attention has rows and heads {sorted(shapes)}; expected one row, as many heads each")
-    blocks, iterations = (max(own) + 1 for own in zip(*mass.by_head, strict=True))
+    blocks, iterations = (max(indices) + 1 for indices in zip(*mass.by_head, strict=True))
     shares = np.full((blocks, iterations, next(iter(shapes))[1], len(masks)), np.nan, np.float32)
     for role, tokens in enumerate(masks):
         if tokens is None:
@@ -234,7 +234,7 @@ class AttentionShares:
     mass: NDArray[np.float32]
 
     def to_bytes(self) -> bytes:
-        """As a `.npz`; the same numbers give the same bytes."""
+        """Return a `.npz`; the same numbers give the same bytes."""
         file = BytesIO()
         np.savez_compressed(file, allow_pickle=False, **{**vars(self), "roles": np.array(self.roles)})
         return file.getvalue()
@@ -243,18 +243,18 @@ class AttentionShares:
     def from_bytes(cls, content: bytes) -> Self:
         """Load what `to_bytes` made."""
         with open_arrays(content) as arrays:
-            found: dict[str, Any] = {own.name: arrays[own.name] for own in fields(cls)}
-        return cls(**{**found, "roles": tuple(map(str, found["roles"]))})
+            values: dict[str, Any] = {field.name: arrays[field.name] for field in fields(cls)}
+        return cls(**{**values, "roles": tuple(map(str, values["roles"]))})
 
     @classmethod
     def of(cls, measurement: Measurement) -> Self:
-        """Of a stored intervention of the kind `attention`. Raises RunDamagedError if it was changed."""
+        """Read those of a stored intervention of this kind. Raises RunDamagedError if it was changed."""
         return cls.from_bytes(measurement.read(ATTENTION_FILE))
 
-    def only(self, chosen: NDArray[np.bool_]) -> Self:
+    def only(self, selected: NDArray[np.bool_]) -> Self:
         """Some of the inferences. chosen: (N,)."""
         return type(self)(
-            self.roles, *(getattr(self, own.name)[chosen] for own in fields(self) if own.name != "roles")
+            self.roles, *(getattr(self, field.name)[selected] for field in fields(self) if field.name != "roles")
         )
 
     def by_category(self) -> list[tuple[str, Self]]:
@@ -262,13 +262,16 @@ class AttentionShares:
         return [(name, self.only(self.categories == name)) for name in dict.fromkeys(map(str, self.categories))]
 
     def shares(self) -> dict[str, Shares]:
-        """By role (N, B, I, H): those that are stored, tiles also by where the answer lies, and the rest of 1."""
-        found = {role: self.mass[..., at].astype(np.float64) for at, role in enumerate(self.roles)}
-        if set(TILE_ROLES) <= found.keys():
-            left, right = (found[role] for role in TILE_ROLES)
+        """Return (N, B, I, H) by role: as stored, tiles also by the answer's side, and what is missing to 1."""
+        by_role = {role: self.mass[..., at].astype(np.float64) for at, role in enumerate(self.roles)}
+        if set(TILE_ROLES) <= by_role.keys():
+            left_tile, right_tile = (by_role[role] for role in TILE_ROLES)
             is_left = (self.sides == "left")[:, None, None, None]
-            found |= {CORRECT: np.where(is_left, left, right), OTHER: np.where(is_left, right, left)}
-        return {**found, ACTION: 1 - found[ALL]} if ALL in found else found
+            by_role |= {
+                CORRECT: np.where(is_left, left_tile, right_tile),
+                OTHER: np.where(is_left, right_tile, left_tile),
+            }
+        return {**by_role, ACTION: 1 - by_role[ALL]} if ALL in by_role else by_role
 
     def rows(self, by: Sequence[Axis] = ("block", "iteration", "head")) -> "list[AttentionRow]":
         """One per category, role and place along the axes `by`; means over the others, every episode alike.
@@ -277,24 +280,24 @@ class AttentionShares:
         """
         if unknown := set(by) - set(get_args(Axis)):
             raise UsageError(f"attention has no axis {min(unknown)!r}; it has {', '.join(get_args(Axis))}")
-        found = []
-        for category, own in self.by_category():
-            calls = np.unique(own.calls).tolist() if "call" in by else [None]
+        rows = []
+        for category, inferences in self.by_category():
+            calls = np.unique(inferences.calls).tolist() if "call" in by else [None]
             for call in calls:
-                part = own if call is None else own.only(own.calls == call)
-                found += part._rows(category, call, by)
-        return found
+                part = inferences if call is None else inferences.only(inferences.calls == call)
+                rows += part._rows(category, call, by)
+        return rows
 
     def frame(self, by: Sequence[Axis] = ("block", "iteration", "head")) -> "pd.DataFrame":
         """`rows` as a data frame, with the columns of the axes that are asked for."""
         import pandas as pd
 
         unused = [axis for axis in get_args(Axis) if axis not in by]
-        columns = [own.name for own in fields(AttentionRow)]
+        columns = [field.name for field in fields(AttentionRow)]
         return pd.DataFrame([asdict(row) for row in self.rows(by)], columns=columns).drop(columns=unused)
 
     def correct_minus_other(self, seed_text: str) -> "dict[int, tuple[float, tuple[float, float]]]":
-        """By block, the share on the correct picture's tile minus the other's, with its 95 % interval by groups.
+        """Return by block the share on the correct tile minus the other's, with its 95 % interval by groups.
 
         Of one category; a mean over iterations, heads and calls. Empty without tiles.
         """
@@ -302,33 +305,33 @@ class AttentionShares:
         if CORRECT not in shares:
             return {}
         episodes, groups = self._episodes()
-        found = {}
+        by_block = {}
         for block in range(self.mass.shape[1]):
             apart = (shares[CORRECT] - shares[OTHER])[:, block : block + 1]
             if np.isnan(apart).all():
                 continue
             every = _mean(_per_episode(apart, episodes), (1, 2, 3))
-            seen = ~np.isnan(every)
-            values, units = every[seen], groups[seen]
+            has_share = ~np.isnan(every)
+            values, units = every[has_share], groups[has_share]
             limits = student_interval(values, units, units_seed(units, seed_text), GAINS)
-            found[block] = float(values.mean()), limits
-        return found
+            by_block[block] = float(values.mean()), limits
+        return by_block
 
     def _rows(self, category: str, call: int | None, by: Sequence[Axis]) -> "list[AttentionRow]":
         episodes, _ = self._episodes()
         over = tuple(at for axis, at in _AXES.items() if axis not in by)
-        found = []
+        rows = []
         for role, values in self.shares().items():
             every = _per_episode(values, episodes)
             means = _mean(every, (0, *over))
-            for place, share in np.ndenumerate(means):
+            for index, share in np.ndenumerate(means):
                 if not np.isnan(share):
                     at: dict[str, Any] = dict(
-                        zip((axis for axis in _AXES if axis in by), map(int, place), strict=True)
+                        zip((axis for axis in _AXES if axis in by), map(int, index), strict=True)
                     )
-                    named: dict[str, Any] = {"category": category, "role": role, "call": call}
-                    found.append(AttentionRow(**named, **at, share=float(share), n_episodes=len(every)))
-        return found
+                    labels: dict[str, Any] = {"category": category, "role": role, "call": call}
+                    rows.append(AttentionRow(**labels, **at, share=float(share), n_episodes=len(every)))
+        return rows
 
     def _episodes(self) -> tuple[NDArray[np.int64], NDArray[np.str_]]:
         """(N,) which of the E episodes an inference is of, and the (E,) groups of these."""
@@ -338,7 +341,7 @@ class AttentionShares:
 
 @dataclass(frozen=True, kw_only=True)
 class AttentionRow(Effect):
-    """How much attention lies on one role's tokens, in one category: a share, of 1 in all.
+    """The share of the attention on one role's tokens, in one category.
 
     block, iteration, head, call: of which; None for the mean over all.
     """
@@ -358,7 +361,7 @@ class AttentionRow(Effect):
 
 
 def stored_attention(run: RunReader) -> dict[str, AttentionShares]:
-    """By category, the one of most episodes, and of these of most roles; empty if there is none.
+    """Return by category the shares of most episodes, and of these of most roles; empty if there is none.
 
     Raises RunDamagedError.
     """
@@ -367,32 +370,32 @@ def stored_attention(run: RunReader) -> dict[str, AttentionShares]:
 
 def preferred_attention(run: RunReader) -> dict[str, tuple[StoredResult, AttentionShares]]:
     """`stored_attention`, and of which stored intervention each is."""
-    found: dict[str, tuple[StoredResult, AttentionShares]] = {}
+    preferred: dict[str, tuple[StoredResult, AttentionShares]] = {}
     read: dict[str, AttentionShares] = {}
     for result in stored_results(run, ATTENTION):
-        key, before = result.stored.key, found.get(result.category)
+        key, before = result.stored.key, preferred.get(result.category)
         if key not in read:
             read[key] = AttentionShares.from_bytes(result.stored.bundle.read(ATTENTION_FILE))
         category_shares = read[key].only(read[key].categories == result.category)
         if before is None or (before[0].rank, len(before[1].roles)) <= (result.rank, len(category_shares.roles)):
-            found[result.category] = result, category_shares
-    return found
+            preferred[result.category] = result, category_shares
+    return preferred
 
 
 def _per_episode(values: Shares, episodes: NDArray[np.int64]) -> Shares:
     """(E, …) means over the inferences of every episode, of those that are not NaN."""
     sums, counts = (np.zeros((episodes.max() + 1, *values.shape[1:])) for _ in range(2))
-    known = ~np.isnan(values)
-    np.add.at(sums, episodes, np.where(known, values, 0.0))
-    np.add.at(counts, episodes, known)
+    has_share = ~np.isnan(values)
+    np.add.at(sums, episodes, np.where(has_share, values, 0.0))
+    np.add.at(counts, episodes, has_share)
     return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
 
 
 def _mean(values: Shares, axes: tuple[int, ...]) -> Shares:
     """Mean over some axes of what is not NaN; NaN where nothing is."""
-    known = ~np.isnan(values)
-    counts = known.sum(axis=axes)
-    sums = np.where(known, values, 0.0).sum(axis=axes)
+    has_share = ~np.isnan(values)
+    counts = has_share.sum(axis=axes)
+    sums = np.where(has_share, values, 0.0).sum(axis=axes)
     return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
 
 

@@ -156,7 +156,7 @@ class AttributionPatching(Intervention):
         exact = [patch_of(cell, sites, f"{EXACT}|") for cell in every if cell in patched]
         estimated = [
             Estimated(
-                f"{ESTIMATE}|{cell.place.name}|{cell.role}",
+                f"{ESTIMATE}|{cell.site_group.name}|{cell.role}",
                 {at_row: float(by_cell[at]) for at_row, by_cell in rows.items()},
                 cell in drawn,
             )
@@ -167,7 +167,9 @@ class AttributionPatching(Intervention):
     def certificate_entries(self, conditions: Sequence[Condition], batch: ReplayBatch) -> dict[str, Any]:
         """Return the cells that were drawn."""
         del batch
-        drawn = [one.name for one in conditions if isinstance(one, Estimated) and one.is_drawn]
+        drawn = [
+            condition.name for condition in conditions if isinstance(condition, Estimated) and condition.is_drawn
+        ]
         return {NAME: {"drawn": [f"{EXACT}{name.removeprefix(ESTIMATE)}" for name in drawn]}}
 
     def _estimates(
@@ -189,23 +191,23 @@ class AttributionPatching(Intervention):
                 session.on_fit_progress(number + 1, len(items), item)
         shares = []
         for part in wholes.values():
-            whole = np.array([moved for moved, _ in part])
+            swap = np.array([moved for moved, _ in part])
             by_cell = np.array([rows[row] for _, row in part])
-            shares.append(np.array([pooled_share(moved, whole) for moved in by_cell.T]))
+            shares.append(np.array([pooled_share(moved, swap) for moved in by_cell.T]))
         return rows, shares
 
     def _chosen(self, cells: Sequence[Cell], shares: Sequence[NDArray[np.float64]]) -> tuple[set[Cell], set[Cell]]:
         """Return those with the largest estimates of any category, by kind, and those drawn from the rest."""
         top: set[Cell] = set()
         drawn: set[Cell] = set()
-        kinds = [kind_of_place(cell.place.name) for cell in cells]
+        kinds = [kind_of_place(cell.site_group.name) for cell in cells]
         for kind in dict.fromkeys(kinds):
             members = [at for at, other in enumerate(kinds) if other == kind]
             best = {at for values in shares for at in sorted(members, key=lambda at: -abs(values[at]))[: self.top]}
-            others = [at for at in members if at not in best]
+            remaining = [at for at in members if at not in best]
             draw = np.random.default_rng(derive_seed("attribution", self.seed, kind))
             top |= {cells[at] for at in best}
-            drawn |= {cells[at] for at in draw.permutation(others)[: self.controls].tolist()}
+            drawn |= {cells[at] for at in draw.permutation(remaining)[: self.controls].tolist()}
         return top, drawn
 
     @staticmethod
@@ -267,7 +269,7 @@ def _rows(
     p_fwe = dict(zip(exact, max_t(toward, outcomes.items, outcomes.groups, seed)[2], strict=True))
     rows = []
     for name in names:
-        place, _, role = name.partition("|")
+        site, _, role = name.partition("|")
         shares: dict[str, Any] = {}
         for part in (ESTIMATE, EXACT):
             condition = f"{part}|{name}"
@@ -277,7 +279,7 @@ def _rows(
         rows.append(
             AttributionEffect(
                 category=category,
-                place=place,
+                place=site,
                 role=role,
                 is_anchor=role == ALL,
                 is_drawn=f"{EXACT}|{name}" in drawn,

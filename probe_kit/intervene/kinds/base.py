@@ -166,8 +166,12 @@ class Intervention(ABC):
 
     def parameters(self) -> dict[str, Any]:
         """Return its own settings as plain JSON; with the run they decide its numbers."""
-        common = {own.name for own in fields(Intervention)}
-        values = {own.name: getattr(self, own.name) for own in fields(self) if own.init and own.name not in common}
+        common = {setting.name for setting in fields(Intervention)}
+        values = {
+            setting.name: getattr(self, setting.name)
+            for setting in fields(self)
+            if setting.init and setting.name not in common
+        }
         return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
     def check_run(self, run: Run) -> None:
@@ -180,9 +184,9 @@ class Intervention(ABC):
                     "scene the pictures are swapped. Leave them out"
                 )
         elif self.needs_sides or self.readout != FIRST_CHUNK:
-            asked = f"--kind {self.kind}" if self.needs_sides else f"--readout {self.readout}"
+            option = f"--kind {self.kind}" if self.needs_sides else f"--readout {self.readout}"
             raise UsageError(
-                f"{run.location} has no correct picture on a side, which {asked} needs. Take --kind interchange, "
+                f"{run.location} has no correct picture on a side, which {option} needs. Take --kind interchange, "
                 "or a run of the scene"
             )
 
@@ -296,8 +300,8 @@ class AlongDirection(Intervention):
 def capabilities_for(sites: Sequence[str], roles: Sequence[str]) -> tuple[InterventionKind, ...]:
     """Return the interventions that a family must support for edits at such places and roles."""
     reads_kv = any(pattern.partition(".")[0] == KV_STREAM for pattern in sites)
-    further: dict[InterventionKind, bool] = {"kv": reads_kv, "tiles": bool(set(roles) & set(TILES))}
-    return ("edit", *(kind for kind, is_needed in further.items() if is_needed))
+    needs: dict[InterventionKind, bool] = {"kv": reads_kv, "tiles": bool(set(roles) & set(TILES))}
+    return ("edit", *(kind for kind, is_needed in needs.items() if is_needed))
 
 
 # -- names of conditions -------------------------------------------------------------------------------------
@@ -305,9 +309,9 @@ def capabilities_for(sites: Sequence[str], roles: Sequence[str]) -> tuple[Interv
 
 @dataclass(frozen=True)
 class ConditionName:
-    """The parts of a condition's stored name, `place|role|direction|coefficient`; the last ones may be missing."""
+    """The parts of a condition's stored name, `site|role|direction|coefficient`; the last ones may be missing."""
 
-    place: str
+    site: str
     role: str = ""
     direction: str = ""
     coefficient: str = ""
@@ -318,7 +322,7 @@ class ConditionName:
         return cls(*condition.split(SEPARATOR))
 
     def __str__(self) -> str:
-        parts = (self.place, self.role, self.direction, self.coefficient)
+        parts = (self.site, self.role, self.direction, self.coefficient)
         return SEPARATOR.join(filter(None, parts))
 
     @property
@@ -328,7 +332,7 @@ class ConditionName:
 
     def is_control_of(self, other: "ConditionName") -> bool:
         """Whether `other`, no control itself, is compared with this one."""
-        same = (self.place, self.role, self.coefficient) == (other.place, other.role, other.coefficient)
+        same = (self.site, self.role, self.coefficient) == (other.site, other.role, other.coefficient)
         return self.is_control and bool(other.direction) and not other.is_control and same
 
 
@@ -370,7 +374,7 @@ def common_columns(outcomes: ConditionOutcomes, row: int, name: ConditionName) -
     logged = dict(zip(LOG_FIELDS, outcomes.edit_log[row].T, strict=True))
     norm = float((logged["norm"] * logged["fires"]).sum())
     return {
-        "place": name.place,
+        "place": name.site,
         "role": name.role,
         "direction": name.direction,
         "is_control": name.is_control,
@@ -527,8 +531,10 @@ def count_edits(names: Sequence[str], tried: int, most: int = 3) -> str:
     """Return how many of the edits that were tried, and the first of them by name."""
     if not names:
         return f"none of {tried}"
-    further = len(names) - most
-    return f"{len(names)} of {tried} ({', '.join(names[:most])}{f' and {further} more' if further > 0 else ''})"
+    remaining = len(names) - most
+    return (
+        f"{len(names)} of {tried} ({', '.join(names[:most])}{f' and {remaining} more' if remaining > 0 else ''})"
+    )
 
 
 def category_sentences[Row: Effect](

@@ -174,9 +174,11 @@ class ClosedLoop(AlongDirection):
         from probe_kit.intervene.directions import fit_token_directions
 
         targets = [self._split(target) for target in self.targets]
-        cells = [Cell(place, role) for name, role in targets for place in resolve_sites(name, session.policy)]
+        cells = [
+            Cell(site_group, role) for name, role in targets for site_group in resolve_sites(name, session.policy)
+        ]
         source_sites = sites_of_cells(cells)
-        within = [cell for cell in cells if len(cell.place.sites) == 1 and cell.role not in TILES]
+        within = [cell for cell in cells if len(cell.site_group.sites) == 1 and cell.role not in TILES]
         patterns = [pattern for pattern, _ in targets]
         bases = {} if self.direction == NONE else fit_token_directions(session, self, within, patterns)
         conditions: list[Condition] = [IdentityPatch(source_sites), SourceRun()]
@@ -195,7 +197,7 @@ class ClosedLoop(AlongDirection):
     @staticmethod
     def _split(target: str) -> tuple[str, str]:
         name = ConditionName.parse(target)
-        return name.place, name.role
+        return name.site, name.role
 
     @staticmethod
     def effects(measurement: Measurement) -> "list[ClosedLoopEffect]":
@@ -297,7 +299,7 @@ def _of_category(outcomes: ConditionOutcomes, category: str, seed_text: str, key
     disrupted = in_zone < MIN_IN_ZONE_RATIO * in_zone[0]
     net = wrong - wrong[0]
     left_out = set(np.flatnonzero(disrupted).tolist())
-    clean = {at for at, name in enumerate(names) if name.place == CLEAN}
+    clean = {at for at, name in enumerate(names) if name.site == CLEAN}
     tests = test_against_controls(net, names, outcomes, seed_text, left_out | clean, left_out)
     rows = []
     for at, (name, test) in enumerate(zip(names, tests, strict=True)):

@@ -144,13 +144,16 @@ class ConceptErasure(Intervention):
         for cell, category, features in collect_token_features(session, self.items_in(session.run), cells):
             with passed_over.fitting(cell):
                 self._fit(erased.setdefault(cell, {}), cell, category, features)
-        return [CleanRun(), *(one for by_name in passed_over.left(erased).values() for one in by_name.values())]
+        return [
+            CleanRun(),
+            *(condition for by_name in passed_over.left(erased).values() for condition in by_name.values()),
+        ]
 
     def certificate_entries(self, conditions: Sequence[Condition], batch: ReplayBatch) -> dict[str, Any]:
         """Return how well a fresh probe reads the answer behind each condition, by category."""
         del batch
-        erased = [one for one in conditions if isinstance(one, ErasedCondition)]
-        return {PROBE_ACCURACY: {one.name: dict(one.probe_accuracy) for one in erased}}
+        erased = [condition for condition in conditions if isinstance(condition, ErasedCondition)]
+        return {PROBE_ACCURACY: {condition.name: dict(condition.probe_accuracy) for condition in erased}}
 
     def _fit(
         self, by_name: "dict[str, ErasedCondition]", cell: Cell, category: str, features: "TokenFeatures"
@@ -232,21 +235,21 @@ class ErasedCondition:
     def name(self) -> str:
         """Return place, role and direction, see `ConditionName`."""
         coefficient = ZERO if self.direction == UNTOUCHED else ""
-        return str(ConditionName(self.cell.place.name, self.cell.role, self.direction, coefficient))
+        return str(ConditionName(self.cell.site_group.name, self.cell.role, self.direction, coefficient))
 
     def play(self, context: ConditionContext) -> ConditionResult:
         """Infer without it."""
-        pair, session, place = context.pair, context.session, self.cell.place
-        tokens = role_tokens(session.policy, pair, place.stream, self.cell.role, context.memo)
+        pair, session, site_group = context.pair, context.session, self.cell.site_group
+        tokens = role_tokens(session.policy, pair, site_group.stream, self.cell.role, context.memo)
         change = ApplyEraser(self.erasers[pair.episode]) if self.erasers else Identity()
-        with apply_patch(session.policy, place.sites, tokens, change) as edit_log:
+        with apply_patch(session.policy, site_group.sites, tokens, change) as edit_log:
             chunk = session.act(pair.clean, pair.seed)
         return ConditionResult(chunk, edit_log)
 
 
 @dataclass(frozen=True)
 class ApplyEraser:
-    """What an eraser leaves; tokens beyond those it was fitted on stay as they are."""
+    """An edit that leaves what an eraser leaves; tokens beyond those it was fitted on stay as they are."""
 
     eraser: Eraser
 
@@ -262,7 +265,7 @@ class ApplyEraser:
         return after
 
 
-def _probe_accuracy(own: "TokenFeatures", folds: Sequence[Fold], erasers: Sequence[Eraser] | None) -> float:
+def _probe_accuracy(features: "TokenFeatures", folds: Sequence[Fold], erasers: Sequence[Eraser] | None) -> float:
     """Held-out accuracy of a probe on the mean over tokens; chance is one half."""
     from sklearn.linear_model import LogisticRegression
     from sklearn.pipeline import make_pipeline
@@ -270,18 +273,18 @@ def _probe_accuracy(own: "TokenFeatures", folds: Sequence[Fold], erasers: Sequen
 
     right = 0
     for number, fold in enumerate(folds):
-        pooled = _pooled(own.tokens, None if erasers is None else erasers[number])
+        pooled = _pooled(features.tokens, None if erasers is None else erasers[number])
         probe = make_pipeline(StandardScaler(), LogisticRegression(C=0.01, max_iter=1000))
-        probe.fit(pooled[fold.train], own.left[fold.train])
-        right += int((probe.predict(pooled[fold.test]) == own.left[fold.test]).sum())
-    return right / own.left.size
+        probe.fit(pooled[fold.train], features.is_left[fold.train])
+        right += int((probe.predict(pooled[fold.test]) == features.is_left[fold.test]).sum())
+    return right / features.is_left.size
 
 
 def _pooled(tokens: PaddedTokens, eraser: Eraser | None) -> NDArray[np.float64]:
     """(N, D) mean over the tokens that are there."""
     values = tokens.values if eraser is None else eraser(tokens.values)
-    here = tokens.present[..., None]
-    return np.asarray(np.where(here, values, 0).sum(axis=1) / here.sum(axis=1))
+    mask = tokens.present[..., None]
+    return np.asarray(np.where(mask, values, 0).sum(axis=1) / mask.sum(axis=1))
 
 
 # -- effects -----------------------------------------------------------------------------------------------
@@ -289,7 +292,7 @@ def _pooled(tokens: PaddedTokens, eraser: Eraser | None) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, kw_only=True)
 class ErasureEffect(EffectRow):
-    """What was left of an answer in the action once it was erased at one place, in one category; see `EffectRow`.
+    """The effect on the action of erasing an answer at one place, in one category; see `EffectRow`.
 
     right_before, right: share of episodes whose action goes to the correct picture's side, without and with the
     edit. kept: of how far actions go to the correct side, the share that is left; None if they do not go there,
@@ -322,15 +325,19 @@ class ErasureEffect(EffectRow):
             return "control"
         if self.kept is None:
             return "no baseline effect"
-        beside = 1.0 if self.control_kept is None else self.control_kept
-        if beside < LOCALISATION_SHARE:
+        control_share = 1.0 if self.control_kept is None else self.control_kept
+        if control_share < LOCALISATION_SHARE:
             return "controls also disrupt"
-        gone = self.p is not None and self.p < SIGNIFICANCE and beside - self.kept >= SMALLEST_EFFECT_OF_INTEREST
+        gone = (
+            self.p is not None
+            and self.p < SIGNIFICANCE
+            and control_share - self.kept >= SMALLEST_EFFECT_OF_INTEREST
+        )
         return "effect" if gone else "no effect"
 
     @property
     def name(self) -> str:
-        """What was edited, in a few words."""
+        """Return the edit in a few words."""
         what = "identity patch" if self.direction == UNTOUCHED else self.direction
         return " ".join((self.place, self.role, what))
 
@@ -345,8 +352,8 @@ def erasure_effects(
     """One per category and condition. probe_accuracy: as a certificate has it."""
     return [
         row
-        for category, own in outcomes.by_category()
-        for row in _of_category(own, category, seed_text, key, probe_accuracy)
+        for category, part in outcomes.by_category()
+        for row in _of_category(part, category, seed_text, key, probe_accuracy)
     ]
 
 
@@ -362,23 +369,23 @@ def _of_category(
     untouched = [at for at, name in enumerate(names) if name.coefficient]
     tests = test_against_controls(away, names, outcomes, seed_text, untouched, ())
     goes_there = paired_greater_p(clean, outcomes.items, outcomes.groups) < SIGNIFICANCE
-    kept = values.sum(axis=1) / clean.sum() if goes_there else None
+    share = values.sum(axis=1) / clean.sum() if goes_there else None
     net = (clean > 0).astype(float) - (values > 0)
     rows = []
     for at, (condition, name, test) in enumerate(zip(conditions, names, tests, strict=True)):
         columns: dict[str, Any] = common_columns(outcomes, outcomes.conditions.index(condition), name)
-        before = str(ConditionName(name.place, name.role, UNTOUCHED, ZERO))
+        before = str(ConditionName(name.site, name.role, UNTOUCHED, ZERO))
         rows.append(
             ErasureEffect(
                 category=category,
                 **columns,
                 right_before=float((clean > 0).mean()),
                 right=float((values[at] > 0).mean()),
-                kept=None if kept is None else float(kept[at]),
+                kept=None if share is None else float(share[at]),
                 net=float(net[at].mean()),
                 net_ci=net_interval(net[at], outcomes, seed_text),
                 mean_displacement=float(away[at].mean()),
-                control_kept=None if kept is None else mean_of(kept[test.controls]),
+                control_kept=None if share is None else mean_of(share[test.controls]),
                 control_net=mean_of(net.mean(axis=1)[test.controls]),
                 control_displacement=mean_of(away.mean(axis=1)[test.controls]),
                 p=None if test.beyond is None else paired_greater_p(test.beyond, outcomes.items, outcomes.groups),
@@ -395,8 +402,9 @@ def _finding(rows: Sequence[ErasureEffect]) -> str:
     tried = [row for row in rows if row.finding != "identity patch"]
     if tried and all(row.finding == "no baseline effect" for row in tried):
         return "the unedited action does not go to the correct picture, so that nothing can be lost"
-    taken = [f"{row.name} keeps {row.kept:.2f}" for row in tried if row.finding == "effect"]
-    return f"erasures that take the answer from the action beyond their controls: {count_edits(taken, len(tried))}"
+    losses = [f"{row.name} keeps {row.kept:.2f}" for row in tried if row.finding == "effect"]
+    counts = count_edits(losses, len(tried))
+    return f"erasures that take the answer from the action beyond their controls: {counts}"
 
 
 def _percent(share: float | None) -> str:

@@ -81,9 +81,9 @@ class Reach:
 
         Medians: a few categories in which the policy moves weakly do not shorten it.
         """
-        left, right = clean[clean > 0], clean[clean < 0]
-        if min(left.size, right.size) >= FEWEST_TO_EITHER_SIDE:
-            metres = float(np.median(left) - np.median(right))
+        to_left, to_right = clean[clean > 0], clean[clean < 0]
+        if min(to_left.size, to_right.size) >= FEWEST_TO_EITHER_SIDE:
+            metres = float(np.median(to_left) - np.median(to_right))
             if metres >= SMALLEST_REACH:
                 return cls(metres, "actions")
         return cls(tiles_apart, "tiles")
@@ -338,13 +338,13 @@ class ImageSwap(Intervention):
             return input_sentences(rows)
         names = [category_of(row.category).title for row in rows]
         width = max(map(len, names), default=0)
-        found = []
+        lines = []
         for row, name in zip(rows, names, strict=True):
             turned = f"a swap turns it in {100 * row.follow_rate:.0f} % of the episodes"
             use = context.verdicts.get(row.category)
             verdict, what = ("swapped", "") if use is None else use.finding
-            found.append(f"{name.ljust(width)}  {verdict}: {'; '.join(filter(None, (what, turned)))}.")
-        return found
+            lines.append(f"{name.ljust(width)}  {verdict}: {'; '.join(filter(None, (what, turned)))}.")
+        return lines
 
     @staticmethod
     def keys_in_use(run: RunReader) -> set[str]:

@@ -68,7 +68,7 @@ class InputSensitivity:
 
 @dataclass(frozen=True, kw_only=True)
 class InstructionSwapEffect(ImageSwapEffect):
-    """As `ImageSwapEffect`, of the swapped instruction. sensitivity: of one step to each input."""
+    """The columns of `ImageSwapEffect`, of the swapped instruction. sensitivity: of one step to each input."""
 
     sensitivity: InputSensitivity
 

@@ -53,12 +53,16 @@ _LEGEND = (
 
 def cells_at(session: "ReplaySession", places: Iterable[SiteGroup], roles: Sequence[str]) -> list[Cell]:
     """Return the cells of these roles at places, as far as tokens play them."""
-    return [Cell(place, role) for place in places for role in roles_of(session.policy, place.stream, roles)]
+    return [
+        Cell(site_group, role)
+        for site_group in places
+        for role in roles_of(session.policy, site_group.stream, roles)
+    ]
 
 
 def patch_of(cell: Cell, source_sites: tuple[Site, ...], prefix: str = "") -> Patched:
     """Return the patch of one cell in full. prefix: of its name."""
-    return Patched(f"{prefix}{ConditionName(cell.place.name, cell.role)}", {"": (cell,)}, source_sites)
+    return Patched(f"{prefix}{ConditionName(cell.site_group.name, cell.role)}", {"": (cell,)}, source_sites)
 
 
 def patches_within(
@@ -66,7 +70,8 @@ def patches_within(
 ) -> list[Patched]:
     """Return the patch along a direction, and along each of its controls."""
     names = {
-        name: str(ConditionName(cell.place.name, cell.role, name)) for name in (direction, *bases.control_names)
+        name: str(ConditionName(cell.site_group.name, cell.role, name))
+        for name in (direction, *bases.control_names)
     }
     return [Patched(name, {"": (cell,)}, source_sites, along, bases) for along, name in names.items()]
 

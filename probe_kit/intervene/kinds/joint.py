@@ -142,24 +142,26 @@ class JointPlaces(Intervention):
         searched = {name: self._search(session, cells, part) for name, part in pairs.items()}
         sets: dict[str, dict[str, tuple[Cell, ...]]] = {EVERY: {"": cells}}
         for cell in cells:
-            at = f"{cell.place.name}{SEPARATOR}{cell.role}"
+            at = f"{cell.site_group.name}{SEPARATOR}{cell.role}"
             sets |= {f"{ALONE}|{at}": {"": (cell,)}, f"{WITHOUT}|{at}": {"": all_but(cells, (cell,))}}
-        without = {name: all_but(cells, one.cells) if one.cells else () for name, one in searched.items()}
-        sets |= {WITHOUT_MINIMAL: without, SECOND: {name: one.second for name, one in searched.items()}}
+        without = {name: all_but(cells, search.cells) if search.cells else () for name, search in searched.items()}
+        sets |= {WITHOUT_MINIMAL: without, SECOND: {name: search.second for name, search in searched.items()}}
         patches = [Patched(name, by_name, sites) for name, by_name in sets.items()]
-        smallest = {name: one.cells for name, one in searched.items()}
+        smallest = {name: search.cells for name, search in searched.items()}
         minimal = MinimalPatched(MINIMAL, smallest, sites, searched=searched)
         return [CleanRun(), SourceRun(), *patches, minimal]
 
     def certificate_entries(self, conditions: Sequence[Condition], batch: ReplayBatch) -> dict[str, Any]:
         """Return by category the smallest sets, and the groups in which they were searched."""
         del batch
-        (minimal,) = (one for one in conditions if isinstance(one, MinimalPatched))
-        return {NAME: {name: one.to_json() for name, one in (minimal.searched or {}).items()}}
+        (minimal,) = (condition for condition in conditions if isinstance(condition, MinimalPatched))
+        return {NAME: {name: search.to_json() for name, search in (minimal.searched or {}).items()}}
 
     def _cells(self, session: "ReplaySession") -> tuple[Cell, ...]:
         places = resolve_all(self.sites, session.policy)
-        layers = {KV_STREAM if place.stream == KV_STREAM else place.layer for place in places.values()}
+        layers = {
+            KV_STREAM if site_group.stream == KV_STREAM else site_group.layer for site_group in places.values()
+        }
         if len(layers) > 1:
             raise UsageError(
                 f"{', '.join(places)} come one after the other, so that the first decides for all; name blocks of "
@@ -175,15 +177,15 @@ class JointPlaces(Intervention):
     def _search(self, session: "ReplaySession", cells: tuple[Cell, ...], pairs: Sequence[Pair]) -> SearchedSets:
         """Return the smallest sets of one category, searched on the choosing half of its groups."""
         choosing = choosing_half([pair.group for pair in pairs], self.seed)
-        chosen = [pair for pair in pairs if pair.group in choosing]
-        effects = partial(self._effects, session, chosen, sites_of_cells(cells))
-        if not chosen or effects([cells])[0] < WORTH_SEARCHING:
+        searched_pairs = [pair for pair in pairs if pair.group in choosing]
+        effects = partial(self._effects, session, searched_pairs, sites_of_cells(cells))
+        if not searched_pairs or effects([cells])[0] < WORTH_SEARCHING:
             return SearchedSets(choosing)
         first = find_minimal_set(cells, effects)
-        others = all_but(cells, first.cells)
-        if not others or effects([others])[0] < KEEP * first.effect:
+        remaining = all_but(cells, first.cells)
+        if not remaining or effects([remaining])[0] < KEEP * first.effect:
             return SearchedSets(choosing, first.cells, (), first.effect, first.tried)
-        second = find_minimal_set(others, effects)
+        second = find_minimal_set(remaining, effects)
         return SearchedSets(choosing, first.cells, second.cells, first.effect, first.tried + second.tried)
 
     def _effects(

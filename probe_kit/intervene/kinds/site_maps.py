@@ -86,9 +86,9 @@ class PatchEffect(EffectRow):
 
         The first layer of the backbone holds the swapped images themselves, and the acting stream the action.
         """
-        place = PlaceName.parse(self.place)
-        is_first = place.stream == "backbone" and place.layer == 0 and place.quantity in ("", RESIDUAL)
-        return place.stream not in ("backbone", KV_STREAM) or is_first
+        parsed = PlaceName.parse(self.place)
+        is_first = parsed.stream == "backbone" and parsed.layer == 0 and parsed.quantity in ("", RESIDUAL)
+        return parsed.stream not in ("backbone", KV_STREAM) or is_first
 
     @property
     def name(self) -> str:
@@ -167,8 +167,8 @@ def _share_toward(outcomes: ConditionOutcomes, row: int, seed_text: str) -> Swap
     """Return the displacement toward the source's action as a share of the full exchange; None without one."""
     if outcomes.toward is None or IMAGE_SWAP not in outcomes.conditions:
         return None
-    whole = outcomes.toward[outcomes.conditions.index(IMAGE_SWAP)]
-    return share_of_whole(outcomes.toward[row], whole, outcomes.groups, seed_text) if whole.any() else None
+    exchange = outcomes.toward[outcomes.conditions.index(IMAGE_SWAP)]
+    return share_of_whole(outcomes.toward[row], exchange, outcomes.groups, seed_text) if exchange.any() else None
 
 
 def _flips(push: Values, clean: Values, edited: Values) -> Values:
@@ -183,7 +183,7 @@ WHOLE, USUAL, WRONG = "none", "mean-difference", "wrong"
 
 
 def stored_site_effects(run: RunReader) -> dict[str, list[PatchEffect]]:
-    """By category, the maps: what happens where tokens are patched in full, a row for every place and role.
+    """Return the maps by category: the effects of tokens patched in full, a row for every place and role.
 
     The backbone first and `kv` last, shallow before deep. Raises RunDamagedError.
     """
@@ -191,26 +191,26 @@ def stored_site_effects(run: RunReader) -> dict[str, list[PatchEffect]]:
 
 
 def stored_subspace_effects(run: RunReader) -> dict[str, list[PatchEffect]]:
-    """By category, what is carried along single directions, and by the random ones beside them."""
+    """Return by category the effects of patches along single directions, and along their random controls."""
     return _by_category(run, _along(run))
 
 
 def stored_steering(run: RunReader) -> dict[str, dict[str, list[PatchEffect]]]:
-    """By category and place (`backbone.02 image`), the effect of steering at every coefficient, controls included.
+    """Return by category and place (`backbone.02 image`) the effects of steering, all coefficients and controls.
 
     Another direction than that of the class means, and another side than the wrong one, stand apart
     (`backbone.02 image, probe, toward left`).
     """
-    found: dict[str, dict[str, list[PatchEffect]]] = {}
-    for one, rows in _rows_of(_steering(run), seed_text_of(run)):
-        found.setdefault(one.group.like.category, {})[_in_words(one)] = rows
-    return found
+    steering: dict[str, dict[str, list[PatchEffect]]] = {}
+    for selection, rows in _rows_of(_steering(run), seed_text_of(run)):
+        steering.setdefault(selection.group.like.category, {})[_in_words(selection)] = rows
+    return steering
 
 
 def keys_in_use(run: RunReader) -> set[str]:
-    """Of the stored interventions of which any number is in a map, a direction or a steering above."""
+    """Return the keys of stored interventions of which any number is in a map, a direction or a steering above."""
     every = [*_maps(run), *_along(run), *_steering(run)]
-    return {one.group.sources[name].stored.key for one in every for name in one.conditions}
+    return {selection.group.sources[name].stored.key for selection in every for name in selection.conditions}
 
 
 def localised_sites(rows: Sequence[PatchEffect]) -> tuple[str, ...]:
@@ -219,11 +219,11 @@ def localised_sites(rows: Sequence[PatchEffect]) -> tuple[str, ...]:
     Those of `kv` with the role of the tokens (`kv.01 language`), unless only all of a block together carry it.
     Without those that carry it by construction.
     """
-    found = [row for row in rows if row.is_localised and not row.direction and not row.is_by_construction]
-    by_role = {row.place for row in found if row.role != ALL and _is_read(row)}
+    localised = [row for row in rows if row.is_localised and not row.direction and not row.is_by_construction]
+    by_role = {row.place for row in localised if row.role != ALL and _is_read(row)}
     names = [
         row.name if row.place in by_role else row.place
-        for row in found
+        for row in localised
         if row.place not in by_role or row.role != ALL
     ]
     return tuple(dict.fromkeys(names))
@@ -239,13 +239,13 @@ def is_backbone_layer(row: PatchEffect) -> bool:
     return name.stream == BACKBONE and name.is_whole_layer
 
 
-def is_upstream(place: str) -> bool:
+def is_upstream(site: str) -> bool:
     """Whether a place of the backbone holds the images themselves, upstream of all that reads them."""
-    return PlaceName.parse(place).layer == 0
+    return PlaceName.parse(site).layer == 0
 
 
 def stored_localised_sites(run: RunReader) -> dict[str, tuple[str, ...]]:
-    """By category, `localised_sites` of its maps; without categories that were not searched.
+    """Return by category `localised_sites` of its maps; without categories that were not searched.
 
     Searched is one of which all tokens of some layer of the backbone were patched, or of which a place was found:
     a null result for one role, iteration or block does not rule out the others.
@@ -256,12 +256,12 @@ def stored_localised_sites(run: RunReader) -> dict[str, tuple[str, ...]]:
         for category, rows in maps.items()
         if any(row.role == ALL and is_backbone_layer(row) for row in rows)
     }
-    found = {category: localised_sites(rows) for category, rows in maps.items()}
-    return {category: places for category, places in found.items() if places or category in searched}
+    localised = {category: localised_sites(rows) for category, rows in maps.items()}
+    return {category: places for category, places in localised.items() if places or category in searched}
 
 
 def stored_carrying_directions(run: RunReader) -> dict[str, tuple[str, ...]]:
-    """By category, the directions that carry half of the effect, beyond random ones: `mean-difference at
+    """Return by category the directions that carry half of the effect, beyond random ones: `mean-difference at
     backbone.02 image`.
     """
     return {
@@ -284,13 +284,17 @@ class _Selection:
 
 
 def _maps(run: RunReader) -> list[_Selection]:
-    result = [own for own in stored_results(run, "interchange") if _direction(own.stored.settings) == WHOLE]
-    return _chosen(pool_conditions(result), ())
+    results = [
+        result for result in stored_results(run, "interchange") if _direction(result.stored.settings) == WHOLE
+    ]
+    return _chosen(pool_conditions(results), ())
 
 
 def _along(run: RunReader) -> list[_Selection]:
-    result = [own for own in stored_results(run, "interchange") if _direction(own.stored.settings) != WHOLE]
-    return _chosen(pool_conditions(result, ("direction", "seed")), ("direction",))
+    results = [
+        result for result in stored_results(run, "interchange") if _direction(result.stored.settings) != WHOLE
+    ]
+    return _chosen(pool_conditions(results, ("direction", "seed")), ("direction",))
 
 
 def _steering(run: RunReader) -> list[_Selection]:
@@ -302,37 +306,37 @@ def _steering(run: RunReader) -> list[_Selection]:
 
 def _chosen(groups: Sequence[PooledConditions], setting: Sequence[str]) -> list[_Selection]:
     """One per category, place, role and values of these settings, by depth within a category."""
-    found: dict[str, dict[tuple[str, ...], _Selection]] = {}
+    selected: dict[str, dict[tuple[str, ...], _Selection]] = {}
     for group in groups:
         values = [str(group.like.stored.settings.get(name)) for name in setting]
-        own = found.setdefault(group.like.category, {})
+        by_subject = selected.setdefault(group.like.category, {})
         for subject, conditions in _by_place(group).items():
-            made = max(group.sources[name].made for name in conditions)
-            candidate = _Selection(group, conditions, (group.like.rank, len(conditions), made))
-            before = own.setdefault((*subject, *values), candidate)
+            created = max(group.sources[name].made for name in conditions)
+            candidate = _Selection(group, conditions, (group.like.rank, len(conditions), created))
+            before = by_subject.setdefault((*subject, *values), candidate)
             if before.merit < candidate.merit:
-                own[*subject, *values] = candidate
-    return [own[subject] for own in found.values() for subject in sorted(own, key=_depth)]
+                by_subject[*subject, *values] = candidate
+    return [by_subject[subject] for by_subject in selected.values() for subject in sorted(by_subject, key=_depth)]
 
 
 def _by_place(group: PooledConditions) -> dict[tuple[str, str], tuple[str, ...]]:
     """The conditions of every place and role, controls and coefficients among them."""
-    found: dict[tuple[str, str], list[str]] = {}
+    grouped: dict[tuple[str, str], list[str]] = {}
     for condition in sorted(group.sources):
-        named = ConditionName.parse(condition)
-        found.setdefault((named.place, named.role), []).append(condition)
-    return {cell: tuple(names) for cell, names in found.items()}
+        name = ConditionName.parse(condition)
+        grouped.setdefault((name.site, name.role), []).append(condition)
+    return {cell: tuple(names) for cell, names in grouped.items()}
 
 
-def _rows_of(chosen: Sequence[_Selection], seed_text: str) -> Iterator[tuple[_Selection, list[PatchEffect]]]:
+def _rows_of(selections: Sequence[_Selection], seed_text: str) -> Iterator[tuple[_Selection, list[PatchEffect]]]:
     """The numbers of each, tested against everything that its group tried in the same stream."""
     tested: dict[tuple[int, str], dict[str, PatchEffect]] = {}
-    for one in chosen:
-        stream = _stream(one.conditions[0])
-        at = id(one.group), stream
+    for selection in selections:
+        stream = _stream(selection.conditions[0])
+        at = id(selection.group), stream
         if at not in tested:
-            tested[at] = _test_together(one.group, stream, seed_text)
-        yield one, [tested[at][name] for name in one.conditions]
+            tested[at] = _test_together(selection.group, stream, seed_text)
+        yield selection, [tested[at][name] for name in selection.conditions]
 
 
 def _test_together(group: PooledConditions, stream: str, seed_text: str) -> dict[str, PatchEffect]:
@@ -344,11 +348,11 @@ def _test_together(group: PooledConditions, stream: str, seed_text: str) -> dict
     }
 
 
-def _by_category(run: RunReader, chosen: Sequence[_Selection]) -> dict[str, list[PatchEffect]]:
-    found: dict[str, list[PatchEffect]] = {}
-    for one, rows in _rows_of(chosen, seed_text_of(run)):
-        found.setdefault(one.group.like.category, []).extend(rows)
-    return found
+def _by_category(run: RunReader, selections: Sequence[_Selection]) -> dict[str, list[PatchEffect]]:
+    effects: dict[str, list[PatchEffect]] = {}
+    for selection, rows in _rows_of(selections, seed_text_of(run)):
+        effects.setdefault(selection.group.like.category, []).extend(rows)
+    return effects
 
 
 def _direction(settings: Mapping[str, Any]) -> str:
@@ -356,20 +360,20 @@ def _direction(settings: Mapping[str, Any]) -> str:
 
 
 def _in_words(steered: _Selection) -> str:
-    named, settings = ConditionName.parse(steered.conditions[0]), steered.group.like.stored.settings
+    name, settings = ConditionName.parse(steered.conditions[0]), steered.group.like.stored.settings
     direction, target_side = str(settings.get("direction", USUAL)), str(settings.get("target_side", WRONG))
-    further = [direction] * (direction != USUAL) + [f"toward {target_side}"] * (target_side != WRONG)
-    return ", ".join([f"{named.place} {named.role}", *further])
+    qualifiers = [direction] * (direction != USUAL) + [f"toward {target_side}"] * (target_side != WRONG)
+    return ", ".join([f"{name.site} {name.role}", *qualifiers])
 
 
 def _stream(condition: str) -> str:
-    return ConditionName.parse(condition).place.partition(".")[0]
+    return ConditionName.parse(condition).site.partition(".")[0]
 
 
 def _depth(subject: tuple[str, ...]) -> tuple[object, ...]:
     """The backbone, then the acting stream, then `kv`; shallow before deep, all tokens before single roles."""
-    place, role, *values = subject
-    name = PlaceName.parse(place)
+    site, role, *values = subject
+    name = PlaceName.parse(site)
     part = {BACKBONE: 0, KV_STREAM: 2}.get(name.stream, 1)
     return part, name.stream, *name.depth, role != ALL, role, *values
 
@@ -382,8 +386,8 @@ def best_patch_targets(run: RunReader, categories: Sequence[str]) -> tuple[str, 
     where no single role carries half of it. Raises UsageError if none was located.
     """
     stored = stored_site_effects(run)
-    found = [best_cell(stored.get(category, [])) for category in categories]
-    cells = tuple(dict.fromkeys(str(ConditionName(cell.place, cell.role)) for cell in found if cell is not None))
+    best = [best_cell(stored.get(category, [])) for category in categories]
+    cells = tuple(dict.fromkeys(str(ConditionName(cell.place, cell.role)) for cell in best if cell is not None))
     if not cells:
         raise UsageError(
             f"no stored interchange of {run.location} located a place of {', '.join(categories)}: run "

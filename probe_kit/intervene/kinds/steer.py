@@ -48,17 +48,19 @@ class Steered:
     @property
     def name(self) -> str:
         """Return place, role, direction and coefficient, see `ConditionName`."""
-        return str(ConditionName(self.cell.place.name, self.cell.role, self.direction, f"{self.coefficient:g}"))
+        return str(
+            ConditionName(self.cell.site_group.name, self.cell.role, self.direction, f"{self.coefficient:g}")
+        )
 
     def play(self, context: ConditionContext) -> ConditionResult:
         """Infer with these tokens moved."""
-        pair, session, place = context.pair, context.session, self.cell.place
-        left = pair.side != "right"
-        side = {"left": 1.0, "right": -1.0, "correct": 1.0 if left else -1.0, "wrong": -1.0 if left else 1.0}
+        pair, session, site_group = context.pair, context.session, self.cell.site_group
+        is_left = pair.side != "right"
+        side = {"left": 1.0, "right": -1.0, "correct": 1.0 if is_left else -1.0, "wrong": -1.0 if is_left else 1.0}
         strength = self.coefficient * (1.0 if pair.side is None else side[self.target_side])
         shift = self.axes.shift(self.direction, pair.episode, pair.category, strength)
-        tokens = role_tokens(session.policy, pair, place.stream, self.cell.role, context.memo)
-        with apply_patch(session.policy, place.sites, tokens, AddVector(shift)) as edit_log:
+        tokens = role_tokens(session.policy, pair, site_group.stream, self.cell.role, context.memo)
+        with apply_patch(session.policy, site_group.sites, tokens, AddVector(shift)) as edit_log:
             chunk = session.act(pair.clean, pair.seed)
         return ConditionResult(chunk, edit_log)
 
@@ -134,7 +136,7 @@ class Steering(AlongDirection):
         """
         from probe_kit.intervene.directions import fit_token_directions
 
-        cells = [Cell(place, self.role) for place in resolve_all(self.sites, session.policy).values()]
+        cells = [Cell(site_group, self.role) for site_group in resolve_all(self.sites, session.policy).values()]
         conditions: list[Condition] = [CleanRun(), SourceRun()]
         for cell, axes in fit_token_directions(session, self, cells, self.sites).items():
             conditions.append(Steered(cell, self.direction, 0.0, self.target_side, axes))

@@ -120,16 +120,16 @@ def estimate_patches(
     act = act or partial(infer, model)
     sites = sites_of_cells(cells)
     captured = []
-    for given in (pair.clean, pair.source):
+    for model_input in (pair.clean, pair.source):
         with capture(model, sites) as cache:
-            captured.append((act(given, pair.seed), cache))
+            captured.append((act(model_input, pair.seed), cache))
     (clean, activations), (moved, source) = captured
     slopes = []
-    for given in (pair.clean, pair.source)[: 1 + (ends == "both")]:
-        assert isinstance(given, Observation)
-        slopes.append(gradients_at(model, [given], [pair.seed], sites, lambda chunks: slope(chunks[0]))[1])
+    for model_input in (pair.clean, pair.source)[: 1 + (ends == "both")]:
+        assert isinstance(model_input, Observation)
+        slopes.append(gradients_at(model, [model_input], [pair.seed], sites, lambda chunks: slope(chunks[0]))[1])
     memo: dict[Any, Any] = {}
-    masks = [role_token_mask(model, pair, cell.place.stream, cell.role, memo) for cell in cells]
+    masks = [role_token_mask(model, pair, cell.site_group.stream, cell.role, memo) for cell in cells]
     return Estimates(clean, moved, sum_over_cells(activations, source, slopes, cells, masks))
 
 
@@ -145,22 +145,24 @@ def sum_over_cells(
     slopes: the gradients at the same sites, of which the mean is taken. masks: (T,) the tokens of every cell.
     """
     products = {
-        site: (source[site].float() - clean[site].float())[0] * sum(one[site][0] for one in slopes) / len(slopes)
+        site: (source[site].float() - clean[site].float())[0]
+        * sum(gradients[site][0] for gradients in slopes)
+        / len(slopes)
         for site in sites_of_cells(cells)
     }
     return np.array(
         [
-            sum(float(_of_head(products[site], cell.place)[tokens].sum()) for site in cell.place.sites)
+            sum(float(_of_head(products[site], cell.site_group)[tokens].sum()) for site in cell.site_group.sites)
             for cell, tokens in zip(cells, masks, strict=True)
         ]
     )
 
 
-def _of_head(product: "Tensor", place: SiteGroup) -> NDArray[np.float64]:
+def _of_head(product: "Tensor", site_group: SiteGroup) -> NDArray[np.float64]:
     """Return (T, D) of all features, or of those of the place's head."""
-    if place.head is not None:
-        width = product.shape[-1] // place.heads
-        product = product[:, place.head * width : (place.head + 1) * width]
+    if site_group.head is not None:
+        width = product.shape[-1] // site_group.heads
+        product = product[:, site_group.head * width : (site_group.head + 1) * width]
     features: NDArray[np.float64] = product.double().cpu().numpy()
     return features
 
@@ -168,14 +170,18 @@ def _of_head(product: "Tensor", place: SiteGroup) -> NDArray[np.float64]:
 def complete_cuts(model: "Model", places: Sequence[SiteGroup]) -> list[Cell]:
     """Return the anchors of a screen: all of `kv`, and all tokens of each backbone layer in which a place lies."""
     streams = {name: stream for name, stream in model.streams.items() if stream.part == "backbone"}
-    layers = [f"{place.stream}.{place.sites[0].layer:02d}" for place in places if place.stream in streams]
-    cuts = [place for name in dict.fromkeys(layers) for place in resolve_sites(name, model)]
+    layers = [
+        f"{site_group.stream}.{site_group.sites[0].layer:02d}"
+        for site_group in places
+        if site_group.stream in streams
+    ]
+    cuts = [site_group for name in dict.fromkeys(layers) for site_group in resolve_sites(name, model)]
     if model.prompt_kv is not None:
         blocks = resolve_sites(EVERY_BLOCK, model)
         cuts.insert(0, SiteGroup(EVERY_BLOCK, tuple(site for block in blocks for site in block.sites)))
     elif not cuts:
         cuts = resolve_sites(f"{next(iter(streams))}.00", model)
-    return [Cell(place, ALL) for place in cuts]
+    return [Cell(site_group, ALL) for site_group in cuts]
 
 
 # -- order ---------------------------------------------------------------------------------------------------
@@ -210,9 +216,9 @@ def order_cells(rows: Sequence[AttributionEffect]) -> list[AttributionEffect]:
 
 def kind_of_place(name: str) -> str:
     """Return what a place can be compared with: `kv`, `backbone`, `backbone heads`, `expert iterations`."""
-    place = PlaceName.parse(name)
-    further = [place.quantity * (place.quantity != RESIDUAL), "iterations" * (place.iterations is not None)]
-    return " ".join(filter(None, (place.stream, *further)))
+    parsed = PlaceName.parse(name)
+    qualifiers = [parsed.quantity * (parsed.quantity != RESIDUAL), "iterations" * (parsed.iterations is not None)]
+    return " ".join(filter(None, (parsed.stream, *qualifiers)))
 
 
 def describe_screen(rows: Sequence[AttributionEffect]) -> str:
@@ -312,9 +318,9 @@ class Screen:
             raise UsageError(f"{self}; patch cells exactly with sweep_cells, or sets with find_minimal_cells")
         ranked = [row for row in self.rows if row.rank is not None]
         largest = [row.name for row in ranked if (row.rank or 0) <= top]
-        others = [row.name for row in ranked if (row.rank or 0) > top]
-        draw = np.random.default_rng(derive_seed("screen", seed)).permutation(len(others))[:drawn]
-        names = largest, [others[at] for at in sorted(draw.tolist())]
+        remaining = [row.name for row in ranked if (row.rank or 0) > top]
+        draw = np.random.default_rng(derive_seed("screen", seed)).permutation(len(remaining))[:drawn]
+        names = largest, [remaining[at] for at in sorted(draw.tolist())]
         first, second = (tuple(self.cells[name] for name in part) for part in names)
         return first, second
 
@@ -338,7 +344,7 @@ def attribute_cells(model: "Policy", pairs: Sequence[Pair], cells: Sequence[Cell
         raise UsageError(f"a screen of {len(screened)} cells in {len(pairs)} pairs; give at least one of both")
     if not all(isinstance(pair.clean, Observation) for pair in pairs):
         raise UsageError("gradients are of actions; give pairs of observations, not of questions")
-    anchors = complete_cuts(model, list(dict.fromkeys(cell.place for cell in screened)))
+    anchors = complete_cuts(model, list(dict.fromkeys(cell.site_group for cell in screened)))
     every = (*anchors, *(cell for cell in screened if cell not in anchors))
     estimates = np.array([estimate_patches(model, pair, every, metric).by_cell for pair in pairs]).T
     exact = sweep_cells(model, pairs, anchors, lambda actions, _: _number(metric, actions))
@@ -360,7 +366,7 @@ def _row(cell: Cell, moved: NDArray[np.float64], exact: Sweep, anchors: Sequence
     estimate = share_of_whole(moved, exact.whole, exact.groups, DRAWS) if is_significant else None
     return AttributionEffect(
         category="",
-        place=cell.place.name,
+        place=cell.site_group.name,
         role=cell.role,
         is_anchor=is_anchor,
         is_drawn=False,

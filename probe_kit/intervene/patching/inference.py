@@ -27,14 +27,14 @@ Output = Union[NDArray[np.float32], "Reading"]
 
 @dataclass(frozen=True)
 class HookPoint:
-    """Where a hook is called. roles: of the site's tokens; None for a stream without roles, such as vision."""
+    """The place of a hook's call. roles: of the site's tokens; None for a stream without roles, such as vision."""
 
     site: Site
     roles: "Roles | None"
 
     @property
     def iteration(self) -> int | None:
-        """Of the site: a flow-matching step or an action token; None where the stream runs once."""
+        """Return the site's flow-matching step or action token; None where the stream runs once."""
         return self.site.iteration
 
 
@@ -42,28 +42,30 @@ HookFunction = Callable[["Tensor", HookPoint], "Tensor"]
 """From an activation (1, T, D) and its place to the activation that passes instead, of the same shape."""
 
 
-def infer(model: "Model", given: Given, seed: int = 0) -> Output:
+def infer(model: "Model", model_input: Given, seed: int = 0) -> Output:
     """One inference. Raises UsageError for an observation of a model that does not act, and the reverse."""
     from probe_kit.hooks import AnswerModel, Policy
 
-    if isinstance(given, Observation):
+    if isinstance(model_input, Observation):
         if isinstance(model, Policy):
             act = model.act if model.embodiment_mismatch() is None else model.infer_without_acting
-            return np.asarray(act([given], [seed])[0], np.float32)
+            return np.asarray(act([model_input], [seed])[0], np.float32)
         raise UsageError(f"{model.card.family} does not act: give it a question, hooks.Prompt(observation, text)")
     if isinstance(model, AnswerModel):
-        return model.read([given])
+        return model.read([model_input])
     raise UsageError(ANSWERS_NOTHING.format(model.card.family))
 
 
 def sites_of(model: "Model", patterns: Sequence[str]) -> list[Site]:
     """The sites of all places that patterns name, each once; see `resolve_sites`."""
-    found = [site for pattern in patterns for place in resolve_sites(pattern, model) for site in place.sites]
-    return list(dict.fromkeys(found))
+    sites = [
+        site for pattern in patterns for site_group in resolve_sites(pattern, model) for site in site_group.sites
+    ]
+    return list(dict.fromkeys(sites))
 
 
 def run_with_cache(
-    model: "Model", given: Given, seed: int = 0, places: Sequence[str] | None = None
+    model: "Model", model_input: Given, seed: int = 0, places: Sequence[str] | None = None
 ) -> "tuple[Output, ActivationCache]":
     """The output of one inference, and the activations (1, T, D) of it.
 
@@ -73,11 +75,11 @@ def run_with_cache(
     from probe_kit.hooks import capture
 
     with capture(model, model.sites(RESIDUAL) if places is None else sites_of(model, places)) as cache:
-        output = infer(model, given, seed)
+        output = infer(model, model_input, seed)
     return output, cache
 
 
-def run_with_hooks(model: "Model", given: Given, hooks: Mapping[str, HookFunction], seed: int = 0) -> Output:
+def run_with_hooks(model: "Model", model_input: Given, hooks: Mapping[str, HookFunction], seed: int = 0) -> Output:
     """The output of one inference in which functions change activations.
 
     hooks: by pattern of places a function of (activation, `HookPoint`), called at each of their sites; the
@@ -86,7 +88,7 @@ def run_with_hooks(model: "Model", given: Given, hooks: Mapping[str, HookFunctio
     """
     from probe_kit.hooks import edit
 
-    roles = roles_of_tokens(model, given)
+    roles = roles_of_tokens(model, model_input)
     edits: dict[Site, Callable[[Tensor], Tensor]] = {}
     for pattern, function in hooks.items():
         for site in sites_of(model, [pattern]):
@@ -94,7 +96,7 @@ def run_with_hooks(model: "Model", given: Given, hooks: Mapping[str, HookFunctio
                 raise UsageError(f"two patterns name {site}; give every site one function")
             edits[site] = partial(_call, function, HookPoint(site, roles.get(site.stream)))
     with edit(model, edits):
-        return infer(model, given, seed)
+        return infer(model, model_input, seed)
 
 
 def _call(function: HookFunction, point: HookPoint, activation: "Tensor") -> "Tensor":

@@ -27,11 +27,11 @@ if TYPE_CHECKING:
 class Cell:
     """The tokens of one role at one place."""
 
-    place: SiteGroup
+    site_group: SiteGroup
     role: str
 
     def __str__(self) -> str:
-        return f"{self.place.name} {self.role}"
+        return f"{self.site_group.name} {self.role}"
 
 
 Cells = Cell | Sequence[Cell]
@@ -47,7 +47,7 @@ def all_but(cells: tuple[Cell, ...], left_out: tuple[Cell, ...]) -> tuple[Cell, 
 
 def sites_of_cells(cells: Sequence[Cell]) -> tuple[Site, ...]:
     """Return the sites of all cells, each once."""
-    return tuple(dict.fromkeys(site for cell in cells for site in cell.place.sites))
+    return tuple(dict.fromkeys(site for cell in cells for site in cell.site_group.sites))
 
 
 def find_cells(model: "Model", *patterns: str) -> tuple[Cell, ...]:
@@ -60,10 +60,10 @@ def find_cells(model: "Model", *patterns: str) -> tuple[Cell, ...]:
     cells = []
     for pattern in patterns:
         places, _, roles = pattern.partition(SEPARATOR)
-        for place in resolve_sites(places, model):
+        for site_group in resolve_sites(places, model):
             for role in roles.split(",") if roles else (ALL,):
-                _check_role(model, place.stream, role.strip())
-                cells.append(Cell(place, role.strip()))
+                _check_role(model, site_group.stream, role.strip())
+                cells.append(Cell(site_group, role.strip()))
     if not cells:
         raise UsageError("no pattern was given; name cells such as 'backbone.*|image'")
     return tuple(dict.fromkeys(cells))
@@ -83,7 +83,7 @@ def _check_role(model: "Model", stream: str, role: str) -> None:
 
 
 def patch_cells(
-    model: "Model", pair: Pair, cells: Cells, *, along: Basis | None = None, rest: bool = False
+    model: "Model", pair: Pair, cells: Cells, *, along: Basis | None = None, complement: bool = False
 ) -> Output:
     """Return the output of the clean inference with the cells' activations from the source.
 
@@ -92,8 +92,8 @@ def patch_cells(
     is not orthonormal, CaptureError for a source with another number of tokens.
     """
     together = as_tuple(cells)
-    _, source = run_with_cache(model, pair.source, pair.seed, [cell.place.name for cell in together])
-    return infer_patched(model, pair, together, source, along, rest)
+    _, source = run_with_cache(model, pair.source, pair.seed, [cell.site_group.name for cell in together])
+    return infer_patched(model, pair, together, source, along, complement)
 
 
 def infer_patched(
@@ -102,10 +102,10 @@ def infer_patched(
     cells: Sequence[Cell],
     source: "ActivationCache",
     along: Basis | None = None,
-    rest: bool = False,
+    complement: bool = False,
 ) -> Output:
     """Return the same with activations of the source that are captured already; one inference."""
-    with patched(model, pair, cells, source, along, rest):
+    with patched(model, pair, cells, source, along, complement):
         return infer(model, pair.clean, pair.seed)
 
 
@@ -116,7 +116,7 @@ def patched(
     cells: Sequence[Cell],
     source: "ActivationCache",
     along: Basis | None = None,
-    rest: bool = False,
+    complement: bool = False,
     memo: MutableMapping[Any, Any] | None = None,
 ) -> Iterator[EditLog]:
     """Patch cells of a pair while the model infers once; every patch of the package is made here.
@@ -126,9 +126,9 @@ def patched(
     memo = {} if memo is None else memo
     changes: dict[Site, list[tuple[TokenSelection, TokenEdit]]] = {}
     for cell in cells:
-        tokens = role_tokens(model, pair, cell.place.stream, cell.role, memo)
-        change = cell.place.limit(_change(source, tokens.count, along, rest))
-        for site in cell.place.sites:
+        tokens = role_tokens(model, pair, cell.site_group.stream, cell.role, memo)
+        change = cell.site_group.limit(_change(source, tokens.count, along, complement))
+        for site in cell.site_group.sites:
             changes.setdefault(site, []).append((tokens, change))
     with apply_patches(model, changes) as log:
         yield log
@@ -142,9 +142,9 @@ def as_tuple(cells: Cells) -> tuple[Cell, ...]:
     return together
 
 
-def _change(source: "ActivationCache", tokens: int, along: Basis | None, rest: bool) -> TokenEdit:
+def _change(source: "ActivationCache", tokens: int, along: Basis | None, complement: bool) -> TokenEdit:
     if along is None:
-        if rest:
+        if complement:
             raise UsageError("rest patches all but a subspace; give its orthonormal basis as along")
         return ReplaceWith(source, tokens)
     basis = np.atleast_2d(np.asarray(along, np.float32))
@@ -152,4 +152,4 @@ def _change(source: "ActivationCache", tokens: int, along: Basis | None, rest: b
         raise UsageError(
             f"along has shape {basis.shape} and rows that are not orthonormal; take those of numpy.linalg.qr"
         )
-    return ReplaceInSubspace(source, tokens, basis, rest)
+    return ReplaceInSubspace(source, tokens, basis, complement)

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class AttentionPattern:
-    """What the heads of a block attend to, in one inference.
+    """The attention of the heads of a block, in one inference.
 
     weights: (H, S, T) float32, rows sum to 1. queries: roles of the S tokens that attend; keys: of the T attended
     ones. Both are None for a stream whose tokens have no roles, such as a vision tower.
@@ -39,12 +39,12 @@ class AttentionPattern:
         rows = self.queries.mask(asking) if asking else self.queries.valid
         if not rows.any():
             raise EmptyRoleError(f"no token with the role {asking!r} attends here")
-        own = self.weights[:, rows][..., self.keys.mask(role)]
-        return np.asarray(own.sum(axis=-1, dtype=np.float64).mean(axis=-1))
+        weights = self.weights[:, rows][..., self.keys.mask(role)]
+        return np.asarray(weights.sum(axis=-1, dtype=np.float64).mean(axis=-1))
 
 
 def attention_patterns(
-    model: "Model", given: Given, places: Sequence[str], seed: int = 0
+    model: "Model", model_input: Given, places: Sequence[str], seed: int = 0
 ) -> dict[Site, AttentionPattern]:
     """The model's own attention patterns in one inference, by site.
 
@@ -53,11 +53,11 @@ def attention_patterns(
     """
     from probe_kit.hooks import attended_roles, capture_patterns
 
-    with capture_patterns(model, sites_of(model, places)) as found:
-        infer(model, given, seed)
-    roles = {name: [own] for name, own in roles_of_tokens(model, given).items()}
+    with capture_patterns(model, sites_of(model, places)) as captured:
+        infer(model, model_input, seed)
+    roles = {name: [stream_roles] for name, stream_roles in roles_of_tokens(model, model_input).items()}
     patterns = {}
-    for site, weights in found.items():
+    for site, weights in captured.items():
         queries = keys = None
         if site.stream in roles:
             (queries,) = roles[site.stream]

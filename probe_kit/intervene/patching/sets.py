@@ -54,16 +54,16 @@ def find_minimal_set[C](
     Adding cells one by one would stop at once where a majority decides: no first cell has an effect.
     """
     have = tuple(cells)
-    (whole,) = effects([have])
-    effect, tried, is_singly = whole, 1, len(have) <= MOST_SINGLY
+    (full,) = effects([have])
+    effect, tried, is_singly = full, 1, len(have) <= MOST_SINGLY
     parts = len(have) if is_singly else 2
     while len(have) > 1:
         smaller = [_without(have, chunk) for chunk in np.array_split(np.arange(len(have)), parts)]
-        found = effects(smaller)
+        shares = effects(smaller)
         tried += len(smaller)
-        best = int(np.argmax(found))
-        if found[best] >= keep * whole:
-            have, effect = smaller[best], found[best]
+        best = int(np.argmax(shares))
+        if shares[best] >= keep * full:
+            have, effect = smaller[best], shares[best]
             parts = len(have) if is_singly else max(2, min(parts - 1, len(have)))
         elif parts < len(have):
             parts = min(2 * parts, len(have))
@@ -77,10 +77,10 @@ def _without[C](cells: tuple[C, ...], left_out: Sequence[int]) -> tuple[C, ...]:
     return tuple(cell for number, cell in enumerate(cells) if number not in gone)
 
 
-def pooled_share(moved: NDArray[np.float64], whole: NDArray[np.float64]) -> float:
+def pooled_share(moved: NDArray[np.float64], full: NDArray[np.float64]) -> float:
     """Return Σ moved · whole / Σ whole² over pairs (E,); 0 where the whole moves nothing."""
-    total = float((whole**2).sum())
-    return float((moved * whole).sum()) / total if total else 0.0
+    total = float((full**2).sum())
+    return float((moved * full).sum()) / total if total else 0.0
 
 
 def choosing_half(groups: Sequence[str], seed: int) -> tuple[str, ...]:
@@ -144,13 +144,13 @@ def compare_alone_and_without(
     """
     import pandas as pd
 
-    own = _several(cells)
-    sets = [own, *[(cell,) for cell in own], *[all_but(own, (cell,)) for cell in own]]
+    distinct = _several(cells)
+    sets = [distinct, *[(cell,) for cell in distinct], *[all_but(distinct, (cell,)) for cell in distinct]]
     swept = sweep_cells(model, pairs, sets, metric)
-    alone = _only(swept, range(1, 1 + len(own)))
+    alone = _only(swept, range(1, 1 + len(distinct)))
     rows = []
-    for at, cell in enumerate(own):
-        lost = swept.patched[0] - swept.patched[1 + len(own) + at]
+    for at, cell in enumerate(distinct):
+        lost = swept.patched[0] - swept.patched[1 + len(distinct) + at]
         needed = share_of_whole(lost, swept.whole, swept.groups, DRAWS) if alone.shares[at] else None
         p = float(alone.table["p_fwe"][at])
         rows.append(
@@ -179,32 +179,32 @@ def find_minimal_cells(
     It is searched in one half of the groups, drawn with `seed`, and scored in the other; see `find_minimal_set`.
     The cells must be parallel. Raises UsageError for fewer than two cells, or fewer than two groups.
     """
-    own = _several(cells)
+    distinct = _several(cells)
     groups, _ = groups_and_items(pairs)
     choosing = choosing_half(groups, seed)
-    chosen = [pair for pair, group in zip(pairs, groups, strict=True) if group in choosing]
-    others = [pair for pair, group in zip(pairs, groups, strict=True) if group not in choosing]
-    if not chosen:
+    searched = [pair for pair, group in zip(pairs, groups, strict=True) if group in choosing]
+    held_out = [pair for pair, group in zip(pairs, groups, strict=True) if group not in choosing]
+    if not searched:
         raise UsageError(f"{len(set(groups))} group of pairs cannot be halved; give pairs of at least two groups")
 
     def effects(sets: Sequence[tuple[Cell, ...]]) -> list[float]:
-        swept = sweep_cells(model, chosen, sets, metric)
+        swept = sweep_cells(model, searched, sets, metric)
         return [pooled_share(values - swept.clean, swept.whole) for values in swept.patched]
 
-    found = find_minimal_set(own, effects, keep)
-    scored = sweep_cells(model, others, [found.cells], metric)
+    smallest = find_minimal_set(distinct, effects, keep)
+    scored = sweep_cells(model, held_out, [smallest.cells], metric)
     return MinimalCells(
-        found.cells, found.effect, found.tried, scored.shares[0], float(scored.table["p"][0]), choosing
+        smallest.cells, smallest.effect, smallest.tried, scored.shares[0], float(scored.table["p"][0]), choosing
     )
 
 
 def _several(cells: Sequence[Cell]) -> tuple[Cell, ...]:
-    own = tuple(dict.fromkeys(cells))
-    if len(own) < 2:
+    distinct = tuple(dict.fromkeys(cells))
+    if len(distinct) < 2:
         raise UsageError(
-            f"a comparison of sets needs two cells or more; {', '.join(map(str, own)) or 'none'} given"
+            f"a comparison of sets needs two cells or more; {', '.join(map(str, distinct)) or 'none'} given"
         )
-    return own
+    return distinct
 
 
 def _only(swept: Sweep, rows: range) -> Sweep:

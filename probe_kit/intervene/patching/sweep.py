@@ -34,11 +34,11 @@ class SwapShare(NamedTuple):
 
 
 def share_of_whole(
-    moved: NDArray[np.float64], whole: NDArray[np.float64], groups: NDArray[np.str_], seed_text: str
+    moved: NDArray[np.float64], full: NDArray[np.float64], groups: NDArray[np.str_], seed_text: str
 ) -> SwapShare:
     """Return Σ moved · whole / Σ whole² over episodes (E,), with its interval by groups (E,)."""
     names, group_of = np.unique(groups, return_inverse=True)
-    above, below = np.bincount(group_of, moved * whole), np.bincount(group_of, whole**2)
+    above, below = np.bincount(group_of, moved * full), np.bincount(group_of, full**2)
     times = draw_groups(names.size, units_seed(groups, seed_text))
     drawn = (times @ above) / np.maximum(times @ below, np.finfo(float).tiny)
     low, high = np.percentile(drawn, [2.5, 97.5])
@@ -66,7 +66,7 @@ DRAWS = "patching"
 
 @dataclass(frozen=True)
 class Sweep:
-    """What K sets of cells move in E pairs.
+    """The effects of K sets of cells in E pairs.
 
     cells: the sets. groups, items: (E,) of the pairs. toward: (E,) ±1, see `Pair`. clean, source: (E,) the metric
     of both inferences; patched: (K, E) of those with a set of cells patched.
@@ -82,8 +82,8 @@ class Sweep:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the sets: their cells, joined by +."""
-        return tuple(" + ".join(map(str, own)) for own in self.cells)
+        """Return the cells of every set, joined by +."""
+        return tuple(" + ".join(map(str, cells)) for cells in self.cells)
 
     @property
     def whole(self) -> NDArray[np.float64]:
@@ -92,7 +92,7 @@ class Sweep:
 
     @cached_property
     def source_p(self) -> float:
-        """That the source moves the metric, in the better of both directions: exact sign test, as of the swap."""
+        """Return p that the source moves the metric, in the better direction: exact sign test, as of the swap."""
         return min(self._source_p_values)
 
     @cached_property
@@ -107,7 +107,9 @@ class Sweep:
         """Per set its share of the source's effect with a 95 % interval by groups; see `table`."""
         if self.source_p >= SIGNIFICANCE:
             return (None,) * len(self.cells)
-        return tuple(share_of_whole(own - self.clean, self.whole, self.groups, DRAWS) for own in self.patched)
+        return tuple(
+            share_of_whole(values - self.clean, self.whole, self.groups, DRAWS) for values in self.patched
+        )
 
     @cached_property
     def table(self) -> "pd.DataFrame":
@@ -124,7 +126,7 @@ class Sweep:
         seed = derive_seed(DRAWS, "sign flips", *np.unique(self.groups).tolist())
         sign = -1.0 if self._source_p_values[1] < SIGNIFICANCE else 1.0
         _, p, p_fwe = max_t(sign * moved, self.items, self.groups, seed)
-        shares = [(np.nan,) * 3 if own is None else tuple(own) for own in self.shares]
+        shares = [(np.nan,) * 3 if share is None else tuple(share) for share in self.shares]
         return pd.DataFrame(
             {
                 "cells": self.names,
@@ -144,18 +146,20 @@ class Sweep:
         """
         from matplotlib.figure import Figure
 
-        if any(len(own) > 1 for own in self.cells):
+        if any(len(cells) > 1 for cells in self.cells):
             raise UsageError("a heatmap shows single cells; this sweep has sets of several, use its table")
         values = self.table[column].to_numpy(float)
         if np.isnan(values).all():
             raise UsageError(
                 f"no cell has a {column}: p of the source itself is {self.source_p:.2g}; take 'moved'"
             )
-        places = sorted({own[0].place.name for own in self.cells}, key=lambda name: _order(PlaceName.parse(name)))
-        roles = list(dict.fromkeys(own[0].role for own in self.cells))
+        places = sorted(
+            {cells[0].site_group.name for cells in self.cells}, key=lambda name: _order(PlaceName.parse(name))
+        )
+        roles = list(dict.fromkeys(cells[0].role for cells in self.cells))
         grid = np.full((len(roles), len(places)), np.nan)
         for (cell,), value in zip(self.cells, values, strict=True):
-            grid[roles.index(cell.role), places.index(cell.place.name)] = value
+            grid[roles.index(cell.role), places.index(cell.site_group.name)] = value
         figure = Figure(figsize=(2 + 0.4 * len(places), 1.5 + 0.4 * len(roles)), layout="constrained")
         axes = figure.add_subplot()
         image = axes.imshow(grid, aspect="auto", cmap="viridis")
@@ -172,25 +176,25 @@ def sweep_cells(
     metric: Metric,
     *,
     along: Basis | None = None,
-    rest: bool = False,
+    complement: bool = False,
 ) -> Sweep:
     """Patch every cell, or every set of cells, of `cells` in every pair; one inference each, and two per pair.
 
     metric: of an output and what was given, such as `session.lateral_displacement`; of the same inference as the
     patch. along, rest: see `patch_cells`. Raises UsageError without pairs, and what `patch_cells` raises.
     """
-    sets = tuple(as_tuple(own) for own in cells)
+    sets = tuple(as_tuple(together) for together in cells)
     if not pairs or not sets:
         raise UsageError(f"a sweep of {len(sets)} sets of cells in {len(pairs)} pairs; give at least one of both")
-    places = list(dict.fromkeys(cell.place.name for own in sets for cell in own))
+    places = list(dict.fromkeys(cell.site_group.name for together in sets for cell in together))
     clean, moved = np.empty(len(pairs)), np.empty(len(pairs))
     patched = np.empty((len(sets), len(pairs)))
     for column, pair in enumerate(pairs):
         output, source = run_with_cache(model, pair.source, pair.seed, places)
         moved[column] = metric(output, pair.source)
         clean[column] = metric(infer(model, pair.clean, pair.seed), pair.clean)
-        for row, own in enumerate(sets):
-            output = infer_patched(model, pair, own, source, along, rest)
+        for row, together in enumerate(sets):
+            output = infer_patched(model, pair, together, source, along, complement)
             patched[row, column] = metric(output, pair.clean)
     groups, items = groups_and_items(pairs)
     toward = np.array([float(np.sign(pair.toward)) for pair in pairs])

@@ -1,4 +1,4 @@
-"""Where stored interventions found that the answer passes and is read, for verdicts. Needs no model."""
+"""The places at which stored interventions found that the answer passes and is read. Needs no model."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import starmap
@@ -40,16 +40,16 @@ if TYPE_CHECKING:
 
 
 def stored_places(run: RunReader) -> dict[str, Places]:
-    """By category, of interchanges and joint places; without categories that were not searched.
+    """Return by category the places of interchanges and joint searches; without categories that were not searched.
 
     Raises RunDamagedError.
     """
     located, carried = stored_localised_sites(run), stored_carrying_directions(run)
     searched = {name: rows for name, rows in stored_joint_places(run).items() if _says_where(rows)}
     jointly = {name: describe_joint_places(rows) for name, rows in searched.items()}
-    rest = {name: describe_remainder(rows) for name, rows in searched.items()}
+    remainders = {name: describe_remainder(rows) for name, rows in searched.items()}
     return {
-        name: Places(located.get(name), carried.get(name, ()), jointly.get(name, ""), rest.get(name, ""))
+        name: Places(located.get(name), carried.get(name, ()), jointly.get(name, ""), remainders.get(name, ""))
         for name in dict.fromkeys((*located, *carried, *jointly))
     }
 
@@ -60,18 +60,19 @@ def _says_where(rows: Sequence[JointEffect]) -> bool:
     return every.finding != "past it" or every.cells == KV_STREAM
 
 
-def stored_other_readouts(run: RunReader, found: Mapping[str, ImageSwapEffect]) -> dict[str, UseVerdict]:
-    """By category, the behaviour by the other readout; without categories in which that is not stored.
+def stored_other_readouts(run: RunReader, swaps: Mapping[str, ImageSwapEffect]) -> dict[str, UseVerdict]:
+    """Return by category the behaviour by the other readout; without categories in which that is not stored.
 
-    found: what is shown, by category. The positive control is of the other readout too. Raises RunDamagedError.
+    swaps: the image swaps that are shown, by category. The positive control is of the other readout too. Raises
+    RunDamagedError.
     """
     stored = {readout: stored_image_swaps(run, readout) for readout in (FIRST_CHUNK, PER_STEP)}
-    others: dict[str, UseVerdict] = {}
-    for category, own in found.items():
-        same = stored[PER_STEP if own.readout == FIRST_CHUNK else FIRST_CHUNK]
+    verdicts: dict[str, UseVerdict] = {}
+    for category, swap in swaps.items():
+        same = stored[PER_STEP if swap.readout == FIRST_CHUNK else FIRST_CHUNK]
         if category in same:
-            others[category] = classify_behaviour(same[category], control_for(category, same))
-    return others
+            verdicts[category] = classify_behaviour(same[category], control_for(category, same))
+    return verdicts
 
 
 TieAtSite = Literal["read", "unread", "another code", "in part", "not tested"]
@@ -86,7 +87,7 @@ Sites = Mapping[tuple[str, str], TieAtSite]
 
 
 def tie_at_site(
-    whole: PatchEffect | None, along: Sequence[PatchEffect], layer: Sequence[PatchEffect] = ()
+    full: PatchEffect | None, along: Sequence[PatchEffect], layer: Sequence[PatchEffect] = ()
 ) -> TieAtSite:
     """The tie at one place and role. whole: its tokens patched in full. along: within subspaces, no controls.
 
@@ -98,10 +99,10 @@ def tie_at_site(
     """
     if any(map(_is_read_along, along)):
         return "read"
-    if whole is None or whole.effect_ci is None:
+    if full is None or full.effect_ci is None:
         return "not tested"
-    if carries_nothing(*whole.effect_ci):
-        return "unread" if whole.role == ALL else _without_others(whole, layer)
+    if carries_nothing(*full.effect_ci):
+        return "unread" if full.role == ALL else _without_others(full, layer)
     tested = [row.effect_ci for row in along if row.effect_ci is not None]
     if not tested:
         return "not tested"
@@ -109,13 +110,13 @@ def tie_at_site(
         return "in part"
     if not any(row.direction.startswith(MEAN_DIFFERENCE) for row in along):
         return "not tested"
-    carries = whole.effect is not None and whole.effect >= LOCALISATION_SHARE
+    carries = full.effect is not None and full.effect >= LOCALISATION_SHARE
     return "another code" if carries else "in part"
 
 
-def _without_others(whole: PatchEffect, layer: Sequence[PatchEffect]) -> TieAtSite:
+def _without_others(full: PatchEffect, layer: Sequence[PatchEffect]) -> TieAtSite:
     """The tie of a role that carries nothing alone."""
-    if any(row.is_localised and row.role not in (ALL, whole.role) for row in layer):
+    if any(row.is_localised and row.role not in (ALL, full.role) for row in layer):
         return "unread"
     every = next((row for row in layer if row.role == ALL and row.effect_ci is not None), None)
     if every is None or every.effect_ci is None:
@@ -129,7 +130,10 @@ def describe_tie(sites: Sites, is_joint: bool = False) -> str:
     is_joint: whether joint places found that the answer is read at several places together. What carries nothing
     alone can then be one of them.
     """
-    at = {tie: [f"{place} {role}" for (place, role), own in sites.items() if own == tie] for tie in sites.values()}
+    at = {
+        tie: [f"{site} {role}" for (site, role), site_tie in sites.items() if site_tie == tie]
+        for tie in sites.values()
+    }
     if "read" in at:
         return f"the readable copy is read ({list_places(at['read'])})"
     if not sites or "not tested" in at:
@@ -142,7 +146,7 @@ def describe_tie(sites: Sites, is_joint: bool = False) -> str:
 
 
 def stored_ties(run: RunReader, results: "ProbeResults | None", view: str | None = None) -> dict[str, str]:
-    """By category `describe_tie` of the sites at which probes of a view are significant.
+    """Return by category `describe_tie` of the sites at which probes of a view are significant.
 
     So are sites at which a direction of the same means carries the effect: it is read out of other episodes. The
     first layer counts only where a direction was patched, because its tokens carry the effect by construction.
@@ -153,30 +157,32 @@ def stored_ties(run: RunReader, results: "ProbeResults | None", view: str | None
     if results is None or role is None:
         return {}
     scores = results.scores
-    own = scores[(scores["stream"] == BACKBONE) & (scores["view"] == (view or results.settings.views[0]))]
-    whole, along = stored_site_effects(run), _of_answers(stored_subspace_effects(run))
+    backbone_scores = scores[
+        (scores["stream"] == BACKBONE) & (scores["view"] == (view or results.settings.views[0]))
+    ]
+    in_full, along = stored_site_effects(run), _of_answers(stored_subspace_effects(run))
     jointly = stored_joint_places(run)
-    found = {}
-    for category, rows in own.groupby("category", sort=False):
+    ties = {}
+    for category, rows in backbone_scores.groupby("category", sort=False):
         name = str(category)
-        patched, within = whole.get(name, ()), along.get(name, ())
+        patched, within = in_full.get(name, ()), along.get(name, ())
         significant = [f"{BACKBONE}.{int(layer):02d}" for layer in rows.loc[rows["signal"], "layer"]]
         pooled = [row.place for row in within if row.role == role and _is_pooled_carrier(row)]
         if pooled and not significant:
-            found[name] = f"{UNPROBED} ({list_places([f'{place} {role}' for place in pooled])})"
+            ties[name] = f"{UNPROBED} ({list_places([f'{site} {role}' for site in pooled])})"
             continue
         places = sorted({*significant, *pooled})
         sites = {
-            (place, role): tie_at_site(
-                next(iter(_at(patched, place, role)), None),
-                [row for row in _at(within, place, role) if not row.is_control],
-                [row for row in patched if row.place == place],
+            (site, role): tie_at_site(
+                next(iter(_at(patched, site, role)), None),
+                [row for row in _at(within, site, role) if not row.is_control],
+                [row for row in patched if row.place == site],
             )
-            for place in places
+            for site in places
         }
         inside = {at: tie for at, tie in sites.items() if tie != "not tested" or not is_upstream(at[0])}
-        found[name] = describe_tie(inside, is_read_jointly(jointly.get(name, ())))
-    return found
+        ties[name] = describe_tie(inside, is_read_jointly(jointly.get(name, ())))
+    return ties
 
 
 def _of_answers(along: Mapping[str, Sequence[PatchEffect]]) -> dict[str, list[PatchEffect]]:
@@ -206,8 +212,8 @@ def role_of_view(view: str) -> str | None:
     return (role or ALL) if kind == "mean" else None
 
 
-def _at(rows: Iterable[PatchEffect], place: str, role: str) -> list[PatchEffect]:
-    return [row for row in rows if (row.place, row.role) == (place, role)]
+def _at(rows: Iterable[PatchEffect], site: str, role: str) -> list[PatchEffect]:
+    return [row for row in rows if (row.place, row.role) == (site, role)]
 
 
 def _low(row: PatchEffect) -> float:
@@ -229,31 +235,33 @@ _TIES: dict[TieAtSite, str] = {
 def which_layer(
     run: RunReader, results: "ProbeResults | None", places: Mapping[str, Places], categories: Sequence[str]
 ) -> dict[str, str]:
-    """By category: where the answer passes, where it is read, and whether the probes' best site is read.
+    """Return by category where the answer passes, where it is read, and whether the probes' best site is read.
 
     results: the newest probes, None without any. places: as `stored_places` gives them. Of stored interchanges and
     joint places; what was not tested is named with the command that tests it.
     """
     maps, along = stored_site_effects(run), stored_subspace_effects(run)
-    found = {}
+    lines = {}
     for name in categories:
-        rows, own = maps.get(name, []), places.get(name)
+        rows, category_places = maps.get(name, []), places.get(name)
         cell = best_cell(rows)
         parts = [
-            _passes(rows, () if own is None or own.located is None else own.located),
-            _read(run, "" if own is None else str(own)),
+            _passes(
+                rows, () if category_places is None or category_places.located is None else category_places.located
+            ),
+            _read(run, "" if category_places is None else str(category_places)),
             _best_site(run, results, name, rows, along.get(name, [])),
         ]
         if cell is not None and is_backbone_layer(cell):
             parts.append(f"steer at {cell.place} {cell.role} (--direction {ALONG})")
-        found[name] = f"Which layer, {category_of(name).title}: {'; '.join(filter(None, parts))}."
-    return found
+        lines[name] = f"Which layer, {category_of(name).title}: {'; '.join(filter(None, parts))}."
+    return lines
 
 
 def _passes(rows: Sequence[PatchEffect], located: Sequence[str]) -> str:
     if not any(row.role == ALL and is_backbone_layer(row) for row in rows):
         return "where the answer passes was not tested (--kind interchange)"
-    passes = [place for place in located if place.partition(".")[0] == BACKBONE]
+    passes = [site for site in located if site.partition(".")[0] == BACKBONE]
     return f"passes at {list_places(passes)}" if passes else "no layer of the backbone carries half of it"
 
 
@@ -275,24 +283,26 @@ def _best_site(
     if results is None:
         return "no probes (probe-kit train)"
     view, scores = results.settings.views[0], results.scores
-    own = scores[(scores["stream"] == BACKBONE) & (scores["view"] == view) & (scores["category"] == category)]
-    if own.empty:
+    site_scores = scores[
+        (scores["stream"] == BACKBONE) & (scores["view"] == view) & (scores["category"] == category)
+    ]
+    if site_scores.empty:
         return ""
-    best = own.loc[own["accuracy"].idxmax()]
-    place = f"{BACKBONE}.{int(best['layer']):02d}"
+    best = site_scores.loc[site_scores["accuracy"].idxmax()]
+    site = f"{BACKBONE}.{int(best['layer']):02d}"
     signal = "" if best["signal"] else " (no signal)"
-    return f"the probes' best site {place}{signal} {_in_words(run, place, view, rows, along)}"
+    return f"the probes' best site {site}{signal} {_in_words(run, site, view, rows, along)}"
 
 
 def _in_words(
-    run: RunReader, place: str, view: str, rows: Sequence[PatchEffect], along: Sequence[PatchEffect]
+    run: RunReader, site: str, view: str, rows: Sequence[PatchEffect], along: Sequence[PatchEffect]
 ) -> str:
     family, role = get_family(run.model), role_of_view(view)
-    if family is not None and unread_places([place], run.streams, family.interventions):
+    if family is not None and unread_places([site], run.streams, family.interventions):
         return "is unread: nothing that acts reads the end of the backbone"
-    whole = next((row for row in rows if (row.place, row.role) == (place, role)), None)
-    inside = [row for row in along if (row.place, row.role) == (place, role) and not row.is_control]
-    tie = tie_at_site(whole, inside, [row for row in rows if row.place == place])
-    if tie == "not tested" and whole is not None and whole.is_localised:
+    full = next((row for row in rows if (row.place, row.role) == (site, role)), None)
+    inside = [row for row in along if (row.place, row.role) == (site, role) and not row.is_control]
+    tie = tie_at_site(full, inside, [row for row in rows if row.place == site])
+    if tie == "not tested" and full is not None and full.is_localised:
         return "carries the effect; --direction mean-difference tests what probes read there"
     return _TIES[tie]

@@ -1,4 +1,4 @@
-"""What interventions a run holds, for `probe-kit run show`."""
+"""The stored interventions of a run, for `probe-kit run show`."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -41,16 +41,18 @@ class ListedIntervention:
 
     @property
     def words(self) -> str:
-        """In a line."""
-        own = [f"{name} {_plain(value)}" for name, value in self.parameters.items() if value not in (None, [])]
+        """Return a line about it."""
+        settings = [
+            f"{name} {_plain(value)}" for name, value in self.parameters.items() if value not in (None, [])
+        ]
         parts = [self.kind, f"of {', '.join(self.categories)}"]
         parts += [] if self.items is None else [f"{counted(self.items, 'item')} each"]
         parts += [f"wording {self.wording}"] * bool(self.wording)
         if self.state == "other":
-            own.append("another one stands in its place in tables")
+            settings.append("another one stands in its place in tables")
         if self.state == "other episodes":
-            own.append("of other episodes than the run has now")
-        return "; ".join([" ".join(parts[:2]), *parts[2:], *own, self._when])
+            settings.append("of other episodes than the run has now")
+        return "; ".join([" ".join(parts[:2]), *parts[2:], *settings, self._when])
 
     @property
     def _when(self) -> str:
@@ -61,29 +63,29 @@ def listed_interventions(run: Any) -> list[ListedIntervention]:
     """All of a run, oldest first. Raises RunDamagedError if one was changed."""
     wordings = getattr(run, "wordings", ())
     readers: list[RunReader] = [run.in_wording(name) for name in wordings] or [run]
-    current = {one.key for reader in readers for one in stored_interventions(reader)}
+    current = {intervention.key for reader in readers for intervention in stored_interventions(reader)}
     used = {key for reader in readers for key in _used(reader)}
-    found = [_listed(bundle, current, used) for bundle in read_interventions(run.location).values()]
-    return sorted(found, key=lambda one: (one.created, one.key))
+    listed = [_listed(bundle, current, used) for bundle in read_interventions(run.location).values()]
+    return sorted(listed, key=lambda intervention: (intervention.created, intervention.key))
 
 
 def unfinished_interventions(location: Location) -> dict[str, int]:
     """Number of finished items of every intervention that was interrupted, by the key it will have."""
     parts = (key.split("/") for key in location.keys(INTERVENTIONS))
-    names = [own[1] for own in parts if len(own) > 2 and own[1].startswith(".") and own[1].endswith(PARTIAL)]
+    names = [path[1] for path in parts if len(path) > 2 and path[1].startswith(".") and path[1].endswith(PARTIAL)]
     return {name.removeprefix(".").removesuffix(PARTIAL): names.count(name) for name in dict.fromkeys(names)}
 
 
 def _used(run: RunReader) -> set[str]:
     """Keys of what is read, and of the kinds of which nothing takes another's place."""
     by_kind: dict[str, list[str]] = {}
-    for one in stored_interventions(run):
-        by_kind.setdefault(str(one.settings["kind"]), []).append(one.key)
-    found: set[str] = set()
+    for intervention in stored_interventions(run):
+        by_kind.setdefault(str(intervention.settings["kind"]), []).append(intervention.key)
+    used: set[str] = set()
     for name, keys in by_kind.items():
         preferred = kind_of(name).keys_in_use(run) if name in kind_names() else None
-        found |= set(keys) if preferred is None else preferred
-    return found
+        used |= set(keys) if preferred is None else preferred
+    return used
 
 
 def _listed(bundle: Bundle, current: set[str], used: set[str]) -> ListedIntervention:
@@ -112,9 +114,9 @@ def readers_of_results(run: Run) -> Iterator[Callable[[], object]]:
     """
     read_interventions(run.location)
     for wording in run.wordings or (None,):
-        shown = run if wording is None else run.in_wording(wording)
-        for stored in stored_interventions(shown):
-            yield partial(_read, shown, stored)
+        reader = run if wording is None else run.in_wording(wording)
+        for stored in stored_interventions(reader):
+            yield partial(_read, reader, stored)
 
 
 def _read(run: Run, stored: StoredIntervention) -> object:

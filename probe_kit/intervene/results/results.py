@@ -1,4 +1,4 @@
-"""What an intervention did: a table, the verdicts, and the ways to write them down."""
+"""The result of an intervention: a table, the verdicts, and the ways to write them down."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -57,22 +57,22 @@ class InterventionResult:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What decided its numbers, as stored."""
+        """Return what decided its numbers, as stored."""
         return dict(self.measurement.settings)
 
     @property
     def certificate(self) -> dict[str, Any]:
-        """What was loaded and checked, as stored."""
+        """Return what was loaded and checked, as stored."""
         return dict(self.measurement.certificate)
 
     @property
     def outcomes(self) -> ConditionOutcomes:
-        """What its conditions gave."""
+        """Return the numbers of its conditions."""
         return self.measurement.outcomes
 
     @property
     def kind(self) -> str:
-        """Of the intervention."""
+        """Return the kind of the intervention."""
         return str(self.measurement.settings["kind"])
 
     @cached_property
@@ -85,17 +85,17 @@ class InterventionResult:
         """One line per row of `effects`, with its columns; of a kind with verdicts also those of `UseVerdict`."""
         frame = frame_of(self.effects)
         if self._kind.has_verdict and self.outcomes.has_sides:
-            found = [self.verdicts.get(str(category), None) for category in frame["category"]]
+            verdicts = [self.verdicts.get(str(category), None) for category in frame["category"]]
             for name in _VERDICT_COLUMNS:
-                frame[name] = [None if one is None else getattr(one, name) for one in found]
+                frame[name] = [None if verdict is None else getattr(verdict, name) for verdict in verdicts]
         return frame
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What a reader must know, a sentence each."""
-        own = self._kind.notes(self.effects, self.measurement)
+        """Return what a reader must know, a sentence each."""
+        kind_notes = self._kind.notes(self.effects, self.measurement)
         tests = () if self._kind.is_descriptive else (*self._few_groups(), *self._one_step())
-        return *self._replayed(), *self._skipped_items(), *self._places(), *tests, *own
+        return *self._replayed(), *self._skipped_items(), *self._places(), *tests, *kind_notes
 
     @property
     def _kind(self) -> type[Intervention]:
@@ -116,7 +116,7 @@ class InterventionResult:
         return [f"{left_out} of {counts['asked']} items have no counterpart and were skipped."] if left_out else []
 
     def _few_groups(self) -> list[str]:
-        counts = {category: np.unique(own.groups).size for category, own in self.outcomes.by_category()}
+        counts = {category: np.unique(part.groups).size for category, part in self.outcomes.by_category()}
         return [
             f"{category}: with {counted(count, 'group')} of items no p can be below "
             f"{smallest_flip_p(count):.2g}, so that nothing is beyond chance. Play more (--items)."
@@ -208,19 +208,19 @@ def effects_of(run: RunReader, stored: StoredIntervention) -> InterventionResult
         stored.outcomes(), seed_text_of(run), stored.settings, stored.certificate(), stored.bundle.read,
         stored.key, tiles_apart(run),
     )  # fmt: skip
-    found = InterventionResult(run.label, run.random_weights, run.suite, measurement)
-    if not found.outcomes.has_sides:
-        return found
-    shown = found.effects if kind_of(found.kind).has_verdict else ()
+    result = InterventionResult(run.label, run.random_weights, run.suite, measurement)
+    if not result.outcomes.has_sides:
+        return result
+    swaps = result.effects if kind_of(result.kind).has_verdict else ()
     results, places = _newest_probes(run), stored_places(run)
-    found.verdicts.update(_verdicts(run, results, places, shown))
-    if kind_of(found.kind).asks_where:
-        found.layers.update(which_layer(run, results, places, list(stored.settings["categories"])))
-    return found
+    result.verdicts.update(_verdicts(run, results, places, swaps))
+    if kind_of(result.kind).asks_where:
+        result.layers.update(which_layer(run, results, places, list(stored.settings["categories"])))
+    return result
 
 
 def verdicts_of(run: RunReader) -> dict[str, UseVerdict]:
-    """By category, from all interventions and the newest probes that are stored with a run."""
+    """Return verdicts by category, from all interventions and the newest probes that are stored with a run."""
     return _verdicts(run, _newest_probes(run), stored_places(run), ())
 
 
@@ -228,12 +228,12 @@ def _verdicts(
     run: RunReader,
     results: "ProbeResults | None",
     places: Mapping[str, Places],
-    shown: Sequence[ImageSwapEffect],
+    swaps: Sequence[ImageSwapEffect],
 ) -> dict[str, UseVerdict]:
-    """shown: the image swap that is to be classified, whatever else is stored of these categories."""
-    found = {**stored_image_swaps(run), **{row.category: row for row in shown}}
-    others = stored_other_readouts(run, found)
-    return classify_all(found, encoded_in(results), places, stored_ties(run, results), others)
+    """Classify the stored image swaps. swaps: classified whatever else is stored of their categories."""
+    effects = {**stored_image_swaps(run), **{row.category: row for row in swaps}}
+    other_readouts = stored_other_readouts(run, effects)
+    return classify_all(effects, encoded_in(results), places, stored_ties(run, results), other_readouts)
 
 
 def _newest_probes(run: RunReader) -> "ProbeResults | None":
@@ -244,6 +244,6 @@ def _newest_probes(run: RunReader) -> "ProbeResults | None":
 
 
 def effects_csv(measurement: Measurement) -> str:
-    """As stored beside the outcomes, without verdicts, which later probes may change."""
+    """Return the effects as they are stored with the outcomes, without verdicts, which later probes may change."""
     rows: Sequence[Effect] = kind_of(str(measurement.settings["kind"])).effects(measurement)
     return csv_of_frame(frame_of(rows).drop(columns="key", errors="ignore"))

@@ -58,7 +58,7 @@ UNTESTED = "whether the answer is used was not tested"
 
 @dataclass(frozen=True, kw_only=True)
 class UseVerdict:
-    """Whether the action uses the answer, where it passes, and whether what probes read is what is used.
+    """The verdict: is the answer used, where does it pass, and is what probes read what is used?
 
     behaviour: of the image swap. reason: the numbers it rests on, or why there is none. reversed: the same, away
     from the correct picture. side: of a behaviour that is one-sided. place: where interchanges found that the
@@ -84,13 +84,13 @@ class UseVerdict:
 
         By either readout: what is used in the first chunk is used, and so is what is used later.
         """
-        return any(one.behaviour in USES for one in self.by_readout)
+        return any(verdict.behaviour in USES for verdict in self.by_readout)
 
     @property
     def by_readout(self) -> "tuple[UseVerdict, ...]":
-        """This one, and the one of the other readout if that is stored; the first chunk comes first."""
-        found = (self,) if self.other is None else (self, self.other)
-        return tuple(sorted(found, key=lambda one: one.readout != FIRST_CHUNK))
+        """Return this verdict, and that of the other readout if it is stored; the first chunk comes first."""
+        verdicts = (self,) if self.other is None else (self, self.other)
+        return tuple(sorted(verdicts, key=lambda verdict: verdict.readout != FIRST_CHUNK))
 
     @property
     def verdict(self) -> str:
@@ -113,13 +113,13 @@ class UseVerdict:
     @property
     def is_bounded(self) -> bool:
         """Whether the intervals of every stored readout exclude a use that would matter."""
-        return all(one.behaviour == "not used" or one.lacks_control for one in self.by_readout)
+        return all(verdict.behaviour == "not used" or verdict.lacks_control for verdict in self.by_readout)
 
     @property
     def explanation(self) -> str:
         """Reason, place and tie."""
         first, *second = self.by_readout
-        reasons = [first.reason, *(f"over the whole episode: {one.reason}" for one in second)]
+        reasons = [first.reason, *(f"over the whole episode: {verdict.reason}" for verdict in second)]
         return "; ".join(filter(None, (*reasons, self.place, self.tie)))
 
     @property
@@ -127,15 +127,15 @@ class UseVerdict:
         """Behaviour by every stored readout, place and tie; with the reason where it is not used."""
         first, *second = self.by_readout
         if second and first.own_verdict == second[0].own_verdict:
-            both = " and ".join(_READOUTS[one.readout] for one in (first, *second))
-            said = [
+            both = " and ".join(_READOUTS[verdict.readout] for verdict in (first, *second))
+            clauses = [
                 first.clause("the answer", both),
-                *(f"episode: {one.reason}" for one in second if one.needs_reason),
+                *(f"episode: {verdict.reason}" for verdict in second if verdict.needs_reason),
             ]
         else:
-            said = [first.clause("the answer"), *(one.clause("it") for one in second)]
-        found = "; ".join(filter(None, (*said, self.place, self.tie)))
-        return f"{found[0].upper()}{found[1:]}."
+            clauses = [first.clause("the answer"), *(verdict.clause("it") for verdict in second)]
+        text = "; ".join(filter(None, (*clauses, self.place, self.tie)))
+        return f"{text[0].upper()}{text[1:]}."
 
     @property
     def needs_reason(self) -> bool:
@@ -185,8 +185,8 @@ class UseVerdict:
 
 
 def describe_readouts(uses: Iterable[UseVerdict | None]) -> str:
-    """Of which readouts verdicts are, for a legend; empty without a verdict."""
-    stored = {one.readout for use in uses if use is not None for one in use.by_readout}
+    """Return the readouts of the verdicts in words, for a legend; empty without a verdict."""
+    stored = {verdict.readout for use in uses if use is not None for verdict in use.by_readout}
     if not stored:
         return ""
     if len(stored) == 2:
@@ -210,31 +210,31 @@ class _Seen(NamedTuple):
     reached: Mapping[Side, float]
 
     @classmethod
-    def of(cls, found: ImageSwapEffect, mirrored: bool) -> "_Seen":
-        reached: dict[Side, float] = {"left": found.left_reached, "right": found.right_reached}
+    def of(cls, effect: ImageSwapEffect, mirrored: bool) -> "_Seen":
+        reached: dict[Side, float] = {"left": effect.left_reached, "right": effect.right_reached}
         toward = cls(
-            found.follow_p, found.net_follow_rate, found.net_follow_rate_ci, found.reach_share,
-            found.reach_share_ci, reached,
+            effect.follow_p, effect.net_follow_rate, effect.net_follow_rate_ci, effect.reach_share,
+            effect.reach_share_ci, reached,
         )  # fmt: skip
         if not mirrored:
             return toward
-        low, high = found.net_follow_rate_ci
-        least, most = found.reach_share_ci
+        low, high = effect.net_follow_rate_ci
+        least, most = effect.reach_share_ci
         return cls(
-            found.reversal_p, -toward.follow, (-high, -low), -toward.share, (-most, -least),
+            effect.reversal_p, -toward.follow, (-high, -low), -toward.share, (-most, -least),
             {side: -value for side, value in reached.items()},
         )  # fmt: skip
 
     @property
     def only_side(self) -> Side | None:
         """The side that is reached where the answer lies there, if the other one is not."""
-        left, right = self.reached["left"], self.reached["right"]
-        if max(left, right) < DECIDES or min(left, right) >= SMALLEST_EFFECT_OF_INTEREST:
+        at_left, at_right = self.reached["left"], self.reached["right"]
+        if max(at_left, at_right) < DECIDES or min(at_left, at_right) >= SMALLEST_EFFECT_OF_INTEREST:
             return None
-        return "left" if left > right else "right"
+        return "left" if at_left > at_right else "right"
 
     def behaviour(self) -> Behaviour | None:
-        """What it shows; None if that is nothing."""
+        """Return the behaviour that the numbers show; None if they show none."""
         is_moved = self.share_ends[0] > SMALLEST_SHARE_OF_INTEREST
         decides = self.follow_ends[0] > 0
         is_beyond_half = decides or self.share_ends[0] > DECIDES
@@ -252,36 +252,36 @@ class _Seen(NamedTuple):
         return "moves with it, does not decide" if is_bounded else "partly used, graded"
 
 
-def classify_behaviour(found: ImageSwapEffect, control: str | None) -> UseVerdict:
+def classify_behaviour(effect: ImageSwapEffect, control: str | None) -> UseVerdict:
     """The verdict of the image swap alone.
 
     control: another category of the run that is used, which shows that use would have been seen; None if there is
     none, and then nothing is *not used*.
     """
     for mirrored in (False, True):
-        seen = _Seen.of(found, mirrored)
-        behaviour = seen.behaviour()
+        numbers = _Seen.of(effect, mirrored)
+        behaviour = numbers.behaviour()
         if behaviour is not None:
-            side = seen.only_side if behaviour == "partly used, one-sided" else None
+            side = numbers.only_side if behaviour == "partly used, one-sided" else None
             return UseVerdict(
-                behaviour=behaviour, reason=_measured(found), reversed=mirrored, side=side, readout=found.readout
+                behaviour=behaviour, reason=_measured(effect), reversed=mirrored, side=side, readout=effect.readout
             )
-    if not is_bounded(found):
-        return UseVerdict(behaviour="inconclusive", reason=_open(found), readout=found.readout)
+    if not is_bounded(effect):
+        return UseVerdict(behaviour="inconclusive", reason=_open(effect), readout=effect.readout)
     bound = (
         f"within {SMALLEST_SHARE_OF_INTEREST} of its reach and {SMALLEST_EFFECT_OF_INTEREST} of the episodes "
-        f"({_measured(found)})"
+        f"({_measured(effect)})"
     )
     if control is None:
         reason = f"{bound}, and no other category of the run is used, so that use is not known to show"
-        return UseVerdict(behaviour="inconclusive", reason=reason, readout=found.readout, lacks_control=True)
-    reason = f"{_trace(found)}{bound}; positive control: {control}"
-    return UseVerdict(behaviour="not used", reason=reason, readout=found.readout)
+        return UseVerdict(behaviour="inconclusive", reason=reason, readout=effect.readout, lacks_control=True)
+    reason = f"{_trace(effect)}{bound}; positive control: {control}"
+    return UseVerdict(behaviour="not used", reason=reason, readout=effect.readout)
 
 
-def is_bounded(found: ImageSwapEffect) -> bool:
+def is_bounded(effect: ImageSwapEffect) -> bool:
     """Whether both intervals exclude, on both sides, what would matter."""
-    (low, high), (least, most) = found.net_follow_rate_ci, found.reach_share_ci
+    (low, high), (least, most) = effect.net_follow_rate_ci, effect.reach_share_ci
     flips, share = SMALLEST_EFFECT_OF_INTEREST, SMALLEST_SHARE_OF_INTEREST
     return -flips < low and high < flips and -share < least and most < share
 
@@ -296,36 +296,36 @@ def groups_for_not_used() -> int:
     raise AssertionError("no number of groups bounds the net follow rate")
 
 
-def _measured(found: ImageSwapEffect) -> str:
+def _measured(effect: ImageSwapEffect) -> str:
     """Displacement and net follow rate with their intervals."""
     return (
-        f"moved by {found.reach_share:.2f} {_ends(found.reach_share_ci)} of its reach, net follow rate "
-        f"{found.net_follow_rate:.2f} {_ends(found.net_follow_rate_ci)}"
+        f"moved by {effect.reach_share:.2f} {_ends(effect.reach_share_ci)} of its reach, net follow rate "
+        f"{effect.net_follow_rate:.2f} {_ends(effect.net_follow_rate_ci)}"
     )
 
 
-def _open(found: ImageSwapEffect) -> str:
+def _open(effect: ImageSwapEffect) -> str:
     """Why it is inconclusive."""
     is_other = (
-        found.moved_share >= SMALLEST_EFFECT_OF_INTEREST
-        and abs(found.reach_share) < found.moved_share / 2
-        and min(found.follow_p, found.reversal_p) >= SIGNIFICANCE
+        effect.moved_share >= SMALLEST_EFFECT_OF_INTEREST
+        and abs(effect.reach_share) < effect.moved_share / 2
+        and min(effect.follow_p, effect.reversal_p) >= SIGNIFICANCE
     )
     if is_other:
         return (
-            f"the images move it by {found.moved_share:.2f} of its reach, the answer by {found.reach_share:.2f} "
-            f"{_ends(found.reach_share_ci)}: it depends on something else in the images, or on the answer in "
+            f"the images move it by {effect.moved_share:.2f} of its reach, the answer by {effect.reach_share:.2f} "
+            f"{_ends(effect.reach_share_ci)}: it depends on something else in the images, or on the answer in "
             "opposite directions, or the items are too few"
         )
     needed = groups_for_not_used()
-    too_few = f"; “not used” needs {needed} groups of items, there are {found.n_groups}"
-    return f"{_measured(found)}{too_few * (found.n_groups < needed)}"
+    too_few = f"; “not used” needs {needed} groups of items, there are {effect.n_groups}"
+    return f"{_measured(effect)}{too_few * (effect.n_groups < needed)}"
 
 
-def _trace(found: ImageSwapEffect) -> str:
-    if min(found.follow_p, found.reversal_p) >= SIGNIFICANCE or abs(found.reach_share) <= TRACE:
+def _trace(effect: ImageSwapEffect) -> str:
+    if min(effect.follow_p, effect.reversal_p) >= SIGNIFICANCE or abs(effect.reach_share) <= TRACE:
         return ""
-    return f"but for a trace of {100 * found.reach_share * found.reach:.1f} cm: "
+    return f"but for a trace of {100 * effect.reach_share * effect.reach:.1f} cm: "
 
 
 def _ends(limits: tuple[float, float]) -> str:
@@ -337,7 +337,7 @@ def _ends(limits: tuple[float, float]) -> str:
 
 @dataclass(frozen=True)
 class Places:
-    """What was found inside the network, in one category.
+    """The findings inside the network, in one category.
 
     located: places that carry half of the effect, see `localised_sites`; None if an interchange did not search for
     them. carried: places and the directions along which half of it passes there. jointly: what joint places found,
@@ -351,18 +351,18 @@ class Places:
     remainder: str = ""
 
     def __str__(self) -> str:
-        read = [place for place in self.located or () if place.partition(".")[0] == KV_STREAM]
-        names_tokens = any(" " in place for place in read)
+        read = [site for site in self.located or () if site.partition(".")[0] == KV_STREAM]
+        names_tokens = any(" " in site for site in read)
         is_finer = "read jointly" in self.jointly or (not names_tokens and "read" in self.jointly)
-        located = [place for place in self.located or () if not (is_finer and place in read)]
+        located = [site for site in self.located or () if not (is_finer and site in read)]
         jointly = self.jointly if is_finer or not read else ""
-        found = "; ".join(filter(None, (describe_sites(located, self.carried), jointly, self.remainder)))
-        return found or NOT_LOCATED * (self.located is not None)
+        text = "; ".join(filter(None, (describe_sites(located, self.carried), jointly, self.remainder)))
+        return text or NOT_LOCATED * (self.located is not None)
 
 
 def classify_use(
     encoded: bool | None,
-    found: ImageSwapEffect,
+    effect: ImageSwapEffect,
     control: str | None,
     places: Places | None = None,
     tie: str = "",
@@ -375,77 +375,83 @@ def classify_use(
     `evidence.describe_tie`; empty if it was not tested. other: the behaviour by the other readout, see
     `evidence.stored_other_readouts`; None if that is not stored.
     """
-    own = replace(classify_behaviour(found, control), other=other)
-    if all(one.behaviour in ("not used", "inconclusive") for one in own.by_readout):
-        return own
-    said = "" if encoded is None else tie or (NOT_TESTED if encoded else NO_COPY)
-    return replace(own, place=str(places or ""), tie=said)
+    use = replace(classify_behaviour(effect, control), other=other)
+    if all(verdict.behaviour in ("not used", "inconclusive") for verdict in use.by_readout):
+        return use
+    tie_text = "" if encoded is None else tie or (NOT_TESTED if encoded else NO_COPY)
+    return replace(use, place=str(places or ""), tie=tie_text)
 
 
 def describe_sites(located: Sequence[str], carried: Sequence[str] = ()) -> str:
-    """Where the answer passes, of keys and values that the acting stream reads where it is read, and along what.
+    """Return where the answer passes, where the acting stream reads it, and along which directions, in words.
 
     A patch in the backbone shows that something downstream depends on that place; one in `kv`, which only the
     acting stream reads, that it is read there.
     """
-    read = [place for place in located if place.partition(".")[0] == KV_STREAM]
-    passes = [place for place in located if place not in read]
+    read = [site for site in located if site.partition(".")[0] == KV_STREAM]
+    passes = [site for site in located if site not in read]
     parts = [f"passes at {list_places(passes)}"] * bool(passes) + [f"read at {list_places(read)}"] * bool(read)
     along: dict[str, list[str]] = {}
-    for one in carried:
-        direction, _, place = one.partition(" at ")
-        along.setdefault(direction, []).append(place)
+    for entry in carried:
+        direction, _, site = entry.partition(" at ")
+        along.setdefault(direction, []).append(site)
     directions = [f"{direction} at {list_places(places)}" for direction, places in along.items()]
     parts += [f"carried by {'; '.join(directions)}"] * bool(carried)
     return "; ".join(parts)
 
 
-def control_for(category: str, found: Mapping[str, ImageSwapEffect]) -> str | None:
+def control_for(category: str, effects: Mapping[str, ImageSwapEffect]) -> str | None:
     """Another category of the run that is used, the one in which most episodes follow; None if there is none."""
-    others = [one for one in found.values() if one.category != category and classify_behaviour(one, None).is_used]
-    return max(others, key=lambda one: abs(one.net_follow_rate)).category if others else None
+    used = [
+        effect
+        for effect in effects.values()
+        if effect.category != category and classify_behaviour(effect, None).is_used
+    ]
+    return max(used, key=lambda effect: abs(effect.net_follow_rate)).category if used else None
 
 
 def classify_all(
-    found: Mapping[str, ImageSwapEffect],
+    effects: Mapping[str, ImageSwapEffect],
     encoded: Mapping[str, bool | None],
     places: Mapping[str, Places] = MappingProxyType({}),
     ties: Mapping[str, str] = MappingProxyType({}),
-    others: Mapping[str, UseVerdict] = MappingProxyType({}),
+    other_readouts: Mapping[str, UseVerdict] = MappingProxyType({}),
 ) -> dict[str, UseVerdict]:
-    """Of every category that was intervened on.
+    """Return the verdict of every category that was intervened on.
 
-    encoded, places, ties, others: by category; one that is not there was not probed, not looked for inside, or
-    measured by one readout alone.
+    encoded, places, ties, other_readouts: by category; one that is not there was not probed, not looked for
+    inside, or measured by one readout alone.
     """
     return {
         name: classify_use(
             encoded.get(name),
-            one,
-            control_for(name, found),
+            effect,
+            control_for(name, effects),
             places.get(name),
             ties.get(name, ""),
-            others.get(name),
+            other_readouts.get(name),
         )
-        for name, one in found.items()
+        for name, effect in effects.items()
     }
 
 
 def encoded_in(results: "ProbeResults | None", view: str | None = None) -> dict[str, bool | None]:
-    """By category, whether the backbone's best site beats chance and every control that was run.
+    """Return by category whether the backbone's best site beats chance and every control that was run.
 
     As `retention` has it. view: None for the first that was probed. Empty without probes.
     """
     if results is None:
         return {}
     scores = results.scores
-    own = scores[(scores["stream"] == "backbone") & (scores["view"] == (view or results.settings.views[0]))]
-    best = own.loc[own.groupby("category", sort=False)["accuracy"].idxmax()]
+    backbone_scores = scores[
+        (scores["stream"] == "backbone") & (scores["view"] == (view or results.settings.views[0]))
+    ]
+    best = backbone_scores.loc[backbone_scores.groupby("category", sort=False)["accuracy"].idxmax()]
     return {str(row["category"]): bool(row["signal"]) for _, row in best.iterrows()}
 
 
 def describe_swap(swap: Swapped, use: UseVerdict) -> str:
-    """What a swap of the pictures does to the action, with the numbers that the verdict's sentence lacks.
+    """Return what a swap of the pictures does to the action, with the numbers that the verdict's sentence lacks.
 
     Numbers and words are of the verdict's own readout.
     """

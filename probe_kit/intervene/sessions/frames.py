@@ -119,13 +119,13 @@ class RecordedFrames(Frames):
                 "hash differs. Give the data set of the run (--dataset)"
             )
         pictures = self._reader.pictures(episode, frame.number, features)
-        shown = {camera: pictures[feature] for camera, feature in self._features.items()}
+        images = {camera: pictures[feature] for camera, feature in self._features.items()}
         for camera, degrees in self._dataset["rotations"]:
-            shown[camera] = np.ascontiguousarray(np.rot90(shown[camera], degrees // 90))
-        first, *others = shown
+            images[camera] = np.ascontiguousarray(np.rot90(images[camera], degrees // 90))
+        first, *other_cameras = images
         return Observation(
-            shown[first], frame.state.astype(np.float32) if frame.state.size else np.zeros(8, np.float32),
-            frame.instruction, None, {name: shown[name] for name in others},
+            images[first], frame.state.astype(np.float32) if frame.state.size else np.zeros(8, np.float32),
+            frame.instruction, None, {name: images[name] for name in other_cameras},
         )  # fmt: skip
 
 
@@ -138,15 +138,15 @@ class EnvironmentFrames(Frames):
 
         stored = run.settings["environment"]
         options = {**stored["options"], **source.environment_options}
-        chosen = EnvSource(stored["environment"], options=options)
-        self._name, self._environment = chosen.name, open_environment(chosen)
+        env_source = EnvSource(stored["environment"], options=options)
+        self._name, self._environment = env_source.name, open_environment(env_source)
         if self._environment.revision != stored["revision"]:
             raise OtherFramesError(
                 f"{self._name} has the revision {self._environment.revision!r}; {run.location} was played in "
                 f"{stored['revision']!r}. Use that version"
             )
         self._cameras = tuple(stored["cameras"])
-        self._episodes = {episode.id: episode for _, episode in listed_episodes(self._environment, chosen)}
+        self._episodes = {episode.id: episode for _, episode in listed_episodes(self._environment, env_source)}
         super().__init__(run)
 
     @property

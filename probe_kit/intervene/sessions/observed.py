@@ -102,30 +102,32 @@ class ObservedSession(ReplaySession):
                     )
             return [(frame, donor) for frame, donor in rows if frame and donor and frame.item == item]
         frames = [frame for frame in self.frames.index if frame.item == item]
-        chosen = np.unique(np.linspace(0, len(frames) - 1, min(self.frames_each, len(frames))).round().astype(int))
-        found = [(frames[at], self._donor(frames[at])) for at in chosen]
-        return [(frame, donor) for frame, donor in found if donor is not None]
+        indices = np.unique(
+            np.linspace(0, len(frames) - 1, min(self.frames_each, len(frames))).round().astype(int)
+        )
+        donors = [(frames[at], self._donor(frames[at])) for at in indices]
+        return [(frame, donor) for frame, donor in donors if donor is not None]
 
     def _donor(self, frame: Frame) -> Frame | None:
         """Return another group's frame: of the nearest state, and of another instruction if that varies."""
-        others: list[Frame] = [other for other in self.frames.index if other.group != frame.group]
+        candidates: list[Frame] = [other for other in self.frames.index if other.group != frame.group]
         if self.vary == INSTRUCTION:
-            others = [other for other in others if other.instruction != frame.instruction]
+            candidates = [other for other in candidates if other.instruction != frame.instruction]
         draw = np.random.default_rng(derive_seed("donor", self.vary, frame.name))
-        if self.vary == INSTRUCTION and others:
-            texts = sorted({other.instruction for other in others})
+        if self.vary == INSTRUCTION and candidates:
+            texts = sorted({other.instruction for other in candidates})
             text = texts[int(draw.integers(len(texts)))]
-            others = [other for other in others if other.instruction == text]
-        if not others:
+            candidates = [other for other in candidates if other.instruction == text]
+        if not candidates:
             return None
         if self.vary == STATE:
-            return others[int(draw.integers(len(others)))]
-        apart = [float(np.linalg.norm((other.state - frame.state) / self._spread)) for other in others]
+            return candidates[int(draw.integers(len(candidates)))]
+        apart = [float(np.linalg.norm((other.state - frame.state) / self._spread)) for other in candidates]
         clean = self.frames.observe(frame)
         for at in np.argsort(apart, kind="stable"):
-            donor = self.frames.observe(others[int(at)])
+            donor = self.frames.observe(candidates[int(at)])
             if not same_input(clean, donor, self.vary):
-                return others[int(at)]
+                return candidates[int(at)]
         return None
 
     def check_vary(self) -> None:
@@ -141,11 +143,11 @@ class ObservedSession(ReplaySession):
 
     # -- actions and readout -----------------------------------------------------------------------------
 
-    def act(self, given: Given, seed: int) -> Chunk:
+    def act(self, model_input: Given, seed: int) -> Chunk:
         """Return (chunk, D): one prediction in the checkpoint's own units, alone in its batch."""
-        assert isinstance(given, Observation)
+        assert isinstance(model_input, Observation)
         with while_acting(self.run.model, self.policy.card.checkpoint):
-            return np.asarray(self.policy.predict(copied([given]), [seed])[0], np.float32)
+            return np.asarray(self.policy.predict(copied([model_input]), [seed])[0], np.float32)
 
     def displacement(self, chunk: Chunk, pair: Pair) -> float:
         """Return how far a chunk lies toward the source's, in spreads of clean actions; 0 is the clean action."""

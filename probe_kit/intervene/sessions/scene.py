@@ -41,8 +41,11 @@ class SceneSession(ReplaySession):
         super().__init__(run, policy)
         self.scene, self.items, self.counterparts = scene, items, counterparts_of(items.values())
         self.stage = ScenePlayer(scene)
-        left, right = np.array(scene.tile_left), np.array(scene.tile_right)
-        self._middle, self._across = (left + right) / 2, (left - right) / float(np.linalg.norm(left - right))
+        left_tile, right_tile = np.array(scene.tile_left), np.array(scene.tile_right)
+        self._middle, self._across = (
+            (left_tile + right_tile) / 2,
+            (left_tile - right_tile) / float(np.linalg.norm(left_tile - right_tile)),
+        )
 
     @classmethod
     def of(cls, run: Run, source: ReplaySource, load: "Callable[[], Policy]") -> "SceneSession":
@@ -103,8 +106,8 @@ class SceneSession(ReplaySession):
     def _look(self, item: Item, layout: Layout, scene_seed: int) -> Seen:
         return self.stage.look(scene_row(0, Episode(item, layout), scene_seed, 0))
 
-    def _check_frame(self, record: Any, seen: Seen) -> None:
-        stored, drawn = record.get("first_frame_sha256"), seen.facts["first_frame_sha256"]
+    def _check_frame(self, record: Any, look: Seen) -> None:
+        stored, drawn = record.get("first_frame_sha256"), look.facts["first_frame_sha256"]
         if stored is not None and stored != drawn:
             raise OtherFramesError(
                 f"the first frame of {record['episode_id']}, drawn again, is {drawn[:12]}; {self.run.location} "
@@ -132,9 +135,9 @@ class SceneSession(ReplaySession):
         del pair
         return self.lateral_motion
 
-    def lateral_displacement(self, chunk: Chunk, seen: Observation) -> float:
+    def lateral_displacement(self, chunk: Chunk, observation: Observation) -> float:
         """Return where the chunk would bring the hand, in metres left of the middle between the tiles."""
-        end = np.asarray(seen.state[:2], np.float64) + chunk[:, :2].astype(np.float64).sum(axis=0)
+        end = np.asarray(observation.state[:2], np.float64) + chunk[:, :2].astype(np.float64).sum(axis=0)
         return self.lateral_offset(end)
 
     def lateral_motion(self, chunk: "Tensor") -> "Tensor":

@@ -36,13 +36,13 @@ FAR = 0.01
 class Progress(Protocol):
     """Called after every item."""
 
-    def __call__(self, done: int, total: int, what: str, /) -> None:
+    def __call__(self, count: int, total: int, what: str, /) -> None:
         """Take items so far, of `total`, and the last one."""
 
 
 @dataclass(frozen=True)
 class ReplaySource:
-    """Where a run's policy, pictures and files lie; their hashes must be the run's.
+    """The places of a run's policy, pictures and files; their hashes must be the run's.
 
     suite: folder; None for that of the run, see `suite_of`. checkpoint, options, weights_seed: as for
     `probe-kit extract`; by default those of the run, of a checkpoint its folder if it is still there. Options of
@@ -119,10 +119,10 @@ class ReplaySession(ABC):
         with torch_threads(threads):
             yield
 
-    def act(self, given: Given, seed: int) -> Chunk:
+    def act(self, model_input: Given, seed: int) -> Chunk:
         """Return (chunk, D): one inference, alone in its batch. Raises PolicyFailedError if the policy raises."""
         with while_acting(self.run.model, self.policy.card.checkpoint):
-            return np.asarray(self.policy.act(copied([_observation(given)]), [seed])[0], np.float32)
+            return np.asarray(self.policy.act(copied([_observation(model_input)]), [seed])[0], np.float32)
 
     def replay_error(self, pair: Pair, chunk: Chunk) -> float:
         """Return by how much a clean inference differs from the stored actions; NaN where there are none.
@@ -131,8 +131,8 @@ class ReplaySession(ABC):
         """
         if pair.stored is None:
             return nan
-        known = min(len(pair.stored), len(chunk))
-        largest = float(np.abs(chunk[:known] - pair.stored[:known]).max())
+        count = min(len(pair.stored), len(chunk))
+        largest = float(np.abs(chunk[:count] - pair.stored[:count]).max())
         if not largest <= FAR:
             raise CaptureChangedActionError(
                 f"the first action of {pair.episode}, inferred again, differs from the stored one by "
@@ -142,9 +142,9 @@ class ReplaySession(ABC):
         return largest
 
 
-def _observation(given: Given) -> Observation:
-    assert isinstance(given, Observation), "pairs of runs are of observations"
-    return given
+def _observation(model_input: Given) -> Observation:
+    assert isinstance(model_input, Observation), "pairs of runs are of observations"
+    return model_input
 
 
 def load_policy_of(run: Run, source: ReplaySource) -> "Policy":

@@ -30,8 +30,8 @@ def pack_floats(values: ArrayLike) -> Packed:
 def pack_log_odds(values: ArrayLike) -> Packed:
     """Log-odds as int16 in steps of 1/256, at most ±127.99; not a number becomes `MISSING`."""
     scaled = np.asarray(values, np.float64) * LOG_ODDS_SCALE
-    whole = np.clip(np.round(scaled), MISSING + 1, -MISSING - 1)
-    return _packed(np.where(np.isnan(scaled), MISSING, whole), "<i2")
+    steps = np.clip(np.round(scaled), MISSING + 1, -MISSING - 1)
+    return _packed(np.where(np.isnan(scaled), MISSING, steps), "<i2")
 
 
 def _packed(values: ArrayLike, kind: str) -> Packed:
@@ -41,7 +41,7 @@ def _packed(values: ArrayLike, kind: str) -> Packed:
 def code_words(words: Sequence[Any]) -> dict[str, Any]:
     """`words` once each, and a `codes` entry per place; None stays None."""
     distinct = list(dict.fromkeys(words))
-    code = {word: place for place, word in enumerate(distinct)}
+    code = {word: number for number, word in enumerate(distinct)}
     return {"words": distinct, "codes": [code[word] for word in words]}
 
 
@@ -75,7 +75,7 @@ def _shown(value: Any, places: tuple[str, ...]) -> Any:
     if isinstance(value, str):
         return without_places(terminal_safe(value), places)
     if isinstance(value, dict):
-        return {_shown(key, places): _shown(own, places) for key, own in value.items()}
+        return {_shown(key, places): _shown(entry, places) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_shown(own, places) for own in value]
+        return [_shown(entry, places) for entry in value]
     return value

@@ -39,16 +39,16 @@ def episode_payload(viewed: ViewedRun, number: int) -> dict[str, Any]:
     run, position = viewed.run, viewed.position_of[number]
     row = {str(name): value for name, value in run.episodes.iloc[position].to_dict().items()}
     probes = viewed.probes.get(str(row["category"]))
-    found = None if probes is None else probes.log_odds(position)
+    probed = None if probes is None else probes.log_odds(position)
     calls = int(viewed.captured_inferences[position])
     trajectory = run.trajectory(position) if run.has_trajectories else None
     return {
         "number": number,
         "frames": _frames(viewed, number, row),
         "inferences": _inference_steps(viewed, position),
-        "log_odds": None if found is None else pack_log_odds(found.values),
-        "refitted": None if found is None else _refitted(viewed, row, calls),
-        "held_out": found is None or found.held_out,
+        "log_odds": None if probed is None else pack_log_odds(probed.values),
+        "refitted": None if probed is None else _refitted(viewed, row, calls),
+        "held_out": probed is None or probed.held_out,
         "trajectory": None if trajectory is None else _trajectory(trajectory),
         "events": {} if trajectory is None else _events(trajectory),
         "outcomes": {} if trajectory is None else _outcomes(viewed, trajectory, row),
@@ -59,21 +59,21 @@ def episode_payload(viewed: ViewedRun, number: int) -> dict[str, Any]:
 
 
 def _answers(viewed: ViewedRun, row: dict[str, Any]) -> dict[str, str]:
-    """What a VLM was asked and said, by heading; none of a policy."""
-    found = {heading: row.get(column) for heading, column in _ANSWERS.items()} if viewed.answers else {}
-    return {heading: str(viewed.outcome_word(value)) for heading, value in found.items() if value is not None}
+    """Return by heading the question to a VLM and its answer; none of a policy."""
+    answers = {heading: row.get(column) for heading, column in _ANSWERS.items()} if viewed.answers else {}
+    return {heading: str(viewed.outcome_word(value)) for heading, value in answers.items() if value is not None}
 
 
 def _lost_words(row: dict[str, Any]) -> int:
-    """How many words at the end of the instruction did not reach the network."""
+    """Return the number of words at the end of the instruction that did not reach the network."""
     lost = row.get("lost_words")
     return 0 if lost is None or lost != lost else int(lost)
 
 
 def _inference_steps(viewed: ViewedRun, position: int) -> list[int]:
     """The control step of every inference of an episode."""
-    own = viewed.run.control_steps[position]
-    return [int(step) for step in own[own >= 0]]
+    steps = viewed.run.control_steps[position]
+    return [int(step) for step in steps[steps >= 0]]
 
 
 def _refitted(viewed: ViewedRun, row: dict[str, Any], calls: int) -> Any:
@@ -81,18 +81,18 @@ def _refitted(viewed: ViewedRun, row: dict[str, Any], calls: int) -> Any:
     category, view = str(row["category"]), viewed.view
     if len(viewed.refitted) < 2:
         return None
-    found = np.full((calls, len(viewed.sites)), np.nan)
+    log_odds = np.full((calls, len(viewed.sites)), np.nan)
     for call, results in viewed.refitted.items():
         curve = results.curves.get((category, str(view)))
         places = [] if curve is None else np.flatnonzero(curve.episodes == row["episode_id"]).tolist()
         if curve is not None and places and call < calls:
             sign = toward(str(row["side_correct"]))
-            found[call] = curve.decisions[:, places[0]] * sign
-    return pack_log_odds(found)
+            log_odds[call] = curve.decisions[:, places[0]] * sign
+    return pack_log_odds(log_odds)
 
 
 def _frames(viewed: ViewedRun, number: int, row: dict[str, Any]) -> dict[str, Any] | None:
-    """How the episode's picture is divided: `count` frames of one size in `columns`; None without a picture."""
+    """Return the division of the episode's picture: `count` frames of one size in `columns`; None without one."""
     sheet = read_sheet(viewed.run.location, number)
     if sheet is None:
         return None
@@ -127,8 +127,8 @@ def _moved(places: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def _events(trajectory: Trajectory) -> dict[str, int | None]:
-    found = Events.of(trajectory)
-    return {name: found.frame(name) for name in EVENTS}
+    events = Events.of(trajectory)
+    return {name: events.frame(name) for name in EVENTS}
 
 
 def _outcomes(viewed: ViewedRun, trajectory: Trajectory, row: dict[str, Any]) -> dict[str, str]:

@@ -72,11 +72,11 @@ def _first_frames(viewed: ViewedRun) -> list[Any]:
 def _best_log_odds(viewed: ViewedRun, part: str) -> Packed | None:
     """Packed (E,); None without probes of that part."""
     places = {name: best_places(viewed, name)[part] for name in viewed.probed_categories}
-    if all(place is None for place in places.values()):
+    if all(best is None for best in places.values()):
         return None
-    found = np.full(len(viewed.run.episodes), np.nan)
+    log_odds = np.full(len(viewed.run.episodes), np.nan)
     for position, category in enumerate(viewed.run.episodes["category"]):
-        place = places.get(category)
-        if place is not None:
-            found[position] = viewed.probes[category].first(position)[place["site"]]
-    return pack_log_odds(found)
+        best = places.get(category)
+        if best is not None:
+            log_odds[position] = viewed.probes[category].first(position)[best["site"]]
+    return pack_log_odds(log_odds)

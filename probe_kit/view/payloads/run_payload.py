@@ -27,8 +27,8 @@ from probe_kit.view.viewed_run import ViewedRun
 _PROBED = (BACKBONE, BACKBONE_VERDICT, ACTION, ACTION_VERDICT, RETENTION)
 
 
-def run_payload(viewed: ViewedRun, others: Sequence[ViewedRun] = ()) -> dict[str, Any]:
-    """Everything that is said once per run. others: runs of the same page, of which VLM runs give a column."""
+def run_payload(viewed: ViewedRun, page_runs: Sequence[ViewedRun] = ()) -> dict[str, Any]:
+    """Return everything that is said once per run. page_runs: of the page, of which VLM runs give a column."""
     run, results = viewed.run, viewed.results
     certificate = run.certificate if len(run.episodes) else {}
     return {
@@ -67,7 +67,7 @@ def run_payload(viewed: ViewedRun, others: Sequence[ViewedRun] = ()) -> dict[str
             "same_actions": certificate.get("hooks_on_equals_hooks_off"),
             "device": certificate.get("device"),
         },
-        "table": _table(viewed, [other for other in others if other.answers and other.run.suite == run.suite]),
+        "table": _table(viewed, [other for other in page_runs if other.answers and other.run.suite == run.suite]),
         "notes": [note for note in viewed.table.notes if len(run.episodes)],
         "settings": {name: str(value) for name, value in flat_settings(run.settings).items()},
         "stamp": run.stamp,
@@ -75,7 +75,7 @@ def run_payload(viewed: ViewedRun, others: Sequence[ViewedRun] = ()) -> dict[str
 
 
 def best_places(viewed: ViewedRun, category: str) -> dict[str, Any]:
-    """By part, the place of the best site among the run's, and whether it has signal; None without probes."""
+    """Return by part the index of the best site among all, and whether it has signal; None without probes."""
     row = viewed.probed_rows.get(category)
     if row is None or viewed.curve(category) is None:
         return {"backbone": None, "action": None}
@@ -93,7 +93,7 @@ def _scene(scene: Mapping[str, Any] | None) -> dict[str, Any] | None:
     return {name: scene[name] for name in ("tile_side", "epsilon", "max_steps", "tile_left", "tile_right", "home")}
 
 
-def _table(viewed: ViewedRun, asked: Sequence[ViewedRun]) -> dict[str, Any]:
+def _table(viewed: ViewedRun, vlm_runs: Sequence[ViewedRun]) -> dict[str, Any]:
     """Headings, a row per category and their mean, as the retention table spells them."""
     rows = [*viewed.rows.values(), viewed.mean] if len(viewed.run.episodes) else []
     columns: tuple[Column, ...] = (ACCURACY if viewed.answers else SR,)
@@ -101,7 +101,7 @@ def _table(viewed: ViewedRun, asked: Sequence[ViewedRun]) -> dict[str, Any]:
         columns += _PROBED
     if any(row.image_swap.follow_rate is not None for row in rows):
         columns += (USED,)
-    vlm = asked[0] if asked and not viewed.answers else None
+    vlm = vlm_runs[0] if vlm_runs and not viewed.answers else None
     return {
         "columns": [
             *([] if vlm is None else [{"key": "vlm", "heading": ACCURACY.heading, "help": ACCURACY.help}]),

@@ -46,8 +46,8 @@ def site_map_payload(viewed: ViewedRun, category: str) -> dict[str, Any]:
         "groups": int(scores["groups"].iloc[0]),
         "headings": HEADINGS,
         "cells": [
-            _cells(row, quantiles[place] if quantiles else None)
-            for place, row in enumerate(scores.to_dict("records"))
+            _cells(row, quantiles[index] if quantiles else None)
+            for index, row in enumerate(scores.to_dict("records"))
         ],
         **_shades(scores),
         "rows": rows,
@@ -67,11 +67,11 @@ def _first_log_odds(viewed: ViewedRun, category: str) -> tuple[list[int], Values
         rows = np.flatnonzero(viewed.run.episodes["category"] == category).tolist()
         return rows, np.stack([probes.first(row) for row in rows], axis=-1)
     curve = probes.curve
-    positions = {str(name): place for place, name in enumerate(viewed.run.episodes["episode_id"])}
-    shown = [place for place, name in enumerate(curve.episodes.tolist()) if name in positions]
-    rows = [positions[name] for name in curve.episodes[shown].tolist()]
+    positions = {str(name): index for index, name in enumerate(viewed.run.episodes["episode_id"])}
+    columns = [index for index, name in enumerate(curve.episodes.tolist()) if name in positions]
+    rows = [positions[name] for name in curve.episodes[columns].tolist()]
     every = viewed.run.episodes["side_correct"].astype(str).tolist()
-    return rows, decisions_toward_correct(curve, shown, [every[row] for row in rows])
+    return rows, decisions_toward_correct(curve, columns, [every[row] for row in rows])
 
 
 def _scores(results: ProbeResults, category: str, view: str | None) -> pd.DataFrame:

@@ -92,7 +92,9 @@ def test_a_subspace_and_the_rest_of_it_are_parts_of_the_whole(pi0_tiny: Pi0, pai
     whole, clean = pt.patch_cells(pi0_tiny, pair, cell), pi0_tiny.act([pair.clean], [pair.seed])[0]  # type: ignore[list-item]
     every = np.eye(96)
     np.testing.assert_allclose(pt.patch_cells(pi0_tiny, pair, cell, along=every), whole, atol=1e-5)
-    np.testing.assert_allclose(pt.patch_cells(pi0_tiny, pair, cell, along=every, rest=True), clean, atol=1e-5)
+    np.testing.assert_allclose(
+        pt.patch_cells(pi0_tiny, pair, cell, along=every, complement=True), clean, atol=1e-5
+    )
     basis = np.linalg.qr(np.random.default_rng(0).normal(size=(96, 40)))[0].T
     within, image = torch.from_numpy(basis.T @ basis).float(), slice(0, 36)
     _, source = pt.run_with_cache(pi0_tiny, pair.source, pair.seed, ["backbone.02"])
@@ -107,7 +109,7 @@ def test_a_subspace_and_the_rest_of_it_are_parts_of_the_whole(pi0_tiny: Pi0, pai
         by_hand = pt.run_with_hooks(
             pi0_tiny, pair.clean, {"backbone.02": lambda own, at, rest=rest: write(own, at, rest)}, 3
         )
-        patched = pt.patch_cells(pi0_tiny, pair, cell, along=basis, rest=rest)
+        patched = pt.patch_cells(pi0_tiny, pair, cell, along=basis, complement=rest)
         np.testing.assert_allclose(patched, by_hand, atol=1e-5)
         assert np.abs(np.asarray(patched) - whole).max() > 1e-4
 
@@ -160,7 +162,7 @@ def test_what_cannot_be_patched_is_refused(pi0_tiny: Pi0, pair: pt.Pair) -> None
     with pytest.raises(UsageError, match="rows that are not orthonormal"):
         pt.patch_cells(pi0_tiny, pair, cell, along=np.ones((2, 96)))
     with pytest.raises(UsageError, match="give its orthonormal basis as along"):
-        pt.patch_cells(pi0_tiny, pair, cell, rest=True)
+        pt.patch_cells(pi0_tiny, pair, cell, complement=True)
     with pytest.raises(UsageError, match="no cell is given"):
         pt.patch_cells(pi0_tiny, pair, ())
     with pytest.raises(UsageError, match="no pattern was given"):

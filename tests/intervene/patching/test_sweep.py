@@ -39,7 +39,7 @@ def test_the_place_that_is_read_carries_everything_and_no_other_block_does(copie
 def test_a_sweep_gives_the_numbers_of_the_interchange(copied: pt.Sweep, wired: WiredSession) -> None:
     chosen = [row for row, name in enumerate(copied.names) if name.endswith(("01 image", "01 language", "01 all"))]
     cells = [copied.cells[row][0] for row in chosen]
-    sites = tuple(dict.fromkeys(site for cell in cells for site in cell.place.sites))
+    sites = tuple(dict.fromkeys(site for cell in cells for site in cell.site_group.sites))
     stored = outcomes_of(wired, ["copied"], [patch_of(own, sites) for own in cells])
     rows = copied.table.iloc[chosen].iterrows()
     for at, (effect, (row, own)) in enumerate(zip(patch_effects(stored, "suite"), rows, strict=True)):

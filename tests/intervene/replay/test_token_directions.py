@@ -47,7 +47,7 @@ def test_marks_that_cancel_in_the_mean_lie_along_one_direction() -> None:
     mark = np.eye(WIDTH)[3]
     own = marked(mark)
     pooled = own.tokens.values.mean(axis=1)
-    difference = pooled[own.left].mean(axis=0) - pooled[~own.left].mean(axis=0)
+    difference = pooled[own.is_left].mean(axis=0) - pooled[~own.is_left].mean(axis=0)
     assert np.linalg.norm(difference) < 0.05
     fits = fit_by_fold(own, SITE, "image", Method.of("mean-difference:1"), 2, 0, "color")
     found = by_episode(own, fits)
@@ -67,7 +67,7 @@ def test_a_place_without_a_direction_is_refused_by_category_site_and_role(method
     values = np.random.default_rng(0).normal(size=(GROUPS, POSITIONS, WIDTH)) + 1e3
     own = marked(np.zeros(WIDTH))
     same = TokenFeatures(
-        own.episodes, own.groups, own.left, PaddedTokens(np.repeat(values, 4, axis=0), own.tokens.present)
+        own.episodes, own.groups, own.is_left, PaddedTokens(np.repeat(values, 4, axis=0), own.tokens.present)
     )
     with pytest.raises(UsageError, match=f"color, {SITE}, role image: no direction for {method}"):
         fit_by_fold(same, SITE, "image", Method.of(method), 1, 0, "color")
@@ -79,7 +79,7 @@ def test_an_episodes_own_group_has_no_say_in_its_directions() -> None:
     spoilt = own.tokens.values.copy()
     mine = own.groups == "g4"
     spoilt[mine] = 100 * np.random.default_rng(1).normal(size=spoilt[mine].shape)
-    other = TokenFeatures(own.episodes, own.groups, own.left, PaddedTokens(spoilt, own.tokens.present))
+    other = TokenFeatures(own.episodes, own.groups, own.is_left, PaddedTokens(spoilt, own.tokens.present))
     after = by_episode(other, fit_by_fold(other, SITE, "image", method, 1, 0, "color"))
     same = [
         np.array_equal(before[str(method)][name].removed, after[str(method)][name].removed)
@@ -172,7 +172,7 @@ def test_a_dose_of_two_takes_the_marks_from_one_half_of_the_tokens_to_the_other(
     }
     axes = TokenDirections(bases, half_differences_of(own, fits, method), ("control-1",))
     first = np.arange(POSITIONS) < POSITIONS // 2
-    for episode, left in zip(own.episodes, own.left, strict=True):
+    for episode, left in zip(own.episodes, own.is_left, strict=True):
         shift = axes.shift(method, episode, "color", -2.0 if left else 2.0)
         expected = np.where(first == left, -1.0, 1.0)[:, None] * mark
         np.testing.assert_allclose(shift, expected, atol=0.1)
