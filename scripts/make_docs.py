@@ -44,7 +44,7 @@ def main() -> None:
     DATA.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     for page in (README, *PAGES):
         page.write_text(filled(page.read_text(encoding="utf-8"), content), encoding="utf-8")
-    write_report([made.asked, made.run], ROOT / "docs" / SAMPLE, made.table, pictures=SAMPLE_PICTURES)
+    write_report([made.vlm_run, made.run], ROOT / "docs" / SAMPLE, made.table, pictures=SAMPLE_PICTURES)
     draw_picture(demo, content["demo"]["probes"])
     shutil.copyfile(demo / "episode.gif", ROOT / "docs" / "episode.gif")
     sheet = [sys.executable, str(ROOT / "benchmarks" / "env.py"), "sheet", str(ROOT / "docs" / "scenes.png")]

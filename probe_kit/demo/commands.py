@@ -44,13 +44,13 @@ def demo(
             raise typer.Exit(1)
         return
     with progress() as bar:
-        made = run_demo(out_folder, lambda stage: counter(bar, stage), FULL if full else QUICK)
-    print_demo(made)
+        products = run_demo(out_folder, lambda stage: counter(bar, stage), FULL if full else QUICK)
+    print_demo(products)
 
 
-def print_demo(made: "Demo") -> None:
-    """Where to look, then the table and a sentence per category, and last the command that opens the viewer."""
-    out.print(made.next_steps(), soft_wrap=True)
+def print_demo(products: "Demo") -> None:
+    """Print where to look, then the table and a sentence per category, and last the command for the viewer."""
+    out.print(products.next_steps(), soft_wrap=True)
     out.print()
-    out.print(made.table.to_rich(with_next_step=False))
-    out.print(made.viewer(), soft_wrap=True)
+    out.print(products.table.to_rich(with_next_step=False))
+    out.print(products.viewer(), soft_wrap=True)

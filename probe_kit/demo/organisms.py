@@ -47,8 +47,8 @@ COMPATIBLE: Mapping[Truth, tuple[str, ...]] = {
 class Organism:
     """A model by its name, and the verdict that is true of it per category; `absent` or `not shown` if not named.
 
-    folder: what its run is called. asked: it reads and does not act. max_steps: actions per episode; None for as
-    many as its scene has. view: the tokens whose mean is probed.
+    folder: what its run is called. answers: it answers questions and does not act. max_steps: actions per
+    episode; None for as many as its scene has. view: the tokens whose mean is probed.
     """
 
     name: str
@@ -57,13 +57,13 @@ class Organism:
     random_weights: bool = False
     weights_seed: int = 0
     truth: tuple[tuple[str, Truth], ...] = ()
-    asked: bool = False
+    answers: bool = False
     max_steps: int | None = None
     view: str = "mean"
 
     def expected(self, category: str) -> Truth:
-        """What is true by construction."""
-        return dict(self.truth).get(category, "not shown" if self.asked else "absent")
+        """Return what is true of a category by construction."""
+        return dict(self.truth).get(category, "not shown" if self.answers else "absent")
 
 
 TRAINED = Organism(
@@ -98,13 +98,13 @@ VLM = Organism(
     "run-vlm",
     "vlm-tiny",
     truth=(("color", "known"), ("shape", "known"), ("state", "known"), ("traffic", "known")),
-    asked=True,
+    answers=True,
 )
 
 
 @dataclass(frozen=True)
 class Finding:
-    """What the instrument says about one organism and category, beside the truth."""
+    """The verdict of the instrument on one organism and category, and the truth."""
 
     organism: str
     category: str
@@ -114,14 +114,14 @@ class Finding:
 
     @property
     def agreement(self) -> Agreement:
-        """Whether the verdict is true, inconclusive or wrong."""
+        """The verdict compared with the truth: true, inconclusive or wrong."""
         if self.measured in COMPATIBLE.get(self.expected, (self.expected,)):
             return "true"
         return "inconclusive" if self.measured == "inconclusive" else "wrong"
 
 
 def settings_of(organism: Organism, suite: Suite) -> ExtractSettings:
-    """How an organism that acts plays `suite`."""
+    """Return the settings with which an organism that acts plays `suite`."""
     return ExtractSettings(
         organism.model,
         suite=suite.folder,
@@ -133,7 +133,7 @@ def settings_of(organism: Organism, suite: Suite) -> ExtractSettings:
 
 
 def source_of(organism: Organism, suite: Suite) -> ReplaySource:
-    """Where interventions find the organism and its pictures again; of an untrained network its own seed."""
+    """Return where interventions find the organism and its pictures; of an untrained network its own seed."""
     return ReplaySource(suite.folder, weights_seed=organism.weights_seed)
 
 
@@ -169,7 +169,7 @@ def probed(
 
 
 def answered(organism: Organism, suite: Suite, folder: Path, stage: NamedProgress) -> Run:
-    """What a VLM answers on `suite`, in the prompt nearest to an instruction; finished work is reused."""
+    """Return the run of a VLM on `suite`, in the prompt nearest to an instruction; finished work is reused."""
     settings = AskSettings(organism.model, suite=suite.folder, prompt=TEMPLATES["p2"])
     return ask_run(settings, folder / organism.folder, progress=stage(f"questions, {organism.name}"))
 
@@ -182,31 +182,37 @@ def compare(suite: Suite, folder: Path, permutations: int, stage: NamedProgress)
     control, _ = probed(UNTRAINED_NETWORK, suite, folder, permutations, stage)
     runs = [(VLM, answered(VLM, suite, folder, stage))]
     runs += [
-        (one, control if one == UNTRAINED_NETWORK else probed(one, suite, folder, permutations, stage, control)[0])
-        for one in ORGANISMS
+        (
+            organism,
+            control
+            if organism == UNTRAINED_NETWORK
+            else probed(organism, suite, folder, permutations, stage, control)[0],
+        )
+        for organism in ORGANISMS
     ]
     return findings(runs)
 
 
 def findings(runs: Sequence[tuple[Organism, Run]]) -> list[Finding]:
-    """What the instrument says of every organism's run, and the truth, a category each."""
+    """Return the verdicts on every organism's run, and the truth, one for each category."""
     rows = [(organism, row) for organism, run in runs for row in retention_table([run]).rows]
-    shown = any(verdict(row) == "used" for organism, row in rows if organism == TRAINED)
+    trained_acts = any(verdict(row) == "used" for organism, row in rows if organism == TRAINED)
     return [
-        Finding(one.name, row.category, one.expected(row.category), measured(row, shown), row) for one, row in rows
+        Finding(organism.name, row.category, organism.expected(row.category), measured(row, trained_acts), row)
+        for organism, row in rows
     ]
 
 
-def measured(row: RetentionRow, shown: bool) -> Truth:
+def measured(row: RetentionRow, another_acts: bool) -> Truth:
     """The row's verdict. Where only a category that follows is wanting, another organism's counts as one.
 
-    shown: whether the trained one acts on some category. It has the same scene, questions and network, so that
-    following would be seen in every other; a policy that was not trained to act follows nowhere by itself.
+    another_acts: whether the trained one acts on some category. It has the same scene, questions and network, so
+    that following would be seen in every other; a policy that was not trained to act follows nowhere by itself.
     """
-    use, found = row.image_swap.use, readable(row)
-    if use is None or (use.is_bounded and found in ("absent", "not shown")):
-        return "absent" if found == "not shown" else found  # so few items cannot show that it is absent
-    if use.lacks_control and shown:
+    use, reading = row.image_swap.use, readable(row)
+    if use is None or (use.is_bounded and reading in ("absent", "not shown")):
+        return "absent" if reading == "not shown" else reading  # so few items cannot show that it is absent
+    if use.lacks_control and another_acts:
         return "not used"
     return f"{'against: ' * use.reversed}{use.behaviour}"
 
@@ -227,11 +233,11 @@ def organism_table(findings: Sequence[Finding]) -> Table:
     return Table.of("Model organisms", headings, list(map(_cells, findings)), notes=notes)
 
 
-def count_agreements(found: Sequence[Agreement]) -> str:
+def count_agreements(agreements: Sequence[Agreement]) -> str:
     """`20 of 24 verdicts are true, 4 inconclusive, none is wrong`."""
-    true, left_open, wrong = (found.count(agreement) for agreement in get_args(Agreement))
+    true, left_open, wrong = (agreements.count(agreement) for agreement in get_args(Agreement))
     return (
-        f"{true} of {len(found)} verdicts are true, {left_open} inconclusive, "
+        f"{true} of {len(agreements)} verdicts are true, {left_open} inconclusive, "
         f"{wrong or 'none'} {'are' if wrong > 1 else 'is'} wrong"
     )
 

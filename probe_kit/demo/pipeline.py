@@ -21,7 +21,7 @@ from probe_kit.suite import Suite, build_suite
 
 @dataclass(frozen=True)
 class Size:
-    """How much is measured. items: per category; permutations: of the labels, for the probes."""
+    """The extent of a demo. items: per category; permutations: of the labels, for the probes."""
 
     items: Mapping[str, int]
     permutations: int
@@ -38,15 +38,15 @@ FULL = Size(dict.fromkeys(("color", "shape", "state", "counting"), 24), permutat
 
 @dataclass(frozen=True)
 class Demo:
-    """What the demo made. asked: the run of the VLM; table: of both."""
+    """The products of the demo. vlm_run: the run of the VLM. table: of both runs."""
 
     folder: Path
-    asked: Run
+    vlm_run: Run
     run: Run
     table: RetentionTable
 
     def next_steps(self) -> Text:
-        """Where to look, and what to try."""
+        """Return where to look, and what to try."""
         lines: list[str | Text] = [
             marked("[bold]Look at[/] {}  everything on one page, in a browser", self.folder / "report.html"),
             f"        {self.folder / 'layer_curves.png'}  where the answer can be read, layer by layer",
@@ -64,7 +64,7 @@ class Demo:
 
     def viewer(self) -> Text:
         """Return one line: the command that shows both runs episode by episode."""
-        runs = (shlex.quote(str(run.path)) for run in (self.run, self.asked))
+        runs = (shlex.quote(str(run.path)) for run in (self.run, self.vlm_run))
         return marked("[bold]Open[/]    probe-kit view {} {}", *runs)
 
 
@@ -83,12 +83,12 @@ def run_demo(folder: Path, stage: NamedProgress, size: Size = QUICK) -> Demo:
     stage: gives a progress callback (done, total, …) for a stage of this name.
     """
     suite = _questions(folder, size, stage)
-    asked = answered(VLM, suite, folder, stage)
+    vlm_run = answered(VLM, suite, folder, stage)
     run, results = probed(TRAINED, suite, folder, size.permutations, stage)
-    table = retention_table([asked, run])
+    table = retention_table([vlm_run, run])
     layer_curve(results).savefig(folder / "layer_curves.png")
     write_whole(folder / "table.md", table.to_markdown())
-    write_report([asked, run], folder / "report.html", table)
+    write_report([vlm_run, run], folder / "report.html", table)
     film = next((run.path / VIDEOS).glob("*.gif"))
     shutil.copyfile(film, folder / "episode.gif")
-    return Demo(folder, asked, run, table)
+    return Demo(folder, vlm_run, run, table)

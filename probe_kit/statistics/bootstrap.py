@@ -128,12 +128,12 @@ def unlike(each: NDArray[np.floating]) -> NDArray[np.int64]:
 
 def _commonest(each: NDArray[np.floating]) -> tuple[Matrix, Matrix]:
     """(S,) least and largest of the values that most of (G, S) means of groups have."""
-    found = []
+    ends = []
     for column in each.round(9).T:
         values, counts = np.unique(column, return_counts=True)
         common = values[counts == counts.max()]
-        found.append((common[0], common[-1]))
-    least, largest = np.array(found, np.float64).T
+        ends.append((common[0], common[-1]))
+    least, largest = np.array(ends, np.float64).T
     return least, largest
 
 
@@ -148,7 +148,7 @@ def units_seed(names: ArrayLike, seed_text: str) -> int:
 
 @lru_cache(maxsize=4)  # of one table: its groups and items, drawn for every number alike
 def draw_groups(count: int, seed: int, draws: int = DRAWS) -> NDArray[np.int64]:
-    """How often each of `count` groups is drawn, (draws, count), read-only."""
+    """Return how often each of `count` groups is drawn, (draws, count), read-only."""
     times = np.random.default_rng(seed).multinomial(count, np.full(count, 1 / count), size=draws)
     times.setflags(write=False)
     return times

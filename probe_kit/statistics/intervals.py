@@ -43,8 +43,8 @@ def fieller_interval(
     if square <= 0:
         return Interval(-inf, inf)
     middle = numerator * denominator - cut * covariance[0, 1]
-    rest = numerator**2 - cut * covariance[0, 0]
-    spread = sqrt(max(0.0, middle**2 - square * rest))
+    constant = numerator**2 - cut * covariance[0, 0]
+    spread = sqrt(max(0.0, middle**2 - square * constant))
     return Interval(float((middle - spread) / square), float((middle + spread) / square))
 
 

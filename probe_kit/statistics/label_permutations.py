@@ -74,8 +74,8 @@ def _every_flip(surplus: NDArray[np.int64]) -> NDArray[np.bool_]:
     if mirrored:
         keeps &= ~flips[0]
     keeps[0] = False
-    kept: NDArray[np.bool_] = flips[:, keeps]
-    return kept
+    allowed: NDArray[np.bool_] = flips[:, keeps]
+    return allowed
 
 
 def exchange_groups(
@@ -106,12 +106,12 @@ def _shapes(groups: ArrayLike, items: ArrayLike, layouts: ArrayLike) -> list[tup
     columns = (np.asarray(column).astype(str).tolist() for column in (groups, items, layouts))
     for row, (group, item, layout) in enumerate(zip(*columns, strict=True)):
         members.setdefault(group, {}).setdefault(item, {})[layout] = row
-    found = []
+    shapes = []
     for of_group in members.values():
         ordered = sorted((tuple(sorted(rows)), item) for item, rows in of_group.items())
         episodes = [of_group[item][layout] for present, item in ordered for layout in present]
-        found.append((tuple(present for present, _ in ordered), episodes))
-    return found
+        shapes.append((tuple(present for present, _ in ordered), episodes))
+    return shapes
 
 
 Positions = NDArray[np.intp]
@@ -142,8 +142,8 @@ def exchange_blocks(
     columns = []
     for order in orders:
         source = np.arange(size)
-        for family, own in zip(families, order, strict=True):
-            source[family.ravel()] = family[list(own)].ravel()
+        for family, family_order in zip(families, order, strict=True):
+            source[family.ravel()] = family[list(family_order)].ravel()
         columns.append(source)
     return np.stack(columns, axis=1)
 
@@ -166,16 +166,16 @@ def _drawn(
     sizes: Sequence[int], count: int, generator: np.random.Generator
 ) -> Iterator[tuple[tuple[int, ...], ...]]:
     """`count` different orders of families, none of them the identity; there are more than `count`."""
-    seen = {tuple(tuple(range(size)) for size in sizes)}
-    while len(seen) <= count:
+    drawn = {tuple(tuple(range(size)) for size in sizes)}
+    while len(drawn) <= count:
         order = tuple(tuple(generator.permutation(size).tolist()) for size in sizes)
-        if order not in seen:
-            seen.add(order)
+        if order not in drawn:
+            drawn.add(order)
             yield order
 
 
 def possible_flips(groups: int) -> int:
-    """How many permutations `flip_groups` makes of so many groups, each with as many episodes of either class.
+    """Return how many permutations `flip_groups` makes of groups that have as many episodes of either class.
 
     Below ENUMERATED_BELOW groups; of more it draws as many as it is asked for.
     """

@@ -37,8 +37,8 @@ def exchange_p(first: Sequence[float], second: Sequence[float], seed: int = 0) -
     ways = comb(values.size, size)
     turned = 2 if 2 * size == values.size else 1  # the same split with the labels exchanged has the same gap
     if ways <= MOST_EXACT:
-        chosen = np.array(list(combinations(range(values.size), size)))
-        gaps = _gaps(values, values[chosen].sum(axis=1), size)
+        members = np.array(list(combinations(range(values.size), size)))
+        gaps = _gaps(values, values[members].sum(axis=1), size)
         return ModelsP(float((gaps >= gaps[0] - _slack(values)).mean()), turned / ways, True)
     generator = np.random.default_rng(seed)
     sums = generator.permuted(np.tile(values, (DRAWS, 1)), axis=1)[:, :size].sum(axis=1)
@@ -73,11 +73,11 @@ def welch_interval(first: Sequence[float], second: Sequence[float], largest: flo
     _values(first, second)
     sizes = np.array([len(first), len(second)])
     spreads = [float(np.var(group, ddof=1)) if len(group) > 1 else None for group in (first, second)]
-    known = [spread for spread in spreads if spread is not None]
-    if not known or max(known) == 0:
+    measured = [spread for spread in spreads if spread is not None]
+    if not measured or max(measured) == 0:
         return NO_LIMITS
-    of_mean = np.array([known[0] if spread is None else spread for spread in spreads]) / sizes
-    if len(known) == 1:
+    of_mean = np.array([measured[0] if spread is None else spread for spread in spreads]) / sizes
+    if len(measured) == 1:
         df = float(sizes.max() - 1)
     else:
         df = float(of_mean.sum() ** 2 / (of_mean**2 / (sizes - 1)).sum())

@@ -34,35 +34,35 @@ def better_than_reference(
 
 def better_than_best(
     correct: NDArray[np.bool_] | Matrix,
-    others: NDArray[np.bool_] | Matrix,
+    references: NDArray[np.bool_] | Matrix,
     groups: ArrayLike,
     seed: int,
     widening: float = 1.0,
 ) -> Matrix:
     """Family-wise p (S,) of every site against the best of another model's: is its mean score higher?
 
-    correct: (S, E) scores, such as whether a decision is right. others: (S', E) on the same episodes. groups:
+    correct: (S, E) scores, such as whether a decision is right. references: (S', E) on the same episodes. groups:
     (E,). If the models are alike, a group's scores could as well have come from either: whole groups change
     places, and both best sites are chosen anew. widening: as in `better_than_reference`.
     """
-    here, there = _group_sums(correct, groups), _group_sums(others, groups)
-    kept = (np.random.default_rng(seed).random((here.shape[1], DRAWS)) < 0.5).astype(float)
+    sums, reference_sums = _group_sums(correct, groups), _group_sums(references, groups)
+    stays = (np.random.default_rng(seed).random((sums.shape[1], DRAWS)) < 0.5).astype(float)
     # A model that keeps its own groups and takes the other's elsewhere, site by site.
-    shared = min(len(here), len(there))
-    mixed_here = _mixed(here, there[_matching(len(here), shared)], kept)
-    mixed_there = _mixed(there, here[_matching(len(there), shared)], kept)
+    shared = min(len(sums), len(reference_sums))
+    mixed_here = _mixed(sums, reference_sums[_matching(len(sums), shared)], stays)
+    mixed_there = _mixed(reference_sums, sums[_matching(len(reference_sums), shared)], stays)
     null = mixed_here.max(axis=0) - mixed_there.max(axis=0)
-    return p_value(here.sum(axis=1) - there.sum(axis=1).max(), widening * null[None, :])
+    return p_value(sums.sum(axis=1) - reference_sums.sum(axis=1).max(), widening * null[None, :])
 
 
-def _mixed(own: Matrix, other: Matrix, kept: Matrix) -> Matrix:
-    """(S, draws) sums over groups, of `own` where `kept` and of `other` elsewhere."""
-    mixed: Matrix = own @ kept + other @ (1 - kept)
+def _mixed(sums: Matrix, other: Matrix, stays: Matrix) -> Matrix:
+    """(S, draws) sums over groups, of `sums` where a group `stays` and of `other` elsewhere."""
+    mixed: Matrix = sums @ stays + other @ (1 - stays)
     return mixed
 
 
 def _matching(count: int, shared: int) -> NDArray[np.intp]:
-    """Which of the other's sites stands for each of `count`: the one at the same place, or the last."""
+    """Return for each of `count` sites the other model's that stands for it: of the same number, or the last."""
     matching: NDArray[np.intp] = np.minimum(np.arange(count), shared - 1)
     return matching
 

@@ -121,22 +121,22 @@ def overlap_p(first: Right, second: Right, strata: ArrayLike, seed: int, draws: 
     generator = np.random.default_rng(seed)
     drawn = np.zeros(draws)
     for stratum in range(names.size):
-        own = stratum_of == stratum
-        hits, marked, size = int(second[own].sum()), int(first[own].sum()), int(own.sum())
+        members = stratum_of == stratum
+        hits, marked, size = int(second[members].sum()), int(first[members].sum()), int(members.sum())
         drawn += generator.hypergeometric(marked, size - marked, hits, draws) if size else 0
     observed, middle = float((first & second).sum()), drawn.mean()
-    further = np.abs(drawn - middle) >= abs(observed - middle) - 1e-9
-    return float((further.sum() + 1) / (draws + 1))
+    as_far = np.abs(drawn - middle) >= abs(observed - middle) - 1e-9
+    return float((as_far.sum() + 1) / (draws + 1))
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
     """Holm's family-wise p of each; None stays None and takes no part."""
-    order = sorted((p, place) for place, p in enumerate(p_values) if p is not None)
+    order = sorted((p, position) for position, p in enumerate(p_values) if p is not None)
     corrected: list[float | None] = [None] * len(p_values)
     highest = 0.0
-    for rank, (p, place) in enumerate(order):
+    for rank, (p, position) in enumerate(order):
         highest = max(highest, min(1.0, (len(order) - rank) * p))
-        corrected[place] = highest
+        corrected[position] = highest
     return corrected
 
 
@@ -151,12 +151,12 @@ def corrected[Row](
     summary: whether a row is over several categories; such rows are a family of their own. test: what a row
     tests; several rows of one test, such as the views of one success rate, count once. By default each its own.
     """
-    named = list(range(len(rows))) if test is None else [test(row) for row in rows]
-    found: dict[Hashable, float | None] = {}
+    tests = list(range(len(rows))) if test is None else [test(row) for row in rows]
+    corrected_of: dict[Hashable, float | None] = {}
     for over_all in (False, True):
-        family = {name: p(row) for name, row in zip(named, rows, strict=True) if summary(row) == over_all}
-        found |= zip(family, holm(list(family.values())), strict=True)
-    return [found[name] for name in named]
+        family = {name: p(row) for name, row in zip(tests, rows, strict=True) if summary(row) == over_all}
+        corrected_of |= zip(family, holm(list(family.values())), strict=True)
+    return [corrected_of[name] for name in tests]
 
 
 FLOOR = 1e-6

@@ -33,8 +33,8 @@ def unbounded_student_interval(values: NDArray[np.floating], groups: ArrayLike) 
     if names.size == 1:
         return -inf, inf
     mean, sizes = float(values.mean()), np.bincount(group_of)
-    rest = np.bincount(group_of, values) - mean * sizes
-    spread = _reach(rest, values.size)
+    residuals = np.bincount(group_of, values) - mean * sizes
+    spread = _reach(residuals, values.size)
     return mean - spread, mean + spread
 
 
@@ -58,19 +58,19 @@ def explained_interval(
     if missing <= 0:
         return 1.0, 1.0
     relative = deviations / varying if varying > 0 else np.ones(scores.size)
-    rest = np.asarray(np.bincount(group_of, (1 - scores) - missing * relative), dtype=np.float64)
-    reach = _reach(rest, scores.size) * widening / missing
+    residuals = np.asarray(np.bincount(group_of, (1 - scores) - missing * relative), dtype=np.float64)
+    reach = _reach(residuals, scores.size) * widening / missing
     low, high = 1 - missing * exp(min(reach, 100.0)), 1 - missing * exp(-reach)
     # The subtractions round: around a score of -5e-17, the limits of groups that all agree would both be 0.
     return min(low, explained), max(high, explained)
 
 
-def _reach(rest: NDArray[np.floating], count: int) -> float:
+def _reach(residuals: NDArray[np.floating], count: int) -> float:
     """Student's quantile times the standard error of a mean over `count` episodes of G groups.
 
-    rest: (G,) sums over the episodes of a group of what is left without the mean.
+    residuals: (G,) sums over the episodes of a group of the values without their mean.
     """
     from scipy.special import stdtrit  # type: ignore[import-untyped]
 
-    error = sqrt(float(rest @ rest) * rest.size / (rest.size - 1)) / count
-    return float(stdtrit(rest.size - 1, 1 - SIGNIFICANCE / 2)) * error
+    error = sqrt(float(residuals @ residuals) * residuals.size / (residuals.size - 1)) / count
+    return float(stdtrit(residuals.size - 1, 1 - SIGNIFICANCE / 2)) * error

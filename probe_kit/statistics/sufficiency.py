@@ -1,4 +1,4 @@
-"""What a number of groups is enough for: one definition for the plan of a run and for later refusals."""
+"""The conclusions that a number of groups is enough for: one definition for plans and for later refusals."""
 
 from collections.abc import Callable
 from functools import lru_cache

@@ -157,10 +157,12 @@ def probe(
                 model=model,
                 suite="arrays@1#0",
                 episodes=episodes,
-                features={(Site(STREAM, layer), VIEW): array[order] for layer, array in enumerate(own.values())},
+                features={
+                    (Site(STREAM, layer), VIEW): array[order] for layer, array in enumerate(site_arrays.values())
+                },
                 control_features=of_controls if model == "arrays" else {},
             )
-            for model, own in networks.items()
+            for model, site_arrays in networks.items()
         }
         results = train_probes(
             runs["arrays"],
@@ -183,30 +185,32 @@ def _names(controls: Mapping[str, ArrayLike] | None) -> list[str]:
     return names
 
 
-def _sites(given: Sites, what: str, count: int | None = None) -> dict[str, NDArray[np.float32]]:
+def _sites(arrays: Sites, what: str, count: int | None = None) -> dict[str, NDArray[np.float32]]:
     """Features (N, D) by the name of their site."""
-    if isinstance(given, Mapping):
-        named = {str(name): array for name, array in given.items()}
+    if isinstance(arrays, Mapping):
+        by_name = {str(name): array for name, array in arrays.items()}
     else:
-        array = np.asarray(given)
+        array = np.asarray(arrays)
         if array.ndim not in (2, 3):
             raise UsageError(
                 f"{what} has the shape {array.shape}; expected (N, D) of one site or (S, N, D) of several"
             )
-        named = {str(number): one for number, one in enumerate(array if array.ndim == 3 else array[None])}
-    if not named:
+        by_name = {
+            str(number): site_array for number, site_array in enumerate(array if array.ndim == 3 else array[None])
+        }
+    if not by_name:
         raise UsageError(f"{what} holds no site; expected one or more")
-    found: dict[str, NDArray[np.float32]] = {}
-    for name, one in named.items():
-        found[name] = _matrix(one, f"site {name!r} of {what}" if len(named) > 1 else what, count)
-        count = len(found[name])
-    return found
+    sites: dict[str, NDArray[np.float32]] = {}
+    for name, site_array in by_name.items():
+        sites[name] = _matrix(site_array, f"site {name!r} of {what}" if len(by_name) > 1 else what, count)
+        count = len(sites[name])
+    return sites
 
 
-def _matrix(given: ArrayLike, what: str, count: int | None) -> NDArray[np.float32]:
+def _matrix(features: ArrayLike, what: str, count: int | None) -> NDArray[np.float32]:
     """(N, D) finite numbers. Raises UsageError."""
     try:
-        array = np.asarray(given, np.float32)
+        array = np.asarray(features, np.float32)
     except (TypeError, ValueError) as error:
         raise UsageError(f"{what} holds no numbers ({error}); expected (N, D) floats") from None
     if array.ndim != 2 or 0 in array.shape or (count is not None and len(array) != count):
@@ -218,9 +222,9 @@ def _matrix(given: ArrayLike, what: str, count: int | None) -> NDArray[np.float3
     return array
 
 
-def _column(given: ArrayLike | Sequence[Any], count: int, what: str) -> list[Any]:
+def _column(column: ArrayLike | Sequence[Any], count: int, what: str) -> list[Any]:
     """N values. Raises UsageError for another number of them, and for missing ones."""
-    array = np.asarray(given)
+    array = np.asarray(column)
     if array.shape != (count,):
         raise UsageError(f"{what} has the shape {array.shape}; expected ({count},), one value per row of X")
     values: list[Any] = array.tolist()

@@ -60,9 +60,9 @@ def train(
     from probe_kit.runs import open_run
     from probe_kit.train.train_options import TargetOptions, TransferOptions
 
-    asked = TargetOptions(target, labels, task, group_by, exchange_within, align_to)
-    asked.check(window)
-    transfer = TransferOptions.of(test_on, test_labels, across_weights, asked)
+    target_options = TargetOptions(target, labels, task, group_by, exchange_within, align_to)
+    target_options.check(window)
+    transfer = TransferOptions.of(test_on, test_labels, across_weights, target_options)
     opened = open_run(run, allow_partial=partial).in_wording(wording)
     options = {
         "views": views,
@@ -81,7 +81,7 @@ def train(
             "a transfer",
         )  # fmt: skip
         other = open_run(transfer.run, allow_partial=partial).in_wording(wording)
-        _transfer(opened, other, asked, transfer, categories, call, options, details)
+        _transfer(opened, other, target_options, transfer, categories, call, options, details)
         return
     control = None if untrained is None else open_run(untrained, allow_partial=partial).in_wording(wording)
     options |= {
@@ -94,20 +94,25 @@ def train(
         "device": device,
         "ray": ray,
     }
-    _train(opened, asked, categories, call, options, details)
-    of_target = "" if asked.is_side else f" --target {shlex.quote(target)}"
+    _train(opened, target_options, categories, call, options, details)
+    of_target = "" if target_options.is_side else f" --target {shlex.quote(target)}"
     say(marked("next: [bold]probe-kit retention {}{}[/]", run, of_target))
 
 
 def _train(
-    run: "Run", asked: "TargetOptions", categories: Any, call: str, options: Mapping[str, Any], details: bool
+    run: "Run",
+    target_options: "TargetOptions",
+    categories: Any,
+    call: str,
+    options: Mapping[str, Any],
+    details: bool,
 ) -> None:
     """Probe the target at the captured inferences that `call` names, and print the best sites."""
     from probe_kit.train import train_probes
     from probe_kit.train.results.summary import best_sites_findings, best_sites_sentences, best_sites_table
 
-    read = asked.read(run, seed=options["seed"])
-    if not asked.is_side:
+    read = target_options.read(run, seed=options["seed"])
+    if not target_options.is_side:
         out.print(read.contents, markup=False, highlight=False)
     left_out: dict[int, Exception] = {}
     fitted: list[ProbeResults] = []
@@ -118,7 +123,7 @@ def _train(
                     run,
                     categories,
                     target=read,
-                    align_to=asked.event(run),
+                    align_to=target_options.event(run),
                     call=number,
                     progress=counter(bar, f"sites, call {number}" if number else "sites"),
                     **options,
@@ -144,7 +149,7 @@ def _train(
 def _transfer(
     run: "Run",
     other: "Run",
-    asked: "TargetOptions",
+    target_options: "TargetOptions",
     transfer: "TransferOptions",
     categories: Any,
     call: str,
@@ -159,8 +164,8 @@ def _transfer(
     if len(numbers) != 1:
         raise UsageError(f"--call {call!r} with a transfer; expected one number")
     fitted_on, scored_on = (
-        asked.read(run, seed=options["seed"]),
-        asked.read(other, transfer.labels, options["seed"]),
+        target_options.read(run, seed=options["seed"]),
+        target_options.read(other, transfer.labels, options["seed"]),
     )
     for contents in dict.fromkeys([fitted_on.contents, scored_on.contents]):
         out.print(contents, markup=False, highlight=False)
@@ -182,31 +187,31 @@ def _transfer(
     say(marked("nothing was stored; [bold]transfer_probes[/] in Python gives every site as a frame"))
 
 
-def facts_table(found: "Inventory", further: Mapping[str, str]) -> "Table":
+def facts_table(inventory: "Inventory", more_lines: Mapping[str, str]) -> "Table":
     """A run and what is stored with it. further: lines below, by name."""
     from rich.table import Table
 
-    missing = found.planned - found.episodes
-    outcomes = ", ".join(f"{name} {count}" for name, count in found.outcomes.items())
+    missing = inventory.planned - inventory.episodes
+    outcomes = ", ".join(f"{name} {count}" for name, count in inventory.outcomes.items())
     facts = {
-        "run": found.run,
-        "model": found.model + (" (random weights)" if found.random_weights else ""),
-        "weights": (found.weights_sha256 or "none (scripted)")[:12],
-        "suite": found.suite,
-        "settings": found.settings_sha256[:12],
-        "episodes": f"{found.episodes} of {found.planned}" * (missing > 0) or str(found.episodes),
-        "wordings": ", ".join(f"{name} {count}" for name, count in found.wordings.items()),
-        "failed": str(found.failed or ""),
+        "run": inventory.run,
+        "model": inventory.model + (" (random weights)" if inventory.random_weights else ""),
+        "weights": (inventory.weights_sha256 or "none (scripted)")[:12],
+        "suite": inventory.suite,
+        "settings": inventory.settings_sha256[:12],
+        "episodes": f"{inventory.episodes} of {inventory.planned}" * (missing > 0) or str(inventory.episodes),
+        "wordings": ", ".join(f"{name} {count}" for name, count in inventory.wordings.items()),
+        "failed": str(inventory.failed or ""),
         "outcomes": outcomes,
-        "categories": ", ".join(found.categories),
-        **found.streams,
-        **{f"probes {probes.key}": _probes_in_words(probes, found) for probes in found.probes},
+        "categories": ", ".join(inventory.categories),
+        **inventory.streams,
+        **{f"probes {probes.key}": _probes_in_words(probes, inventory) for probes in inventory.probes},
         **{
             f"unfinished {key}": f"a sweep of {counted(sites, 'site')} so far; "
             "the same `probe-kit train` continues it"
-            for key, sites in found.unfinished.items()
+            for key, sites in inventory.unfinished.items()
         },
-        **further,
+        **more_lines,
     }
     table = Table(show_header=False, box=None, pad_edge=False)
     table.add_column(style="dim", no_wrap=True)
@@ -225,7 +230,7 @@ _STATES = {
 }
 
 
-def _probes_in_words(probes: "StoredProbes", found: "Inventory") -> str:
+def _probes_in_words(probes: "StoredProbes", inventory: "Inventory") -> str:
     state, fitted = _STATES[probes.state], f"fitted {probes.created[:16].replace('T', ' ')} UTC"
     parts = [f"{state}; views {', '.join(probes.views)}", f"target {probes.target}"]
     parts += [f"{probes.permutations} label permutations"]
@@ -233,7 +238,7 @@ def _probes_in_words(probes: "StoredProbes", found: "Inventory") -> str:
     parts += [f"seed {probes.seed}"]
     parts += [f"captured inference {probes.call}"] * (probes.call > 0)
     parts += [f"wording {probes.wording}"] * bool(probes.wording)
-    parts += [f"only {', '.join(probes.categories)}"] * (probes.categories not in ((), found.categories))
+    parts += [f"only {', '.join(probes.categories)}"] * (probes.categories not in ((), inventory.categories))
     parts += [f"controls {', '.join(probes.controls)}"] * bool(probes.controls)
     return "; ".join([*parts, fitted])
 
@@ -244,7 +249,7 @@ def _calls(text: str, run: "RunReader") -> list[int]:
 
     if text == "all":
         return list(range(captured_calls(run)))
-    found = split(text) or ()
-    if not found or not all(part.isdecimal() for part in found):
+    parts = split(text) or ()
+    if not parts or not all(part.isdecimal() for part in parts):
         raise UsageError(f"--call {text!r}; expected numbers from 0, comma-separated, or all")
-    return list(dict.fromkeys(map(int, found)))
+    return list(dict.fromkeys(map(int, parts)))

@@ -22,7 +22,7 @@ Probed = dict[str, SiteProbe]
 
 @dataclass(frozen=True)
 class ExecutionSettings:
-    """Who probes, which changes no number.
+    """The workers that probe, which change no number.
 
     jobs: columns at once, 1 by default. device: where torch solves them; numpy does without one. ray: address of
     a cluster that solves them, `auto` for the one this process belongs to or a new one on this machine; `jobs` is

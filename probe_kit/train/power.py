@@ -102,12 +102,12 @@ def fewest(reaches: Callable[[int], bool], low: int, high: int) -> tuple[int, in
     simulated power is noisy and goes in steps: where one of the next two larger numbers fails, the search resumes
     above it, so that the goal is reached at three numbers in a row.
     """
-    known: dict[int, bool] = {}
+    answers: dict[int, bool] = {}
 
     def does(items: int) -> bool:
-        if items not in known:
-            known[items] = reaches(items)
-        return known[items]
+        if items not in answers:
+            answers[items] = reaches(items)
+        return answers[items]
 
     below, above = low - ITEMS_PER_GROUP, low
     while not does(above):
@@ -151,24 +151,24 @@ def _part(items: int, signal: NDArray[np.float64], draws: int, seed: int) -> tup
     groups = np.repeat(np.arange(items // ITEMS_PER_GROUP), ITEMS_PER_GROUP * LAYOUTS)
     nothing = np.zeros(signal.size)
     limit = _limit(items // ITEMS_PER_GROUP, signal.size, seed)
-    seen = []
+    detected = []
     for draw in range(draws):
-        here, untrained = _right(generator, signal, groups), _right(generator, nothing, groups)
+        right, untrained = _right(generator, signal, groups), _right(generator, nothing, groups)
         reference = _right(generator, np.zeros(LAYERS), groups).mean(axis=0)
-        seen.append(
+        detected.append(
             (
-                here.mean(axis=1).max() > limit,
-                better_than_reference(here, reference, groups, draw).min() < SIGNIFICANCE,
-                better_than_best(here, untrained, groups, draw).min() < SIGNIFICANCE,
+                right.mean(axis=1).max() > limit,
+                better_than_reference(right, reference, groups, draw).min() < SIGNIFICANCE,
+                better_than_best(right, untrained, groups, draw).min() < SIGNIFICANCE,
                 is_absent(at_most(_group_sums(untrained)), findable(_group_sums(untrained), limit)),
             )
         )
-    chance, random_features, beaten, absent = np.mean(seen, axis=0).tolist()
+    chance, random_features, beaten, absent = np.mean(detected, axis=0).tolist()
     return chance, random_features, beaten, absent
 
 
 def _group_sums(right: NDArray[np.bool_]) -> GroupSums:
-    """Of (S, E) correctness of whole groups."""
+    """Return the sums of (S, E) correctness over whole groups."""
     size = ITEMS_PER_GROUP * LAYOUTS
     sums = right.reshape(len(right), -1, size).sum(axis=2).astype(np.float64)
     return GroupSums(sums, np.full(sums.shape[1], float(size)))
@@ -176,7 +176,7 @@ def _group_sums(right: NDArray[np.bool_]) -> GroupSums:
 
 @lru_cache(maxsize=256)
 def _limit(groups: int, sites: int, seed: int) -> float:
-    """What the best of `sites` without signal exceeds in less than `SIGNIFICANCE` of experiments.
+    """Return the accuracy that the best of `sites` without signal exceeds in a share `SIGNIFICANCE` at most.
 
     Groups are drawn from a pool and its complement, so that every site is right in one half of the pool exactly.
     """
@@ -202,8 +202,8 @@ def _pool(sites: int, seed: int) -> NDArray[np.int8]:
     for _ in range(POOL // 2000):
         right = _right(generator, np.zeros(sites), np.repeat(np.arange(2000), size))
         drawn.append(right.reshape(sites, -1, size).sum(axis=2, dtype=np.int8).T)
-    own = np.concatenate(drawn)
-    return np.concatenate([own, np.int8(size) - own])
+    right_of_group = np.concatenate(drawn)
+    return np.concatenate([right_of_group, np.int8(size) - right_of_group])
 
 
 def _right(
@@ -211,8 +211,8 @@ def _right(
 ) -> NDArray[np.bool_]:
     """(S, E) correctness of sites that are right in a share 0.5 + `above` of the episodes."""
     of_group = generator.standard_normal((above.size, int(groups[-1]) + 1))[:, groups]
-    own = generator.standard_normal((above.size, groups.size))
-    values = sqrt(ALIKE) * of_group + sqrt(1 - ALIKE) * own
+    of_episode = generator.standard_normal((above.size, groups.size))
+    values = sqrt(ALIKE) * of_group + sqrt(1 - ALIKE) * of_episode
     for site in range(1, above.size):
         values[site] = NEIGHBOURS * values[site - 1] + sqrt(1 - NEIGHBOURS**2) * values[site]
     limits = np.array([NormalDist().inv_cdf(min(0.5 + share, 1 - 1e-9)) for share in above.tolist()])

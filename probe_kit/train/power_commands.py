@@ -36,7 +36,7 @@ def power(
         int, typer.Option(help="Number of simulated experiments per estimate.", min=20, max=100_000)
     ] = 400,
     as_json: AsJson = False,
-    wanted: Annotated[
+    goal: Annotated[
         float | None,
         typer.Option(
             "--power",
@@ -64,12 +64,12 @@ def power(
     from probe_kit.statistics.significance import items_for_width
     from probe_kit.train.power import items_needed, simulate
 
-    for name, value in (("--power", wanted), ("--width", width)):
+    for name, value in (("--power", goal), ("--width", width)):
         if value is not None and not isfinite(value):
             raise UsageError(f"{name} is {value}; expected a number")
-    if width is not None and wanted is not None:
+    if width is not None and goal is not None:
         raise UsageError("--power and --width are two questions; ask them one after the other")
-    if items is not None and (width is not None or wanted is not None):
+    if items is not None and (width is not None or goal is not None):
         raise UsageError("--power and --width look for the number of items themselves; leave --items out")
     counts = [_whole(part) for part in split(items or ITEMS) or ()]
     signals = [_points(part) for part in split(signal) or ()]
@@ -78,17 +78,17 @@ def power(
         print_json({"width": width, "items": count}) if as_json else out.print(f"{count} items per category")
         return
     with err.status("simulating"):
-        if wanted is None:
+        if goal is None:
             powers = [simulate(count, above, sites, draws) for count in counts for above in signals]
         else:
-            needed_for = {above: items_needed(above, wanted / 100, sites, draws) for above in signals}
-    if wanted is None:
-        print_json([asdict(one) for one in powers]) if as_json else _print(powers)
+            needed_for = {above: items_needed(above, goal / 100, sites, draws) for above in signals}
+    if goal is None:
+        print_json([asdict(estimate) for estimate in powers]) if as_json else _print(powers)
     elif as_json:
-        print_json([_as_json(above, wanted / 100, needed) for above, needed in needed_for.items()])
+        print_json([_as_json(above, goal / 100, needed) for above, needed in needed_for.items()])
     else:
         for above, needed in needed_for.items():
-            out.print(f"{100 * above:g} points above chance, seen in {wanted:g} %: {_answer(needed)}")
+            out.print(f"{100 * above:g} points above chance, seen in {goal:g} %: {_answer(needed)}")
 
 
 def _as_json(above: float, power: float, needed: "tuple[Power, int] | None") -> dict[str, float | None]:
@@ -96,9 +96,9 @@ def _as_json(above: float, power: float, needed: "tuple[Power, int] | None") -> 
     head: dict[str, float | None] = {"above": above, "power": power}
     if needed is None:
         return head | dict.fromkeys(("items", "resolution", "reached", "spread"))
-    found, resolution = needed
+    estimate, resolution = needed
     return head | {
-        "items": found.items, "resolution": resolution, "reached": found.least, "spread": found.spread,
+        "items": estimate.items, "resolution": resolution, "reached": estimate.least, "spread": estimate.spread,
     }  # fmt: skip
 
 
@@ -107,14 +107,14 @@ def _answer(needed: "tuple[Power, int] | None") -> str:
 
     if needed is None:
         return f"more than {MOST_SEARCHED} items per category"
-    found, resolution = needed
+    estimate, resolution = needed
     return (
-        f"{found.items} items per category (to {resolution}; simulated there {100 * found.least:.0f} % "
-        f"± {100 * found.spread:.1f}; more --draws narrow it)"
+        f"{estimate.items} items per category (to {resolution}; simulated there {100 * estimate.least:.0f} % "
+        f"± {100 * estimate.spread:.1f}; more --draws narrow it)"
     )
 
 
-def _print(found: "list[Power]") -> None:
+def _print(estimates: "list[Power]") -> None:
     from probe_kit._tables.table import Table
     from probe_kit.statistics.estimates.verdict import ABSENT_BELOW
     from probe_kit.statistics.significance import detectable
@@ -131,15 +131,21 @@ def _print(found: "list[Power]") -> None:
     )
     rows = [
         (
-            str(one.items),
+            str(estimate.items),
             *(
                 f"{100 * share:.0f}"
-                for share in (one.above, one.chance, one.random_features, one.untrained, one.absent)
+                for share in (
+                    estimate.above,
+                    estimate.chance,
+                    estimate.random_features,
+                    estimate.untrained,
+                    estimate.absent,
+                )
             ),
-            f"{100 * one.spread:.1f}",
-            f"{100 * detectable(one.items):.0f}",
+            f"{100 * estimate.spread:.1f}",
+            f"{100 * detectable(estimate.items):.0f}",
         )
-        for one in found
+        for estimate in estimates
     ]
     notes = [
         "random-features and the untrained network at chance; absent: how often a stream without signal is called "

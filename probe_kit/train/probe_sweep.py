@@ -102,24 +102,24 @@ def train_probes(
     sweep = Sweep.of(run, target, categories, crew, progress, **options)
     _check_device_of(sweep.target, device)
     sweep.check()
-    own = sweep.settings
+    settings = sweep.settings
     stored = Controls() if sweep.stored is None else sweep.stored.controls
     prepared = prepare_controls(
-        run, sweep.samples, own.is_side, controls, suite, stored, own.categories
+        run, sweep.samples, settings.is_side, controls, suite, stored, settings.categories
     )  # fmt: skip
-    beside = None
+    untrained_sweep = None
     if untrained is not None:
-        check_same_source(run, untrained, sweep.samples, own.is_side)
-        same: Target | str = own.target if own.is_side else sweep.target
-        beside = Sweep.of(untrained, same, own.categories, crew, progress, **options)
-        check_untrained(run, untrained, sweep.samples, beside.samples, own.is_side, call)
-        beside.check()
+        check_same_source(run, untrained, sweep.samples, settings.is_side)
+        same: Target | str = settings.target if settings.is_side else sweep.target
+        untrained_sweep = Sweep.of(untrained, same, settings.categories, crew, progress, **options)
+        check_untrained(run, untrained, sweep.samples, untrained_sweep.samples, settings.is_side, call)
+        untrained_sweep.check()
     results = add_controls(sweep.results(), sweep.problems, sweep.widths, prepared)
-    if beside is not None:
-        others = beside.results()
-        results = add_untrained(results, others)
-        beside.keep(others, asked=False)
-    return sweep.keep(results, asked=True)
+    if untrained_sweep is not None:
+        untrained_results = untrained_sweep.results()
+        results = add_untrained(results, untrained_results)
+        untrained_sweep.keep(untrained_results, requested=False)
+    return sweep.keep(results, requested=True)
 
 
 def check_options(
@@ -280,9 +280,9 @@ class Sweep:
         """Return those that are stored, or new ones that are not stored yet."""
         return self._fit() if self.stored is None else self.stored
 
-    def keep(self, results: ProbeResults, *, asked: bool) -> ProbeResults:
+    def keep(self, results: ProbeResults, *, requested: bool) -> ProbeResults:
         """Store `results` and return them as loaded from the store."""
-        save_results(results, self.run.location, asked=asked)
+        save_results(results, self.run.location, requested=requested)
         SweepCheckpoint.of(self.run.location, self.settings.key).discard()
         return load_results(self.run, self.settings.key)
 
@@ -328,8 +328,8 @@ class Sweep:
 
 def _check_windows(target: Target, window: int | None, align_to: Target | None) -> None:
     if target.is_side and (window is not None or align_to is not None):
-        given = f"window={window}" if window is not None else "align_to"
-        raise UsageError(f"{given} with the side {target.name!r}; it needs labels of single inferences")
+        option = f"window={window}" if window is not None else "align_to"
+        raise UsageError(f"{option} with the side {target.name!r}; it needs labels of single inferences")
 
 
 def _check_groups_named_once(target: Target, folds: FoldUnit) -> None:

@@ -86,7 +86,7 @@ class Problem:
 
     def curve(self, probes: Mapping[Site, SiteProbe], parts: tuple[str, ...] = ()) -> ProbeCurve:
         """Return the curve of the probes of some sites, in order."""
-        own = list(probes.values())
+        fitted = list(probes.values())
         return ProbeCurve(
             sites=tuple(probes),
             labels=self.labels,
@@ -94,18 +94,20 @@ class Problem:
             items=self.items,
             groups=self.groups,
             fold_of=self.fold_of,
-            decisions=np.stack([probe.decisions for probe in own]),
-            strengths=np.stack([probe.strengths for probe in own]),
-            null=np.stack([probe.null for probe in own]),
-            inner=np.stack([sums_by_group(probe.inner, self.groups) for probe in own]).astype(np.float32),
+            decisions=np.stack([probe.decisions for probe in fitted]),
+            strengths=np.stack([probe.strengths for probe in fitted]),
+            null=np.stack([probe.null for probe in fitted]),
+            inner=np.stack([sums_by_group(probe.inner, self.groups) for probe in fitted]).astype(np.float32),
             parts=parts,
             task=self.task,
             is_side=self.is_side,
             classes=self.classes,
-            sample_scores=None if self.is_side else np.stack([probe.scores for probe in own]),
+            sample_scores=None if self.is_side else np.stack([probe.scores for probe in fitted]),
             inferences=self.samples.inferences.astype(np.int64),
             aligned=None if self.samples.aligned is None else self.samples.aligned.astype(np.int64),
-            smallest_p=None if self.is_side else least_p(self.labels, self.permuted_labels[:, : own[0].null.size]),
+            smallest_p=None
+            if self.is_side
+            else least_p(self.labels, self.permuted_labels[:, : fitted[0].null.size]),
         )
 
 
@@ -119,22 +121,22 @@ def make_problem(
     """
     of_category = run.episodes["category"].to_numpy(dtype=str)[samples.rows] == category
     positions = np.flatnonzero(of_category | (category == EVERYWHERE))
-    own = samples.of(positions)
-    table = run.episodes.iloc[own.rows]
+    subset = samples.of(positions)
+    table = run.episodes.iloc[subset.rows]
     if settings.folds != "groups":
-        own = replace(own, groups=fold_units(table, settings.folds))
+        subset = replace(subset, groups=fold_units(table, settings.folds))
     # Of all categories together a class without samples is an error, of one category it is another's.
     pooled = target.is_side or category == EVERYWHERE
-    coded = replace(target.coded, values=own.values) if pooled else target.coded.of_values(own.values)
+    coded = replace(target.coded, values=subset.values) if pooled else target.coded.of_values(subset.values)
     labels: NDArray[Any] = coded.values == 1 if target.is_side else coded.values
     draw = _side_folds_and_permutations if target.is_side else _block_folds_and_permutations
-    folds, permuted = draw(run, replace(target, coded=coded), own, labels, category, settings)
+    folds, permuted = draw(run, replace(target, coded=coded), subset, labels, category, settings)
     return Problem(
         task=target.task,
         is_side=target.is_side,
         classes=coded.classes,
         positions=positions,
-        samples=own,
+        samples=subset,
         episodes=table["episode_id"].to_numpy(dtype=str),
         items=table["item_id" if "item_id" in table else "episode_id"].to_numpy(dtype=str),
         labels=labels,
@@ -171,8 +173,10 @@ def _side_folds_and_permutations(
         folds = _side_folds(target, table, labels, groups, derive_seed("folds", settings.seed, category))
     except TooFewGroupsError as error:
         if settings.call > 0:
-            seen = f"{_reached(labels.size, settings.call)}: {np.unique(groups).size} independent groups of items"
-            raise TooFewGroupsError(f"category {category!r}: {seen}, too few for folds") from error
+            reason = (
+                f"{_reached(labels.size, settings.call)}: {np.unique(groups).size} independent groups of items"
+            )
+            raise TooFewGroupsError(f"category {category!r}: {reason}, too few for folds") from error
         raise TooFewGroupsError(f"category {category!r}, target {settings.target!r}: {error}") from error
     seed = derive_seed("relabelling", settings.seed, category)
     count = max(settings.permutations, settings.token_permutations)
@@ -213,7 +217,7 @@ def _check_balance(labels: NDArray[np.bool_], category: str, call: int) -> None:
     if share == 0.5:
         return
     why = "Episodes are missing from the run" if call == 0 else _reached(labels.size, call)
-    seen = (
+    finding = (
         f"category {category!r}: classes are not balanced, chance is {share:.3f}; expected 0.5 with both layouts "
         f"of every item. {why}."
     )
@@ -221,9 +225,9 @@ def _check_balance(labels: NDArray[np.bool_], category: str, call: int) -> None:
     if share > MOST_OF_ONE_SIDE:
         instead = "Extract the missing episodes again" if call == 0 else "Probe an earlier inference (--call)"
         raise UnbalancedEpisodesError(
-            f"{seen} Beyond {MOST_OF_ONE_SIDE} nothing is left to be read. {instead}, or {pair}"
+            f"{finding} Beyond {MOST_OF_ONE_SIDE} nothing is left to be read. {instead}, or {pair}"
         )
-    warnings.warn(f"{seen} Leave out the other layout of their items with incomplete='drop'.", stacklevel=4)
+    warnings.warn(f"{finding} Leave out the other layout of their items with incomplete='drop'.", stacklevel=4)
 
 
 def _reached(episodes: int, call: int) -> str:
@@ -262,8 +266,8 @@ def _block_folds_and_permutations(
             f"{name} has one class, {classes[0]!r}; expected two or more. Leave the category out"
         )
     _check_groups(name, target, labels, classes, samples.groups)
-    place = () if category == EVERYWHERE else (category,)
-    seed = derive_seed("label folds", settings.seed, *place)
+    scope = () if category == EVERYWHERE else (category,)
+    seed = derive_seed("label folds", settings.seed, *scope)
     folds = nested_folds(samples.strata, samples.groups, seed, stratified_folds)
     blocks, kinds = _blocks(run, samples)
     permutations, share = max(settings.permutations, settings.token_permutations), movable_share(blocks, kinds)
@@ -276,7 +280,7 @@ def _block_folds_and_permutations(
             stacklevel=3,
         )
         permutations = 0
-    source = exchange_blocks(blocks, kinds, permutations, derive_seed("label exchanges", settings.seed, *place))
+    source = exchange_blocks(blocks, kinds, permutations, derive_seed("label exchanges", settings.seed, *scope))
     columns = np.column_stack([labels, labels[source]])
     columns = columns[:, _trainable(name, columns, folds)]
     least = least_p(columns[:, 0], columns[:, 1:])
@@ -332,27 +336,27 @@ def _blocks(
 
     Episodes correspond by their layout and labelled inferences, then by item.
     """
-    places: dict[int, list[int]] = {}
+    positions_of: dict[int, list[int]] = {}
     for position, row in enumerate(samples.rows.tolist()):
-        places.setdefault(row, []).append(position)
+        positions_of.setdefault(row, []).append(position)
     members: dict[str, list[int]] = {}
-    for row, own in places.items():
-        members.setdefault(str(samples.groups[own[0]]), []).append(row)
+    for row, positions in positions_of.items():
+        members.setdefault(str(samples.groups[positions[0]]), []).append(row)
     table = run.episodes
     items = table["item_id" if "item_id" in table else "episode_id"].to_numpy(dtype=str)
     layouts = table["layout"].to_numpy(dtype=str) if "layout" in table else np.full(len(table), "")
-    looks = {row: (str(layouts[row]), tuple(samples.steps[own].tolist())) for row, own in places.items()}
+    looks = {row: (str(layouts[row]), tuple(samples.steps[at].tolist())) for row, at in positions_of.items()}
     blocks: dict[str, NDArray[np.intp]] = {}
     kinds: dict[str, tuple[Hashable, ...]] = {}
     for group, rows in members.items():
         by_item: dict[str, list[int]] = {}
         for row in rows:
             by_item.setdefault(str(items[row]), []).append(row)
-        ordered = sorted((sorted((looks[row], row) for row in own), item) for item, own in by_item.items())
-        chain: list[tuple[Any, int]] = [pair for own, _ in ordered for pair in own]
-        blocks[group] = np.array([place for _, row in chain for place in places[row]], np.intp)
+        ordered = sorted((sorted((looks[row], row) for row in of_item), item) for item, of_item in by_item.items())
+        chain: list[tuple[Any, int]] = [pair for pairs, _ in ordered for pair in pairs]
+        blocks[group] = np.array([position for _, row in chain for position in positions_of[row]], np.intp)
         stratum = str(samples.strata[blocks[group][0]])
-        kinds[group] = stratum, tuple(tuple(look for look, _ in own) for own, _ in ordered)
+        kinds[group] = stratum, tuple(tuple(look for look, _ in pairs) for pairs, _ in ordered)
     return blocks, kinds
 
 
@@ -360,8 +364,8 @@ def _trainable(name: str, columns: Matrix, folds: list[NestedFold]) -> NDArray[n
     """(1 + P,) whether a labelling leaves no training fold with a single value. Raises TooFewGroupsError."""
     fine = np.ones(columns.shape[1], bool)
     for fold in folds:
-        for one in (fold.outer, *fold.inner):
-            fine &= np.ptp(columns[one.train], axis=0) > 0
+        for split in (fold.outer, *fold.inner):
+            fine &= np.ptp(columns[split.train], axis=0) > 0
     if not fine[0]:
         raise TooFewGroupsError(
             f"{name} is constant in a training fold, so there is nothing to learn; expected both "

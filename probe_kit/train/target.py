@@ -87,30 +87,32 @@ class Target:
         Raises UsageError, naming file and line, for a missing or mixed column, a key used twice, an integer beyond
         2^53, an infinite number, a control character, or a task that the values cannot have.
         """
-        further = [column for column in (group_by, exchange_within) if column is not None]
-        found = read_table(table, [name, *further])
-        of_source = EPISODE not in found.columns
+        group_columns = [column for column in (group_by, exchange_within) if column is not None]
+        label_table = read_table(table, [name, *group_columns])
+        of_source = EPISODE not in label_table.columns
         episode_key, step_key = (SOURCE, FRAME) if of_source else (EPISODE, INFERENCE)
-        if name not in found.columns or name in (episode_key, step_key):
-            others = (column for column in found.names if column not in (episode_key, step_key))
-            listed = ", ".join(map(terminal_safe, others))[:500] or "none"
-            raise UsageError(f"{found.source} has no column {name!r} to decode; it has: {listed}")
-        if not found.lines:
-            raise UsageError(f"{found.source} has no {found.unit} below its heading; expected one per label")
-        inferences = _numbers(found, step_key)
+        if name not in label_table.columns or name in (episode_key, step_key):
+            columns = (column for column in label_table.names if column not in (episode_key, step_key))
+            listed = ", ".join(map(terminal_safe, columns))[:500] or "none"
+            raise UsageError(f"{label_table.source} has no column {name!r} to decode; it has: {listed}")
+        if not label_table.lines:
+            raise UsageError(
+                f"{label_table.source} has no {label_table.unit} below its heading; expected one per label"
+            )
+        inferences = _numbers(label_table, step_key)
         if of_source:  # numbers as a spreadsheet or a merge may leave them, such as 3.0
-            episodes = tuple(map(str, _numbers(found, episode_key) or ()))
+            episodes = tuple(map(str, _numbers(label_table, episode_key) or ()))
         else:
-            episodes = tuple(found.texts(episode_key))
-        cells = found.values(name, task)
-        groups, strata = _names(found, group_by), _names(found, exchange_within)
-        at = _once(found, episodes, inferences, [cells, *filter(None, (groups, strata))])
+            episodes = tuple(label_table.texts(episode_key))
+        cells = label_table.values(name, task)
+        groups, strata = _names(label_table, group_by), _names(label_table, exchange_within)
+        at = _once(label_table, episodes, inferences, [cells, *filter(None, (groups, strata))])
         return cls(
             name,
             code_labels([cells[row] for row in at], task, name),
             tuple(episodes[row] for row in at),
             None if inferences is None else tuple(inferences[row] for row in at),
-            found.at(at),
+            label_table.at(at),
             group_by,
             exchange_within,
             None if groups is None else tuple(groups[row] for row in at),
@@ -131,14 +133,14 @@ class Target:
                 f"{self.table.source} has the key {SOURCE!r} of recordings, and {run.location} is of scenes; "
                 f"expected {EPISODE!r}. `probe-kit labels RUN` writes the ids"
             )
-        shown = _shown(run, self.inferences is not None)
+        run_keys = _shown(run, self.inferences is not None)
         frames: Sequence[int] = self.inferences or (-1,) * len(self.episodes)
         _check_recorded(run, self.table, self.episodes, self.inferences)
-        keys = [shown.get((episode, frame), ()) for episode, frame in zip(self.episodes, frames, strict=True)]
-        at = [number for number, found in enumerate(keys) for _ in found]
+        keys = [run_keys.get((episode, frame), ()) for episode, frame in zip(self.episodes, frames, strict=True)]
+        at = [number for number, matches in enumerate(keys) for _ in matches]
         if not at:
             raise UsageError(f"{self.table.source} has no label of a frame that {run.location} shows")
-        flat = [key for found in keys for key in found]
+        flat = [key for matches in keys for key in matches]
         return replace(
             self,
             coded=self.coded.of(at),
@@ -148,7 +150,7 @@ class Target:
             groups=None if self.groups is None else tuple(self.groups[number] for number in at),
             strata=None if self.strata is None else tuple(self.strata[number] for number in at),
             of_source=False,
-        ), sum(not found for found in keys)
+        ), sum(not matches for matches in keys)
 
     @classmethod
     def of_run(
@@ -181,11 +183,11 @@ class Target:
         """
         classes = self.coded.classes
         if value not in classes:
-            there = ", ".join(classes[:8]) or "quantities, not classes"
-            raise UsageError(f"{self.described} has no value {value!r}; it has {there}")
-        own = self.coded.values
+            listed = ", ".join(classes[:8]) or "quantities, not classes"
+            raise UsageError(f"{self.described} has no value {value!r}; it has {listed}")
+        codes = self.coded.values
         coded = LabelValues(
-            "binary", ("False", "True"), np.where(np.isnan(own), np.nan, own == classes.index(value))
+            "binary", ("False", "True"), np.where(np.isnan(codes), np.nan, codes == classes.index(value))
         )
         return replace(self, name=f"{self.name}={value}", coded=coded)
 
@@ -266,10 +268,10 @@ def _side(
     Raises UsageError for a run without sides, and for options of other targets.
     """
     check_scene_run(run, f"a probe of the side ({name})")
-    further = {"task": task, "group_by": group_by, "exchange_within": exchange_within}
-    if refused := [option for option, value in further.items() if value not in (None, "binary")]:
+    options = {"task": task, "group_by": group_by, "exchange_within": exchange_within}
+    if refused := [option for option, value in options.items() if value not in (None, "binary")]:
         raise UsageError(
-            f"{refused[0]}={further[refused[0]]} with the side {name!r}; expected none, because a side is "
+            f"{refused[0]}={options[refused[0]]} with the side {name!r}; expected none, because a side is "
             "binary and its groups are the run's. Leave it out, or take another target"
         )
     labels = side_labels(run.episodes, name, seed)
@@ -294,13 +296,13 @@ def side_labels(episodes: "pd.DataFrame", name: str, seed: int) -> NDArray[np.in
 
 def _shown(run: RunReader, by_frame: bool) -> dict[tuple[str, int], list[tuple[str, int]]]:
     """Episode ids and inferences of a run by source episode and frame; of whole episodes the frame is -1."""
-    found: dict[tuple[str, int], list[tuple[str, int]]] = {}
+    keys_of: dict[tuple[str, int], list[tuple[str, int]]] = {}
     steps = run.control_steps  # type: ignore[attr-defined]
     for row, (name, source) in enumerate(zip(run.episodes[EPISODE], run.episodes[SOURCE], strict=True)):
         for call, frame in enumerate(steps[row].tolist() if by_frame else [-1]):
             if frame >= 0 or not by_frame:
-                found.setdefault((str(source), frame), []).append((str(name), call))
-    return found
+                keys_of.setdefault((str(source), frame), []).append((str(name), call))
+    return keys_of
 
 
 def _check_recorded(
@@ -332,9 +334,9 @@ def _numbers(table: LabelTable, column: str) -> tuple[int, ...] | None:
     for row, cell in enumerate(cells):
         fraction = isinstance(cell, float) and not cell.is_integer()
         if isinstance(cell, bool | str | None) or fraction or cell < 0:
-            shown = "empty" if cell is None else repr(cell)
+            text = "empty" if cell is None else repr(cell)
             raise UsageError(
-                f"{table.where(row, column)} is {shown}; expected the number of {_COUNTED[column]}, from 0"
+                f"{table.where(row, column)} is {text}; expected the number of {_COUNTED[column]}, from 0"
             )
     return tuple(int(cell) for cell in cells if cell is not None)
 
@@ -351,10 +353,10 @@ def _once(
         key = episode, -1 if inferences is None else inferences[row]
         if (before := first.setdefault(key, row)) == row or all(cells[before] == cells[row] for cells in columns):
             continue
-        named = f"episode {episode!r}" + ("" if inferences is None else f", inference {key[1]}")
+        described = f"episode {episode!r}" + ("" if inferences is None else f", inference {key[1]}")
         raise UsageError(
-            f"{table.where(row)}: {named} has a label in {table.unit} {table.lines[before]} already. Leave one "
-            f"out{'' if inferences is not None else f', or add a column {INFERENCE!r}'}"
+            f"{table.where(row)}: {described} has a label in {table.unit} {table.lines[before]} already. Leave "
+            f"one out{'' if inferences is not None else f', or add a column {INFERENCE!r}'}"
         )
     return list(first.values())
 

@@ -45,10 +45,10 @@ class TargetSamples:
         """(n,) the place in the window, or the inference: what corresponds between episodes."""
         return self.inferences if self.aligned is None else self.aligned
 
-    def of(self, chosen: NDArray[Any]) -> "TargetSamples":
+    def of(self, selection: NDArray[Any]) -> "TargetSamples":
         """Return some of the samples, by a mask (n,) or by positions."""
         names = ("rows", "inferences", "values", "groups", "strata", *(["aligned"] * (self.aligned is not None)))
-        return replace(self, **{name: getattr(self, name)[chosen] for name in names})
+        return replace(self, **{name: getattr(self, name)[selection] for name in names})
 
 
 def target_samples(
@@ -77,16 +77,16 @@ def target_samples(
             f"episode. Use --window N for the first N inferences, or leave out the column {INFERENCE!r}"
         )
     check_call(run, call)
-    grid, reached, chosen = _label_grid(run, target), reached_calls(run), _of_categories(run, categories)
+    grid, reached, selected = _label_grid(run, target), reached_calls(run), _of_categories(run, categories)
     start: NDArray[np.intp] = np.full(len(reached), call)
     left_out: dict[str, int] = {}
     if align_to is not None:
         start = _events(run, target, align_to)
-        left_out[f"episodes in which {align_to.name} is never true"] = int((chosen & (start < 0)).sum())
-        chosen = chosen & (start >= 0)
+        left_out[f"episodes in which {align_to.name} is never true"] = int((selected & (start < 0)).sum())
+        selected = selected & (start >= 0)
     counts = reached.sum(axis=1) - start
     if target.per_step:
-        window = _window(counts[chosen], reached.shape[1], window)
+        window = _window(counts[selected], reached.shape[1], window)
     else:
         if window is not None:
             raise UsageError(
@@ -95,21 +95,23 @@ def target_samples(
         window = 1
         grid = np.repeat(grid[:, :1], reached.shape[1], axis=1)
     complete = _complete(run, counts >= window, incomplete)
-    whole = chosen & (counts >= window) & complete
+    reaching = selected & (counts >= window) & complete
     calls = start[:, None] + np.arange(window)
     values = np.take_along_axis(grid, calls.clip(0, grid.shape[1] - 1), axis=1)
-    labelled = whole[:, None] & np.isfinite(values)
+    labelled = reaching[:, None] & np.isfinite(values)
     rows, steps = np.nonzero(labelled)
     groups, strata = groups_of(run, target)
     if not target.is_side:
         _check_groups(run, target, groups, strata, np.unique(rows))
     short = f"before inference {call + window - 1}" if align_to is None else f"within {window} inferences of it"
     left_out |= {
-        f"episodes that end {short}": int((chosen & (counts < window)).sum()),
-        "episodes of items without their other layout": int((chosen & (counts >= window) & ~complete).sum()),
-        "episodes without a label": int((whole & ~labelled.any(axis=1)).sum()),
+        f"episodes that end {short}": int((selected & (counts < window)).sum()),
+        "episodes of items without their other layout": int((selected & (counts >= window) & ~complete).sum()),
+        "episodes without a label": int((reaching & ~labelled.any(axis=1)).sum()),
         "inferences without a label": int((~labelled)[labelled.any(axis=1)].sum()),
-        f"labels outside the window of {window}": _outside(grid[whole], labelled[whole]) if target.per_step else 0,
+        f"labels outside the window of {window}": _outside(grid[reaching], labelled[reaching])
+        if target.per_step
+        else 0,
         "labels of frames or episodes that the run does not show": unseen,
     }
     return TargetSamples(
@@ -149,7 +151,7 @@ def _complete(run: RunReader, reached: NDArray[np.bool_], incomplete: Incomplete
 
 
 def _outside(table: NDArray[np.float64], labelled: NDArray[np.bool_]) -> int:
-    """How many labels (E, C) of episodes with a whole window are outside it. labelled: (E, window) inside it."""
+    """Return how many labels (E, C) lie outside the windows of their episodes. labelled: (E, window) inside."""
     return int(np.isfinite(table).sum() - labelled.sum())
 
 
@@ -170,16 +172,16 @@ def _events(run: RunReader, target: Target, align_to: Target) -> NDArray[np.intp
 def _of_categories(run: RunReader, categories: Sequence[str] | None) -> NDArray[np.bool_]:
     if categories is None or EVERYWHERE in categories:
         return np.ones(len(run.episodes), bool)
-    chosen: NDArray[np.bool_] = run.episodes["category"].isin(list(categories)).to_numpy()
-    return chosen
+    selected: NDArray[np.bool_] = run.episodes["category"].isin(list(categories)).to_numpy()
+    return selected
 
 
-def _window(counts: NDArray[np.intp], most: int, asked: int | None) -> int:
+def _window(counts: NDArray[np.intp], most: int, requested: int | None) -> int:
     """Inferences per episode. counts: those of every episode from the start of its window on."""
-    if asked is not None:
-        if not 1 <= asked <= most:
-            raise UsageError(f"window={asked}; expected 1 to {most}, the captured inferences of an episode")
-        return asked
+    if requested is not None:
+        if not 1 <= requested <= most:
+            raise UsageError(f"window={requested}; expected 1 to {most}, the captured inferences of an episode")
+        return requested
     shares = [float((counts >= size).mean()) if counts.size else 0.0 for size in range(1, most + 1)]
     return max(1, sum(share >= REACHED for share in shares))
 
@@ -189,18 +191,18 @@ def _label_grid(run: RunReader, target: Target) -> NDArray[np.float64]:
 
     Raises UsageError for an episode or inference that the run does not have.
     """
-    place = {name: row for row, name in enumerate(run.episodes[EPISODE].astype(str))}
+    row_of = {name: row for row, name in enumerate(run.episodes[EPISODE].astype(str))}
     planned = _planned(run)
     reached = reached_calls(run)
-    grid = np.full((len(place), reached.shape[1] if target.per_step else 1), np.nan)
+    grid = np.full((len(row_of), reached.shape[1] if target.per_step else 1), np.nan)
     for number, name in enumerate(target.episodes):
-        row = place.get(name)
+        row = row_of.get(name)
         if row is None:
             if name in planned:
                 continue
             raise UsageError(
-                f"{target.table.where(number)}: {run.location} has no episode {name!r}; it has {len(place)}, such "
-                f"as {next(iter(place), 'none')!r}. `probe-kit labels RUN` writes the ids"
+                f"{target.table.where(number)}: {run.location} has no episode {name!r}; it has {len(row_of)}, "
+                f"such as {next(iter(row_of), 'none')!r}. `probe-kit labels RUN` writes the ids"
             )
         inference = 0 if target.inferences is None else target.inferences[number]
         if target.per_step and not (inference < reached.shape[1] and reached[row, inference]):
@@ -240,16 +242,17 @@ def _column(
                 f"{target.table.where(number, name)}: episode {episode!r} is in {cells[number]!r}, and in "
                 f"{cells[before]!r} in {target.table.unit} {target.table.lines[before]}; expected one value"
             )
-    return np.array([cells[first[one]] if one in first else "" for one in run.episodes[EPISODE].astype(str)], str)
+    ids = run.episodes[EPISODE].astype(str)
+    return np.array([cells[first[episode]] if episode in first else "" for episode in ids], str)
 
 
 def _check_groups(
     run: RunReader, target: Target, groups: NDArray[np.str_], strata: NDArray[np.str_], rows: NDArray[np.intp]
 ) -> None:
     """Raise UsageError for groups that separate items with a shared picture, and strata that split a group."""
-    own = run.episodes["group_id"].to_numpy(dtype=str) if "group_id" in run.episodes else groups
+    run_groups = run.episodes["group_id"].to_numpy(dtype=str) if "group_id" in run.episodes else groups
     for inner, outer, problem in (
-        (own, groups, f"--group-by {target.group_by} separates items that share a picture"),
+        (run_groups, groups, f"--group-by {target.group_by} separates items that share a picture"),
         (groups, strata, f"--exchange-within {target.exchange_within} splits a group"),
     ):
         for name, first, other in _split(inner[rows], outer[rows]):

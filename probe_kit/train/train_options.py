@@ -41,10 +41,10 @@ class TargetOptions:
             "--task": self.task, "--group-by": self.group_by, "--exchange-within": self.exchange_within,
             "--window": window, "--align-to": self.align_to,
         }  # fmt: skip
-        given = [option for option, value in options.items() if value is not None]
-        if is_side and given:
+        present = [option for option, value in options.items() if value is not None]
+        if is_side and present:
             raise UsageError(
-                f"{given[0]} is for labels of your own and built-in columns; give --target COLUMN too, and "
+                f"{present[0]} is for labels of your own and built-in columns; give --target COLUMN too, and "
                 "--labels FILE for one of a table"
             )
 
@@ -57,10 +57,10 @@ class TargetOptions:
         """Return the target for a run: of the table, of another `file`, or built in."""
         from probe_kit.train import Target
 
-        further = self.task, self.group_by, self.exchange_within
+        options = self.task, self.group_by, self.exchange_within
         if (table := file or self.file) is None:
-            return Target.of_run(run, self.name, *further, seed=seed)
-        return Target.read(table, self.name, *further)
+            return Target.of_run(run, self.name, *options, seed=seed)
+        return Target.read(table, self.name, *options)
 
     def event(self, run: "RunReader") -> "Target | None":
         """Return the column where windows begin; of `COLUMN=VALUE` whether it has the value."""
@@ -89,8 +89,8 @@ class TransferOptions:
         """Return the options; None without `--test-on`. Raises UsageError where one needs another."""
         if run is None:
             if labels is not None or across_weights:
-                given = "--test-labels" if labels is not None else "--across-weights"
-                raise UsageError(f"{given} is for a transfer; give --test-on RUN too, or leave it out")
+                option = "--test-labels" if labels is not None else "--across-weights"
+                raise UsageError(f"{option} is for a transfer; give --test-on RUN too, or leave it out")
             return None
         if labels is not None and target.file is None:
             raise UsageError("--test-labels with a built-in target; give --labels FILE too, or leave it out")

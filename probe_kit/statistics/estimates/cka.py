@@ -30,9 +30,9 @@ def unbiased_cka(first: Matrix, second: Matrix) -> float:
         raise UsageError(
             f"features of {count} and {len(second)} episodes; expected those of the same {FEWEST} or more episodes"
         )
-    here, there = (_products(features) for features in (first, second))
-    spread = _hsic(here, here) * _hsic(there, there)
-    return _hsic(here, there) / sqrt(spread) if spread > 0 else float("nan")
+    products, other_products = (_products(features) for features in (first, second))
+    spread = _hsic(products, products) * _hsic(other_products, other_products)
+    return _hsic(products, other_products) / sqrt(spread) if spread > 0 else float("nan")
 
 
 def _products(features: Matrix) -> Matrix:
@@ -44,10 +44,10 @@ def _products(features: Matrix) -> Matrix:
     return products
 
 
-def _hsic(here: Matrix, there: Matrix) -> float:
-    count = len(here)
-    rows, columns = here.sum(axis=0), there.sum(axis=0)
-    total = float((here * there).sum())
+def _hsic(first: Matrix, second: Matrix) -> float:
+    count = len(first)
+    rows, columns = first.sum(axis=0), second.sum(axis=0)
+    total = float((first * second).sum())
     total += float(rows.sum() * columns.sum()) / ((count - 1) * (count - 2))
     total -= 2 * float(rows @ columns) / (count - 2)
     return total / (count * (count - 3))

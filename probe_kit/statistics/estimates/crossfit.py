@@ -106,10 +106,10 @@ class CrossFit:
         A share t of groups at chance costs t of a score above chance. Where all G groups agree, t² is
         2 / ((G + 1)(G + 2)) on average; a variance is at least that times the squared score.
         """
-        found = self.covariance_with(self)
+        covariance = self.covariance_with(self)
         unseen = 2 / ((self.n_groups + 1) * (self.n_groups + 2)) * self.above**2
-        np.fill_diagonal(found, np.maximum(found.diagonal(), unseen))
-        return found
+        np.fill_diagonal(covariance, np.maximum(covariance.diagonal(), unseen))
+        return covariance
 
     @property
     def df(self) -> int:
@@ -139,11 +139,11 @@ def crossfit(
     fewer than 5 groups, and UsageError for NaN or streams on other groups.
     """
     _check(streams, groups)
-    found = [_scored(stream) for stream in streams]
+    scored = [_scored(stream) for stream in streams]
     return CrossFit(
-        np.array([score for score, _ in found]) - chance,
+        np.array([score for score, _ in scored]) - chance,
         np.array([stream.peak for stream in streams]),
-        np.array([influence for _, influence in found]),
+        np.array([influence for _, influence in scored]),
         min(stream.scores.n_episodes for stream in streams),
         tuple(map(str, groups)),
         suite,
@@ -185,11 +185,11 @@ def _influence_on_choice(times: Matrix, scores: Matrix) -> Matrix:
     So few resamples give covariances even where there are none, G / R of the variance of the scores in sum of
     squares (Wager, Hastie and Efron, JMLR 15, 2014). The covariances are shrunk by that.
     """
-    found: Matrix = (times - 1) @ (scores - scores.mean()) / scores.size
-    found -= found.mean()
-    length = float(found @ found)
+    influence: Matrix = (times - 1) @ (scores - scores.mean()) / scores.size
+    influence -= influence.mean()
+    length = float(influence @ influence)
     by_few_resamples = len(times) / scores.size * float(scores.var())
-    return found * np.sqrt(max(0.0, 1 - by_few_resamples / length)) if length > 0 else found
+    return influence * np.sqrt(max(0.0, 1 - by_few_resamples / length)) if length > 0 else influence
 
 
 def smoothing(layers: ArrayLike, iterations: ArrayLike) -> Matrix:
@@ -198,15 +198,15 @@ def smoothing(layers: ArrayLike, iterations: ArrayLike) -> Matrix:
     At an edge, or beside a site that was not captured, the site stands for its missing neighbour.
     """
     places = [np.unique(np.asarray(axis), return_inverse=True)[1] for axis in (layers, iterations)]
-    row_at = {place: row for row, place in enumerate(zip(*(axis.tolist() for axis in places), strict=True))}
+    row_at = {position: row for row, position in enumerate(zip(*(axis.tolist() for axis in places), strict=True))}
     weights: Matrix = np.eye(len(row_at))
     for step in ((1, 0), (0, 1)):
         along = np.zeros_like(weights)
         for (layer, iteration), row in row_at.items():
             along[row, row] += 0.5
             for way in (1, -1):
-                beside = (layer + way * step[0], iteration + way * step[1])
-                along[row, row_at.get(beside, row)] += 0.25
+                neighbour = (layer + way * step[0], iteration + way * step[1])
+                along[row, row_at.get(neighbour, row)] += 0.25
         weights = along @ weights
     return weights
 

@@ -63,8 +63,8 @@ class Share:
                 "Leave out episodes without a value."
             )
         names, group_of = np.unique(np.asarray(groups, str), return_inverse=True)
-        own: Matrix = np.ones(each.size) if weights is None else counted[counted > 0]
-        sums, sizes = (np.bincount(group_of, part).astype(np.float64) for part in (each * own, own))
+        weight: Matrix = np.ones(each.size) if weights is None else counted[counted > 0]
+        sums, sizes = (np.bincount(group_of, part).astype(np.float64) for part in (each * weight, weight))
         return cls(names, sums, sizes)
 
     @property
@@ -84,13 +84,13 @@ class Share:
 
     @property
     def variance(self) -> float:
-        """Of the share, groups as the unit; infinite with a single group."""
+        """The variance of the share, groups as the unit; infinite with a single group."""
         return self.covariance(self)
 
     @cached_property
     def _residuals(self) -> Matrix:
-        rest: Matrix = (self.sums - self.value * self.sizes) / self.sizes.sum()
-        return rest
+        residuals: Matrix = (self.sums - self.value * self.sizes) / self.sizes.sum()
+        return residuals
 
     def covariance(self, other: "Share") -> float:
         """Covariance of two shares on the same groups; 0 where the groups are not the same."""
@@ -162,8 +162,8 @@ def group_shares(sums: Matrix, sizes: Matrix) -> tuple[Matrix, Matrix]:
     """
     total, count = sizes.sum(), sizes.size
     shares: Matrix = sums.sum(axis=1) / total
-    rest = sums - shares[:, None] * sizes
-    variances: Matrix = (rest**2).sum(axis=1) * count / (count - 1) / total**2
+    residuals = sums - shares[:, None] * sizes
+    variances: Matrix = (residuals**2).sum(axis=1) * count / (count - 1) / total**2
     return shares, variances
 
 

@@ -56,7 +56,7 @@ def findable(sites: GroupSums, threshold: float) -> float:
 
 
 def permuted_threshold(null: Matrix) -> float:
-    """What the best of (S, P) permuted accuracies stays below in 95 %; infinite with too few permutations."""
+    """Return the 95 % point of the best of (S, P) permuted accuracies; infinite with too few permutations."""
     if null.shape[1] < FEWEST_PERMUTATIONS:
         return inf
     return float(np.percentile(null.max(axis=0), 100 * (1 - SIGNIFICANCE)))
@@ -71,7 +71,7 @@ def is_absent(most: float, least: float, absent_below: float = ABSENT_BELOW) -> 
 
 
 def verdict(signal: bool, most: float, least: float, absent_below: float = ABSENT_BELOW) -> Verdict:
-    """What was found: `shown`, `absent` as `is_absent` says, else `not shown`.
+    """Return the verdict: `shown`, `absent` as `is_absent` says, else `not shown`.
 
     signal: above chance family-wise and better than every control that was run. What is absent is an accuracy that
     a linear probe of so many items has: with more items a probe may have more.

@@ -43,42 +43,42 @@ class BuiltinColumn:
 class Instant:
     """A frame of a trajectory, and the side of the correct picture."""
 
-    seen: Any
+    trajectory: Any
     side: str
     frame: int
 
     def tool(self, axis: int) -> float:
-        """Where the hand is, metres in the world frame."""
-        return float(self.seen.tool[self.frame, axis])
+        """Return a coordinate of the hand, metres in the world frame."""
+        return float(self.trajectory.tool[self.frame, axis])
 
     def cube(self, axis: int) -> float:
-        """Where the cube is, metres in the world frame."""
-        return float(self.seen.cube[self.frame, axis])
+        """Return a coordinate of the cube, metres in the world frame."""
+        return float(self.trajectory.cube[self.frame, axis])
 
     @property
     def distance_correct(self) -> float:
-        """Of the cube to the middle of the correct picture, from above, metres."""
-        away = self.seen.cube[self.frame, :2] - self.seen.tile(self.side)[self.frame, :2]
+        """The distance of the cube from the middle of the correct picture, from above, metres."""
+        away = self.trajectory.cube[self.frame, :2] - self.trajectory.tile(self.side)[self.frame, :2]
         return float(np.hypot(*away))
 
     @property
     def steps_to_grasp(self) -> float | None:
         """Control steps to the first grasp, negative behind it; None if there is none."""
-        held = self._held
-        return float(held[0] - self.frame) if held.size else None
+        held_frames = self._held
+        return float(held_frames[0] - self.frame) if held_frames.size else None
 
     @property
     def phase(self) -> str:
         """One of PHASES; the release is the last one of the episode."""
-        held = self._held
-        if not held.size or self.frame < held[0]:
+        held_frames = self._held
+        if not held_frames.size or self.frame < held_frames[0]:
             return PHASES[0]
-        return PHASES[1] if self.frame <= held[-1] else PHASES[2]
+        return PHASES[1] if self.frame <= held_frames[-1] else PHASES[2]
 
     @property
     def _held(self) -> NDArray[np.intp]:
         """Frames in which both fingers touch the cube."""
-        return np.flatnonzero(self.seen.held)
+        return np.flatnonzero(self.trajectory.held)
 
 
 SIM_COLUMNS: dict[str, tuple[Task, Callable[[Instant], Cell]]] = {
@@ -90,7 +90,7 @@ SIM_COLUMNS: dict[str, tuple[Task, Callable[[Instant], Cell]]] = {
     "cube_z": ("continuous", lambda at: at.cube(2)),
     "distance_correct": ("continuous", lambda at: at.distance_correct),
     "steps_to_grasp": ("continuous", lambda at: at.steps_to_grasp),
-    "held": ("binary", lambda at: bool(at.seen.held[at.frame])),
+    "held": ("binary", lambda at: bool(at.trajectory.held[at.frame])),
     "phase": ("classes", lambda at: at.phase),
 }
 """Task and value of every `sim.*` column."""
@@ -112,9 +112,9 @@ def builtin_column(run: RunReader, name: str) -> BuiltinColumn:
     """
     if name.startswith(SIM) and name.removeprefix(SIM) in SIM_COLUMNS:
         task, value = SIM_COLUMNS[name.removeprefix(SIM)]
-        found = list(_inferences(run))
+        pairs = list(_inferences(run))
         of_frames = _of_frames(run, [value])
-        keys = tuple(zip(*found, strict=True)) or ((), ())
+        keys = tuple(zip(*pairs, strict=True)) or ((), ())
         return BuiltinColumn(task, keys[0], keys[1], tuple(cells[0] for cells in of_frames))
     if name.startswith(ITEM) and name.removeprefix(ITEM) in ITEM_COLUMNS:
         ids = tuple(run.episodes[EPISODE].astype(str))
@@ -130,16 +130,19 @@ def builtin_column(run: RunReader, name: str) -> BuiltinColumn:
 def _of_source(run: RunReader, name: str) -> BuiltinColumn:
     """A column of the data set or environment for every shown frame, such as `dataset.state.x` or `env.held`."""
     prefix, columns = prefix_of(run), recorded_columns(run)
-    wanted = name.removeprefix(prefix)
-    if not name.startswith(prefix) or wanted not in columns:
-        asked = "recordings" if name.startswith(RECORDED) else "an environment of your own"
-        there = ", ".join(prefix + one for one in columns) or f"none, because the run is not of {asked}"
-        raise UsageError(f"{run.location} has no column {name}; there are: {there}")
-    found = list(_inferences(run))
-    rows = _rows(run, [episode for episode, _ in found])
-    calls = [call for _, call in found]
-    cells = _cells(run, wanted, columns[wanted][rows, calls])
-    episodes, inferences = zip(*found, strict=True)
+    column = name.removeprefix(prefix)
+    if not name.startswith(prefix) or column not in columns:
+        source = "recordings" if name.startswith(RECORDED) else "an environment of your own"
+        available = (
+            ", ".join(prefix + known_column for known_column in columns)
+            or f"none, because the run is not of {source}"
+        )
+        raise UsageError(f"{run.location} has no column {name}; there are: {available}")
+    pairs = list(_inferences(run))
+    rows = _rows(run, [episode for episode, _ in pairs])
+    calls = [call for _, call in pairs]
+    cells = _cells(run, column, columns[column][rows, calls])
+    episodes, inferences = zip(*pairs, strict=True)
     return BuiltinColumn(None, episodes, inferences, cells)
 
 
@@ -152,7 +155,7 @@ def _cells(run: RunReader, name: str, values: NDArray[np.float64]) -> tuple[Cell
 
 
 def prefix_of(run: RunReader) -> str:
-    """In front of the columns of a run's own source."""
+    """Return the prefix of the columns of a run's own source."""
     return PLAYED if getattr(run, "in_own_environment", False) else RECORDED
 
 
@@ -168,15 +171,15 @@ def recorded_columns(run: RunReader) -> dict[str, NDArray[np.float64]]:
     inputs = getattr(run, "inputs", None)
     if inputs is None:
         return {}
-    found = {name: inputs.column(name) for name in inputs.columns}
+    columns = {name: inputs.column(name) for name in inputs.columns}
     for kind, names in inputs.names.items():
         if kind in inputs.kinds:
             values = inputs.read(kind)
             now = values if kind == "state" else values[:, :, 0]
-            found |= {f"{kind}.{name}": now[..., place].astype(np.float64) for place, name in enumerate(names)}
+            columns |= {f"{kind}.{name}": now[..., number].astype(np.float64) for number, name in enumerate(names)}
     if getattr(run, "recorded", False) and why_not_compared(run) is None:  # type: ignore[arg-type]  # only runs have inputs
-        found[ACTION_ERROR] = compare_actions(run).of_frames[0]  # type: ignore[arg-type]
-    return found
+        columns[ACTION_ERROR] = compare_actions(run).of_frames[0]  # type: ignore[arg-type]
+    return columns
 
 
 def is_builtin(name: str) -> bool:
@@ -216,8 +219,8 @@ def label_frame(run: RunReader) -> "pd.DataFrame":
     if getattr(run, "inputs", None) is not None:
         table["instruction"] = run.episodes["instruction"].iloc[rows].tolist()
         sim = {
-            prefix_of(run) + name: list(_cells(run, name, own[rows, list(inferences)]))
-            for name, own in recorded_columns(run).items()
+            prefix_of(run) + name: list(_cells(run, name, column[rows, list(inferences)]))
+            for name, column in recorded_columns(run).items()
         }
         sim |= {name: [cells[row] for row in rows] for name, cells in outcome_column(run).items()}
     for name in ("group_id", "category"):
@@ -240,8 +243,8 @@ def why_no_sim(run: RunReader) -> str | None:
 
 
 def _rows(run: RunReader, ids: Sequence[str]) -> NDArray[np.intp]:
-    place = {name: row for row, name in enumerate(run.episodes[EPISODE].astype(str))}
-    return np.array([place[name] for name in ids], np.intp)
+    row_of = {name: row for row, name in enumerate(run.episodes[EPISODE].astype(str))}
+    return np.array([row_of[name] for name in ids], np.intp)
 
 
 def _inferences(run: RunReader) -> Iterator[tuple[str, int]]:
@@ -260,16 +263,16 @@ def frames_of_inferences(run: RunReader) -> Iterator[tuple[Any, int, list[int]]]
     if not hasattr(run, "trajectories") or not hasattr(run, "control_steps"):
         raise UsageError(f"{run.location} has no trajectories; `sim.*` and the state need them")
     trajectories, steps, reached = run.trajectories, run.control_steps, reached_calls(run)
-    for row, seen in enumerate(trajectories):
-        yield seen, row, steps[row, np.flatnonzero(reached[row])].astype(int).tolist()
+    for row, trajectory in enumerate(trajectories):
+        yield trajectory, row, steps[row, np.flatnonzero(reached[row])].astype(int).tolist()
 
 
 def _of_frames(run: RunReader, values: Sequence[Callable[[Instant], Cell]]) -> Iterator[list[Cell]]:
     """The cells of some `sim.*` columns for every captured inference."""
-    for seen, row, frames in frames_of_inferences(run):
+    for trajectory, row, frames in frames_of_inferences(run):
         side = str(run.episodes["side_correct"].iloc[row])
         for frame in frames:
-            yield [_finite(value(Instant(seen, side, frame))) for value in values]
+            yield [_finite(value(Instant(trajectory, side, frame))) for value in values]
 
 
 def _finite(value: Cell) -> Cell:
@@ -292,6 +295,6 @@ def _of_item(run: RunReader, name: str) -> Iterator[Cell]:
             yield row["category"]
             continue
         correct, wrong, side = (row[column] for column in _needed(name))
-        left = correct if side == "left" else wrong
+        left_concept = correct if side == "left" else wrong
         pair = " / ".join(sorted((correct, wrong)))
-        yield {"named": correct, "other": wrong, "left": left, "pair": pair}[name]
+        yield {"named": correct, "other": wrong, "left": left_concept, "pair": pair}[name]

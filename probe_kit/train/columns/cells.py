@@ -59,14 +59,14 @@ def _answers(cells: Sequence[Cell], where: Where) -> list[Cell] | None:
     """Truth values, or the texts `yes` and `no`; None for a column of anything else."""
     words = {cell.lower() for cell in cells if isinstance(cell, str)}
     words |= {str(cell).lower() for cell in cells if isinstance(cell, bool)}
-    others = any(isinstance(cell, int | float) and not isinstance(cell, bool) for cell in cells)
+    has_numbers = any(isinstance(cell, int | float) and not isinstance(cell, bool) for cell in cells)
     strange = _FOREIGN if words <= set(_ANSWERS) | _FOREIGN else _FOREIGN | set(_ANSWERS) - {"yes", "no"}
     if words & {"yes", "no"} and (foreign := words & strange):
         row = next(row for row, cell in enumerate(cells) if isinstance(cell, str) and cell.lower() in foreign)
         raise UsageError(
             f"{where(row)} is {cells[row]!r} in a column of yes and no; expected yes or no. Write one"
         )
-    if others or not words:
+    if has_numbers or not words:
         return None
     if words <= set(_BOOLEANS) and words & {"true", "false"}:
         return [_word(cell, _BOOLEANS) for cell in cells]

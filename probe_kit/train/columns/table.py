@@ -54,8 +54,8 @@ class LabelTable:
 
     def where(self, row: int, column: str | None = None) -> str:
         """The place of a cell, as errors name it."""
-        place = f"{self.source}, {self.unit} {self.lines[row]}"
-        return place if column is None else f"{place}, column {terminal_safe(column)!r}"
+        line = f"{self.source}, {self.unit} {self.lines[row]}"
+        return line if column is None else f"{line}, column {terminal_safe(column)!r}"
 
     def at(self, rows: Sequence[int]) -> "LabelTable":
         """The table of some rows."""
@@ -138,27 +138,27 @@ class LabelTable:
             if isinf(cell):
                 raise UsageError(f"{self.where(row, column)} is infinite; expected a finite number or no entry")
             return "number"
-        if found := UNSAFE.search(str(cell)):
+        if unsafe := UNSAFE.search(str(cell)):
             raise UsageError(
-                f"{self.where(row, column)} holds the control or direction character U+{ord(found[0]):04X}; "
+                f"{self.where(row, column)} holds the control or direction character U+{ord(unsafe[0]):04X}; "
                 "expected plain text. Remove it"
             )
         return "text"
 
 
-def read_table(table: "Path | str | pd.DataFrame", wanted: Sequence[str]) -> LabelTable:
-    """The key columns and the columns `wanted` of a table. wanted: those that it lacks are left out.
+def read_table(table: "Path | str | pd.DataFrame", requested: Sequence[str]) -> LabelTable:
+    """The key columns and the columns `requested` of a table. requested: those that it lacks are left out.
 
     table: a CSV file (see `open_table`), a Parquet file (`.parquet`), or a DataFrame. Raises UsageError for a file
     that is no such table, or has no column `episode_id`; MissingExtraError for Parquet without pyarrow.
     """
     if not isinstance(table, str | Path):
-        return _of_frame(table, "DataFrame", wanted)
+        return _of_frame(table, "DataFrame", requested)
     path = Path(table)
     if path.suffix.lower() in (".parquet", ".pq"):
         _check_file(path)
-        return _of_parquet(path, wanted)
-    return _of_csv(path, wanted)
+        return _of_parquet(path, requested)
+    return _of_csv(path, requested)
 
 
 def _check_file(path: Path) -> None:
@@ -168,9 +168,9 @@ def _check_file(path: Path) -> None:
         raise UsageError(f"{path} cannot be read: {error.strerror}. Give a CSV or Parquet file") from error
 
 
-def _of_csv(path: Path, wanted: Sequence[str]) -> LabelTable:
+def _of_csv(path: Path, requested: Sequence[str]) -> LabelTable:
     opened = open_table(path, (EPISODE, SOURCE))
-    read = list(_places(opened.names, wanted, str(path), opened.line))
+    read = list(_places(opened.names, requested, str(path), opened.line))
     columns: dict[str, list[Cell]] = {name: [] for name in read}
     lines = []
     for line, cells in opened.rows(read):
@@ -180,17 +180,17 @@ def _of_csv(path: Path, wanted: Sequence[str]) -> LabelTable:
     return LabelTable(str(path), "line", opened.names, columns, lines, opened.separator == ";")
 
 
-def _places(names: Sequence[str], wanted: Sequence[str], source: str, line: int = 1) -> dict[str, int]:
+def _places(names: Sequence[str], requested: Sequence[str], source: str, line: int = 1) -> dict[str, int]:
     """Position of every column to read. Raises UsageError without the key, and for a name used twice."""
     if EPISODE not in names and SOURCE not in names:
-        shown = ", ".join(terminal_safe(name) for name in names[:12]) or "no column"
+        listed = ", ".join(terminal_safe(name) for name in names[:12]) or "no column"
         raise UsageError(
-            f"{source}, line {line} lacks the key column {EPISODE!r}; it has {shown}. "
+            f"{source}, line {line} lacks the key column {EPISODE!r}; it has {listed}. "
             f"{_other_delimiter(names)}`probe-kit labels RUN` writes a table with the keys of a run"
         )
     keys = (EPISODE, INFERENCE) if EPISODE in names else (SOURCE, FRAME)
-    read = [name for name in dict.fromkeys((*keys, *wanted)) if name in names]
-    if unsafe := [found for name in read if (found := UNSAFE.search(name))]:
+    read = [name for name in dict.fromkeys((*keys, *requested)) if name in names]
+    if unsafe := [character for name in read if (character := UNSAFE.search(name))]:
         raise UsageError(
             f"{source}, line {line}: the name of a column holds the control or direction character "
             f"U+{ord(unsafe[0][0]):04X}; expected plain text. Rename the column"
@@ -203,9 +203,9 @@ def _places(names: Sequence[str], wanted: Sequence[str], source: str, line: int 
 
 
 def _other_delimiter(names: Sequence[str]) -> str:
-    """What to do about a heading that has the key beside another delimiter than a comma."""
+    """Return advice for a heading that holds the key and another delimiter than a comma; empty for others."""
     for delimiter, name in (("|", "bars"), (":", "colons")):
-        fields = {field.strip().strip('"') for one in names for field in one.split(delimiter)}
+        fields = {field.strip().strip('"') for heading in names for field in heading.split(delimiter)}
         if len(fields) > len(names) and fields & {EPISODE, SOURCE}:
             return f"Its fields are separated by {name}; save it with commas, semicolons or tabs. "
     return ""
@@ -216,14 +216,14 @@ def _short(number: int) -> str:
     return digits if len(digits) <= 40 else f"{digits[:12]}… of {len(digits)} digits or more"
 
 
-def _of_parquet(path: Path, wanted: Sequence[str]) -> LabelTable:
+def _of_parquet(path: Path, requested: Sequence[str]) -> LabelTable:
     """Cells by arrow, because pandas rounds large integers beside empty cells."""
     require("pyarrow.parquet", "export")
     try:
         with open_parquet(path, "export") as file:
             names = file.schema_arrow.names
-            place = _places(names, wanted, str(path))
-            read = read_parquet(file, list(place))
+            position_of = _places(names, requested, str(path))
+            read = read_parquet(file, list(position_of))
     except UsageError:
         raise
     except OSError as error:
@@ -232,16 +232,16 @@ def _of_parquet(path: Path, wanted: Sequence[str]) -> LabelTable:
     except Exception as error:  # pyarrow raises many kinds for files that are no Parquet
         reason = str(error).rstrip(".")
         raise UsageError(f"{path} is no Parquet file: {reason}. Write it again, or give a CSV file") from error
-    cells = {name: read.column(name).to_pylist() for name in place}
+    cells = {name: read.column(name).to_pylist() for name in position_of}
     return _of_cells(cells, tuple(names), len(read), str(path))
 
 
-def _of_frame(frame: "pd.DataFrame", source: str, wanted: Sequence[str]) -> LabelTable:
+def _of_frame(frame: "pd.DataFrame", source: str, requested: Sequence[str]) -> LabelTable:
     if any(name is not None for name in frame.index.names):
         frame = frame.reset_index()
     names = [str(name) for name in frame.columns]
-    place = _places(names, wanted, source)
-    cells = {name: frame.iloc[:, number].tolist() for name, number in place.items()}
+    position_of = _places(names, requested, source)
+    cells = {name: frame.iloc[:, number].tolist() for name, number in position_of.items()}
     return _of_cells(cells, tuple(names), len(frame), source)
 
 

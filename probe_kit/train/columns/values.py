@@ -38,8 +38,8 @@ class LabelValues:
         if not self.classes:
             return LabelValues(self.task, (), values)
         present = np.unique(values[np.isfinite(values)])
-        place = np.where(np.isfinite(values), np.searchsorted(present, values), np.nan)
-        return LabelValues(self.task, tuple(self.classes[int(code)] for code in present), place)
+        codes = np.where(np.isfinite(values), np.searchsorted(present, values), np.nan)
+        return LabelValues(self.task, tuple(self.classes[int(code)] for code in present), codes)
 
 
 def code_labels(cells: Sequence[Cell], task: Task | None, target: str) -> LabelValues:
@@ -53,17 +53,17 @@ def code_labels(cells: Sequence[Cell], task: Task | None, target: str) -> LabelV
     present = [_whole(cell) for cell in cells if cell is not None]
     distinct = sorted(set(present))  # type: ignore[type-var]  # of one kind, so that they can be ordered
     if len(distinct) < 2:
-        seen = f"one value, {distinct[0]!r}" if distinct else "no value"
-        raise UsageError(f"column {target!r} has {seen}; expected two or more. There is nothing to decode")
-    chosen = task or _only_task(distinct, target)
-    _check_task(chosen, distinct, target)
-    if chosen == "continuous":
+        contents = f"one value, {distinct[0]!r}" if distinct else "no value"
+        raise UsageError(f"column {target!r} has {contents}; expected two or more. There is nothing to decode")
+    fitting_task = task or _only_task(distinct, target)
+    _check_task(fitting_task, distinct, target)
+    if fitting_task == "continuous":
         numbers = np.array([np.nan if cell is None else float(cell) for cell in cells], np.float64)
         _check_squares(numbers, target)
-        return LabelValues(chosen, (), numbers)
+        return LabelValues(fitting_task, (), numbers)
     code = {value: number for number, value in enumerate(distinct)}
     codes = [np.nan if cell is None else code[_whole(cell)] for cell in cells]
-    return LabelValues(chosen, tuple(map(str, distinct)), np.array(codes, np.float64))
+    return LabelValues(fitting_task, tuple(map(str, distinct)), np.array(codes, np.float64))
 
 
 def _whole(cell: Cell) -> Cell:
@@ -102,14 +102,14 @@ def _check_task(task: Task, distinct: Sequence[Cell], target: str) -> None:
             f"{'binary' if len(distinct) == 2 else 'classes'}"
         )
     if task == "binary" and len(distinct) != 2:
-        shown = ", ".join(repr(value) for value in distinct[:4])
+        listed = ", ".join(repr(value) for value in distinct[:4])
         raise UsageError(
-            f"column {target!r} has {len(distinct)} values ({shown}, …); a binary label needs two. "
+            f"column {target!r} has {len(distinct)} values ({listed}, …); a binary label needs two. "
             "Use --task classes or --task continuous"
         )
     if task == "classes" and not all(isinstance(value, str | int) for value in distinct):
-        found = next(value for value in distinct if not isinstance(value, str | int))
+        decimal = next(value for value in distinct if not isinstance(value, str | int))
         raise UsageError(
-            f"column {target!r} has decimals such as {cast(float, found)!r}; classes need texts or integers. Use "
-            "--task continuous, or write the classes as words"
+            f"column {target!r} has decimals such as {cast(float, decimal)!r}; classes need texts or integers. "
+            "Use --task continuous, or write the classes as words"
         )

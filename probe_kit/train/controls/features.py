@@ -46,8 +46,8 @@ class ControlInputs:
 
     def features(self, name: str) -> Features:
         """(n, D) features of a control but `random-features`."""
-        if name in (own := control_features(self.run)):
-            return own[name][self.samples.rows].astype(np.float32)
+        if name in (array_features := control_features(self.run)):
+            return array_features[name][self.samples.rows].astype(np.float32)
         if name == "instruction":
             return self._words()
         makers: dict[str, Callable[[], Features]] = {
@@ -112,8 +112,8 @@ class ControlInputs:
         if self.recorded is not None:
             return small_pictures(self._recorded("pixels"), side)
         assert self.suite is not None, "a control that needs pictures is given the suite"
-        rows, place = np.unique(self.samples.rows, return_inverse=True)
-        return tile_pixels(self.run.episodes.iloc[rows], self.suite, side)[place]
+        rows, row_number = np.unique(self.samples.rows, return_inverse=True)
+        return tile_pixels(self.run.episodes.iloc[rows], self.suite, side)[row_number]
 
 
 def why_impossible(run: RunReader, samples: TargetSamples) -> dict[str, str]:
@@ -192,7 +192,9 @@ def small_pictures(pixels: NDArray[np.uint8], side: int) -> Features:
 
     box = Image.Resampling.BOX
     rows = [
-        np.concatenate([np.asarray(Image.fromarray(one).resize((side, side), box)).ravel() for one in cameras])
+        np.concatenate(
+            [np.asarray(Image.fromarray(picture).resize((side, side), box)).ravel() for picture in cameras]
+        )
         for cameras in pixels
     ]
     return np.stack(rows).astype(np.float32) / np.float32(255)
@@ -217,13 +219,13 @@ def state_features(run: RunReader, samples: TargetSamples) -> Features:
     Raises UsageError for a run without trajectories or control steps.
     """
     of_row: dict[int, list[int]] = {}
-    for place, row in enumerate(samples.rows.tolist()):
-        of_row.setdefault(row, []).append(place)
+    for position, row in enumerate(samples.rows.tolist()):
+        of_row.setdefault(row, []).append(position)
     features = np.empty((samples.rows.size, 7), np.float32)
     for trajectory, row, frames in frames_of_inferences(run):
-        for place in of_row.get(row, ()):
-            frame = frames[samples.inferences[place]]
-            features[place] = [*trajectory.tool[frame], trajectory.opening[frame]]
+        for position in of_row.get(row, ()):
+            frame = frames[samples.inferences[position]]
+            features[position] = [*trajectory.tool[frame], trajectory.opening[frame]]
     return features
 
 

@@ -67,19 +67,19 @@ def prepare_controls(
     pictures are missing. folder: of the run's suite, see `suite_of`. Raises UsageError for a control that was
     asked for and is unknown or not possible, and what `suite_of` raises.
     """
-    own = control_features(run)
-    available = (*own, *(name for name in CONTROLS if name not in own))
+    array_features = control_features(run)
+    available = (*array_features, *(name for name in CONTROLS if name not in array_features))
     if unknown := [name for name in names or () if name not in available]:
         raise UsageError(f"unknown control {unknown[0]!r}; expected some of {', '.join(available)}")
     default = SIDE_DEFAULT if is_side else tuple(name for name in available if name not in NOT_BY_DEFAULT)
     ordered = [name for name in available if name in (default if names is None else names)]
-    reasons = {name: why for name, why in why_impossible(run, samples).items() if name not in own}
+    reasons = {name: why for name, why in why_impossible(run, samples).items() if name not in array_features}
     if names is not None and (wrong := [name for name in ordered if name in reasons]):
         raise UsageError(f"the control {wrong[0]!r} is not possible: {reasons[wrong[0]]}. Leave it out")
     left_out = {name: reasons[name] for name in ordered if name in reasons}
     missing = [name for name in ordered if name not in reasons and not stored.has(name, categories)]
     suite = None
-    if PICTURED.intersection(missing).difference(own) and getattr(run, "inputs", None) is None:
+    if PICTURED.intersection(missing).difference(array_features) and getattr(run, "inputs", None) is None:
         try:
             suite = suite_of(run, folder)
         except SuiteNotFoundError as error:
@@ -177,8 +177,8 @@ def control_score(name: str, category: str, curve: ProbeCurve, stream: str = "",
 def _compared(
     results: ProbeResults, name: str, category: str, references: Mapping[str, ProbeCurve]
 ) -> Iterator[ControlComparison]:
-    for (own, view), curve in results.curves.items():
-        for stream in curve.streams if own == category else ():
+    for (curve_category, view), curve in results.curves.items():
+        for stream in curve.streams if curve_category == category else ():
             rows, reference = curve.stream(stream), references[stream].scores.mean(axis=0)
             seed = comparison_seed(results.settings, name, category, view, stream)
             p = better_than_reference(curve.scores[rows], reference, curve.groups, seed, curve.widening)
@@ -189,8 +189,8 @@ def comparison_seed(settings: ProbeSettings, name: str, category: str, view: str
     """Return the seed of the resamples that compare a stream in a category and view with a control."""
     if settings.is_side:
         return derive_seed(_SIDE_SEEDS[name], settings.seed, category, view, stream)
-    place = (view, stream) if settings.categories == (EVERYWHERE,) else (category, view, stream)
-    return derive_seed("label control", settings.seed, name, *place)
+    parts = (view, stream) if settings.categories == (EVERYWHERE,) else (category, view, stream)
+    return derive_seed("label control", settings.seed, name, *parts)
 
 
 def comparisons(

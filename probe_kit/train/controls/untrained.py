@@ -44,24 +44,33 @@ def check_same_source(run: RunReader, untrained: RunReader, samples: TargetSampl
 
 
 def check_untrained(
-    run: RunReader, untrained: RunReader, samples: TargetSamples, others: TargetSamples, is_side: bool, call: int
+    run: RunReader,
+    untrained: RunReader,
+    samples: TargetSamples,
+    untrained_samples: TargetSamples,
+    is_side: bool,
+    call: int,
 ) -> None:
     """Raise UsageError unless `untrained` is another run of the same episodes, instructions, frames and labels.
 
     samples, others: of the two runs. Of a target that is no side also for inferences after the first of a network
     that acted: the frames it was shown then follow from its own actions.
     """
-    own, other = (_identities(*pair) for pair in ((run, samples), (untrained, others)))
-    if own != other:
+    identities, untrained_identities = (
+        _identities(*pair) for pair in ((run, samples), (untrained, untrained_samples))
+    )
+    if identities != untrained_identities:
         advice = "Extract both by the same command, one with --random-weights"
         if call > 0:
             advice = (
                 f"Not the same episodes got as far as captured inference {call}: leave --call or --untrained out"
             )
-        differing = next((f"; the first is {a[0]!r}" for a, b in zip(own, other, strict=False) if a != b), "")
+        pairs = zip(identities, untrained_identities, strict=False)
+        differing = next((f"; the first is {first!r}" for first, second in pairs if first != second), "")
         raise UsageError(
-            f"the untrained control {untrained.model!r} has {len(other)} samples to probe, {run.model!r} has "
-            f"{len(own)}, and they are not the same in episode, instruction and label{differing}. {advice}."
+            f"the untrained control {untrained.model!r} has {len(untrained_identities)} samples to probe, "
+            f"{run.model!r} has {len(identities)}, and they are not the same in episode, instruction and "
+            f"label{differing}. {advice}."
         )
     if run.settings_sha256 == untrained.settings_sha256:
         raise UsageError(
@@ -69,7 +78,7 @@ def check_untrained(
             "give a run of other weights"
         )
     if not is_side:
-        _check_frames(run, untrained, samples, others)
+        _check_frames(run, untrained, samples, untrained_samples)
 
 
 def _identities(run: RunReader, samples: TargetSamples) -> list[tuple[str, str, int, float]]:
@@ -82,8 +91,8 @@ def _identities(run: RunReader, samples: TargetSamples) -> list[tuple[str, str, 
 
 
 def _check_settings(run: RunReader, untrained: RunReader) -> None:
-    own, other = (getattr(one, "settings", {}) for one in (run, untrained))
-    if differing := [name for name in _SHOWN if _identity(own, name) != _identity(other, name)]:
+    settings, untrained_settings = (getattr(reader, "settings", {}) for reader in (run, untrained))
+    if differing := [name for name in _SHOWN if _identity(settings, name) != _identity(untrained_settings, name)]:
         raise UsageError(
             f"the untrained control {untrained.location} has another {differing[0]} than {run.location}; expected "
             "the same frames. Extract both by the same command, one with --random-weights"
@@ -95,11 +104,13 @@ def _identity(settings: Any, name: str) -> Any:
     return value.get("identity", value) if isinstance(value, dict) else value
 
 
-def _check_frames(run: RunReader, untrained: RunReader, samples: TargetSamples, others: TargetSamples) -> None:
+def _check_frames(
+    run: RunReader, untrained: RunReader, samples: TargetSamples, untrained_samples: TargetSamples
+) -> None:
     if getattr(run, "recorded", False):
         frames, other_frames = (
-            one.control_steps[of.rows, of.inferences]  # type: ignore[attr-defined]
-            for one, of in ((run, samples), (untrained, others))
+            reader.control_steps[reader_samples.rows, reader_samples.inferences]  # type: ignore[attr-defined]
+            for reader, reader_samples in ((run, samples), (untrained, untrained_samples))
         )
         if (frames != other_frames).any():
             raise UsageError(
@@ -122,23 +133,21 @@ def add_untrained(results: ProbeResults, untrained: ProbeResults) -> ProbeResult
     gains: list[UntrainedScore] = []
     scores: list[ControlScore] = []
     compared: list[ControlComparison] = []
-    for place, curve in results.curves.items():
-        other = untrained.curves[place]
-        _check_samples(place[0], curve, other, untrained.label)
+    for key, curve in results.curves.items():
+        other = untrained.curves[key]
+        _check_samples(key[0], curve, other, untrained.label)
         if curve.is_side:
-            gains += _gains(place, curve, other, untrained)
+            gains += _gains(key, curve, other, untrained)
         for stream in curve.streams:
-            if not (others := other.stream(stream)).size:
+            if not (other_rows := other.stream(stream)).size:
                 raise UsageError(
-                    f"the untrained control {untrained.label!r} has no {place[1]!r} of the stream {stream}; "
+                    f"the untrained control {untrained.label!r} has no {key[1]!r} of the stream {stream}; "
                     "expected all streams of the run. Extract both by the same command"
                 )
             if not curve.is_side:
                 best = replace(other, **_only(other, other.best(stream)))
-                scores.append(
-                    replace(control_score(UNTRAINED, place[0], best, stream, place[1]), chance=None, p=None)
-                )
-            compared += _compared(results, place, stream, other.scores[others])
+                scores.append(replace(control_score(UNTRAINED, key[0], best, stream, key[1]), chance=None, p=None))
+            compared += _compared(results, key, stream, other.scores[other_rows])
     controls = results.controls.with_untrained(gains).with_scores(scores, compared)
     return replace(results, controls=controls)
 
@@ -159,36 +168,36 @@ def _check_samples(category: str, curve: ProbeCurve, other: ProbeCurve, name: st
 
 
 def _compared(
-    results: ProbeResults, place: tuple[str, str], stream: str, others: NDArray[np.float64]
+    results: ProbeResults, key: tuple[str, str], stream: str, other_scores: NDArray[np.float64]
 ) -> Iterator[ControlComparison]:
     """Yield every site of a stream against the best of the untrained network's."""
-    curve = results.curves[place]
-    rows, seed = curve.stream(stream), comparison_seed(results.settings, UNTRAINED, *place, stream)
-    p = better_than_best(curve.scores[rows], others, curve.groups, seed, curve.widening)
-    yield from comparisons(UNTRAINED, *place, curve, rows, float(others.mean(axis=1).max()), p)
+    curve = results.curves[key]
+    rows, seed = curve.stream(stream), comparison_seed(results.settings, UNTRAINED, *key, stream)
+    p = better_than_best(curve.scores[rows], other_scores, curve.groups, seed, curve.widening)
+    yield from comparisons(UNTRAINED, *key, curve, rows, float(other_scores.mean(axis=1).max()), p)
 
 
 def _gains(
-    place: tuple[str, str], curve: ProbeCurve, other: ProbeCurve, untrained: ProbeResults
+    key: tuple[str, str], curve: ProbeCurve, other: ProbeCurve, untrained: ProbeResults
 ) -> Iterator[UntrainedScore]:
     """Yield the gain of every site, and of the best one of every stream."""
     pairs = [(row, other.sites.index(site), False) for row, site in enumerate(curve.sites) if site in other.sites]
     streams = [name for name in curve.streams if other.stream(name).size]
     pairs += [(curve.best(stream), other.best(stream), True) for stream in streams]
-    own, others = (
+    correct, untrained_correct = (
         c.correct[[pair[side] for pair in pairs]].T.astype(float) for side, c in enumerate((curve, other))
     )
     for column, (row, untrained_row, peak) in enumerate(pairs):
-        here, there = own[:, column], others[:, column]
-        gap = Accuracy.of(here, curve.groups).difference(Accuracy.of(there, curve.groups))
+        hits, untrained_hits = correct[:, column], untrained_correct[:, column]
+        gap = Accuracy.of(hits, curve.groups).difference(Accuracy.of(untrained_hits, curve.groups))
         yield UntrainedScore(
-            *place,
+            *key,
             site=str(curve.sites[row]),
             untrained_site=str(other.sites[untrained_row]),
             peak=peak,
-            accuracy=float(here.mean()),
-            untrained_accuracy=float(there.mean()),
-            difference=float((own - others)[:, column].mean()),
+            accuracy=float(hits.mean()),
+            untrained_accuracy=float(untrained_hits.mean()),
+            difference=float((correct - untrained_correct)[:, column].mean()),
             ci=(gap.low, gap.high),
             untrained=untrained.label + (" (random weights)" if untrained.settings.random_weights else ""),
         )

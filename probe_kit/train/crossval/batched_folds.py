@@ -37,18 +37,22 @@ def cross_validate_together(
 
     Raises ProbeNotConvergedError, and TooFewGroupsError for a training set with a single class.
     """
-    inner = _at_once([one for nested in folds for one in nested.inner], labels)
+    inner = _at_once([fold for nested in folds for fold in nested.inner], labels)
     parts = [_Together.of(samples, labels, some).losses() for some in inner]
     loss, by_episode = (np.concatenate(part, axis=1) for part in zip(*parts, strict=True))
     begins = np.cumsum([0, *(len(nested.inner) for nested in folds[:-1])])
     loss, by_episode = (np.add.reduceat(part, begins, axis=1) for part in (loss, by_episode))
-    chosen = select_c(loss)
-    found = [
-        (STRENGTHS[chosen[number]], InnerQuality.of(-loss[:, number], -by_episode[:, number], chosen[number]))
+    best = select_c(loss)
+    choices = [
+        (STRENGTHS[best[number]], InnerQuality.of(-loss[:, number], -by_episode[:, number], best[number]))
         for number in range(len(folds))
     ]
-    outer = zip(_at_once([one.outer for one in folds], labels), _at_once(found, labels), strict=True)
-    return [fitted for some, own in outer for fitted in _Together.of(samples, labels, some).fitted(own)]
+    outer = zip(_at_once([fold.outer for fold in folds], labels), _at_once(choices, labels), strict=True)
+    return [
+        fitted
+        for some, some_choices in outer
+        for fitted in _Together.of(samples, labels, some).fitted(some_choices)
+    ]
 
 
 def _at_once[T](folds: Iterable[T], labels: NDArray[np.bool_]) -> Iterator[tuple[T, ...]]:
@@ -73,8 +77,10 @@ class _Together:
     @classmethod
     def of(cls, samples: Samples, labels: NDArray[np.bool_], folds: Sequence[Fold]) -> "_Together":
         coordinates = [Projection.fit(samples.of(fold.train).features) for fold in folds]
-        held_out = [one(samples.of(fold.test).means) for one, fold in zip(coordinates, folds, strict=True)]
-        design = StackedDesign.of_folds([one.train for one in coordinates], labels.shape[1])
+        held_out = [
+            projection(samples.of(fold.test).means) for projection, fold in zip(coordinates, folds, strict=True)
+        ]
+        design = StackedDesign.of_folds([projection.train for projection in coordinates], labels.shape[1])
         signs = np.zeros((design.shape[0], len(folds), labels.shape[1]))
         for number, fold in enumerate(folds):
             check_single_class(labels[fold.train])
@@ -91,21 +97,21 @@ class _Together:
         by_episode = np.zeros((STRENGTHS.size, len(self.folds), len(self.labels)))
         for step, weights in enumerate(self.solver.path_of_signs(self.signs, STRENGTHS)):
             parts = zip(self.held_out, self._of_folds(weights), self.folds, strict=True)
-            for number, (held_out, own, fold) in enumerate(parts):
-                decisions, truth = to_numpy(held_out @ own), self.labels[fold.test]
+            for number, (held_out, fold_weights, fold) in enumerate(parts):
+                decisions, truth = to_numpy(held_out @ fold_weights), self.labels[fold.test]
                 loss[step, number] = log_loss(decisions, truth) * fold.test.size
                 by_episode[step, number, fold.test] = log_losses(decisions[:, 0], truth[:, 0])
         return loss, by_episode
 
-    def fitted(self, found: Sequence[tuple[Matrix, InnerQuality]]) -> list[FittedFold]:
-        """Of every fold, with its (K,) chosen strengths and the quality that chose them."""
-        strengths = np.array([own for own, _ in found])
+    def fitted(self, choices: Sequence[tuple[Matrix, InnerQuality]]) -> list[FittedFold]:
+        """Return the probes of every fold with its choice: (K,) strengths, and the quality that chose them."""
+        strengths = np.array([strength for strength, _ in choices])
         of_columns = to_device_of(self.signs, strengths.reshape(-1))
         (weights,) = self.solver.path_of_signs(self.signs, [of_columns])
         return [
-            FittedFold.of(coordinates, own, to_numpy(held_out @ own), *fold)
-            for coordinates, own, held_out, fold in zip(
-                self.coordinates, self._of_folds(weights), self.held_out, found, strict=True
+            FittedFold.of(coordinates, fold_weights, to_numpy(held_out @ fold_weights), *choice)
+            for coordinates, fold_weights, held_out, choice in zip(
+                self.coordinates, self._of_folds(weights), self.held_out, choices, strict=True
             )
         ]
 
@@ -113,6 +119,6 @@ class _Together:
         """(R, K) of every fold, without what was filled up."""
         count = self.labels.shape[1]
         for number, coordinates in enumerate(self.coordinates):
-            own = weights[:, number * count : (number + 1) * count]
+            fold_weights = weights[:, number * count : (number + 1) * count]
             rank = coordinates.train.shape[1]
-            yield array_namespace(own).concatenate([own[: rank - 1], own[-1:]])
+            yield array_namespace(fold_weights).concatenate([fold_weights[: rank - 1], fold_weights[-1:]])

@@ -69,7 +69,7 @@ def labels_at_once(site: JointSite, folds: Sequence[NestedFold]) -> int:
 
 
 def _times_at_once(site: JointSite, folds: Sequence[NestedFold]) -> int:
-    """How often the problems of all inner folds fit into COLUMN_MEMORY; at least once.
+    """Return how often the problems of all inner folds fit into COLUMN_MEMORY; at least once.
 
     A problem takes three curvatures of every sample in float32 while a step is found, and some 16 rows of weights.
     """
@@ -88,17 +88,17 @@ class _Columns:
     folds: Sequence[NestedFold]
 
     def fitted(self) -> list[FittedFold]:
-        chosen, starts, quality = self._chosen()
-        inner = len(self.site.sets.outer) - len(chosen)
-        fold, column = (part.ravel() for part in np.indices(chosen.shape))
-        problems = self._problems(inner + fold, column, STRENGTHS[chosen].ravel())
-        weights = solve(problems, starts[chosen.ravel(), fold, column])
-        decisions = to_numpy(problems.decisions(weights, self.samples.means)).reshape(*chosen.shape, -1)
-        first = _kept(problems, weights, fold, np.flatnonzero(column == 0))
+        best, starts, quality = self._chosen()
+        inner = len(self.site.sets.outer) - len(best)
+        fold, column = (part.ravel() for part in np.indices(best.shape))
+        problems = self._problems(inner + fold, column, STRENGTHS[best].ravel())
+        weights = solve(problems, starts[best.ravel(), fold, column])
+        decisions = to_numpy(problems.decisions(weights, self.samples.means)).reshape(*best.shape, -1)
+        first = _raw_probes(problems, weights, fold, np.flatnonzero(column == 0))
         return [
             FittedFold(
                 decisions[number][:, nested.outer.test].T,
-                STRENGTHS[chosen[number]],
+                STRENGTHS[best[number]],
                 *first[number],
                 quality[number],
             )
@@ -116,21 +116,21 @@ class _Columns:
         by_episode = np.zeros((STRENGTHS.size, len(self.folds), len(self.labels)))
         starts = []
         for step, (weights, of_sets) in enumerate(self._along_grid(len(sets))):
-            for (number, inner), found in zip(sets, of_sets, strict=True):
-                decided, truth = found[:, inner.test].T, self.labels[inner.test]
+            for (number, inner), decisions in zip(sets, of_sets, strict=True):
+                decided, truth = decisions[:, inner.test].T, self.labels[inner.test]
                 loss[step, number] += log_loss(decided, truth) * inner.test.size
                 by_episode[step, number, inner.test] = log_losses(decided[:, 0], truth[:, 0])
             starts.append([weights[of_fold == number].mean(axis=0) for number in range(len(self.folds))])
         xp = array_namespace(self.site.mean)
-        chosen = select_c(loss)
+        best = select_c(loss)
         quality = [
-            InnerQuality.of(-loss[:, number], -by_episode[:, number], chosen[number])
+            InnerQuality.of(-loss[:, number], -by_episode[:, number], best[number])
             for number in range(len(self.folds))
         ]
-        return chosen, xp.stack([xp.stack(by_fold) for by_fold in starts]), quality
+        return best, xp.stack([xp.stack(by_fold) for by_fold in starts]), quality
 
     def _along_grid(self, sets: int) -> Iterator[tuple[Array, Matrix]]:
-        """For each C, weights (S, L, D + 1) and decisions (S, L, E) of all inner folds, many at once."""
+        """Yield for each C weights (S, L, D + 1) and decisions (S, L, E) of all inner folds, many at once."""
         xp, columns = array_namespace(self.site.mean), self.labels.shape[1]
         width = len(self.site.mean) + 1
         for some in batched(STRENGTHS, _times_at_once(self.site, self.folds)):
@@ -149,15 +149,15 @@ class _Columns:
         return JointProblems(self.site, sets, signs[columns], strength)
 
 
-def _kept(
+def _raw_probes(
     problems: JointProblems, weights: Array, fold: NDArray[np.intp], some: NDArray[np.intp]
 ) -> dict[int, tuple[Matrix, float, float]]:
     """Raw weights, intercept and spread of `some` problems, by their outer fold."""
     if not some.size:
         return {}
-    chosen = JointProblems(problems.site, problems.set_of[some], problems.signs[some], problems.strength[some])
-    found = (*chosen.raw(weights[some]), chosen.deviations(weights[some]))
-    raw, intercepts, along = (to_numpy(part) for part in found)
+    subset = JointProblems(problems.site, problems.set_of[some], problems.signs[some], problems.strength[some])
+    parts = (*subset.raw(weights[some]), subset.deviations(weights[some]))
+    raw, intercepts, along = (to_numpy(part) for part in parts)
     length = np.linalg.norm(raw, axis=1)
     spread = np.where(length > 0, along / np.where(length > 0, length, 1.0), 0.0)
     return {

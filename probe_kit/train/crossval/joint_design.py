@@ -83,7 +83,7 @@ class JointSite:
         turned = xp.empty(features.shape, dtype=xp.float32, device=mean.device)
         moments, member = _Moments(), _members(folds, len(samples.counts))
         for block in blocks:
-            exact = (features.matrix[features.chosen[block.rows]] - mean) / scale
+            exact = (features.matrix[features.rows[block.rows]] - mean) / scale
             turned[block.rows] = exact
             moments.add(exact, xp.asarray(member[:, block.episode], device=mean.device))
         counts = member @ samples.counts
@@ -106,7 +106,7 @@ class JointSite:
 
     def centred(self, block: Block) -> Array:
         """(B, D) float64: the block's raw rows without the site's mean."""
-        return self.features.matrix[self.features.chosen[block.rows]] - self.mean
+        return self.features.matrix[self.features.rows[block.rows]] - self.mean
 
 
 @dataclass
@@ -143,8 +143,8 @@ def _members(folds: Sequence[NestedFold], episodes: int) -> NDArray[np.float64]:
     """(F, E) 1 where an episode belongs to a training set."""
     sets = training_sets(folds)
     member = np.zeros((len(sets), episodes))
-    for number, chosen in enumerate(sets):
-        member[number, chosen] = 1
+    for number, members in enumerate(sets):
+        member[number, members] = 1
     return member
 
 

@@ -68,10 +68,10 @@ class JointProblems:
             by_feature = shrunk + strength * (pulled / self.site.scale - mean * total[:, None])
             by_axis, measured = by_feature @ self._wide_axes, by_feature / self._divisor[sets]
         else:
-            mean, left = self._turned_mean[sets], xp.asarray(weights, dtype=xp.float32)
-            v, shift = left[:, :-1] @ self.site.axes.T, left[:, -1] - (mean * left[:, :-1]).sum(axis=1)
+            mean, narrow = self._turned_mean[sets], xp.asarray(weights, dtype=xp.float32)
+            v, shift = narrow[:, :-1] @ self.site.axes.T, narrow[:, -1] - (mean * narrow[:, :-1]).sum(axis=1)
             shrunk = self._square_scale[sets] * v
-            pulled, total = self._blockwise_products(left[:, :-1], shift, sets, inside)
+            pulled, total = self._blockwise_products(narrow[:, :-1], shift, sets, inside)
             by_axis = shrunk @ self.site.axes + strength * (pulled - mean * total[:, None])
             measured = by_axis  # as long as by features, but for their scales: nothing is accepted by it
         gradient = xp.hstack([by_axis, strength * total[:, None]])
@@ -146,26 +146,26 @@ class JointProblems:
         return xp.sqrt((square / count - (total / count) ** 2).clip(0.0))
 
     def _blockwise_products(
-        self, left: Array, shift: Array, sets: NDArray[np.intp], inside: Inside
+        self, vectors: Array, shift: Array, sets: NDArray[np.intp], inside: Inside
     ) -> tuple[Array, Array]:
         """Σ inside(f)·x (k, D) and Σ inside(f) (k,) over samples x, with f = left·x + shift.
 
         float64: x are raw samples without the site's mean; float32: samples along the axes.
         """
-        xp = array_namespace(left)
-        exact = left.dtype == xp.float64
-        pulled, total = xp.zeros_like(left), xp.zeros_like(shift)
+        xp = array_namespace(vectors)
+        exact = vectors.dtype == xp.float64
+        pulled, total = xp.zeros_like(vectors), xp.zeros_like(shift)
         for fold, blocks in groupby(self.site.blocks, key=lambda block: block.outer):
             use = np.flatnonzero(self.site.sets.outer[sets] != fold)
-            some, start = left[use], shift[use][:, None]
-            own, sums = xp.zeros_like(some), xp.zeros_like(start)
+            some, start = vectors[use], shift[use][:, None]
+            fold_pulled, fold_total = xp.zeros_like(some), xp.zeros_like(start)
             for block in blocks if use.size else ():
                 x = self.site.centred(block) if exact else self.site.turned[block.rows]
                 values = inside(some @ x.T + start, block, use)
-                own += values @ x
-                sums += values.sum(axis=1)[:, None]
-            pulled[use] += own
-            total[use] += sums[:, 0]
+                fold_pulled += values @ x
+                fold_total += values.sum(axis=1)[:, None]
+            pulled[use] += fold_pulled
+            total[use] += fold_total[:, 0]
         return pulled, total
 
     def _of_samples(self, block: Block, rows: NDArray[np.intp], like: Array) -> tuple[Array, Array]:

@@ -39,7 +39,7 @@ def cross_validate(samples: Samples, labels: NDArray[np.bool_], folds: list[Nest
 def choose_strengths(
     samples: Samples, labels: NDArray[np.bool_], folds: list[Fold]
 ) -> tuple[Matrix, InnerQuality]:
-    """For each label column the C of the grid with the lowest held-out log-loss, and the quality there.
+    """Return for each label column the C with the lowest held-out log-loss, and the quality there.
 
     The smaller C on ties.
     """
@@ -54,8 +54,8 @@ def choose_strengths(
             decisions = to_numpy(held_out @ weights)
             loss[step] += log_loss(decisions, truth) * fold.test.size
             by_episode[step, fold.test] = log_losses(decisions[:, 0], truth[:, 0])
-    chosen = select_c(loss)
-    return STRENGTHS[chosen], InnerQuality.of(-loss, -by_episode, chosen)
+    best = select_c(loss)
+    return STRENGTHS[best], InnerQuality.of(-loss, -by_episode, best)
 
 
 def _fit_fold(

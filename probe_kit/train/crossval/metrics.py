@@ -9,7 +9,7 @@ Matrix = NDArray[np.float64]
 
 
 def correctness(decisions: Matrix, labels: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Whether each episode is classified correctly; `decisions` and `labels` of one shape."""
+    """Return for each episode whether it is classified correctly; `decisions` and `labels` are of one shape."""
     right: NDArray[np.bool_] = (decisions > 0) == labels
     return right
 

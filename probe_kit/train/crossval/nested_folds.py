@@ -61,9 +61,9 @@ class InnerQuality:
     first: Matrix
 
     @classmethod
-    def of(cls, quality: Matrix, by_episode: Matrix, chosen: NDArray[np.intp]) -> "InnerQuality":
-        """quality: (C, K) along the grid. by_episode: (C, E) of the first column. chosen: (K,) positions."""
-        return cls(np.take_along_axis(quality, chosen[None, :], 0)[0], by_episode[chosen[0]])
+    def of(cls, quality: Matrix, by_episode: Matrix, best: NDArray[np.intp]) -> "InnerQuality":
+        """quality: (C, K) along the grid. by_episode: (C, E) of the first column. best: (K,) positions."""
+        return cls(np.take_along_axis(quality, best[None, :], 0)[0], by_episode[best[0]])
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ class FittedFold:
     def of(
         cls, coordinates: Projection, weights: Array, decisions: Matrix, strengths: Matrix, inner: InnerQuality
     ) -> "FittedFold":
-        """With the first column of `weights` (R, K), found in `coordinates`."""
+        """Return the fold with the first column of `weights` (R, K) in `coordinates` on raw features."""
         raw, intercept = coordinates.raw_weights(weights[:, 0])
         along = float(np.std(to_numpy(coordinates.train @ weights[:, 0])))
         length = float(np.linalg.norm(raw))
@@ -96,5 +96,5 @@ class FittedFold:
 
 def select_c(loss: Matrix) -> NDArray[np.intp]:
     """(...) position of the least of `loss` (C, ...) along the grid; the smaller C on ties."""
-    chosen: NDArray[np.intp] = loss.round(9).argmin(axis=0)  # rounded, so that equal losses are ties
-    return chosen
+    best: NDArray[np.intp] = loss.round(9).argmin(axis=0)  # rounded, so that equal losses are ties
+    return best

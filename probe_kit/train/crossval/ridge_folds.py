@@ -60,12 +60,12 @@ def _nested(
                 gains = gain(predicted)
                 quality[step] += gains.sum(axis=0)
                 by_sample[step, inner.test] = gains[:, 0]
-        chosen = _largest_of_best(quality)
+        best = _largest_of_best(quality)
         for step, predicted in enumerate(predict(fold.outer)):
-            columns = np.flatnonzero(chosen == step)
+            columns = np.flatnonzero(best == step)
             predictions[np.ix_(fold.outer.test, columns)] = predicted[:, columns]
-        penalties.append(PENALTIES[chosen[0]])
-        qualities.append(InnerQuality.of(quality, by_sample, chosen))
+        penalties.append(PENALTIES[best[0]])
+        qualities.append(InnerQuality.of(quality, by_sample, best))
     return predictions, np.array(penalties), qualities
 
 
@@ -80,8 +80,8 @@ def _quantities(samples: Samples, labels: Matrix, fold: Fold) -> Iterator[Matrix
 def _worth(truth: Matrix, classes: int) -> Matrix:
     """(m, K) one over the number of samples of each one's class."""
     counts = np.stack([(truth == number).sum(axis=0) for number in range(classes)])
-    found: Matrix = 1 / np.take_along_axis(counts, truth.astype(np.intp), axis=0)
-    return found
+    worth: Matrix = 1 / np.take_along_axis(counts, truth.astype(np.intp), axis=0)
+    return worth
 
 
 def _best_classes(samples: Samples, labels: Matrix, classes: int, fold: Fold) -> Iterator[Matrix]:
@@ -100,8 +100,8 @@ def _largest_of_best(quality: Matrix) -> NDArray[np.intp]:
     """(K,) position of the best of (L, K) along the grid, the larger penalty on ties."""
     scale = np.abs(quality).max(axis=0) + 1e-300
     rounded = (quality / scale).round(12)[::-1]
-    chosen: NDArray[np.intp] = len(quality) - 1 - rounded.argmax(axis=0)
-    return chosen
+    best: NDArray[np.intp] = len(quality) - 1 - rounded.argmax(axis=0)
+    return best
 
 
 def _fitted(samples: Samples, fold: Fold) -> RidgeFold:

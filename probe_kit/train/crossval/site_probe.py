@@ -72,7 +72,7 @@ def probe_labels(samples: Samples, labels: Matrix, task: Task, folds: list[Neste
     Raises ProbeNotConvergedError for a binary label, and NonFiniteActivationError for NaN or infinity.
     """
     check_non_finite(samples)
-    labels, place = _distinct(labels)
+    labels, column_of = _distinct(labels)
     predictions, strengths, inner = _predict(samples, labels, task, folds)
     if task == "continuous":
         scores = explained_scores(predictions, labels, [fold.outer for fold in folds])
@@ -86,9 +86,10 @@ def probe_labels(samples: Samples, labels: Matrix, task: Task, folds: list[Neste
         weights=np.zeros((len(folds), 0), np.float32),
         intercepts=none,
         spreads=none,
-        null=scores.mean(axis=0)[place[1:]],
+        null=scores.mean(axis=0)[column_of[1:]],
         inner=np.stack([
-            _above_permutations(one, place[1:], fold.outer.train) for one, fold in zip(inner, folds, strict=True)
+            _above_permutations(quality, column_of[1:], fold.outer.train)
+            for quality, fold in zip(inner, folds, strict=True)
         ]),
     )  # fmt: skip
 
@@ -150,9 +151,9 @@ def _distinct(labels: Matrix) -> tuple[Matrix, NDArray[np.intp]]:
     Labels that are constant in a group have few different permutations.
     """
     first: dict[bytes, int] = {}
-    place = [first.setdefault(column.tobytes(), len(first)) for column in labels.T.copy()]
-    different = [place.index(number) for number in range(len(first))]
-    return labels[:, different], np.array(place, np.intp)
+    column_of = [first.setdefault(column.tobytes(), len(first)) for column in labels.T.copy()]
+    different = [column_of.index(number) for number in range(len(first))]
+    return labels[:, different], np.array(column_of, np.intp)
 
 
 def _out_of_fold(fitted: list[FittedFold], folds: list[NestedFold]) -> Matrix:

@@ -56,12 +56,12 @@ def fold_spearman(predicted: Matrix, truth: Matrix, folds: list[Fold]) -> float:
     """
     from scipy.stats import rankdata  # type: ignore[import-untyped]
 
-    found = []
+    correlations = []
     for fold in folds:
         ranks = [rankdata(values[fold.test]) for values in (predicted, truth)]
-        if all(np.ptp(one) > 0 for one in ranks):
-            found.append(float(np.corrcoef(*ranks)[0, 1]))
-    return float(np.mean(found)) if found else float("nan")
+        if all(np.ptp(rank) > 0 for rank in ranks):
+            correlations.append(float(np.corrcoef(*ranks)[0, 1]))
+    return float(np.mean(correlations)) if correlations else float("nan")
 
 
 def score_interval(

@@ -111,12 +111,12 @@ class ArrayRun:
         yield TokenBlock(0, *self.tokens(site, role))
 
     def _stream(self, name: str) -> Stream:
-        found = [(site, array) for (site, _), array in self.features.items() if site.stream == name]
-        steps = {site.iteration for site, _ in found} - {None}
+        sites = [(site, array) for (site, _), array in self.features.items() if site.stream == name]
+        steps = {site.iteration for site, _ in sites} - {None}
         return Stream(
             name,
-            layers=1 + max(site.layer for site, _ in found),
-            width=found[0][1].shape[1],
+            layers=1 + max(site.layer for site, _ in sites),
+            width=sites[0][1].shape[1],
             iterations=len(steps) or None,
         )
 

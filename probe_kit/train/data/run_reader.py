@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 def check_several_wordings(episodes: "pd.DataFrame") -> None:
     """Raise UsageError for episodes of several wordings: probes and success rates are of one."""
     if "wording" in episodes and episodes["wording"].nunique() > 1:
-        there = ", ".join(dict.fromkeys(episodes["wording"].astype(str)))
+        wordings = ", ".join(dict.fromkeys(episodes["wording"].astype(str)))
         raise UsageError(
-            f"the episodes were asked in several wordings ({there}); probes and success rates take one. Choose it "
-            "with --wording NAME, or `run.in_wording(NAME)` in Python"
+            f"the episodes were asked in several wordings ({wordings}); probes and success rates take one. Choose "
+            "it with --wording NAME, or `run.in_wording(NAME)` in Python"
         )
 
 
@@ -71,4 +71,4 @@ class RunReader(DescribedRun, Protocol):
         """
 
     def iter_token_blocks(self, site: Site, role: str | None = None) -> Iterable[Tokens]:
-        """Those tokens, some positions of all episodes at a time. Raises UnknownSiteError as `token_mask`."""
+        """Yield the tokens of `token_mask`, some positions of all episodes at a time. Raises UnknownSiteError."""

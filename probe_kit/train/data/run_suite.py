@@ -27,13 +27,13 @@ def suite_of(run: RunReader, folder: Path | None = None) -> "Suite":
     if folder is not None:
         return _in_folder(run, folder)
     moved = []
-    for own in dict.fromkeys(sources.suite for sources in getattr(run, "sources", ()) if sources.suite):
+    for source_folder in dict.fromkeys(sources.suite for sources in getattr(run, "sources", ()) if sources.suite):
         try:
-            return _in_folder(run, Path(own))
+            return _in_folder(run, Path(source_folder))
         except UsageError:
-            moved.append(f"The folder {own} of its extraction is gone")
+            moved.append(f"The folder {source_folder} of its extraction is gone")
         except SuiteError as error:
-            moved.append(f"The folder {own} of its extraction no longer holds it: {error}")
+            moved.append(f"The folder {source_folder} of its extraction no longer holds it: {error}")
     try:
         return _embedded(run)
     except SuiteNotFoundError as error:
@@ -66,19 +66,19 @@ def _embedded(run: RunReader) -> "Suite":
             f"can be drawn again. {_GIVE}"
         )
     try:
-        found = next((suite for suite in _drawn(counts) if _holds(suite, run)), None)
+        drawn = next((suite for suite in _drawn(counts) if _holds(suite, run)), None)
     except OSError as error:
         raise SuiteNotFoundError(
             f"{run.location} was extracted from {run.suite}, whose pictures are needed and cannot be drawn again: "
             f"{error}. Name a folder that can be written in PROBE_KIT_CACHE. {_GIVE}"
         ) from error
-    if found is None:
+    if drawn is None:
         raise SuiteNotFoundError(
             f"{run.location} was extracted from {run.suite}, whose pictures are needed; drawn again they are "
             f"others, so it was drawn with another seed or other versions of what draws. {_GIVE}"
         )
-    wanted = _items(run)
-    return replace(found, items=tuple(item for item in found.items if item.item_id in wanted))
+    item_ids = _items(run)
+    return replace(drawn, items=tuple(item for item in drawn.items if item.item_id in item_ids))
 
 
 def _drawn(counts: Mapping[str, int]) -> Iterator["Suite"]:
@@ -101,8 +101,8 @@ def _holds(suite: "Suite", run: RunReader) -> bool:
 
 def _hash_of_part(suite: "Suite", run: RunReader) -> str:
     """Hex sha256 that `suite` had with only those items that the run has."""
-    wanted = _items(run)
-    return suite.content_sha256_of(item for item in suite.items if item.item_id in wanted)
+    item_ids = _items(run)
+    return suite.content_sha256_of(item for item in suite.items if item.item_id in item_ids)
 
 
 def _items(run: RunReader) -> Mapping[str, str]:

@@ -105,9 +105,9 @@ def sites_of(run: RunReader, view: str) -> list[Site]:
     having = [stream for stream in probed if resolve_view(pooled, run.views(stream)) in run.views(stream)]
     sites = [site for stream in having for site in run.sites(stream)]
     if not sites:
-        known = sorted({name for stream in run.streams for name in run.views(stream)})
+        views = sorted({name for stream in run.streams for name in run.views(stream)})
         raise UnknownSiteError(
-            f"{run.location} has no view {view!r}; it has: {', '.join(known)}, and with stored tokens: {TOKENS} "
+            f"{run.location} has no view {view!r}; it has: {', '.join(views)}, and with stored tokens: {TOKENS} "
             f"or {TOKENS}:ROLE for every mean:ROLE"
         )
     return sites

@@ -23,10 +23,10 @@ def best_sites(scores: "pd.DataFrame", is_side: bool) -> "list[pd.Series]":
     by_stream = worth.groupby([scores[name] for name in names], sort=False)
     iterations = scores["iteration"].groupby([scores[name] for name in names], sort=False)
     begins = scores["iteration"].eq(iterations.transform("min")).fillna(False).astype(bool)
-    found = scores.assign(ties=worth == by_stream.transform("max"), first=scores["score"].where(begins))
-    grouped = found.groupby(names, sort=False)
-    found = found.assign(ties=grouped["ties"].transform("sum") - 1, first=grouped["first"].transform("max"))
-    best = found.loc[by_stream.idxmax()].sort_values("category", kind="stable")
+    marked = scores.assign(ties=worth == by_stream.transform("max"), first=scores["score"].where(begins))
+    grouped = marked.groupby(names, sort=False)
+    marked = marked.assign(ties=grouped["ties"].transform("sum") - 1, first=grouped["first"].transform("max"))
+    best = marked.loc[by_stream.idxmax()].sort_values("category", kind="stable")
     return [row for _, row in best.iterrows()]
 
 

@@ -42,7 +42,7 @@ class ControlScore:
 
 @dataclass(frozen=True)
 class UntrainedScore:
-    """How much more accurate a probe of a side is than the untrained network's, on the same episodes.
+    """The gain of a probe of a side over the untrained network's, on the same episodes.
 
     ci: 95 % interval over groups.
 
@@ -63,7 +63,7 @@ class UntrainedScore:
 
 @dataclass(frozen=True)
 class ControlComparison:
-    """Whether a site's probe scores more than a control: paired by group, family-wise over its stream.
+    """A test of a site's probe against a control: paired by group, family-wise over its stream.
 
     control: of a side `random-features`, or `untrained` for the best site of that stream in the untrained network;
     of other targets every control that was run. reference: the control's score.
@@ -114,11 +114,16 @@ class Controls:
 
     def exceeded(self, category: str, view: str, site: Site | str) -> dict[str, bool]:
         """Return whether a site exceeds each control that it was compared with, by name."""
-        return {name: one.p < SIGNIFICANCE for name, one in self._of_site(category, view, site).items()}
+        return {
+            name: comparison.p < SIGNIFICANCE for name, comparison in self._of_site(category, view, site).items()
+        }
 
     def reference(self, category: str, view: str, site: Site | str) -> float:
         """Return the score of the best control of a site; NaN without any."""
-        return max((one.reference for one in self._of_site(category, view, site).values()), default=float("nan"))
+        return max(
+            (comparison.reference for comparison in self._of_site(category, view, site).values()),
+            default=float("nan"),
+        )
 
     def _of_site(self, category: str, view: str, site: Site | str) -> dict[str, ControlComparison]:
         return self._compared.get((category, view, str(site)), {})
@@ -127,20 +132,22 @@ class Controls:
     def _compared(self) -> dict[tuple[str, str, str], dict[str, ControlComparison]]:
         """Comparisons by category, view and site, then by control."""
         by_site: dict[tuple[str, str, str], dict[str, ControlComparison]] = {}
-        for one in self.comparisons:
-            by_site.setdefault((one.category, one.view, one.site), {})[one.control] = one
+        for comparison in self.comparisons:
+            by_site.setdefault((comparison.category, comparison.view, comparison.site), {})[comparison.control] = (
+                comparison
+            )
         return by_site
 
     def of_category(self, category: str) -> dict[str, ControlScore]:
         """Return the scores of a category by name, those of an untrained network left out."""
-        own = (score for score in self.scores if score.category == category and score.name != UNTRAINED)
-        return {score.name: score for score in own}
+        scores = (score for score in self.scores if score.category == category and score.name != UNTRAINED)
+        return {score.name: score for score in scores}
 
     def of_stream(self, category: str, view: str, stream: str) -> tuple[ControlScore, ...]:
         """Return the scores that sites of a stream are compared with in a view, the best first."""
-        own = [one for one in self.scores if one.category == category]
-        own = [one for one in own if one.stream in ("", stream) and one.view in ("", view)]
-        return tuple(sorted(own, key=lambda one: -one.score))
+        scores = [score for score in self.scores if score.category == category]
+        scores = [score for score in scores if score.stream in ("", stream) and score.view in ("", view)]
+        return tuple(sorted(scores, key=lambda score: -score.score))
 
     def untrained_peak(self, category: str, view: str, stream: str) -> UntrainedScore | None:
         """Return the best site of a stream against the untrained network's best, None without one."""
@@ -155,9 +162,11 @@ class Controls:
         self, scores: Iterable[ControlScore], comparisons: Iterable[ControlComparison] = ()
     ) -> "Controls":
         """Return these and more; what is new replaces what is of the same control and place."""
-        by_place = {(one.name, one.category, one.stream, one.view): one for one in (*self.scores, *scores)}
+        by_place = {
+            (score.name, score.category, score.stream, score.view): score for score in (*self.scores, *scores)
+        }
         by_site = {(o.control, o.category, o.view, o.site): o for o in (*self.comparisons, *comparisons)}
-        names = {place[0] for place in by_place}
+        names = {key[0] for key in by_place}
         missing = {name: why for name, why in self.left_out.items() if name not in names}
         return replace(
             self, scores=tuple(by_place.values()), comparisons=tuple(by_site.values()), left_out=missing
@@ -168,8 +177,8 @@ class Controls:
         return replace(
             self,
             untrained=tuple(scores),
-            scores=tuple(one for one in self.scores if one.name != UNTRAINED),
-            comparisons=tuple(one for one in self.comparisons if one.control != UNTRAINED),
+            scores=tuple(score for score in self.scores if score.name != UNTRAINED),
+            comparisons=tuple(test for test in self.comparisons if test.control != UNTRAINED),
         )
 
     def to_json(self) -> dict[str, Any]:
@@ -181,12 +190,12 @@ class Controls:
         """Return the controls that `to_json` gave."""
         lists = {"ci": tuple, "by_step": tuple}
 
-        def read(one: dict[str, Any]) -> dict[str, Any]:
-            return {name: lists[name](value) if name in lists else value for name, value in one.items()}
+        def read(members: dict[str, Any]) -> dict[str, Any]:
+            return {name: lists[name](value) if name in lists else value for name, value in members.items()}
 
         return cls(
             tuple(ControlScore(**read(score)) for score in stored["scores"]),
             tuple(UntrainedScore(**read(score)) for score in stored["untrained"]),
-            tuple(ControlComparison(**one) for one in stored["comparisons"]),
+            tuple(ControlComparison(**comparison) for comparison in stored["comparisons"]),
             dict(stored["left_out"]),
         )

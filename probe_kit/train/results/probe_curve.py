@@ -214,7 +214,10 @@ class ProbeCurve:
 
     def of_part(self, part: str) -> str | None:
         """Return the first stream of a part of the model, `backbone` or `action`; None if none was probed."""
-        return next((site.stream for site, own in zip(self.sites, self.parts, strict=True) if own == part), None)
+        return next(
+            (site.stream for site, site_part in zip(self.sites, self.parts, strict=True) if site_part == part),
+            None,
+        )
 
     @property
     def action_stream(self) -> str | None:

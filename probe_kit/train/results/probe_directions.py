@@ -68,19 +68,21 @@ class StoredDirections(Mapping[Place, Direction]):
             self._checked = True
         return self._bundle.open(self._name)
 
-    def __getitem__(self, place: Place) -> Direction:
-        return self.read([place])[place]
+    def __getitem__(self, key: Place) -> Direction:
+        return self.read([key])[key]
 
     def read(self, places: Iterable[Place]) -> dict[Place, Direction]:
         """Several directions in one opening of the file. Raises KeyError for a place that was not probed."""
-        found = {}
+        directions = {}
         with self._open() as file, open_arrays(file) as arrays:
-            for place in places:
-                name = "/".join(map(str, place))
+            for key in places:
+                name = "/".join(map(str, key))
                 if f"{name}/weights" not in arrays:
-                    raise KeyError(place)
-                found[place] = Direction(**{part: arrays[f"{name}/{part}"] for part in Direction.__annotations__})
-        return found
+                    raise KeyError(key)
+                directions[key] = Direction(
+                    **{part: arrays[f"{name}/{part}"] for part in Direction.__annotations__}
+                )
+        return directions
 
     def __iter__(self) -> Iterator[Place]:
         with self._open() as file, open_arrays(file) as arrays:
@@ -96,4 +98,4 @@ def read_directions(directions: Mapping[Place, Direction], places: Iterable[Plac
     """The directions of `places`, stored ones in one opening of their file. Raises KeyError for unknown places."""
     if isinstance(directions, StoredDirections):
         return directions.read(places)
-    return {place: directions[place] for place in places}
+    return {key: directions[key] for key in places}

@@ -45,13 +45,13 @@ class ProbeResults:
         object.__setattr__(self, "label", self.label or self.settings.model)
 
     def __repr__(self) -> str:
-        own = self.settings
-        random = ", RANDOM WEIGHTS" if own.random_weights else ""
-        task = "" if own.is_side else f" ({own.task})"
+        settings = self.settings
+        random = ", RANDOM WEIGHTS" if settings.random_weights else ""
+        task = "" if settings.is_side else f" ({settings.task})"
         return (
-            f"<ProbeResults {own.key} of {self.label}{random}: {', '.join(own.categories)}; "
-            f"views {', '.join(own.views)}; target {own.target}{task}; call {own.call}; "
-            f"{own.permutations} label permutations>"
+            f"<ProbeResults {settings.key} of {self.label}{random}: {', '.join(settings.categories)}; "
+            f"views {', '.join(settings.views)}; target {settings.target}{task}; call {settings.call}; "
+            f"{settings.permutations} label permutations>"
         )
 
     def _repr_html_(self) -> str:
@@ -83,9 +83,7 @@ class ProbeResults:
         import pandas as pd
 
         of = self.settings, self.controls
-        frame = pd.DataFrame(
-            [row for place, curve in self.curves.items() for row in score_rows(*of, place, curve)]
-        )
+        frame = pd.DataFrame([row for key, curve in self.curves.items() for row in score_rows(*of, key, curve)])
         exceeds = [name for name in map(str, frame) if name.startswith("exceeds_")]
         return frame.astype({"iteration": "Int64", **dict.fromkeys(exceeds, "boolean")})
 
@@ -94,11 +92,15 @@ class ProbeResults:
         try:
             return self.directions[category, view, site]
         except KeyError:
-            own = self.settings
-            kept = "" if own.is_side else f"; probes of {own.target!r} store no directions, those of a side do"
+            settings = self.settings
+            hint = (
+                ""
+                if settings.is_side
+                else f"; probes of {settings.target!r} store no directions, those of a side do"
+            )
             raise UnknownSiteError(
                 f"there is no direction of {site}, category {category!r}, view {view!r}; probed were the sites of "
-                f"categories {', '.join(own.categories)} in views {', '.join(own.views)}{kept}"
+                f"categories {', '.join(settings.categories)} in views {', '.join(settings.views)}{hint}"
             ) from None
 
 

@@ -19,12 +19,12 @@ class SweepCheckpoint:
 
     @classmethod
     def of(cls, run: Location, key: str, stamp: str = "") -> "SweepCheckpoint":
-        """Those of the sweep that will be stored as `key`. stamp: hash of the commits that it reads."""
+        """Return the checkpoints of the sweep with the key `key`. stamp: hash of the commits that it reads."""
         return cls(Pieces.of(run, PROBES, key, stamp, "the same `probe-kit train` then probes the site again"))
 
     @property
     def folder(self) -> str:
-        """Where they lie in the run."""
+        """The folder of the checkpoints in the run."""
         return self.pieces.folder
 
     def read(self, view: str, site: Site) -> dict[str, SiteProbe] | None:
@@ -57,5 +57,5 @@ class SweepCheckpoint:
 def unfinished_sweeps(run: Location) -> dict[str, int]:
     """Number of finished sites of every sweep that was interrupted or failed, by the key its results will have."""
     parts = (key.split("/") for key in run.keys(PROBES))
-    names = [own[1] for own in parts if len(own) > 2 and own[1].startswith(".") and own[1].endswith(PARTIAL)]
+    names = [path[1] for path in parts if len(path) > 2 and path[1].startswith(".") and path[1].endswith(PARTIAL)]
     return {name[1:].removesuffix(PARTIAL): names.count(name) for name in dict.fromkeys(names)}

@@ -16,14 +16,14 @@ from probe_kit.train.settings import ProbeSettings
 
 
 def score_rows(
-    settings: ProbeSettings, controls: Controls, place: tuple[str, str], curve: ProbeCurve
+    settings: ProbeSettings, controls: Controls, key: tuple[str, str], curve: ProbeCurve
 ) -> Iterator[dict[str, Any]]:
     """Yield the row of every site of a curve. place: its category and view. See `ProbeResults.scores`."""
-    category, view = place
+    category, view = key
     score, low, high = _estimates(curve)
     p, p_fwe, chance = pointwise_p(curve.metric, curve.null), curve.p_fwe(), curve.chance
     for row, (site, part) in enumerate(zip(curve.sites, curve.parts, strict=True)):
-        exceeds = _exceeds(controls, place, site, float(p_fwe[row]), curve.is_side)
+        exceeds = _exceeds(controls, key, site, float(p_fwe[row]), curve.is_side)
         yield {
             "model": settings.model,
             "random_weights": settings.random_weights,
@@ -47,7 +47,7 @@ def score_rows(
             "smallest_p": curve.least_p,
             **{exceeds_column(name): better for name, better in exceeds.items() if name != "chance"},
             "signal": has_signal(exceeds),
-            **(_of_side(curve, row, score[row]) if curve.is_side else _of_label(controls, place, curve, row)),
+            **(_of_side(curve, row, score[row]) if curve.is_side else _of_label(controls, key, curve, row)),
             "n": curve.labels.size,
             "episodes": np.unique(curve.episodes).size,
             "items": np.unique(curve.items).size,
@@ -73,8 +73,8 @@ def _estimates(curve: ProbeCurve) -> tuple[Matrix, Matrix, Matrix]:
     return curve.metric, limits[:, 0], limits[:, 1]
 
 
-def _exceeds(controls: Controls, place: tuple[str, str], site: Site, p_fwe: float, is_side: bool) -> Exceeds:
-    exceeds = controls.exceeds(*place, site, p_fwe)
+def _exceeds(controls: Controls, key: tuple[str, str], site: Site, p_fwe: float, is_side: bool) -> Exceeds:
+    exceeds = controls.exceeds(*key, site, p_fwe)
     return {name: better for name, better in exceeds.items() if is_side or name == "chance" or better is not None}
 
 
@@ -91,10 +91,10 @@ def _of_side(curve: ProbeCurve, row: int, accuracy: float) -> dict[str, Any]:
     }
 
 
-def _of_label(controls: Controls, place: tuple[str, str], curve: ProbeCurve, row: int) -> dict[str, Any]:
+def _of_label(controls: Controls, key: tuple[str, str], curve: ProbeCurve, row: int) -> dict[str, Any]:
     quantity = curve.task == "continuous"
     return {
         "spearman": fold_spearman(curve.decisions[row], curve.labels, curve.folds()) if quantity else float("nan"),
-        "best_control": controls.reference(*place, curve.sites[row]),
+        "best_control": controls.reference(*key, curve.sites[row]),
         "penalties": " ".join(f"{penalty:g}" for penalty in curve.penalties[row]),
     }

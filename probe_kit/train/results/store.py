@@ -44,24 +44,24 @@ _TEXTS, _FACTS = ("parts", "classes"), ("task", "is_side", "smallest_p")
 """Members of a curve that are tuples of texts, and those that are single values."""
 
 
-def save_results(results: ProbeResults, run: Path | Location, *, asked: bool = True) -> None:
+def save_results(results: ProbeResults, run: Path | Location, *, requested: bool = True) -> None:
     """Write to `probes/<key>/` of the run that lies there, all or nothing; probes that are there are kept.
 
-    asked: whether a user requested these probes, which `load_results` then prefers to all older ones, rather
+    requested: whether a user wants these probes, which `load_results` then prefers to all older ones, rather
     than needing them in passing, as the untrained control of another run.
     """
     location = locate(run)
     if not is_stored(location, results.key):
         files = {SCORES: _scores(results), DECISIONS: _decisions(results), DIRECTIONS: _directions(results)}
         head = {"settings": asdict(results.settings), "stamp": results.stamp, "left_out": dict(results.left_out)}
-        times = {"created": results.created, "asked": _now() if asked else ""}
+        times = {"created": results.created, "requested": _now() if requested else ""}
         write_bundle(location, PROBES, results.key, head, files | _controls(results), times)
         return
     stored = read_probes(location)
     bundle, controls = stored[results.key], _controls(results)
     times = dict(bundle.times)
-    if asked and bundle.key != max(stored.values(), key=_rank).key:
-        times["asked"] = _now()
+    if requested and bundle.key != max(stored.values(), key=_rank).key:
+        times["requested"] = _now()
     if controls or times != bundle.times:
         files = {**controls, SCORES: _scores(results)} if controls else {}
         write_bundle(location, PROBES, results.key, bundle.head, files, times)
@@ -147,14 +147,18 @@ def stored_targets(run: RunReader) -> dict[str, int]:
     With each the number of different values that it had: every one of them was a test.
     """
     settings = [settings_of(bundle) for bundle in _current(run, read_probes(run.location)).values()]
-    versions = {(own.target, own.label) for own in settings if not own.is_side}
+    versions = {(probed.target, probed.label) for probed in settings if not probed.is_side}
     return dict(sorted(Counter(target for target, _ in versions).items()))
 
 
 def _current(run: RunReader, stored: Mapping[str, Bundle]) -> dict[str, Bundle]:
     episodes = run.settings_sha256, episodes_sha256(run)
     settings = {name: settings_of(bundle) for name, bundle in stored.items()}
-    return {name: stored[name] for name, own in settings.items() if (own.run_settings, own.episodes) == episodes}
+    return {
+        name: stored[name]
+        for name, probed in settings.items()
+        if (probed.run_settings, probed.episodes) == episodes
+    }
 
 
 def is_current(settings: ProbeSettings, run: RunReader) -> bool:
@@ -165,9 +169,9 @@ def is_current(settings: ProbeSettings, run: RunReader) -> bool:
 def _why_none(run: RunReader, target: str, stored: int) -> str:
     if not run.streams:
         return f"{run.location} has no activations to probe: of {run.model!r} no stream was stored."
-    others = f" (of {stored} stored, none: other episodes or another target)" if stored else ""
+    hint = f" (of {stored} stored, none: other episodes or another target)" if stored else ""
     advice = how_to_probe(run) if target in SIDES else f"Run `probe-kit train {run.location} --target {target}`."
-    return f"{run.location} has no probes for target {target!r} on its episodes{others}. {advice}"
+    return f"{run.location} has no probes for target {target!r} on its episodes{hint}. {advice}"
 
 
 def how_to_probe(run: RunReader) -> str:
@@ -180,16 +184,15 @@ def how_to_probe(run: RunReader) -> str:
     enough = [str(name) for name, count in counts.items() if count >= GROUPS_FOR_PROBES]
     if not few:
         return f"Run `{command}`."
-    others = f" `{command} --categories {','.join(enough)}` probes the others." if enough else ""
+    hint = f" `{command} --categories {','.join(enough)}` probes the others." if enough else ""
     return (
-        f"Probes need {GROUPS_FOR_PROBES} independent groups of items: {', '.join(few)}. Extract more items."
-        f"{others}"
+        f"Probes need {GROUPS_FOR_PROBES} independent groups of items: {', '.join(few)}. Extract more items.{hint}"
     )
 
 
 def _rank(bundle: Bundle) -> tuple[str, str, str]:
     """Return a key to sort by: the newest results have the highest."""
-    return bundle.times.get("asked", ""), bundle.times.get("created", ""), bundle.key
+    return bundle.times.get("requested", ""), bundle.times.get("created", ""), bundle.key
 
 
 def _now() -> str:
@@ -207,7 +210,7 @@ def _pack(curves: Mapping[tuple[str, str], ProbeCurve]) -> dict[str, Any]:
 
 
 def _as_array(value: Any) -> Any:
-    return np.array([str(own) for own in value], str) if isinstance(value, tuple) else value
+    return np.array([str(member) for member in value], str) if isinstance(value, tuple) else value
 
 
 def _unpack(arrays: Mapping[str, Any]) -> dict[tuple[str, str], ProbeCurve]:
@@ -215,7 +218,7 @@ def _unpack(arrays: Mapping[str, Any]) -> dict[tuple[str, str], ProbeCurve]:
     for name, value in arrays.items():
         category, view, member = name.rsplit("/", 2)
         members.setdefault((category, view), {})[member] = value
-    return {place: ProbeCurve(**_members(stored)) for place, stored in members.items()}
+    return {key: ProbeCurve(**_members(stored)) for key, stored in members.items()}
 
 
 def _members(stored: Mapping[str, Any]) -> dict[str, Any]:
@@ -230,8 +233,8 @@ def read_probes(run: Location) -> dict[str, Bundle]:
     """Return every complete result by key. Raises RunDamagedError for a changed one or another format."""
     bundles = read_bundles(run, PROBES)
     for key, bundle in bundles.items():
-        if (own := sha256_json(bundle.head["settings"])[:12]) != key:
-            raise bundle.head_damaged(f"has the settings of {own}")
+        if (settings_key := sha256_json(bundle.head["settings"])[:12]) != key:
+            raise bundle.head_damaged(f"has the settings of {settings_key}")
         bundle.check_format(FORMAT)
     return bundles
 

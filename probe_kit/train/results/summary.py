@@ -63,17 +63,17 @@ def best_sites_table(fitted: Sequence[ProbeResults], splits: bool = True) -> Tab
 
 
 def _title(fitted: Sequence[ProbeResults], several_views: bool) -> Iterator[str]:
-    own = fitted[0].settings
-    yield f"{own.target}: best site per stream" if not own.is_side else "Best site per stream"
-    if not own.is_side:
-        yield own.task
+    settings = fitted[0].settings
+    yield f"{settings.target}: best site per stream" if not settings.is_side else "Best site per stream"
+    if not settings.is_side:
+        yield settings.task
     if not several_views:
-        yield f"view {own.views[0]}"
-    if len(fitted) == 1 and own.window == 1:
-        yield f"call {own.call}"
-    if own.align_to:
-        yield f"from {own.align_to.partition('#')[0]} on"
-    if own.random_weights:
+        yield f"view {settings.views[0]}"
+    if len(fitted) == 1 and settings.window == 1:
+        yield f"call {settings.call}"
+    if settings.align_to:
+        yield f"from {settings.align_to.partition('#')[0]} on"
+    if settings.random_weights:
         yield "RANDOM WEIGHTS"
 
 
@@ -132,22 +132,24 @@ def best_sites_sentences(results: ProbeResults) -> list[str]:
 
 def best_sites_findings(results: ProbeResults) -> list[str]:
     """Return the last lines of the command: the same in short, without intervals."""
-    own = results.settings
+    settings = results.settings
     lines = []
     for view, category, rows in _places(results):
         by_pictures = ["the pictures alone decode it too"] * bool(_from_pictures(results, category))
-        name = category_of(category).title if own.is_side else own.target
-        if not own.is_side:
-            name = ", ".join([name, *[category] * (own.categories != ("all",)), *[view] * (len(own.views) > 1)])
+        name = category_of(category).title if settings.is_side else settings.target
+        if not settings.is_side:
+            name = ", ".join(
+                [name, *[category] * (settings.categories != ("all",)), *[view] * (len(settings.views) > 1)]
+            )
         lines.append((name, "; ".join([*_findings(results, rows), *by_pictures])))
     width = max((len(name) for name, _ in lines), default=0)
-    return [*_left_out(results), *(f"{name.ljust(width)}  {said}." for name, said in lines)]
+    return [*_left_out(results), *(f"{name.ljust(width)}  {finding}." for name, finding in lines)]
 
 
 def _places(results: ProbeResults) -> "Iterator[tuple[str, str, list[pd.Series]]]":
     """Yield view, category and the best sites of each stream; of a side in the first view alone."""
-    rows, own = _best(results), results.settings
-    for view in own.views[:1] if own.is_side else own.views:
+    rows, settings = _best(results), results.settings
+    for view in settings.views[:1] if settings.is_side else settings.views:
         for category in dict.fromkeys(str(row["category"]) for row in rows):
             yield view, category, [row for row in rows if (row["category"], row["view"]) == (category, view)]
 
@@ -179,12 +181,14 @@ def _findings(results: ProbeResults, rows: "Sequence[pd.Series]") -> Iterator[st
 
 
 def _subject(results: ProbeResults, category: str, view: str, row: "pd.Series") -> str:
-    own = results.settings
-    if own.is_side:
-        return f"{category_of(category).title} ({counted(row['n'], 'episode')}): {_SIDES[own.target]}"
+    settings = results.settings
+    if settings.is_side:
+        return f"{category_of(category).title} ({counted(row['n'], 'episode')}): {_SIDES[settings.target]}"
     facts = [counted(row["groups"], "group"), counted(row["n"], "sample")]
-    facts += [f"category {category}"] * (own.categories != ("all",)) + [f"view {view}"] * (len(own.views) > 1)
-    return f"{own.target} ({', '.join(facts)})"
+    facts += [f"category {category}"] * (settings.categories != ("all",)) + [f"view {view}"] * (
+        len(settings.views) > 1
+    )
+    return f"{settings.target} ({', '.join(facts)})"
 
 
 def _in_stream(results: ProbeResults, row: "pd.Series") -> str:

@@ -32,17 +32,17 @@ def newton_steps(
     xp = array_namespace(gradient)
     size = xp.linalg.norm(gradient, axis=0).clip(np.finfo(float).tiny)
     spectrum = design.spectrum
-    penalty, rest, curvature, precision = (
+    penalty, residual, curvature, precision = (
         xp.asarray(part, dtype=spectrum.dtype) for part in (penalty, -gradient / size, curvature, precision)
     )
-    live = xp.arange(rest.shape[1], device=rest.device)
-    found, changed, step, change = (
-        make(part) for make in (xp.empty_like, xp.zeros_like) for part in (rest, curvature)
+    live = xp.arange(residual.shape[1], device=residual.device)
+    solved, changed, step, change = (
+        make(part) for make in (xp.empty_like, xp.zeros_like) for part in (residual, curvature)
     )
     diagonal = penalty + spectrum * curvature.mean(axis=0)
-    direction = rest / diagonal
-    slope = _dots(rest, direction)
-    bent, scaled = xp.empty_like(curvature), xp.empty_like(rest)
+    direction = residual / diagonal
+    slope = _dots(residual, direction)
+    bent, scaled = xp.empty_like(curvature), xp.empty_like(residual)
     for _ in range(MAX_CG_STEPS):
         along = design @ direction
         product = design.gather(xp.multiply(curvature, along, out=bent))
@@ -52,28 +52,28 @@ def newton_steps(
         along *= length
         change += along
         product *= length
-        rest -= product
-        keep = _dots(rest, rest) > precision**2
+        residual -= product
+        keep = _dots(residual, residual) > precision**2
         if not keep.any():
             if len(live) < len(size):
-                found[:, live], changed[:, live] = step, change
-                step, change = found, changed
+                solved[:, live], changed[:, live] = step, change
+                step, change = solved, changed
             return NewtonSteps(step * size, change * size, live[keep])
         if not keep.all():
-            found[:, live[~keep]], changed[:, live[~keep]] = step[:, ~keep], change[:, ~keep]
+            solved[:, live[~keep]], changed[:, live[~keep]] = step[:, ~keep], change[:, ~keep]
             live, slope, precision = live[keep], slope[keep], precision[keep]
-            rest, direction, diagonal, curvature, step, change = (
-                part[:, keep] for part in (rest, direction, diagonal, curvature, step, change)
+            residual, direction, diagonal, curvature, step, change = (
+                part[:, keep] for part in (residual, direction, diagonal, curvature, step, change)
             )
-            bent, scaled = xp.empty_like(curvature), xp.empty_like(rest)
-        xp.divide(rest, diagonal, out=scaled)
-        previous, slope = slope, _dots(rest, scaled)
+            bent, scaled = xp.empty_like(curvature), xp.empty_like(residual)
+        xp.divide(residual, diagonal, out=scaled)
+        previous, slope = slope, _dots(residual, scaled)
         direction *= slope / previous
         direction += scaled
-    found[:, live], changed[:, live] = 0.0, 0.0
-    return NewtonSteps(found * size, changed * size, live)
+    solved[:, live], changed[:, live] = 0.0, 0.0
+    return NewtonSteps(solved * size, changed * size, live)
 
 
-def _dots(left: Array, right: Array) -> Array:
+def _dots(first: Array, second: Array) -> Array:
     """(K,) products of columns."""
-    return array_namespace(left).einsum("rk,rk->k", left, right)
+    return array_namespace(first).einsum("rk,rk->k", first, second)

@@ -29,7 +29,7 @@ class Design(Protocol):
         """Whether the moments of all label columns cost less than the many small calls of an iteration."""
 
     def of(self, _columns: Array) -> "Design":
-        """What the label columns of a mask (K,) need of it."""
+        """Return the samples that the label columns of a mask (K,) need."""
 
     def narrow(self) -> "Design":
         """The same in float32 where its products gain more than their operands cost to convert, else itself."""
@@ -107,7 +107,7 @@ class StackedDesign:
 
     @classmethod
     def of_folds(cls, folds: Sequence[Design], columns: int) -> "StackedDesign":
-        """Of dense designs, each with so many label columns of its own."""
+        """Return the stack of dense designs, each with so many label columns of its own."""
         dense = [fold.samples for fold in folds if isinstance(fold, DenseDesign)]
         xp, like = array_namespace(dense[0]), dense[0]
         count, width = (max(samples.shape[axis] for samples in dense) for axis in (0, 1))
@@ -157,8 +157,8 @@ class StackedDesign:
 class StreamedDesign(_OfAllColumns):
     """Samples made from raw features block by block in every product: standardised, then turned to `axes`.
 
-    axes: (kept, R − 1). variances: (R − 1,) squared lengths of the columns without the intercept's.
-    Memory is one block in float64, and (N, K) for K problems.
+    axes: (V, R − 1) of the V features that vary. variances: (R − 1,) squared lengths of the columns without the
+    intercept's. Memory is one block in float64, and (N, K) for K problems.
     """
 
     features: RowSubset

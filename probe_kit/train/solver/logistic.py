@@ -40,7 +40,7 @@ SAFETY = 0.3
 
 @dataclass(frozen=True)
 class _Point:
-    """Where problems, one column each, are, and what is known there.
+    """The weights at which problems, one column each, are, and the objective there.
 
     weights: (R, K). decisions: (N, K) Z · weights. loss: (K,) of all samples. misfit: (N, K) 1 − P(label).
     pulled: (R, K) Zᵀ · (signs ∘ misfit).
@@ -53,17 +53,17 @@ class _Point:
     pulled: Array
 
     def like(self) -> "_Point":
-        """As many points, of which nothing is known yet."""
+        """Return as many points without values."""
         return _Point(*(array_namespace(part).empty_like(part) for part in vars(self).values()))
 
-    def only(self, chosen: Array) -> "_Point":
+    def only(self, mask: Array) -> "_Point":
         """Some of them."""
-        return _Point(*(part[..., chosen] for part in vars(self).values()))
+        return _Point(*(part[..., mask] for part in vars(self).values()))
 
-    def put(self, chosen: Array, others: "_Point") -> None:
-        """`others` in the place of some."""
-        for part, other in zip(vars(self).values(), vars(others).values(), strict=True):
-            part[..., chosen] = other
+    def put(self, mask: Array, points: "_Point") -> None:
+        """Put `points` in the place of some."""
+        for part, other in zip(vars(self).values(), vars(points).values(), strict=True):
+            part[..., mask] = other
 
 
 @dataclass(frozen=True)
@@ -77,13 +77,13 @@ class _Problems:
     signs: Array  # (N, K) labels as −1 and +1
     at: _Point
 
-    def only(self, chosen: Array) -> "_Problems":
+    def only(self, mask: Array) -> "_Problems":
         """Some of them."""
-        if chosen.all():
+        if mask.all():
             return self
-        columns, strength, rounding = self.columns[chosen], self.strength[chosen], self.rounding[chosen]
+        columns, strength, rounding = self.columns[mask], self.strength[mask], self.rounding[mask]
         return _Problems(
-            self.samples.of(chosen), columns, strength, rounding, self.signs[:, chosen], self.at.only(chosen)
+            self.samples.of(mask), columns, strength, rounding, self.signs[:, mask], self.at.only(mask)
         )
 
 
@@ -209,16 +209,16 @@ class LogisticSolver:
             return step, todo.samples @ step
         # More than the point has, or is asked, is wasted work.
         precision = self.xp.maximum(relative, (goal / relative).clip(min=FINEST)).clip(max=COARSEST)
-        found = newton_steps(self._narrow, self.penalty, gradient, curvature, precision)
-        for column in found.unsettled:  # one after another: all Hessians may be more than the memory holds
-            one = gradient[:, column, None], curvature[:, column, None]
-            found.step[:, column] = self._exact_newton_steps(self.samples, *one)[:, 0]
-            found.change[:, column] = self.samples @ found.step[:, column]
-        return found.step, found.change
+        steps = newton_steps(self._narrow, self.penalty, gradient, curvature, precision)
+        for column in steps.unsettled:  # one after another: all Hessians may be more than the memory holds
+            problem = gradient[:, column, None], curvature[:, column, None]
+            steps.step[:, column] = self._exact_newton_steps(self.samples, *problem)[:, 0]
+            steps.change[:, column] = self.samples @ steps.step[:, column]
+        return steps.step, steps.change
 
     @cached_property
     def _narrow(self) -> Design:
-        """What steps are found with."""
+        """The samples that steps are found with."""
         return self.samples.narrow()
 
     def _exact_newton_steps(self, samples: Design, gradient: Array, curvature: Array) -> Array:
@@ -232,11 +232,11 @@ class LogisticSolver:
 
         is_exact: whether what is known of them is float64; else float32 adds to what is.
         """
-        here = todo.at
-        value, slope = self._objective(todo.strength, here), (gradient * step).sum(axis=0)
+        start = todo.at
+        value, slope = self._objective(todo.strength, start), (gradient * step).sum(axis=0)
         length = self.xp.ones_like(slope)
         noise = (EXACT if is_exact else 1e-6) * abs(value)
-        weights, decisions = here.weights + step, here.decisions + change
+        weights, decisions = start.weights + step, start.decisions + change
         while True:
             loss, misfit = _losses(todo.signs * decisions)
             bound = value + 1e-4 * length * slope + noise
@@ -244,17 +244,17 @@ class LogisticSolver:
             if not too_far.any():
                 break
             length[too_far] /= 2
-            weights, decisions = here.weights + length * step, here.decisions + length * change
+            weights, decisions = start.weights + length * step, start.decisions + length * change
         if is_exact:
             pulled = todo.samples.gather(todo.signs * misfit)
         else:
             narrow = self._narrow
-            more = self.xp.asarray(todo.signs * (misfit - here.misfit), dtype=narrow.spectrum.dtype)
-            pulled = here.pulled + narrow.gather(more)
+            more = self.xp.asarray(todo.signs * (misfit - start.misfit), dtype=narrow.spectrum.dtype)
+            pulled = start.pulled + narrow.gather(more)
         return _Point(weights, decisions, loss, misfit, pulled)
 
     def _point(self, samples: Design, signs: Array, weights: Array, decisions: Array) -> _Point:
-        """What is known at `weights`, in float64."""
+        """Return the objective at `weights`, in float64."""
         loss, misfit = _losses(signs * decisions)
         return _Point(weights, decisions, loss, misfit, samples.gather(signs * misfit))
 

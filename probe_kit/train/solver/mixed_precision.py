@@ -50,14 +50,14 @@ class NewtonState:
         larger = array_namespace(self.size).maximum(self.length, self.size)
         return self.size / larger.clip(TINY)
 
-    def only(self, chosen: NDArray[np.bool_]) -> "NewtonState":
+    def only(self, mask: NDArray[np.bool_]) -> "NewtonState":
         """Some of the problems."""
-        return self if chosen.all() else NewtonState(*(part[chosen] for part in vars(self).values()))
+        return self if mask.all() else NewtonState(*(part[mask] for part in vars(self).values()))
 
-    def replace(self, chosen: NDArray[np.bool_], others: "NewtonState") -> None:
-        """Put `others` in the place of some of the problems."""
-        for part, other in zip(vars(self).values(), vars(others).values(), strict=True):
-            part[chosen] = other
+    def replace(self, mask: NDArray[np.bool_], states: "NewtonState") -> None:
+        """Put `states` in the place of some of the problems."""
+        for part, other in zip(vars(self).values(), vars(states).values(), strict=True):
+            part[mask] = other
 
 
 class Problems(Protocol):
@@ -112,34 +112,34 @@ class _NewtonSolver:
 
     def rough(self, start: Array) -> Array:
         """Turned `start` brought near the optimum in float32. The last step is not looked back at."""
-        found, rows, weights = start + 0.0, np.arange(len(start)), start
+        solved, rows, weights = start + 0.0, np.arange(len(start)), start
         point = self._at(weights, rows, exact=False)
         for _ in range(MAX_ROUGH_STEPS):
             moving = to_numpy(point.relative > TOLERANCE)
             rows, weights, point = rows[moving], weights[moving], point.only(moving)
             if not rows.size:
-                return found
+                return solved
             step = self._newton_step(point, rows)
             near = to_numpy(point.relative <= NEAR)
-            found[rows[near]] = weights[near] + step[near]
+            solved[rows[near]] = weights[near] + step[near]
             if near.all():
-                return found
+                return solved
             rows, weights, point, step = rows[~near], weights[~near], point.only(~near), step[~near]
             slope = (point.gradient * step).sum(axis=1)
             weights, point = self._moved(weights, point, rows, step, slope, exact=False)
-            found[rows] = weights
-        return found
+            solved[rows] = weights
+        return solved
 
     def refined(self, start: Array) -> Array:
         """`start` brought to the optimum, certified by float64 gradients."""
-        found, rows, weights = array_namespace(start).empty_like(start), np.arange(len(start)), start
+        solved, rows, weights = array_namespace(start).empty_like(start), np.arange(len(start)), start
         point = self._at(weights, rows, exact=True)
         for _ in range(MAX_NEWTON_STEPS):
             # Negated, so that NaN stays open and ends in an error.
             open_ = to_numpy(~((point.relative <= TOLERANCE) | (point.size <= self.problems.rounding(rows))))
-            found[rows[~open_]] = weights[~open_]
+            solved[rows[~open_]] = weights[~open_]
             if not open_.any():
-                return found
+                return solved
             rows, weights, point = rows[open_], weights[open_], point.only(open_)
             step = self._newton_step(point, rows)
             slope = (point.gradient * step).sum(axis=1)
@@ -162,15 +162,15 @@ class _NewtonSolver:
         length = array_namespace(step).ones_like(slope)
         noise = (1e-11 if exact else 1e-6) * abs(point.value)
         moved = weights + step
-        there = self._at(moved, rows, exact=exact)
+        state = self._at(moved, rows, exact=exact)
         for _ in range(MAX_HALVINGS):
-            too_far = to_numpy(there.value > point.value + 1e-4 * length * slope + noise)
+            too_far = to_numpy(state.value > point.value + 1e-4 * length * slope + noise)
             if not too_far.any():
                 break
             length[too_far] /= 2
             moved[too_far] = weights[too_far] + length[too_far, None] * step[too_far]
-            there.replace(too_far, self._at(moved[too_far], rows[too_far], exact=exact))
-        return moved, there
+            state.replace(too_far, self._at(moved[too_far], rows[too_far], exact=exact))
+        return moved, state
 
     def _newton_step(self, point: NewtonState, rows: Rows) -> Array:
         """(k, R) float64: Hessian · step = −gradient, as precisely as the point is worth.
@@ -179,27 +179,27 @@ class _NewtonSolver:
         """
         xp = array_namespace(point.gradient)
         size = xp.amax(abs(point.gradient), axis=1)[:, None].clip(TINY)
-        rest = xp.asarray(-point.gradient / size, dtype=xp.float32)
-        step, live, curvature = xp.zeros_like(point.gradient), np.arange(len(rest)), point.curvature
+        residual = xp.asarray(-point.gradient / size, dtype=xp.float32)
+        step, live, curvature = xp.zeros_like(point.gradient), np.arange(len(residual)), point.curvature
         inverse = 1 / self.problems.diagonal(curvature, rows)
-        direction = inverse * rest
-        slope = (rest * direction).sum(axis=1)
+        direction = inverse * residual
+        slope = (residual * direction).sum(axis=1)
         goal = xp.asarray(_precision(point) ** 2, dtype=xp.float32) * slope
         for _ in range(MAX_CG_STEPS):
             product = self.problems.curved(direction, curvature, rows[live])
             length = (slope / (direction * product).sum(axis=1))[:, None]
             step[live] += length * direction
-            rest = rest - length * product
-            scaled = inverse * rest
-            previous, slope = slope, (rest * scaled).sum(axis=1)
+            residual = residual - length * product
+            scaled = inverse * residual
+            previous, slope = slope, (residual * scaled).sum(axis=1)
             keep = to_numpy(slope > goal)
             if not keep.any():
                 return step * size
             direction = scaled + (slope / previous)[:, None] * direction
             if not keep.all():
                 live = live[keep]
-                slope, goal, rest, direction, inverse, curvature = (
-                    part[keep] for part in (slope, goal, rest, direction, inverse, curvature)
+                slope, goal, residual, direction, inverse, curvature = (
+                    part[keep] for part in (slope, goal, residual, direction, inverse, curvature)
                 )
         step = step * size
         for position in live:

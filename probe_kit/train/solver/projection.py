@@ -47,10 +47,10 @@ class Projection:
 
     def raw_weights(self, weights: Array) -> tuple[NDArray[np.float64], float]:
         """Weights (D,) and intercept on the raw features that decide like `weights` (R + 1,) do here."""
-        kept = to_numpy(self.axes @ weights[:-1] / self.standardise.scale)
-        raw = np.zeros(self.standardise.kept.shape[0])
-        raw[to_numpy(self.standardise.kept)] = kept
-        return raw, float(weights[-1]) - float(to_numpy(self.standardise.mean) @ kept)
+        varying = to_numpy(self.axes @ weights[:-1] / self.standardise.scale)
+        raw = np.zeros(self.standardise.varies.shape[0])
+        raw[to_numpy(self.standardise.varies)] = varying
+        return raw, float(weights[-1]) - float(to_numpy(self.standardise.mean) @ varying)
 
 
 def _stay(features: RowSubset) -> bool:

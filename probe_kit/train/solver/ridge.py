@@ -26,13 +26,13 @@ PENALTIES: Matrix = np.array([*10.0 ** np.arange(-2, 6), np.inf])
 class RidgeFold:
     """Training and test samples of one fold, factorised.
 
-    spectrum: (R,) eigenvalues. left: (R, n) turns centred training targets into coordinates. right: (m, R) turns
-    shrunken coordinates into predictions of the test samples.
+    spectrum: (R,) eigenvalues. to_coordinates: (R, n) turns centred training targets into coordinates.
+    to_predictions: (m, R) turns shrunken coordinates into predictions of the test samples.
     """
 
     spectrum: Matrix
-    left: Matrix
-    right: Matrix
+    to_coordinates: Matrix
+    to_predictions: Matrix
 
     @classmethod
     def fit(cls, train: NDArray[np.floating], test: NDArray[np.floating]) -> "RidgeFold":
@@ -52,9 +52,9 @@ class RidgeFold:
     def predictions(self, targets: Matrix, penalties: Matrix = PENALTIES) -> Iterator[Matrix]:
         """(m, K) predictions of the test samples at each penalty, from (n, K) training targets."""
         mean = targets.mean(axis=0)
-        coordinates = self.left @ (targets - mean)
+        coordinates = self.to_coordinates @ (targets - mean)
         for penalty in penalties:
             if np.isinf(penalty):
-                yield np.repeat(mean[None, :], len(self.right), axis=0)
+                yield np.repeat(mean[None, :], len(self.to_predictions), axis=0)
             else:
-                yield mean + self.right @ (coordinates / (self.spectrum + penalty)[:, None])
+                yield mean + self.to_predictions @ (coordinates / (self.spectrum + penalty)[:, None])

@@ -15,10 +15,10 @@ ROWS_PER_BLOCK = 2048
 
 @dataclass(frozen=True)
 class RowSubset:
-    """The rows `chosen` (N,) of `matrix` (M, D), numpy or torch. Indexing chooses among them, without a copy."""
+    """The `rows` (N,) of `matrix` (M, D), numpy or torch. Indexing selects among them, without a copy."""
 
     matrix: Array
-    chosen: NDArray[np.intp]
+    rows: NDArray[np.intp]
 
     @classmethod
     def all(cls, matrix: Array) -> "RowSubset":
@@ -28,29 +28,29 @@ class RowSubset:
     @property
     def shape(self) -> tuple[int, int]:
         """(N, D)."""
-        return len(self.chosen), self.matrix.shape[1]
+        return len(self.rows), self.matrix.shape[1]
 
     def __len__(self) -> int:
-        return len(self.chosen)
+        return len(self.rows)
 
     def __getitem__(self, rows: NDArray[np.intp]) -> "RowSubset":
-        return RowSubset(self.matrix, self.chosen[rows])
+        return RowSubset(self.matrix, self.rows[rows])
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         return np.asarray(to_numpy(self.read()), dtype)
 
     def read(self) -> Array:
         """(N, D), copied."""
-        return self.matrix[self.chosen]
+        return self.matrix[self.rows]
 
     def blocks(self) -> Iterator[Array]:
         """All rows in order, ROWS_PER_BLOCK at a time, each block a copy."""
         for start in range(0, len(self), ROWS_PER_BLOCK):
-            yield self.matrix[self.chosen[start : start + ROWS_PER_BLOCK]]
+            yield self.matrix[self.rows[start : start + ROWS_PER_BLOCK]]
 
     def to(self, device: str | None) -> "RowSubset":
         """The same with the matrix as a torch tensor on `device`; unchanged without one."""
-        return RowSubset(to_device(self.matrix, device), self.chosen)
+        return RowSubset(to_device(self.matrix, device), self.rows)
 
 
 Features = Array | RowSubset

@@ -16,7 +16,7 @@ class Moments(NamedTuple):
 
     @classmethod
     def of(cls, features: Features) -> "Moments":
-        """Of (N, D) samples.
+        """Return the moments of (N, D) samples.
 
         Sums are of differences from the first sample in float64. A feature that never varies has deviation 0, and
         a variation that is small against its offset is exact. rounding: at least one unit in the last place.
@@ -33,10 +33,10 @@ class Moments(NamedTuple):
 class Standardiser:
     """Mean and scale of every feature that varies, learned on training samples only.
 
-    kept: (D,) bool, features with non-zero variance. mean, scale: (kept,) float64.
+    varies: (D,) bool, features with non-zero variance. mean, scale: (V,) float64 of these V features.
     """
 
-    kept: Array
+    varies: Array
     mean: Array
     scale: Array
 
@@ -48,11 +48,11 @@ class Standardiser:
         the last place of the stored type.
         """
         mean, scale, rounding = Moments.of(features)
-        kept = scale > rounding
-        return cls(kept, mean[kept], scale[kept])
+        varies = scale > rounding
+        return cls(varies, mean[varies], scale[varies])
 
     def __call__(self, features: Array) -> Array:
-        """(N, D) samples as (N, kept) float64 with the training samples' mean 0 and deviation 1."""
-        samples = features[:, self.kept] - self.mean
+        """(N, D) samples as (N, V) float64 with the training samples' mean 0 and deviation 1."""
+        samples = features[:, self.varies] - self.mean
         samples /= self.scale
         return samples

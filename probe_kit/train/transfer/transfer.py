@@ -66,8 +66,8 @@ def transfer_probes(
     for reader in (run, other):
         check_run(reader, categories)
     side = Sweep.of(run, target, pooled, ExecutionSettings(), None, window=window, permutations=0, **options)
-    own_window = side.samples.window if side.target.per_step else None
-    options |= {"permutations": permutations, "token_permutations": token_permutations, "window": own_window}
+    run_window = side.samples.window if side.target.per_step else None
+    options |= {"permutations": permutations, "token_permutations": token_permutations, "window": run_window}
     other_side = Sweep.of(other, of_other, pooled, ExecutionSettings(), None, **options)
     _check_alike(run, other, views, across_weights)
     train = make_problem(run, side.target, side.samples, EVERYWHERE, side.settings)
@@ -83,11 +83,11 @@ def transfer_probes(
     progress = progress or notebook_progress("sites")
     transferred: dict[tuple[str, Site], _Transferred] = {}
     for view, site in keys:
-        own, others = (
+        run_samples, other_samples = (
             read_samples(source, view, site, rows.rows, rows.inferences)
             for source, rows in ((run, train.samples), (other, samples))
         )
-        transferred[view, site] = _transfer(train, own, test, others, code)
+        transferred[view, site] = _transfer(train, run_samples, test, other_samples, code)
         if progress is not None:
             progress(len(transferred), len(keys), f"{site} {view}")
     return TransferResults(
@@ -110,20 +110,20 @@ def transfer_probes(
 
 
 def shared_groups(
-    run: RunReader, samples: TargetSamples, other: RunReader, others: TargetSamples, group_by: str | None
+    run: RunReader, samples: TargetSamples, other: RunReader, other_samples: TargetSamples, group_by: str | None
 ) -> NDArray[np.str_]:
-    """Names of the groups of `others` that `samples` has too.
+    """Return the names of the groups of `other_samples` that `samples` has too.
 
     By name, where names mean the same: with `group_by`, or if both runs are of one suite, data set or environment,
     or of selections of one suite. Also those with an item whose id and content are in both.
     """
-    names = np.unique(others.groups)
+    names = np.unique(other_samples.groups)
     in_both = np.zeros(names.size, bool)
     if group_by is not None or _sources(run) & _sources(other):
         in_both |= np.isin(names, samples.groups)
-    contents, other_contents = _contents(run, samples), _contents(other, others)
+    contents, other_contents = _contents(run, samples), _contents(other, other_samples)
     both = set(contents.values()) & set(other_contents.values())
-    group_of = dict(zip(others.rows.tolist(), others.groups.tolist(), strict=True))
+    group_of = dict(zip(other_samples.rows.tolist(), other_samples.groups.tolist(), strict=True))
     in_both |= np.isin(names, [group_of[row] for row, content in other_contents.items() if content in both])
     shared: NDArray[np.str_] = names[in_both]
     return shared
@@ -151,21 +151,21 @@ def _contents(run: RunReader, samples: TargetSamples) -> dict[int, tuple[str, st
 def _check_alike(run: RunReader, other: RunReader, views: Sequence[str], across_weights: bool) -> None:
     """Raise SettingsMismatchError for two networks, unless that is allowed, and for other sites or widths."""
     if not (across_weights or _same_weights(run, other)):
-        ours, theirs = ((one.weights_sha256 or "unknown")[:12] for one in (run, other))
+        ours, theirs = ((reader.weights_sha256 or "unknown")[:12] for reader in (run, other))
         raise SettingsMismatchError(
             f"{run.location} has the weights {ours}, {other.location} {theirs}; expected one network, because a "
             "direction means nothing in another. Accept that with --across-weights (across_weights=True)"
         )
     for view in views:
-        here, there = (
+        sites, other_sites = (
             [(str(site), run_of.streams[site.stream].width) for site in sites_of(run_of, view)]
             for run_of in (run, other)
         )
-        if here != there:
-            site, width = next(iter(set(here) ^ set(there)))
+        if sites != other_sites:
+            site, width = next(iter(set(sites) ^ set(other_sites)))
             raise SettingsMismatchError(
-                f"view {view!r}: {run.location} has {len(here)} sites, {other.location} {len(there)}, and not "
-                f"both have {site} of width {width}; expected the same sites and widths"
+                f"view {view!r}: {run.location} has {len(sites)} sites, {other.location} {len(other_sites)}, and "
+                f"not both have {site} of width {width}; expected the same sites and widths"
             )
 
 
@@ -175,48 +175,51 @@ def _same_weights(run: RunReader, other: RunReader) -> bool:
 
 
 def _unshared(
-    run: RunReader, samples: TargetSamples, other: RunReader, others: TargetSamples, group_by: str | None
+    run: RunReader, samples: TargetSamples, other: RunReader, other_samples: TargetSamples, group_by: str | None
 ) -> tuple[TargetSamples, int]:
     """The samples in groups that `run` does not have, and how many groups are left out."""
-    shared = shared_groups(run, samples, other, others, group_by)
-    unshared = ~np.isin(others.groups, shared)
-    left = np.unique(others.groups[unshared]).size
-    if left < OUTER_FOLDS:
+    shared = shared_groups(run, samples, other, other_samples, group_by)
+    unshared = ~np.isin(other_samples.groups, shared)
+    remaining = np.unique(other_samples.groups[unshared]).size
+    if remaining < OUTER_FOLDS:
         raise TooFewGroupsError(
-            f"{shared.size} of the {np.unique(others.groups).size} groups of {other.location} are in "
-            f"{run.location} too, which leaves {left}; expected at least {OUTER_FOLDS} to score "
+            f"{shared.size} of the {np.unique(other_samples.groups).size} groups of {other.location} are in "
+            f"{run.location} too, which leaves {remaining}; expected at least {OUTER_FOLDS} to score "
             "on. Give a run of other items or episodes"
         )
-    return others.of(unshared), int(shared.size)
+    return other_samples.of(unshared), int(shared.size)
 
 
-def _codes(classes: Sequence[str], others: Sequence[str]) -> Matrix | None:
+def _codes(classes: Sequence[str], other_classes: Sequence[str]) -> Matrix | None:
     """(K,) code in the other run of every class; -1 where it has none, None for quantities."""
     if not classes:
         return None
-    if unknown := [name for name in others if name not in classes]:
+    if unknown := [name for name in other_classes if name not in classes]:
         raise UsageError(
             f"the other run has the class {unknown[0]!r}, which no probe was fitted to; expected some of "
             f"{', '.join(classes)}. Leave its cells empty, or fit on a run that has it"
         )
-    return np.array([others.index(name) if name in others else -1 for name in classes], np.float64)
+    return np.array([other_classes.index(name) if name in other_classes else -1 for name in classes], np.float64)
 
 
 @dataclass(frozen=True)
 class _Transferred:
-    """One site. plain, moved: (m,) predictions as fitted, and on recentred features. own: (m,) scores."""
+    """One site. plain, moved: (m,) predictions as fitted, and on recentred features. refitted: (m,) scores of
+    a probe of the other run itself."""
 
     plain: Matrix
     moved: Matrix
     scores: tuple[Matrix, Matrix]
     null: tuple[Matrix, Matrix]
-    own: Matrix
+    refitted: Matrix
     strength: float
 
 
-def _transfer(train: Problem, own: Samples, test: Problem, others: Samples, code: Matrix | None) -> _Transferred:
-    count, other_count = own.counts.size, others.counts.size
-    samples = Samples.joined([own, others, _recentred(others, own)])
+def _transfer(
+    train: Problem, run_samples: Samples, test: Problem, other_samples: Samples, code: Matrix | None
+) -> _Transferred:
+    count, other_count = run_samples.counts.size, other_samples.counts.size
+    samples = Samples.joined([run_samples, other_samples, _recentred(other_samples, run_samples)])
     fold = NestedFold(
         Fold(np.arange(count), np.arange(count, count + 2 * other_count)), [fold.outer for fold in train.folds]
     )
@@ -226,24 +229,24 @@ def _transfer(train: Problem, own: Samples, test: Problem, others: Samples, code
     if code is not None:
         predicted = code[predicted.astype(np.intp)]
     plain, moved = predicted[:other_count], predicted[other_count:]
-    permuted = test.permuted_labels if others.pools else test.permuted_labels[:, : test.token_permutations]
+    permuted = test.permuted_labels if other_samples.pools else test.permuted_labels[:, : test.token_permutations]
     truth = np.column_stack([test.labels, permuted]).astype(np.float64)
-    of_plain, of_moved = (_scores(one, truth, test.task) for one in (plain, moved))
-    scores = probe_labels(others, truth[:, :1], test.task, test.folds).scores
+    of_plain, of_moved = (_scores(predictions, truth, test.task) for predictions in (plain, moved))
+    scores = probe_labels(other_samples, truth[:, :1], test.task, test.folds).scores
     return _Transferred(
         plain, moved, (of_plain[0], of_moved[0]), (of_plain[1], of_moved[1]), scores, strength
     )  # fmt: skip
 
 
-def _recentred(others: Samples, own: Samples) -> Samples:
+def _recentred(samples_to_move: Samples, run_samples: Samples) -> Samples:
     """Return the samples of the other run, moved to the mean of the first run's."""
-    means, own_means = (np.asarray(samples.means) for samples in (others, own))
-    shift = own_means.mean(axis=0, dtype=np.float64) - means.mean(axis=0, dtype=np.float64)
-    features = others.read()
+    means, run_means = (np.asarray(samples.means) for samples in (samples_to_move, run_samples))
+    shift = run_means.mean(axis=0, dtype=np.float64) - means.mean(axis=0, dtype=np.float64)
+    features = samples_to_move.read()
     moved = (features + shift).astype(features.dtype)
-    if others.pools:
+    if samples_to_move.pools:
         return Samples.pooled(moved)
-    return Samples(RowSubset.all(moved), others.counts, means + shift)
+    return Samples(RowSubset.all(moved), samples_to_move.counts, means + shift)
 
 
 def _scores(predicted: Matrix, truth: Matrix, task: Task) -> tuple[Matrix, Matrix]:
@@ -261,8 +264,8 @@ def _scores(predicted: Matrix, truth: Matrix, task: Task) -> tuple[Matrix, Matri
 def _curve(
     run: RunReader, test: Problem, view: str, transferred: dict[tuple[str, Site], _Transferred]
 ) -> TransferCurve:
-    of_view = {site: one for (name, site), one in transferred.items() if name == view}
-    own = list(of_view.values())
+    of_view = {site: result for (name, site), result in transferred.items() if name == view}
+    transferred_sites = list(of_view.values())
     plain, moved = (
         ProbeCurve(
             sites=tuple(of_view),
@@ -271,16 +274,16 @@ def _curve(
             items=test.items,
             groups=test.groups,
             fold_of=test.fold_of,
-            decisions=np.stack([(one.plain, one.moved)[at] for one in own]),
-            strengths=np.array([[one.strength] for one in own]),
-            null=np.stack([one.null[at] for one in own]),
-            inner=np.zeros((len(own), 0, 0), np.float32),
+            decisions=np.stack([(result.plain, result.moved)[at] for result in transferred_sites]),
+            strengths=np.array([[result.strength] for result in transferred_sites]),
+            null=np.stack([result.null[at] for result in transferred_sites]),
+            inner=np.zeros((len(transferred_sites), 0, 0), np.float32),
             parts=tuple(str(run.streams[site.stream].part) for site in of_view),
             task=test.task,
             is_side=False,
             classes=test.classes,
-            sample_scores=np.stack([one.scores[at] for one in own]),
+            sample_scores=np.stack([result.scores[at] for result in transferred_sites]),
         )
         for at in (0, 1)
     )
-    return TransferCurve(plain, moved, np.stack([one.own for one in own]))
+    return TransferCurve(plain, moved, np.stack([result.refitted for result in transferred_sites]))

@@ -1,4 +1,4 @@
-"""Results of a transfer: scores on the other run, as fitted and recentred, beside its own."""
+"""Results of a transfer: scores on the other run: as fitted, recentred, and refitted there."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -24,12 +24,12 @@ class TransferCurve:
     """All S sites of one view on the m samples of the other run.
 
     fitted: probes as they were fitted. recentred: the same probes after the other run's features were moved to the
-    mean of the first. own: (S, m) held-out scores of probes of the other run itself.
+    mean of the first. refitted: (S, m) held-out scores of probes of the other run itself.
     """
 
     fitted: ProbeCurve
     recentred: ProbeCurve
-    own: Matrix
+    refitted: Matrix
 
 
 @dataclass(frozen=True, repr=False)
@@ -69,7 +69,8 @@ class TransferResults:
 
         `score`, `ci_low`, `ci_high`, `chance`, `p`, `p_fwe`: as in `ProbeResults.scores`, on the other run.
         `recentred`, `recentred_chance`, `recentred_p_fwe`: the same on features moved to the first run's mean.
-        `own`, `own_ci_low`, `own_ci_high`: cross-validated score of the other run itself. `penalty`: λ, or 1 / C.
+        `refitted`, `refitted_ci_low`, `refitted_ci_high`: cross-validated score of the other run itself.
+        `penalty`: λ, or 1 / C.
         """
         import pandas as pd
 
@@ -81,8 +82,8 @@ class TransferResults:
         rows = []
         for row, (site, part) in enumerate(zip(fitted.sites, fitted.parts, strict=True)):
             low, high = score_interval(fitted.scores[row], self.labels, self.groups, self.task)
-            own_low, own_high = score_interval(
-                curve.own[row], self.labels, self.groups, self.task, (self.labels - self.labels.mean()) ** 2
+            low_refitted, high_refitted = score_interval(
+                curve.refitted[row], self.labels, self.groups, self.task, (self.labels - self.labels.mean()) ** 2
             )
             rows.append(
                 {
@@ -106,9 +107,9 @@ class TransferResults:
                     "recentred": moved.metric[row],
                     "recentred_chance": moved.chance[row],
                     "recentred_p_fwe": moved_p[row],
-                    "own": float(curve.own[row].mean()),
-                    "own_ci_low": own_low,
-                    "own_ci_high": own_high,
+                    "refitted": float(curve.refitted[row].mean()),
+                    "refitted_ci_low": low_refitted,
+                    "refitted_ci_high": high_refitted,
                     "penalty": float(fitted.penalties[row, 0]),
                     "n": self.labels.size,
                     "groups": np.unique(self.groups).size,

@@ -25,7 +25,7 @@ def test_features_constant_up_to_rounding_are_dropped() -> None:
     features = noise(50, 4).astype(np.float32)
     features[:, 1] = 7
     features[:, 2] = 1e4 + 1e-3 * features[:, 2]  # below the resolution of float32 at 1e4
-    assert Standardiser.fit(features).kept.tolist() == [True, False, False, True]
+    assert Standardiser.fit(features).varies.tolist() == [True, False, False, True]
 
 
 @pytest.mark.parametrize("make", [np.asarray, torch.from_numpy])
@@ -40,7 +40,7 @@ def test_a_small_variation_around_a_large_offset_is_kept(
     signs = np.where(np.arange(40) % 2, 1, -1)
     features = np.column_stack([offset + variation * signs, noise(40)]).astype(dtype)
     standardise = Standardiser.fit(make(features))
-    assert standardise.kept.tolist() == [True, True]
+    assert standardise.varies.tolist() == [True, True]
     np.testing.assert_allclose(np.asarray(standardise(make(features)))[:, 0], signs, atol=1e-9)
 
 
@@ -50,14 +50,14 @@ def test_a_feature_that_never_varies_is_dropped_however_many_samples_there_are(v
     if value > float(np.finfo(dtype).max):
         pytest.skip("the type holds no such number")
     features = np.column_stack([np.full(10_007, value), noise(10_007)]).astype(dtype)
-    assert Standardiser.fit(features).kept.tolist() == [False, True]
+    assert Standardiser.fit(features).varies.tolist() == [False, True]
 
 
 def test_a_jitter_of_one_unit_in_the_last_place_is_dropped() -> None:
     constant = np.full(50, 1.7, np.float32)
     constant[::3] = np.nextafter(constant[0], np.float32(2))
     constant[1::3] = np.nextafter(constant[0], np.float32(1))
-    assert Standardiser.fit(np.column_stack([constant, noise(50)]).astype(np.float32)).kept.tolist() == [
+    assert Standardiser.fit(np.column_stack([constant, noise(50)]).astype(np.float32)).varies.tolist() == [
         False,
         True,
     ]

@@ -131,7 +131,7 @@ def test_a_shift_of_all_features_is_undone_by_recentring_alone() -> None:
     row = moved.scores.set_index("layer").loc[1]
     assert row["score"] < 0
     assert row["recentred"] > 0.6
-    assert row["own"] > 0.7
+    assert row["refitted"] > 0.7
 
 
 def test_labels_of_the_other_run_take_part_in_no_fit() -> None:
