@@ -51,7 +51,7 @@ def save_gif(path: Path, pictures: Sequence[Picture], fps: float = 5.0) -> None:
     """
     if not pictures:
         raise ValueError(f"{path}: no pictures to write; call `env.render()` at least once.")
-    first, *rest = (Image.fromarray(picture) for picture in pictures)
+    first, *later = (Image.fromarray(picture) for picture in pictures)
     # A GIF counts in hundredths of a second, and many players slow down anything below two of them.
     duration = max(20, round(100 / fps) * 10)
-    first.save(path, save_all=True, append_images=rest, duration=duration, loop=0)
+    first.save(path, save_all=True, append_images=later, duration=duration, loop=0)

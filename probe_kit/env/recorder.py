@@ -23,11 +23,11 @@ class Recorder:
         """After an action (7,) was executed."""
         trial = self._env.trial
         assert trial.executed is not None
-        asked = np.asarray(commanded, np.float64)
-        self._frames.append(np.concatenate([_state(trial.scene), asked, trial.executed, [trial.ik_error]]))
+        command = np.asarray(commanded, np.float64)
+        self._frames.append(np.concatenate([_state(trial.scene), command, trial.executed, [trial.ik_error]]))
 
     def trajectory(self) -> Trajectory:
-        """What was noted so far."""
+        """Return the trajectory up to the last noted action."""
         return Trajectory.of_frames(np.asarray(self._frames, np.float32))
 
 

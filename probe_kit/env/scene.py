@@ -51,7 +51,7 @@ _KEPT = 8
 
 @dataclass(frozen=True)
 class BodyState:
-    """Where cube or tile is: position (3,) of its middle, quaternion (4,) x, y, z, w, and linear speed in m/s."""
+    """The state of cube or tile: position (3,) of the middle, quaternion (4,) x, y, z, w, linear speed in m/s."""
 
     position: Array
     quaternion: Array
@@ -102,7 +102,7 @@ class Scene:
 
     @contextmanager
     def exchanged(self) -> Iterator[None]:
-        """With the two pictures in each other's place; nothing else differs, because pictures have no weight."""
+        """Exchange the two pictures; nothing else differs, because pictures have no weight."""
         before = self._shown
         self._shown = {side: before[other_side(side)] for side in SIDES}
         self._show()
@@ -155,22 +155,22 @@ class Scene:
         self._closed = (start, self.client.saveState())
 
     def cube_state(self) -> BodyState:
-        """Where the cube is now."""
+        """Return the present state of the cube."""
         return self._state(self.cube)
 
     def tile_state(self, side: Side) -> BodyState:
-        """Where the tile that started on `side` is now."""
+        """Return the present state of the tile that started on `side`."""
         return self._state(self.tiles[side])
 
     def tile_xy(self, side: Side) -> XY:
-        """Where the middle of that tile is now, in the plane."""
+        """Return the present middle of that tile in the plane."""
         if self.spec.tile_mass == 0:
             return self.spec.tile_xy(side)
         x, y, _ = self.tile_state(side).position
         return (float(x), float(y))
 
     def finger_contacts(self) -> tuple[bool, bool]:
-        """Whether the left and the right finger touch the cube."""
+        """Tell of the left and the right finger whether it touches the cube."""
         contacts = self.client.getContactPoints(bodyA=self.arm.body, bodyB=self.cube)
         touching = {contact[3] for contact in contacts}
         left, right = self.arm.model.fingers
@@ -274,23 +274,23 @@ class Scene:
 
     def _find_home(self) -> Array:
         spec, posture, limits = self.spec, np.array(self.arm.model.posture), self.spec.limits
-        wanted = self.arm.tool_down(spec.home, spec.home_rpy)
+        home = self.arm.tool_down(spec.home, spec.home_rpy)
         if spec.home_joints is not None:
-            return self._checked_home(np.array(spec.home_joints), wanted)
-        solution = self.arm.chain.solve(wanted, posture, posture)
+            return self._checked_home(np.array(spec.home_joints), home)
+        solution = self.arm.chain.solve(home, posture, posture)
         if solution.error > limits.ik_error or solution.turn_error > limits.ik_turn_error:
             raise SceneError(f"the {spec.arm} cannot reach its home {spec.home} with the gripper down.")
         return solution.q
 
-    def _checked_home(self, q: Array, wanted: Pose) -> Array:
+    def _checked_home(self, q: Array, home: Pose) -> Array:
         spec, count = self.spec, len(self.arm.model.joints)
         if q.shape != (count,):
             raise SceneError(
                 f"home_joints has {q.size} angles; the {spec.arm} has {count} joints. Give one for each."
             )
         pose = self.arm.chain.pose(q)
-        apart = float(np.linalg.norm(pose.position - wanted.position))
-        turned = float(np.linalg.norm(to_vector(pose.rotation @ wanted.rotation.T)))
+        apart = float(np.linalg.norm(pose.position - home.position))
+        turned = float(np.linalg.norm(to_vector(pose.rotation @ home.rotation.T)))
         if apart > HOME_ERROR or turned > 10 * HOME_ERROR:
             raise SceneError(
                 f"home_joints bring the tool of the {spec.arm} to {pose.position.round(4).tolist()}, "
@@ -332,7 +332,7 @@ class Scene:
         self._tile_pixels = _drawn_once(_TILE_PIXELS, lie, self._count_tile_pixels)
 
     def _count_tile_pixels(self) -> dict[Side, int]:
-        """Of each picture with nothing in front of it, on screen or just outside."""
+        """Count the pixels of each picture with nothing in front of it, on screen or just outside."""
         bodies = self.camera.widened().render(self.client, self.spec.light, self.spec.light_level).bodies
         return {side: int((bodies == self.quads[side]).sum()) for side in SIDES}
 
@@ -349,8 +349,8 @@ class Scene:
         for side in SIDES:
             state = self.tile_state(side)
             up = np.array(self.client.getMatrixFromQuaternion(state.quaternion)).reshape(3, 3)[:, 2]
-            place = (state.position + lift * up).tolist()
-            self.client.resetBasePositionAndOrientation(self.quads[side], place, state.quaternion.tolist())
+            position = (state.position + lift * up).tolist()
+            self.client.resetBasePositionAndOrientation(self.quads[side], position, state.quaternion.tolist())
 
     def _put(self, body: int, position: XYZ, yaw: float) -> None:
         self.client.resetBasePositionAndOrientation(body, position, yaw_quaternion(yaw))
@@ -379,10 +379,10 @@ class Scene:
         return body
 
 
-def _drawn_once[Key, Seen](kept: dict[Key, Seen], key: Key, draw: Callable[[], Seen]) -> Seen:
-    """What `draw` gave when it was last called for `key`; renderings are the same bit for bit."""
-    if key not in kept:
-        if len(kept) == _KEPT:
-            kept.clear()
-        kept[key] = draw()
-    return kept[key]
+def _drawn_once[Key, Seen](drawings: dict[Key, Seen], key: Key, draw: Callable[[], Seen]) -> Seen:
+    """Return the rendering for `key`, drawn on first use; renderings are the same bit for bit."""
+    if key not in drawings:
+        if len(drawings) == _KEPT:
+            drawings.clear()
+        drawings[key] = draw()
+    return drawings[key]

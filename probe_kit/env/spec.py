@@ -72,7 +72,7 @@ class LightSpec:
 
 @dataclass(frozen=True)
 class PhysicsSpec:
-    """How time passes: 48 substeps at 240 Hz make one action at 5 Hz.
+    """The time of the simulation: 48 substeps at 240 Hz make one action at 5 Hz.
 
     A strong grip on a light cube needs many solver iterations: 40 N with 30 iterations squeezes the cube out
     of the hand every time, 15 N with 100 never did.
@@ -88,7 +88,7 @@ class PhysicsSpec:
 
 @dataclass(frozen=True)
 class LimitSpec:
-    """What the controller accepts; anything beyond is clipped and counted.
+    """The limits of the controller; anything beyond is clipped and counted.
 
     translation, rotation: largest change per action and axis. low, high: corners of the box the commanded
     tool position stays in (its floor is raised to the finger clearance of the arm). None means no such limit;
@@ -278,15 +278,15 @@ class SceneSpec:
                 f"a stored scene has the field {unknown[0]!r}, which is unknown to this version; read it with the "
                 "version that wrote it"
             )
-        given: dict[str, Any] = {name: _as_tuple(value) for name, value in values.items()}
-        named = [name for name in ("arm_urdf", "background") if given.get(name) is not None]
-        if without := sorted(set(files) - set(named)):
-            there = ", ".join(named) or "none"
-            raise SceneError(f"the scene was made without a file as {without[0]}; it has {there}. Leave it out")
-        for name in named:
-            given[name] = _file_of(name, str(given[name]), files)
-        given |= {name: part(**_as_tuples(values[name])) for name, part in parts.items() if name in values}
-        return cls(**given)
+        fields: dict[str, Any] = {name: _as_tuple(value) for name, value in values.items()}
+        with_files = [name for name in ("arm_urdf", "background") if fields.get(name) is not None]
+        if without := sorted(set(files) - set(with_files)):
+            names = ", ".join(with_files) or "none"
+            raise SceneError(f"the scene was made without a file as {without[0]}; it has {names}. Leave it out")
+        for name in with_files:
+            fields[name] = _file_of(name, str(fields[name]), files)
+        fields |= {name: part(**_as_tuples(values[name])) for name, part in parts.items() if name in values}
+        return cls(**fields)
 
     def _check_values(self) -> None:
         positive = {
@@ -365,13 +365,13 @@ def _as_tuples(values: Mapping[str, Any]) -> dict[str, Any]:
     return {name: _as_tuple(value) for name, value in values.items()}
 
 
-def _file_of(name: str, wanted: str, files: Mapping[str, Path]) -> Path:
+def _file_of(name: str, expected: str, files: Mapping[str, Path]) -> Path:
     """The file that a stored scene names by its hash."""
     if name not in files:
-        raise SceneError(f"the scene was made with a file as {name}, {wanted[:19]}…; give that file again")
-    if (found := _content_sha256(files[name])) != wanted:
+        raise SceneError(f"the scene was made with a file as {name}, {expected[:19]}…; give that file again")
+    if (content := _content_sha256(files[name])) != expected:
         raise SceneError(
-            f"{files[name]} is {found[:19]}…; the scene was made with {wanted[:19]}… as {name}. Give that file"
+            f"{files[name]} is {content[:19]}…; the scene was made with {expected[:19]}… as {name}. Give that file"
         )
     return files[name]
 

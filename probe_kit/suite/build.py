@@ -75,7 +75,7 @@ def default_suite(
 def default_folder(
     categories: Sequence[str] | None = None, items_per_category: int = ITEMS, seed: int = 0
 ) -> Path:
-    """Where `default_suite` keeps the suite of these arguments, whether it was built yet or not."""
+    """Return the folder in which `default_suite` keeps the suite of these arguments, built or not."""
     key = _cache_key(_options(categories, items_per_category, seed))
     return _cache_folder() / "suites" / f"{default_identity().replace('@', '-')}-{key}"
 
@@ -90,10 +90,10 @@ def _options(
 ) -> dict[str, Any]:
     """The arguments in one spelling, checked: equal numbers of items are one number."""
     embedded = [slug for slug in CATEGORIES if slug in GENERATORS]
-    wanted = embedded if categories is None else check_categories(categories, embedded)
-    if not wanted:
+    requested = embedded if categories is None else check_categories(categories, embedded)
+    if not requested:
         raise UsageError("no category to build. Name at least one, or leave `categories` out for all.")
-    ordered = [slug for slug in embedded if slug in wanted]
+    ordered = [slug for slug in embedded if slug in requested]
     counts = _counts(ordered, items_per_category)
     for count in counts.values():
         if count < 2 or count % 2:
@@ -110,7 +110,7 @@ def _options(
 
 
 def _counts(categories: Sequence[str], items_per_category: int | Mapping[str, int]) -> dict[str, int]:
-    """How many items each category gets."""
+    """Return the number of items of each category."""
     if isinstance(items_per_category, int):
         return dict.fromkeys(categories, items_per_category)
     if items_per_category.keys() != set(categories):
@@ -122,7 +122,7 @@ def _counts(categories: Sequence[str], items_per_category: int | Mapping[str, in
 
 
 def _stats(suite: Suite) -> dict[str, dict[str, int]]:
-    """How many different pairs of concepts each category has, and how many items were made."""
+    """Count the different pairs of concepts and the items of each category."""
     return {
         category: {"pool": len(GENERATORS[category].pairs), "emitted": emitted}
         for category, emitted in suite.card["counts"].items()
@@ -130,8 +130,8 @@ def _stats(suite: Suite) -> dict[str, dict[str, int]]:
 
 
 def _cache_folder() -> Path:
-    given = os.environ.get("PROBE_KIT_CACHE")
-    return Path(given) if given else Path.home() / ".cache" / "probe_kit"
+    folder = os.environ.get("PROBE_KIT_CACHE")
+    return Path(folder) if folder else Path.home() / ".cache" / "probe_kit"
 
 
 def _cache_key(options: Mapping[str, Any]) -> str:
@@ -141,10 +141,10 @@ def _cache_key(options: Mapping[str, Any]) -> str:
     the notice beside it holds its checksums.
     """
     folder = Path(__file__).parent
-    own = ("build", "categories", "grouping", "items", "making", "manifest", "pictures", "suite", "wording")
+    modules = ("build", "categories", "grouping", "items", "making", "manifest", "pictures", "suite", "wording")
     sources = [
         *sorted((folder / "generators").rglob("*.py")),
-        *(folder / f"{name}.py" for name in own),
+        *(folder / f"{name}.py" for name in modules),
         folder / "art" / "NOTICE.md",
     ]
     code = sha256_text("\n".join(source.read_text(encoding="utf-8") for source in sources))

@@ -62,8 +62,8 @@ def check_slug(name: str) -> str:
 
 def in_order(slugs: Iterable[str]) -> tuple[str, ...]:
     """Each name once: the paper's categories in its order, then the others by the alphabet."""
-    given = set(slugs)
-    return (*(slug for slug in CATEGORIES if slug in given), *sorted(given - CATEGORIES.keys()))
+    names = set(slugs)
+    return (*(slug for slug in CATEGORIES if slug in names), *sorted(names - CATEGORIES.keys()))
 
 
 def check_categories(names: Sequence[str], available: Sequence[str]) -> tuple[str, ...]:

@@ -175,22 +175,22 @@ def validate(
     """
     from probe_kit.suite import default_suite, validate_suite
 
-    place = default_suite().folder if folder is None else folder
+    location = default_suite().folder if folder is None else folder
     with err.status("checking"):
-        report = validate_suite(place, baselines=baselines)
-    least = _least_leaks(place) if power and not report.errors else {}
+        report = validate_suite(location, baselines=baselines)
+    least = _least_leaks(location) if power and not report.errors else {}
     if as_json:
         print_json(report.to_json() | ({"power": least} if power else {}))
     else:
         for category, accuracy in least.items():
-            seen = f"{category}: a leak is found in 4 of 5 suites of this size from {100 * accuracy:.1f} % on"
-            out.print(seen, soft_wrap=True)
+            line = f"{category}: a leak is found in 4 of 5 suites of this size from {100 * accuracy:.1f} % on"
+            out.print(line, soft_wrap=True)
         out.print(report.to_text(), soft_wrap=True)
     raise typer.Exit(0 if report.ok else 1)
 
 
 def _least_leaks(folder: Path) -> dict[str, float]:
-    """By category, the accuracy from which on a baseline is found above chance in four of five suites."""
+    """Return by category the accuracy from which on a baseline is found above chance in four of five suites."""
     from probe_kit.statistics.significance import detectable
     from probe_kit.suite import load_suite
     from probe_kit.suite.suite import count_by_category

@@ -138,12 +138,12 @@ class Episode:
     @property
     def episode_id(self) -> str:
         """`<item_id>:o` or `<item_id>:s`, and `:<wording>` behind it for all but the item's own words."""
-        own = self.wording in (None, "knowledge")
-        return f"{self.item.item_id}:{self.layout[0]}" + ("" if own else f":{self.wording}")
+        is_plain = self.wording in (None, "knowledge")
+        return f"{self.item.item_id}:{self.layout[0]}" + ("" if is_plain else f":{self.wording}")
 
     @property
     def seed_id(self) -> str:
-        """What seeds are derived from: the same in all wordings."""
+        """The name that seeds are derived from: the same in all wordings."""
         return f"{self.item.item_id}:{self.layout[0]}"
 
     @property

@@ -40,7 +40,7 @@ Rows = npt.NDArray[np.intp]
 
 @dataclass(frozen=True)
 class Baseline:
-    """How often one baseline found the correct side in one category.
+    """The accuracy of one baseline on the correct side in one category.
 
     interval: 95 %, from resampling groups. limit: what it may not exceed. grouping: what folds kept together.
     """
@@ -131,7 +131,7 @@ def _category_baselines(suite: Suite, category: str, seed: int) -> Iterator[Base
 
 
 def _groups(episodes: Sequence[Episode]) -> tuple[npt.NDArray[np.str_], str]:
-    """What a fold must not separate: connected pictures, or twins where all pictures are connected."""
+    """Return the groups that a fold must not separate: connected pictures, or twins where all are connected."""
     groups = np.array([episode.item.group_id for episode in episodes])
     if len(np.unique(groups)) >= FOLDS:
         return groups, "group_id"
@@ -148,7 +148,7 @@ def _interval(hits: Array, groups: npt.NDArray[np.str_]) -> tuple[float, float]:
 
 
 def _both_sides(episodes: Sequence[Episode], describe: Callable[[Image.Image], Array]) -> Array:
-    """What `describe` says of the left and then the right picture of every episode."""
+    """Return the values of `describe` for the left and then the right picture of every episode."""
     paths = {episode.picture(side) for episode in episodes for side in _SIDES}
     described = {path: describe(load_picture(path)) for path in paths}
     return np.array(
@@ -165,7 +165,7 @@ def _pixels(episodes: Sequence[Episode]) -> Array:
 
 
 def _statistics(episodes: Sequence[Episode]) -> Array:
-    """What can be seen without recognising anything: colour, spread, background, ink, edges, extent."""
+    """Return the features that need no recognition: colour, spread, background, ink, edges, extent."""
 
     def describe(image: Image.Image) -> Array:
         pixels = np.asarray(image.resize((64, 64), Image.Resampling.BOX), np.float64)

@@ -34,7 +34,7 @@ class Picture:
 
     @property
     def file_name(self) -> str:
-        """Where it lies inside the suite's `items/`."""
+        """The file's name inside the suite's `items/`."""
         return picture_file_name(self.pixels_sha256)
 
 

@@ -80,13 +80,13 @@ def _rename_unless_taken(draft: Path, folder: Path) -> None:
 
 def _load_same(suite: Suite, folder: Path) -> Suite:
     check_foreign_folder(folder)
-    found = load_suite(folder)
-    if found.identity != suite.identity:
+    stored = load_suite(folder)
+    if stored.identity != suite.identity:
         raise SuiteError(
-            f"{folder} already holds {found.identity}; expected {suite.identity} or a new folder. "
+            f"{folder} already holds {stored.identity}; expected {suite.identity} or a new folder. "
             "Choose another folder, or delete this one if nothing was measured with it."
         )
-    return found
+    return stored
 
 
 def _write(suite: Suite, pictures: Mapping[str, bytes], stats: Mapping[str, Any], folder: Path) -> None:

@@ -323,8 +323,8 @@ def _row(record: Mapping[str, str | None], line: int, opened: TextTable, categor
     for column, cell in cells.items():
         if problem := problem_of(cell):
             raise UsageError(f"{where}, column {column}: {problem}")
-    asked = cells.get("object") or _object_of(cells["instruction"])
-    if asked is None or asked not in cells["instruction"]:
+    phrase = cells.get("object") or _object_of(cells["instruction"])
+    if phrase is None or phrase not in cells["instruction"]:
         raise UsageError(
             f"{where}, column instruction: no target can be parsed from {cells['instruction']!r}. Write it as "
             "'Put the cube on the …', or name the words in a column `object`"
@@ -337,7 +337,7 @@ def _row(record: Mapping[str, str | None], line: int, opened: TextTable, categor
         if not cells.get("category"):
             raise
         raise UsageError(f"{where}, column category: {error}") from error
-    return Row(line, cells["instruction"], correct, wrong, cells.get("group", ""), slug, asked, other)
+    return Row(line, cells["instruction"], correct, wrong, cells.get("group", ""), slug, phrase, other)
 
 
 def _object_of(instruction: str) -> str | None:
@@ -345,6 +345,6 @@ def _object_of(instruction: str) -> str | None:
     words = instruction.split()
     for number, word in enumerate(words):
         if word.lower() in ("on", "onto"):
-            rest = words[number + 1 :]
-            return " ".join(rest[1:] if rest and rest[0].lower() in ("the", "a", "an") else rest) or None
+            phrase = words[number + 1 :]
+            return " ".join(phrase[1:] if phrase and phrase[0].lower() in ("the", "a", "an") else phrase) or None
     return None

@@ -56,7 +56,7 @@ def pixels_sha256(image: Image.Image) -> str:
 
 
 def picture_file_name(pixels_sha256: str) -> str:
-    """Where a picture lies inside `items/`; its name gives away nothing but its content."""
+    """Return the file name of a picture inside `items/`; the name gives away nothing but its content."""
     return f"images/{pixels_sha256[:2]}/{pixels_sha256[:16]}.png"
 
 
@@ -84,9 +84,9 @@ def load_picture(path: Path, pixels: str | None = None) -> Image.Image:
     pixels: the hash its pixels must have. Raises SuiteError as `decode_picture` does, and for other pixels.
     """
     picture = decode_picture(path)
-    if pixels is not None and (found := pixels_sha256(picture)) != pixels:
+    if pixels is not None and (actual := pixels_sha256(picture)) != pixels:
         raise SuiteError(
-            f"{path}: has other pixels than its suite says (expected {pixels[:12]}, found {found[:12]}). {RESTORE}"
+            f"{path}: has other pixels than its suite says (expected {pixels[:12]}, found {actual[:12]}). {RESTORE}"
         )
     return letterboxed(picture)
 

@@ -133,13 +133,15 @@ class Suite:
         Raises UnknownCategoryError for a category the suite lacks, and UsageError for a number that is not
         positive, exceeds what a category has, or would separate role-exchanged twins.
         """
-        wanted = self.categories if categories is None else check_categories(categories, self.categories)
-        if not wanted:
+        selected = self.categories if categories is None else check_categories(categories, self.categories)
+        if not selected:
             raise UsageError("no category selected. Name at least one, or leave `categories` out for all.")
-        chosen = {item.item_id for category in wanted for item in self._first_items(category, items_per_category)}
-        if len(chosen) == len(self.items):
+        item_ids = {
+            item.item_id for category in selected for item in self._first_items(category, items_per_category)
+        }
+        if len(item_ids) == len(self.items):
             return self
-        items = tuple(item for item in self.items if item.item_id in chosen)
+        items = tuple(item for item in self.items if item.item_id in item_ids)
         card = self.card | {
             "parent": self.content_sha256,
             "counts": count_by_category(items),
@@ -157,14 +159,14 @@ class Suite:
                 f"{count} items per category are asked for, and {category!r} has {counted(len(items), 'item')}; "
                 f"give a number from 1 to {len(items)}."
             )
-        kept, dropped = items[:count], items[count:]
-        separated = {item.pair_id for item in kept} & {item.pair_id for item in dropped}
+        first, dropped = items[:count], items[count:]
+        separated = {item.pair_id for item in first} & {item.pair_id for item in dropped}
         if separated:
             raise UsageError(
                 f"{count} items per category would keep one of the role-exchanged twins "
                 f"{min(separated)!r} of {category!r} and drop the other. Give an even number."
             )
-        return kept
+        return first
 
 
 def new_suite(

@@ -16,7 +16,7 @@ from probe_kit.suite.validation.warnings import WARNING_RULES
 
 @dataclass(frozen=True)
 class Report:
-    """What is wrong with a suite and what one should know of it.
+    """The findings on a suite: violated rules, warnings, and baselines.
 
     suite: its identity, or its folder if the card cannot be read. baselines: None if they were not run.
     """
@@ -53,7 +53,7 @@ class Report:
         }
 
     def to_text(self) -> str:
-        """For a terminal: at most 20 findings of each rule, then the baselines, then the verdict."""
+        """Return the text for a terminal: at most 20 findings of each rule, the baselines, the verdict."""
         lines = [listing(self.errors), listing(self.warnings)]
         lines += [f"{category_of(baseline.category).title}: {baseline}" for baseline in self.baselines or ()]
         if self.missing:

@@ -43,8 +43,8 @@ def check_wordings(names: Sequence[str]) -> tuple[Wording, ...]:
     """The names, each once. Raises UsageError for an unknown one, for none, and for one that comes twice."""
     unknown = [name for name in names if name not in WORDINGS]
     if unknown or not names:
-        seen = repr(unknown[0]) if unknown else "empty"
-        raise UsageError(f"wordings: {seen}; expected some of {', '.join(WORDINGS)}")
+        problem = repr(unknown[0]) if unknown else "empty"
+        raise UsageError(f"wordings: {problem}; expected some of {', '.join(WORDINGS)}")
     if len(set(names)) < len(names):
         raise UsageError(f"wordings {','.join(names)}: one comes twice; name each once")
     return tuple(name for name in names if name in WORDINGS)
@@ -57,11 +57,11 @@ def in_words(episode: Episode, wording: Wording) -> Episode | None:
     SuiteError if its wording `side` never says where, because it would then tell both layouts the same.
     """
     item = episode.item
-    own = item.wordings.get(wording)
+    wording_text = item.wordings.get(wording)
     if wording == "knowledge":
         text: str | None = item.instruction
     elif wording == "side":
-        text = SIDE if own is None else own
+        text = SIDE if wording_text is None else wording_text
         if "{side}" not in text:
             raise SuiteError(
                 f"item {item.item_id}: its wording 'side' is {text!r}; expected a text that contains '{{side}}', "
@@ -69,5 +69,5 @@ def in_words(episode: Episode, wording: Wording) -> Episode | None:
             )
         text = text.replace("{side}", episode.side_correct)
     else:
-        text = NEUTRAL if own is None and wording == "neutral" else own
+        text = NEUTRAL if wording_text is None and wording == "neutral" else wording_text
     return None if not text else replace(episode, item=replace(item, instruction=text), wording=wording)

@@ -12,7 +12,7 @@ from probe_kit.scene_names import ArmName
 
 @dataclass(frozen=True)
 class ArmModel:
-    """What is particular to one arm.
+    """The constants of one arm: joints, links, fingers and limits.
 
     urdf: finds the description file on this machine, or writes it into the folder it is given.
     base: where it stands in the world. joints, fingers, tool: link indices in PyBullet's order.

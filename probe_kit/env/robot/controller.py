@@ -21,7 +21,7 @@ OPEN_ABOVE = 0.5
 
 @dataclass(frozen=True)
 class Move:
-    """What one action asks of the arm.
+    """The motion that one action asks of the arm.
 
     q_from, q_to: (n,) commanded joints before and after. opening: 1 open, 0 closed.
     clipped: a limit changed the action. ik_error: metres that remain to the wanted position.
@@ -78,13 +78,13 @@ class DeltaController:
         if self._low is not None or limits.high is not None:
             position = np.clip(position, self._low, limits.high)
         shift = position - self.target.position
-        wanted = Pose(position, self._rotation(turn) @ self.target.rotation)
+        pose = Pose(position, self._rotation(turn) @ self.target.rotation)
         clipped = not np.allclose(shift, action[:3], atol=1e-9) or bool((turn != action[3:6]).any())
 
         q_from = self.q
-        solution = self._arm.chain.solve(wanted, q_from, np.array(self._arm.model.posture))
+        solution = self._arm.chain.solve(pose, q_from, np.array(self._arm.model.posture))
         if solution.error <= limits.ik_error and solution.turn_error <= limits.ik_turn_error:
-            self.q, self.target = solution.q, wanted
+            self.q, self.target = solution.q, pose
         else:
             shift, turn = np.zeros(3), np.zeros(3)
         opening = 1.0 if action[6] > OPEN_ABOVE else 0.0

@@ -101,10 +101,10 @@ def _find_meshes() -> Path:
 
 
 def _link_xml(link: _Link, meshes: Path) -> str:
-    place = _origin(link.mesh_xyz, link.mesh_rpy)
+    origin = _origin(link.mesh_xyz, link.mesh_rpy)
     material = f'<material name="grey"><color rgba="{GREY}"/></material>'
     shapes = "".join(
-        f'    <{kind}>{place}<geometry><mesh filename="{meshes}/WXSA-250-M-{mesh}.stl" '
+        f'    <{kind}>{origin}<geometry><mesh filename="{meshes}/WXSA-250-M-{mesh}.stl" '
         f'scale="0.001 0.001 0.001"/></geometry>{material}</{kind}>\n'
         for mesh in link.meshes
         for kind in ("visual", "collision")

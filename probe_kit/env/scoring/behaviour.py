@@ -59,20 +59,21 @@ class Behaviour:
     start_side_correct: bool
 
 
-def behaviour_of(seen: Trajectory, side_correct: Side, box_half: float, moved: float) -> Behaviour:
-    """What was done in one episode; box_half, moved: as in the scene, metres."""
+def behaviour_of(trajectory: Trajectory, side_correct: Side, box_half: float, moved: float) -> Behaviour:
+    """Describe the behaviour in one episode; box_half, moved: as in the scene, metres."""
     sides: tuple[Side, Side] = (side_correct, other_side(side_correct))
-    over = [_over(seen, side, box_half) for side in sides]
-    distances = [np.hypot(*(seen.tool[:, :2] - seen.tile(side)[:, :2]).T) for side in sides]
+    over = [_over(trajectory, side, box_half) for side in sides]
+    distances = [np.hypot(*(trajectory.tool[:, :2] - trajectory.tile(side)[:, :2]).T) for side in sides]
     correct, wrong = (
-        there & ~_left_where_it_began(there, away, moved) for there, away in zip(over, distances, strict=True)
+        over_picture & ~_left_where_it_began(over_picture, away, moved)
+        for over_picture, away in zip(over, distances, strict=True)
     )
     start, least = [float(away[0]) for away in distances], [_least(away) for away in distances]
-    furthest = _furthest(seen)
-    released_at = _first_release(seen.held)
-    beside = _beside(seen, side_correct)
+    furthest = _furthest(trajectory)
+    released_at = _first_release(trajectory.held)
+    towards_correct = _beside(trajectory, side_correct)
     return Behaviour(
-        grasped=bool(seen.held.any()),
+        grasped=bool(trajectory.held.any()),
         released=released_at is not None,
         released_at=released_at,
         moved=furthest > moved,
@@ -87,14 +88,14 @@ def behaviour_of(seen: Trajectory, side_correct: Side, box_half: float, moved: f
         min_distance_wrong=least[1],
         closer_to=_larger(start[0] - least[0], start[1] - least[1]),
         release_near=_release_near(correct, wrong, released_at),
-        correct_side_share=float((beside[1:] > 0).mean()),
-        start_side_correct=bool(beside[0] > 0),
+        correct_side_share=float((towards_correct[1:] > 0).mean()),
+        start_side_correct=bool(towards_correct[0] > 0),
     )
 
 
-def _over(seen: Trajectory, side: Side, half: float) -> Flags:
+def _over(trajectory: Trajectory, side: Side, half: float) -> Flags:
     """(T + 1,) whether the hand is over the box around a picture."""
-    away = seen.tool[:, :3] - seen.tile(side)[:, :3]
+    away = trajectory.tool[:, :3] - trajectory.tile(side)[:, :3]
     return np.asarray((np.abs(away[:, :2]) <= half).all(axis=1) & (away[:, 2] >= HAND_ABOVE))
 
 
@@ -117,8 +118,8 @@ def _larger(correct: float, wrong: float, tie: float = 1e-3) -> Choice:
     return _choice(correct > wrong + tie, wrong > correct + tie)
 
 
-def _first_release(held: Flags) -> int | None:
-    let_go = np.flatnonzero(held[:-1] & ~held[1:])
+def _first_release(grasped: Flags) -> int | None:
+    let_go = np.flatnonzero(grasped[:-1] & ~grasped[1:])
     return None if let_go.size == 0 else int(let_go[0]) + 1
 
 
@@ -131,12 +132,12 @@ def _least(distance: NDArray[np.float32]) -> float:
     return float(np.nanmin(distance))
 
 
-def _furthest(seen: Trajectory) -> float:
-    return float(np.nanmax(np.hypot(*(seen.cube[:, :2] - seen.cube[0, :2]).T)))
+def _furthest(trajectory: Trajectory) -> float:
+    return float(np.nanmax(np.hypot(*(trajectory.cube[:, :2] - trajectory.cube[0, :2]).T)))
 
 
-def _beside(seen: Trajectory, side_correct: Side) -> NDArray[np.float32]:
+def _beside(trajectory: Trajectory, side_correct: Side) -> NDArray[np.float32]:
     """(T + 1,) how far the hand is on the correct side of the line midway between where the pictures began."""
-    there, other = seen.tile(side_correct)[0, :2], seen.tile(other_side(side_correct))[0, :2]
-    middle, towards = (there + other) / 2, (there - other) / np.linalg.norm(there - other)
-    return np.asarray((seen.tool[:, :2] - middle) @ towards)
+    correct, wrong = trajectory.tile(side_correct)[0, :2], trajectory.tile(other_side(side_correct))[0, :2]
+    middle, towards = (correct + wrong) / 2, (correct - wrong) / np.linalg.norm(correct - wrong)
+    return np.asarray((trajectory.tool[:, :2] - middle) @ towards)

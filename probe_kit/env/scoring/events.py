@@ -32,11 +32,11 @@ class Events:
 
     @classmethod
     def of(cls, trajectory: Trajectory) -> "Events":
-        """From where everything was, frame by frame."""
+        """Return the events of a trajectory, from the positions frame by frame."""
         tool = trajectory.tool[:, :3].astype(np.float64)
         grasp = _first(trajectory.held)
-        held = np.flatnonzero(trajectory.held)
-        release = None if held.size == 0 or held[-1] + 1 == len(trajectory) else int(held[-1]) + 1
+        frames = np.flatnonzero(trajectory.held)
+        release = None if frames.size == 0 or frames[-1] + 1 == len(trajectory) else int(frames[-1]) + 1
         return cls(
             first_motion=_first(np.linalg.norm(tool - tool[0], axis=1) > MOTION),
             grasp=grasp,
@@ -45,9 +45,9 @@ class Events:
         )
 
     def frame(self, event: str) -> int | None:
-        """Of an event by its name in `EVENTS`."""
-        found: int | None = getattr(self, event.replace(" ", "_"))
-        return found
+        """Return the frame of an event by its name in `EVENTS`."""
+        frame: int | None = getattr(self, event.replace(" ", "_"))
+        return frame
 
 
 def _lateral(trajectory: Trajectory, tool: NDArray[np.float64], grasp: int) -> int | None:
@@ -61,5 +61,5 @@ def _lateral(trajectory: Trajectory, tool: NDArray[np.float64], grasp: int) -> i
 
 
 def _first(happened: NDArray[np.bool_]) -> int | None:
-    found = np.flatnonzero(happened)
-    return int(found[0]) if found.size else None
+    frames = np.flatnonzero(happened)
+    return int(frames[0]) if frames.size else None

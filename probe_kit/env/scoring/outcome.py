@@ -30,7 +30,7 @@ def distance(a: XY, b: XY) -> float:
 
 
 def zone(distance_correct: float, distance_wrong: float, radius: float) -> Zone:
-    """Which zone the cube ended in, from its distances to both tile centres (all in one unit).
+    """Return the zone in which the cube ended, from its distances to both tile centres (all in one unit).
 
     A cube on the edge of a zone is inside. Out of bounds if it is in neither; if a distance is not a
     number, because the simulator broke, it is in neither. Raises SceneError if it would be in both.
@@ -46,7 +46,7 @@ def zone(distance_correct: float, distance_wrong: float, radius: float) -> Zone:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What is stored about one finished or running episode. Metres, in the world frame.
+    """The stored result of one finished or running episode. Metres, in the world frame.
 
     zone: by the rule of the paper, with radius `epsilon`. cube_xy, cube_z: the middle of the cube.
     distance_correct, distance_wrong: in the plane, to the tile centres. cube_moved: it is further than

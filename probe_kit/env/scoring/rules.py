@@ -28,18 +28,18 @@ Flags = NDArray[np.bool_]
 
 
 class OutcomeRule(ABC):
-    """When the cube counts as put on a picture."""
+    """A rule that decides when the cube counts as put on a picture."""
 
     name: str
 
     @abstractmethod
-    def inside(self, seen: Trajectory, side: Side) -> Flags:
+    def inside(self, trajectory: Trajectory, side: Side) -> Flags:
         """(T + 1,) whether the cube counts as put on the picture on `side`, frame by frame. Not a number: no."""
 
     @property
     @abstractmethod
     def words(self) -> str:
-        """What counts, in a few words, with its numbers."""
+        """The rule in a few words, with its numbers."""
 
 
 @dataclass(frozen=True)
@@ -49,14 +49,14 @@ class Disc(OutcomeRule):
     radius: float
     name = "disc"
 
-    def inside(self, seen: Trajectory, side: Side) -> Flags:
+    def inside(self, trajectory: Trajectory, side: Side) -> Flags:
         """Height, grasp and motion do not count."""
-        away = seen.cube[:, :2] - seen.tile(side)[:, :2]
+        away = trajectory.cube[:, :2] - trajectory.tile(side)[:, :2]
         return np.asarray(np.hypot(*away.T) <= self.radius)
 
     @property
     def words(self) -> str:
-        """As printed in captions."""
+        """The rule as captions print it."""
         return f"within {100 * self.radius:.1f} cm of the picture's middle, seen from above"
 
 
@@ -73,14 +73,14 @@ class Box(OutcomeRule):
     height: float
     name = "box"
 
-    def inside(self, seen: Trajectory, side: Side) -> Flags:
+    def inside(self, trajectory: Trajectory, side: Side) -> Flags:
         """Held or lying, on the picture or beside it."""
-        away = seen.cube[:, :3] - seen.tile(side)[:, :3]
+        away = trajectory.cube[:, :3] - trajectory.tile(side)[:, :3]
         return np.asarray((np.abs(away[:, :2]) <= self.half).all(axis=1) & (away[:, 2] >= self.height))
 
     @property
     def words(self) -> str:
-        """As printed in captions."""
+        """The rule as captions print it."""
         return f"over a square of {200 * self.half:.0f} cm around the picture, held or lying, on it or beside it"
 
 
@@ -91,16 +91,18 @@ class ReleasedOnTile(OutcomeRule):
     half: float
     name = "released-on-tile"
 
-    def inside(self, seen: Trajectory, side: Side) -> Flags:
-        """In the square of the tile as it lies, touching it, not between the fingers, and at rest."""
-        tile, position = seen.tile(side), 0 if side == "left" else 1
-        away = _turned_back(seen.cube[:, :2] - tile[:, :2], tile[:, 3:])
+    def inside(self, trajectory: Trajectory, side: Side) -> Flags:
+        """Demand the square of the tile as it lies, touch, open fingers, and rest."""
+        tile, position = trajectory.tile(side), 0 if side == "left" else 1
+        away = _turned_back(trajectory.cube[:, :2] - tile[:, :2], tile[:, 3:])
         over = (np.abs(away) <= self.half).all(axis=1)
-        return np.asarray(over & seen.touches[:, position] & ~seen.held & (seen.cube_speed < REST_SPEED))
+        return np.asarray(
+            over & trajectory.touches[:, position] & ~trajectory.held & (trajectory.cube_speed < REST_SPEED)
+        )
 
     @property
     def words(self) -> str:
-        """As printed in captions."""
+        """The rule as captions print it."""
         return f"let go and at rest on the picture, {200 * self.half:.1f} cm wide"
 
 
@@ -114,7 +116,7 @@ def _turned_back(away: NDArray[np.float32], quaternion: NDArray[np.float32]) -> 
 
 @dataclass(frozen=True)
 class Judgement:
-    """What a rule says of one episode.
+    """The verdict of a rule on one episode.
 
     outcome: at its end. correct, wrong, oob: share of the judged steps, whole numbers where only the last one is
     judged. both: at its end the cube counts for both pictures, which is called correct. idle: the outcome if
@@ -130,7 +132,11 @@ class Judgement:
 
 
 def judge(
-    seen: Trajectory, rule: OutcomeRule, side_correct: Side, last_steps: int = 1, max_steps: int | None = None
+    trajectory: Trajectory,
+    rule: OutcomeRule,
+    side_correct: Side,
+    last_steps: int = 1,
+    max_steps: int | None = None,
 ) -> Judgement:
     """Judge one episode by a rule.
 
@@ -139,9 +145,9 @@ def judge(
     """
     if last_steps < 1:
         raise UsageError(f"the last {last_steps} steps of an episode cannot be judged; expected at least 1")
-    correct, wrong = rule.inside(seen, side_correct), rule.inside(seen, other_side(side_correct))
-    end = max(seen.steps, max_steps or 0)
-    judged = np.arange(max(1, end - last_steps + 1), end + 1).clip(max=seen.steps)
+    correct, wrong = rule.inside(trajectory, side_correct), rule.inside(trajectory, other_side(side_correct))
+    end = max(trajectory.steps, max_steps or 0)
+    judged = np.arange(max(1, end - last_steps + 1), end + 1).clip(max=trajectory.steps)
     right, other = correct[judged], wrong[judged] & ~correct[judged]
     return Judgement(
         outcome=_zone(bool(correct[-1]), bool(wrong[-1])),

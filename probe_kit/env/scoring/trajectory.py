@@ -67,7 +67,7 @@ class Trajectory:
 
     @classmethod
     def of_frames(cls, frames: Values) -> Self:
-        """From stored frames (T + 1, len(CHANNELS)); see `frames`."""
+        """Return the trajectory of stored frames (T + 1, len(CHANNELS)); see `frames`."""
         parts: dict[str, NDArray[Any]] = {}
         start = 0
         for name, of_name in (STATE | ACTIONS).items():
@@ -113,7 +113,7 @@ class Trajectory:
             if len(parts) == 1:
                 arrays[name] = xr.DataArray(getattr(self, name), dims=(time,))
             else:
-                own = _AXES.get(parts, f"{name}_part")
-                arrays[name] = xr.DataArray(getattr(self, name), dims=(time, own), coords={own: list(parts)})
+                axis = _AXES.get(parts, f"{name}_part")
+                arrays[name] = xr.DataArray(getattr(self, name), dims=(time, axis), coords={axis: list(parts)})
         times = {"frame": np.arange(len(self)), "step": np.arange(1, len(self))}
         return xr.Dataset(arrays, coords=times)

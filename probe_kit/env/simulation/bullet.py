@@ -35,21 +35,21 @@ def _without_greeting() -> Iterator[None]:
     if sys.stderr is not None:
         sys.stderr.flush()
     try:
-        kept = os.dup(2)
+        stderr = os.dup(2)
     except OSError:  # the process has no stderr; nothing can be seen
         yield
         return
-    with TemporaryFile() as held:
-        os.dup2(held.fileno(), 2)
+    with TemporaryFile() as buffer:
+        os.dup2(buffer.fileno(), 2)
         try:
             yield
         finally:
-            os.dup2(kept, 2)
-            os.close(kept)
-            held.seek(0)
-            rest = b"".join(line for line in held if not line.startswith(_GREETING))
-            if rest:
-                os.write(2, rest)
+            os.dup2(stderr, 2)
+            os.close(stderr)
+            buffer.seek(0)
+            text = b"".join(line for line in buffer if not line.startswith(_GREETING))
+            if text:
+                os.write(2, text)
 
 
 class BulletClient:

@@ -76,11 +76,11 @@ class FilmCamera:
 
 def _colors(client: BulletClient, body: int) -> list[tuple[int, int, tuple[float, ...]]]:
     """Link, number of the shape in its link, and colour of every visual shape."""
-    found: list[tuple[int, int, tuple[float, ...]]] = []
+    colors: list[tuple[int, int, tuple[float, ...]]] = []
     for shape in client.getVisualShapeData(body):
-        number = sum(link == shape[1] for link, *_ in found)
-        found.append((shape[1], number, shape[7]))
-    return found
+        number = sum(link == shape[1] for link, *_ in colors)
+        colors.append((shape[1], number, shape[7]))
+    return colors
 
 
 def _over(backdrop: Backdrop, frame: Frame) -> Backdrop:

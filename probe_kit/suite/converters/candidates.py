@@ -29,7 +29,7 @@ class SourcePicture:
 
 @dataclass(frozen=True)
 class Wording:
-    """How an item may be asked for: the phrase, and the opposite phrase if the question has one."""
+    """The wording of an item: its phrase, and the opposite phrase if the question has one."""
 
     phrase: str
     rule_id: str
@@ -71,7 +71,7 @@ class Candidate:
 
 @dataclass
 class Reading:
-    """What a source held: candidates, how many records there were per category, and why others were left out.
+    """The content of a source: candidates, the number of records per category, and why others were left out.
 
     files: annotation files read. license, attribution, url and revision are those of the source.
     """

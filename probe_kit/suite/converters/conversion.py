@@ -111,20 +111,20 @@ def convert(
             raise UsageError(f"{source} takes no curation: its questions are converted unchanged.")
         return act2answer.convert_set(Path(root), Path(out), categories, n, options)
     kind, root, out = SOURCES[source], Path(root), Path(out)
-    chosen = options_from(kind.options, options)
-    wanted = kind.categories if categories is None else check_categories(categories, kind.categories)
+    source_options = options_from(kind.options, options)
+    requested = kind.categories if categories is None else check_categories(categories, kind.categories)
     if not root.exists():
         raise UsageError(f"{source}: {root} does not exist. Name the folder the benchmark was unpacked to.")
     check_foreign_folder(out)
-    conversion = _Conversion(kind, chosen, kind.read(root, wanted, chosen), n, seed)
-    bundles = {category: conversion.propose(category) for category in wanted}
+    conversion = _Conversion(kind, source_options, kind.read(root, requested, source_options), n, seed)
+    bundles = {category: conversion.propose(category) for category in requested}
     if emit_curation is not None:
         write_curation(Path(emit_curation), _flat(bundles), conversion.load)
     if curation is not None:
         accepted = apply_curation(_flat(bundles), read_curation(Path(curation)), Path(curation))
-        bundles = {category: _reviewed(found, accepted) for category, found in bundles.items()}
+        bundles = {category: _reviewed(proposals, accepted) for category, proposals in bundles.items()}
     else:
-        bundles = {category: conversion.without_review(found) for category, found in bundles.items()}
+        bundles = {category: conversion.without_review(proposals) for category, proposals in bundles.items()}
     return conversion.save(bundles, out, Path(curation) if curation is not None else None)
 
 
@@ -185,8 +185,8 @@ class _Conversion:
             "target and distractor are the same picture" if len(pictures) == 2 and self._alike(*pictures) else None
         )
 
-    def _alike(self, one: SourcePicture, other: SourcePicture) -> bool:
-        return self._look(one).same_as(self._look(other))
+    def _alike(self, first: SourcePicture, second: SourcePicture) -> bool:
+        return self._look(first).same_as(self._look(second))
 
     def _look(self, picture: SourcePicture) -> Look:
         if picture.image_id not in self.looks:
@@ -233,8 +233,10 @@ class _Conversion:
         pictures: dict[str, bytes] = {}
         for category, accepted in bundles.items():
             self.stages[category]["accepted"] = sum(map(len, accepted))
-            chosen = sample(accepted, self.n)
-            emitted, files = emit(self.kind.name, chosen, self.reading, self.load, self._random(category, "sides"))
+            sampled = sample(accepted, self.n)
+            emitted, files = emit(
+                self.kind.name, sampled, self.reading, self.load, self._random(category, "sides")
+            )
             self.stages[category]["emitted"] = len(emitted)
             items += emitted
             pictures |= files
@@ -287,12 +289,14 @@ _PLACES = ("image_root", "llm_base", "llm_cache", "instances")  # of this machin
 
 
 def _flat(bundles: dict[str, list[Bundle]]) -> list[Proposal]:
-    return [proposal for found in bundles.values() for bundle in found for proposal in bundle]
+    return [proposal for of_category in bundles.values() for bundle in of_category for proposal in bundle]
 
 
 def _reviewed(bundles: list[Bundle], accepted: dict[str, Proposal]) -> list[Bundle]:
-    kept = (tuple(accepted[p.candidate_id] for p in bundle if p.candidate_id in accepted) for bundle in bundles)
-    return [bundle for bundle in kept if bundle]
+    reviewed = (
+        tuple(accepted[p.candidate_id] for p in bundle if p.candidate_id in accepted) for bundle in bundles
+    )
+    return [bundle for bundle in reviewed if bundle]
 
 
 def _file_sha256(path: Path) -> str:

@@ -23,7 +23,7 @@ a leading article), polarity (pos, neg or none), keep (false if choosing one of 
 
 
 def propose_wording(candidate: Candidate, options: ConvertOptions) -> Wording | None:
-    """What the service proposes, None if it proposes nothing usable.
+    """Return the wording that the service proposes, None if it proposes nothing usable.
 
     Replies are kept in `llm_cache`, so that the same conversion needs no network again. Raises UsageError for
     incomplete options, and SuiteError if the service does not answer.
@@ -34,13 +34,13 @@ def propose_wording(candidate: Candidate, options: ConvertOptions) -> Wording | 
         raise UsageError(
             "llm_base needs llm_model and llm_cache as well. Name the model and a folder for replies."
         )
-    asked = {"question": candidate.question, "answer": candidate.answer}
-    key = sha256_json([options.llm_model, _PROMPT, asked])
-    kept = Path(options.llm_cache) / f"{key}.json"
-    if not kept.is_file():
-        reply = _ask(options.llm_base, options.llm_model, json.dumps(asked, ensure_ascii=False))
-        write_whole(kept, reply)
-    return _usable(read_regular_text(kept), options.llm_model)
+    question = {"question": candidate.question, "answer": candidate.answer}
+    key = sha256_json([options.llm_model, _PROMPT, question])
+    cached = Path(options.llm_cache) / f"{key}.json"
+    if not cached.is_file():
+        reply = _ask(options.llm_base, options.llm_model, json.dumps(question, ensure_ascii=False))
+        write_whole(cached, reply)
+    return _usable(read_regular_text(cached), options.llm_model)
 
 
 def _ask(base: str, model: str, question: str) -> str:

@@ -36,7 +36,7 @@ class ConvertOptions:
     trust_llm: bool = False
 
     def pictures_below(self, root: Path) -> Path:
-        """Where pictures are looked for."""
+        """Return the folder below which pictures are looked for."""
         return Path(self.image_root) if self.image_root else root
 
 
@@ -87,7 +87,7 @@ class VlThinkOptions(ConvertOptions):
 
 @dataclass(frozen=True)
 class Act2AnswerOptions:
-    """What a set of Act2Answer's own format does not say.
+    """The options of a set in Act2Answer's own format, for what the format does not say.
 
     tile_yaw: degrees by which its scene turns the tiles; 90 as released, 0 as VL-Think does.
     contains_real_face: whether its pictures show real people. license: an SPDX name, if you know it.
@@ -99,15 +99,15 @@ class Act2AnswerOptions:
 
 
 def options_from[Options: (ConvertOptions, Act2AnswerOptions)](
-    kind: type[Options], given: dict[str, Any]
+    kind: type[Options], values: dict[str, Any]
 ) -> Options:
     """The options of one source. Raises UsageError for a name it does not have, with the nearest one."""
-    known = [field.name for field in fields(kind)]
-    for name in given:
-        if name not in known:
-            near = get_close_matches(name, known, n=1)
+    names = [field.name for field in fields(kind)]
+    for name in values:
+        if name not in names:
+            near = get_close_matches(name, names, n=1)
             hint = f" Did you mean {near[0]!r}?" if near else ""
-            raise UsageError(f"unknown option {name!r}; this source has: {', '.join(known)}.{hint}")
-    if isinstance(given.get("extra_boards"), list):
-        given = given | {"extra_boards": tuple(given["extra_boards"])}
-    return kind(**given)
+            raise UsageError(f"unknown option {name!r}; this source has: {', '.join(names)}.{hint}")
+    if isinstance(values.get("extra_boards"), list):
+        values = values | {"extra_boards": tuple(values["extra_boards"])}
+    return kind(**values)

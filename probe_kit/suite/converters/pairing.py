@@ -1,4 +1,4 @@
-"""From candidates to items: pairs of pictures, the target of each, sampling, and the sides."""
+"""Pairing of candidates to items: pairs of pictures, the target of each, sampling, and the sides."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -63,16 +63,18 @@ def pair_candidates(
     bundles = list(_native(native, paper_polarity, rng))
     couples = _every_couple(single, rng) if reuse else _disjoint_couples(single, rng)
     bundles += [
-        (_ask(one, other), _ask(other, one)) for one, other in couples if not alike(one.target, other.target)
+        (_ask(first, second), _ask(second, first))
+        for first, second in couples
+        if not alike(first.target, second.target)
     ]
     return [bundles[int(index)] for index in rng.permutation(len(bundles))]
 
 
 def _native(candidates: Sequence[Candidate], paper_polarity: bool, rng: np.random.Generator) -> Iterator[Bundle]:
     negate = rng.permutation(len(candidates)) % 2 == 1
-    for candidate, chosen in zip(candidates, negate, strict=True):
+    for candidate, negated in zip(candidates, negate, strict=True):
         wording, opposite = candidate.wording, candidate.wording.opposite if candidate.wording else None
-        negative = bool(chosen) and opposite is not None and not paper_polarity
+        negative = bool(negated) and opposite is not None and not paper_polarity
         proposal = _native_proposal(candidate, wording)
         yield (_opposite(proposal) if negative else proposal,)
 
@@ -116,27 +118,27 @@ def _opposite(proposal: Proposal) -> Proposal:
     )
 
 
-def _ask(asked: Candidate, other: Candidate) -> Proposal:
+def _ask(candidate: Candidate, other: Candidate) -> Proposal:
     """One of two candidates asked for, with the other's picture as the wrong one."""
-    ids = sorted((asked.source_id, other.source_id))
+    ids = sorted((candidate.source_id, other.source_id))
     return Proposal(
-        candidate_id=_candidate_id(asked.category, asked.source_id, other.source_id),
-        category=asked.category,
-        source_id=f"{asked.source_id}|{other.source_id}",
+        candidate_id=_candidate_id(candidate.category, candidate.source_id, other.source_id),
+        category=candidate.category,
+        source_id=f"{candidate.source_id}|{other.source_id}",
         pair_key="+".join(ids),
-        question=asked.question,
-        question_sha256=asked.question_sha256,
-        target=asked.target,
+        question=candidate.question,
+        question_sha256=candidate.question_sha256,
+        target=candidate.target,
         distractor=other.target,
-        wording=asked.wording,
+        wording=candidate.wording,
         polarity="none",
-        target_concept=asked.concept,
+        target_concept=candidate.concept,
         distractor_concept=other.concept,
         construction="recolored"
-        if "recolored" in (asked.construction, other.construction)
-        else asked.construction,
-        needs_person=asked.needs_person or other.needs_person,
-        side_word=asked.side_word,
+        if "recolored" in (candidate.construction, other.construction)
+        else candidate.construction,
+        needs_person=candidate.needs_person or other.needs_person,
+        side_word=candidate.side_word,
     )
 
 
@@ -144,12 +146,12 @@ def _candidate_id(category: str, *source_ids: str) -> str:
     return f"{category}-{sha256_json(list(source_ids))[:12]}"
 
 
-def _may_meet(one: Candidate, other: Candidate) -> bool:
+def _may_meet(first: Candidate, second: Candidate) -> bool:
     return (
-        one.concept != other.concept
-        and one.target.image_id != other.target.image_id
-        and not one.forbids & other.shows
-        and not other.forbids & one.shows
+        first.concept != second.concept
+        and first.target.image_id != second.target.image_id
+        and not first.forbids & second.shows
+        and not second.forbids & first.shows
     )
 
 
@@ -182,13 +184,13 @@ def _disjoint_couples(
 
 def sample(bundles: Sequence[Bundle], count: int) -> list[Bundle]:
     """The first bundles with at most `count` proposals in all."""
-    chosen: list[Bundle] = []
-    left = count
+    sampled: list[Bundle] = []
+    capacity = count
     for bundle in bundles:
-        if len(bundle) <= left:
-            chosen.append(bundle)
-            left -= len(bundle)
-    return chosen
+        if len(bundle) <= capacity:
+            sampled.append(bundle)
+            capacity -= len(bundle)
+    return sampled
 
 
 def emit(

@@ -167,8 +167,8 @@ def _is_comparative(word: str) -> bool:
 
 def _graded(match: re.Match[str]) -> tuple[str, str] | None:
     """ "more ADJ X" and "less ADJ X" (R1, R3, R6)."""
-    thing, degree, adjective = _thing(match["x"]), match["degree"], _bare(match["adj"])
-    return f"{degree} {adjective} {thing}", f"{opposite_of(degree)} {adjective} {thing}"
+    noun, degree, adjective = _thing(match["x"]), match["degree"], _bare(match["adj"])
+    return f"{degree} {adjective} {noun}", f"{opposite_of(degree)} {adjective} {noun}"
 
 
 def _comparative(match: re.Match[str]) -> tuple[str, str] | None:
@@ -176,15 +176,15 @@ def _comparative(match: re.Match[str]) -> tuple[str, str] | None:
     word = match["er"].lower()
     if not _is_comparative(word) or word in ("more", "less", "fewer"):
         return None
-    thing = _thing(match["x"])
-    return f"{word} {thing}", f"{opposite_of(word)} {thing}"
+    noun = _thing(match["x"])
+    return f"{word} {noun}", f"{opposite_of(word)} {noun}"
 
 
 def _doing(match: re.Match[str]) -> tuple[str, str]:
     verb = match["verb"].removesuffix("s")
     doing = f"{verb[:-1] if verb.endswith('e') else verb}ing"
-    thing = _thing(match["x"])
-    return f"more {doing} {thing}", f"less {doing} {thing}"
+    noun = _thing(match["x"])
+    return f"more {doing} {noun}", f"less {doing} {noun}"
 
 
 def _having(match: re.Match[str]) -> tuple[str, str] | None:
@@ -192,9 +192,9 @@ def _having(match: re.Match[str]) -> tuple[str, str] | None:
     word = match["er"].lower()
     if not _is_comparative(word):
         return None
-    thing, owned = _thing(match["x"]), _bare(match["y"])
+    noun, owned = _thing(match["x"]), _bare(match["y"])
     follows = owned if word == "more" and " " not in owned else owned.split()[-1] if word == "more" else ""
-    return f"{thing} with {word} {owned}", f"{thing} with {opposite_of(word, follows)} {owned}"
+    return f"{noun} with {word} {owned}", f"{noun} with {opposite_of(word, follows)} {owned}"
 
 
 def _with(match: re.Match[str]) -> tuple[str, str]:

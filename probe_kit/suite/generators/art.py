@@ -41,8 +41,8 @@ def mean_color(name: str) -> RGB:
 @cache
 def _cell(sheet: str, name: str) -> Image.Image:
     row, column = divmod(_index()[sheet].index(name), COLUMNS)
-    left, top = column * CELL_PIXELS, row * CELL_PIXELS
-    return _sheet(sheet).crop((left, top, left + CELL_PIXELS, top + CELL_PIXELS))
+    x, y = column * CELL_PIXELS, row * CELL_PIXELS
+    return _sheet(sheet).crop((x, y, x + CELL_PIXELS, y + CELL_PIXELS))
 
 
 @cache

@@ -25,7 +25,7 @@ Points = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Placement:
-    """Where a drawing lies on its tile; none of it means anything.
+    """The place of a drawing on its tile; none of it means anything.
 
     scale is the radius of the drawing and x, y its centre, in tile units; rotation is in degrees.
     """

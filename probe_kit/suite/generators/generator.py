@@ -13,7 +13,7 @@ from probe_kit.suite.generators.canvas import Tile
 
 @dataclass(frozen=True)
 class Concept:
-    """What one picture shows, and the words that ask for it."""
+    """The meaning of one picture, and the words that ask for it."""
 
     name: str
     phrase: str
@@ -27,14 +27,14 @@ class Generator[C: Concept]:
     pairs: every two concepts that may lie side by side, each couple once.
     tiles: draws the two tiles of a couple. Whatever does not show the concepts must be drawn for both from
         the same distribution, because which of the two is asked for is decided elsewhere.
-    named: what a tile literally shows, in words that need no knowledge, for the wording `named`; empty where there
-        are none that say more than the concept does. None if the category has no such words.
+    name_of: the words for what a tile literally shows, which need no knowledge, for the wording `named`. They are
+        empty where they say no more than the concept does; None if the category has no such words.
     """
 
     category: str
     pairs: tuple[tuple[C, C], ...]
     tiles: Callable[[C, C, np.random.Generator], tuple[Tile, Tile]]
-    named: Callable[[Any], str] | None = None
+    name_of: Callable[[Any], str] | None = None
 
 
 def spread_pairs[C: Concept](
@@ -48,9 +48,9 @@ def spread_pairs[C: Concept](
     circle = sorted(concepts, key=lambda concept: sha256_json(asdict(concept)))
     size = len(circle)
     pairs = [
-        (circle[place], circle[(place + step) % size])
+        (circle[position], circle[(position + step) % size])
         for step in range(1, size // 2 + 1)
-        for place in range(size if 2 * step < size else size // 2)
+        for position in range(size if 2 * step < size else size // 2)
     ]
     return tuple(pair for pair in pairs if allowed(*pair))[:most]
 
@@ -69,7 +69,7 @@ def half_within[C: Concept](
 
 def none_alike[C: Concept](families: Sequence[set[str]]) -> Callable[[C, C], bool]:
     """A rule that allows two concepts unless their names are together in one of `families` of look-alikes."""
-    return lambda one, other: not any({one.name, other.name} <= family for family in families)
+    return lambda first, second: not any({first.name, second.name} <= family for family in families)
 
 
 SUITE_NAME = "a2a-embedded"

@@ -78,17 +78,17 @@ def hued_background(ink: RGB, rng: np.random.Generator, contrast: float = INK_CO
     while True:
         shade = colorsys.hsv_to_rgb(rng.uniform(), rng.uniform(0, 0.9), rng.uniform(0.5, 1))
         red, green, blue = (round(255 * channel) for channel in shade)
-        found = red, green, blue
-        if lightness(found) >= _LEAST_LIGHTNESS and abs(lightness(found) - lightness(ink)) >= contrast:
-            return found
+        color = red, green, blue
+        if lightness(color) >= _LEAST_LIGHTNESS and abs(lightness(color) - lightness(ink)) >= contrast:
+            return color
 
 
-def on_hues[T: Any](one: T, other: T, rng: np.random.Generator) -> tuple[T, T]:
+def on_hues[T: Any](first: T, second: T, rng: np.random.Generator) -> tuple[T, T]:
     """The two tiles on backgrounds of any hue, from which each tile's `ink` stands out.
 
     Drawn after both tiles, whose pale backgrounds stay in the stream of `rng`: suite 2.0.0 is drawn in this order.
     """
     return (
-        replace(one, background=hued_background(one.ink, rng)),
-        replace(other, background=hued_background(other.ink, rng)),
+        replace(first, background=hued_background(first.ink, rng)),
+        replace(second, background=hued_background(second.ink, rng)),
     )

@@ -1,4 +1,4 @@
-"""From a couple of tiles to two items: the same pictures in the same places, each the target once.
+"""Two items of a couple of tiles: the same pictures in the same places, each the target once.
 
 Each concept is so the target once and the distractor once in the very same pictures. Neither the pictures alone
 nor the text alone can give the answer away; only both together do.
@@ -97,7 +97,7 @@ def _item(
 
 
 def _wordings(generator: Generator[Any], target: Tile, distractor: Tile) -> dict[str, str]:
-    """What else the item can be asked in; nothing if the words would fit both tiles or name a side."""
-    shown, beside = (generator.named(tile) if generator.named else "" for tile in (target, distractor))
-    tells = shown and shown != beside and not side_words(shown)
-    return {"named": instruction_for(shown, "the")} if tells else {}
+    """Return the item's other wordings; none if the words would fit both tiles or name a side."""
+    name, distractor_name = (generator.name_of(tile) if generator.name_of else "" for tile in (target, distractor))
+    tells = name and name != distractor_name and not side_words(name)
+    return {"named": instruction_for(name, "the")} if tells else {}

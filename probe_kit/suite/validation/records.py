@@ -44,10 +44,10 @@ def listing(findings: Iterable[Finding]) -> str:
     """The findings as lines sorted by rule, at most 20 of each rule and then how many more there are."""
     lines = []
     for rule, same_rule in groupby(sorted(findings, key=attrgetter("rule")), key=attrgetter("rule")):
-        found = [str(finding) for finding in same_rule]
-        lines += found[:PRINTED_PER_RULE]
-        if len(found) > PRINTED_PER_RULE:
-            lines.append(f"{rule}: and {len(found) - PRINTED_PER_RULE} more")
+        lines_of_rule = [str(finding) for finding in same_rule]
+        lines += lines_of_rule[:PRINTED_PER_RULE]
+        if len(lines_of_rule) > PRINTED_PER_RULE:
+            lines.append(f"{rule}: and {len(lines_of_rule) - PRINTED_PER_RULE} more")
     return "\n".join(lines)
 
 
@@ -141,8 +141,8 @@ def _check_text(name: str, text: str, where: str) -> Iterator[Finding]:
     if len(text.encode(errors="replace")) > longest:
         yield error("E02", where, f"field {name!r} has {len(text)} characters; expected at most {longest}")
     elif terminal_safe(text) != text or (name in _NAMES and not text.isprintable()):
-        shown = terminal_safe(text[:80])
-        yield error("E02", where, f"field {name!r} holds characters that cannot be printed ({shown!r})")
+        printable = terminal_safe(text[:80])
+        yield error("E02", where, f"field {name!r} holds characters that cannot be printed ({printable!r})")
     elif not is_normalized("NFC", text):
         advice = "write it in Unicode's form NFC, which looks the same and is other bytes to a model"
         yield error("E02", where, f"field {name!r} is {text[:80]!r} in decomposed characters; {advice}")

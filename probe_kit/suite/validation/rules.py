@@ -62,9 +62,9 @@ def _check_file(item: Item, side: Side) -> Generator[Finding, None, int]:
 
 
 def _check_bytes(encoded: bytes, item: Item, side: Side) -> Iterator[Finding]:
-    expected, found = item.file_sha256(side), hashlib.sha256(encoded).hexdigest()
-    if found != expected:
-        message = f"{side} picture changed on disk (expected {expected[:12]}, found {found[:12]})"
+    expected, actual = item.file_sha256(side), hashlib.sha256(encoded).hexdigest()
+    if actual != expected:
+        message = f"{side} picture changed on disk (expected {expected[:12]}, found {actual[:12]})"
         yield error("E06", f"item {item.item_id}", message)
 
 
@@ -118,9 +118,9 @@ def no_side_words(suite: Suite) -> Iterator[Finding]:
             continue
         outside = item.instruction.replace(item.object_phrase, " ")
         exempt = item.side_word and item.category in SIGN_CATEGORIES
-        named = side_words(outside) or (() if exempt else side_words(item.object_phrase))
-        if named:
-            yield error("E10", f"item {item.item_id}", f"the instruction names a side ({named[0]!r})")
+        sides = side_words(outside) or (() if exempt else side_words(item.object_phrase))
+        if sides:
+            yield error("E10", f"item {item.item_id}", f"the instruction names a side ({sides[0]!r})")
         for wording in ("named", "neutral"):
             if not item.side_word and (named_sides := side_words(item.wordings.get(wording, ""))):
                 yield error(
@@ -149,11 +149,11 @@ def groups_closed(suite: Suite) -> Iterator[Finding]:
 
 def card_agrees(suite: Suite) -> Iterator[Finding]:
     """E13: counts, and the hash of name, version and items, are those of `suite.json`."""
-    said = suite.card["counts"], suite.card["content_sha256"]
-    found = count_by_category(suite.items), suite.content_sha256
-    for what, expected, given in zip(("count per category", "content hash"), said, found, strict=True):
-        if expected != given:
-            yield error("E13", "suite.json", f"{what} differs: it says {expected}, items give {given}")
+    recorded = suite.card["counts"], suite.card["content_sha256"]
+    counted = count_by_category(suite.items), suite.content_sha256
+    for what, expected, actual in zip(("count per category", "content hash"), recorded, counted, strict=True):
+        if expected != actual:
+            yield error("E13", "suite.json", f"{what} differs: it says {expected}, items give {actual}")
 
 
 def license_present(suite: Suite) -> Iterator[Finding]:
@@ -191,25 +191,25 @@ LOADING_RULES: Sequence[Callable[[Suite], Iterator[Finding]]] = (
 
 def pixels_as_recorded(suite: Suite) -> Iterator[Finding]:
     """E07: every picture decodes, and E06: to the recorded pixels."""
-    seen: set[tuple[str, str]] = set()
+    checked: set[tuple[str, str]] = set()
     for item in suite.items:
         recorded = {"left": item.left_pixels_sha256, "right": item.right_pixels_sha256}
         for side in SIDES:
             name = item.file_name(side)
-            if (name, recorded[side]) in seen or not item.picture(side).is_file():
+            if (name, recorded[side]) in checked or not item.picture(side).is_file():
                 continue
-            seen.add((name, recorded[side]))
+            checked.add((name, recorded[side]))
             yield from _check_pixels(item, side, recorded[side])
 
 
 def _check_pixels(item: Item, side: Side, expected: str) -> Iterator[Finding]:
     try:
-        found = pixels_sha256(decode_picture(item.picture(side)))
+        actual = pixels_sha256(decode_picture(item.picture(side)))
     except SuiteError as problem:
         yield error("E07", f"item {item.item_id}", f"{side} picture cannot be decoded ({problem})")
         return
-    if found != expected:
-        message = f"{side} picture has other pixels (expected {expected[:12]}, found {found[:12]})"
+    if actual != expected:
+        message = f"{side} picture has other pixels (expected {expected[:12]}, found {actual[:12]})"
         yield error("E06", f"item {item.item_id}", message)
 
 

@@ -86,19 +86,19 @@ def pictures_distinct(suite: Suite) -> Iterator[Finding]:
                 if item.picture(side).is_file():
                     pictures.setdefault(item.picture(side), item)
     items = list(pictures.values())
-    for one, other in _near_duplicates([look_of(load_picture(path)) for path in pictures]):
-        if items[one].group_id != items[other].group_id:
-            names = f"items {items[one].item_id} and {items[other].item_id}"
+    for first, second in _near_duplicates([look_of(load_picture(path)) for path in pictures]):
+        if items[first].group_id != items[second].group_id:
+            names = f"items {items[first].item_id} and {items[second].item_id}"
             yield warning("W03", names, "show nearly the same picture but are in different groups")
 
 
 def _near_duplicates(looks: Sequence[Look]) -> Iterator[tuple[int, int]]:
     hashes = np.array([look.brightness for look in looks], np.uint64)
-    for one in range(len(looks)):
-        distances = np.bitwise_count(hashes[one + 1 :] ^ hashes[one])
-        for other in one + 1 + np.flatnonzero(distances <= NEAR_DUPLICATE_BITS):
-            if looks[one].same_as(looks[other]):
-                yield one, int(other)
+    for first in range(len(looks)):
+        distances = np.bitwise_count(hashes[first + 1 :] ^ hashes[first])
+        for second in first + 1 + np.flatnonzero(distances <= NEAR_DUPLICATE_BITS):
+            if looks[first].same_as(looks[second]):
+                yield first, int(second)
 
 
 def enough_items(suite: Suite) -> Iterator[Finding]:
@@ -127,12 +127,12 @@ def enough_groups(suite: Suite) -> Iterator[Finding]:
 
 def legible(suite: Suite) -> Iterator[Finding]:
     """W06: at the size a tile has on the screen, something large enough stands out from the picture's border."""
-    seen = set()
+    checked = set()
     for item in suite.items:
         for side in SIDES:
             path = item.picture(side)
-            if path not in seen and path.is_file():
-                seen.add(path)
+            if path not in checked and path.is_file():
+                checked.add(path)
                 problem = _illegible(load_picture(path))
                 if problem:
                     yield warning("W06", f"item {item.item_id}", f"{side} picture {problem}")

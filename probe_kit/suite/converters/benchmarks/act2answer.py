@@ -57,7 +57,7 @@ def read_pairs(root: Path) -> list[Pair]:
         raise SuiteError(f"{SOURCE}: {path} holds no question. {REMEDY}")
     read = (_pair(record, position, path) for position, record in enumerate(records))
     pairs = sorted(read, key=attrgetter("index"))
-    gap = next((place for place, pair in enumerate(pairs) if pair.index != place), None)
+    gap = next((expected for expected, pair in enumerate(pairs) if pair.index != expected), None)
     if gap is not None:
         raise SuiteError(
             f"{SOURCE}: {path} has {len(pairs)} questions, and index {pairs[gap].index} where {gap} was "
@@ -91,9 +91,9 @@ def _pair(record: Any, position: int, path: Path) -> Pair:
 
 
 def object_of(question: str) -> tuple[str, str]:
-    """What a question asks for, and its article: the words behind "on"; all words where there is no "on"."""
-    _, found, behind = question.partition(" on ")
-    phrase = (behind if found else question).strip().rstrip(".").strip()
+    """Return the object of a question and its article: the words behind "on"; all words where there is no "on"."""
+    _, preposition, behind = question.partition(" on ")
+    phrase = (behind if preposition else question).strip().rstrip(".").strip()
     article, space, noun = phrase.partition(" ")
     return (noun.strip(), "the") if space and article.lower() == "the" else (phrase, "none")
 
@@ -110,14 +110,14 @@ class BoundingBoxWarning(UserWarning):
 
 
 def convert_set(
-    root: Path, out: Path, categories: Sequence[str] | None, n: int, given: Mapping[str, Any]
+    root: Path, out: Path, categories: Sequence[str] | None, n: int, values: Mapping[str, Any]
 ) -> Suite:
     """The first `n` questions of the set in `root` as a suite in `out`; sides, words and pictures stay.
 
     categories: the one that its questions are counted under; None for the one that the folder's name tells.
     Raises UsageError, SuiteError naming file and record, MissingExtraError without trimesh.
     """
-    options = options_from(Act2AnswerOptions, dict(given))
+    options = options_from(Act2AnswerOptions, dict(values))
     if options.tile_yaw not in YAWS:
         raise UsageError(f"tile_yaw is {options.tile_yaw}; expected one of {', '.join(map(str, YAWS))} degrees")
     if not root.is_dir():
@@ -138,21 +138,21 @@ def convert_set(
     return save_suite(suite, assets.files, stats, out)
 
 
-def _category(root: Path, asked: Sequence[str] | None) -> str:
+def _category(root: Path, categories: Sequence[str] | None) -> str:
     """The category asked for, or the only one that the folder's name tells."""
-    if asked is not None:
-        if len(asked) != 1:
-            raise UsageError(f"{SOURCE}: a set has one category; {', '.join(asked) or 'none'} given.")
-        return check_categories(asked, list(CATEGORIES))[0]
+    if categories is not None:
+        if len(categories) != 1:
+            raise UsageError(f"{SOURCE}: a set has one category; {', '.join(categories) or 'none'} given.")
+        return check_categories(categories, list(CATEGORIES))[0]
     words = set(re.findall(r"[a-z]+", root.resolve().name.lower()))
     words |= {word.removesuffix("s") for word in words}
-    named = [slug for slug in CATEGORIES if set(slug.split("-")) <= words]
-    if len(named) != 1:
+    matching = [slug for slug in CATEGORIES if set(slug.split("-")) <= words]
+    if len(matching) != 1:
         raise UsageError(
-            f"{SOURCE}: folder name {root.resolve().name!r} contains {' and '.join(named) or 'no category'}; "
+            f"{SOURCE}: folder name {root.resolve().name!r} contains {' and '.join(matching) or 'no category'}; "
             f"name the category of its questions: --categories with one of {', '.join(CATEGORIES)}"
         )
-    return named[0]
+    return matching[0]
 
 
 class _Assets:
@@ -262,5 +262,5 @@ class _Assets:
             except (TypeError, ValueError) as problem:
                 raise SuiteError(f"{SOURCE}: {where}: bbox or scales hold no numbers ({problem}).") from problem
             drawn = [extent * float(scale) for extent in tile.size]
-            if any(abs(one - other) > _SAME_SIZE for one, other in zip(scored, drawn, strict=False)):
+            if any(abs(side - drawn_side) > _SAME_SIZE for side, drawn_side in zip(scored, drawn, strict=False)):
                 yield name, scored[0], drawn[0]

@@ -105,7 +105,10 @@ def _pictures(
     for key in ("image_1", "image_2"):
         name = field_of(record, key, str, SOURCE, where).replace("\\", "/").lstrip("/")
         places = [base, *(base / prefix for prefix in prefixes)]
-        tried = [place / name for place in (*places, base / "dataset", *(base / "dataset" / p for p in prefixes))]
+        tried = [
+            folder_of_pictures / name
+            for folder_of_pictures in (*places, base / "dataset", *(base / "dataset" / p for p in prefixes))
+        ]
         path = first_existing(tried, SOURCE, where, _REMEDY)
         yield SourcePicture(
             image_id=f"{SOURCE}/{name}",

@@ -77,24 +77,24 @@ def _meshes(scene: Any) -> Iterator[tuple[NDArray[np.float64], Any]]:
 
 
 def _top(meshes: list[tuple[NDArray[np.float64], Any]], low: float, high: float, path: Path) -> _Top:
-    """What faces up at the tile's top."""
-    found = []
+    """Return the surface that faces up at the tile's top."""
+    upward = []
     for points, mesh in meshes:
         corners = points[mesh.faces]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         lengths = np.linalg.norm(normals, axis=1)
         steep = np.divide(normals[:, 2], lengths, out=np.zeros_like(lengths), where=lengths > 0)
         level = corners[:, :, 2].mean(axis=1) >= high - _LEVEL * max(high - low, 1e-9)
-        if (chosen := np.unique(mesh.faces[(steep > _UP) & level])).size:
-            found.append((points[chosen, :2], chosen, mesh))
-    if len(found) != 1:
-        what = f"{len(found)} meshes face up at its top" if found else "nothing faces up at its top"
+        if (vertices := np.unique(mesh.faces[(steep > _UP) & level])).size:
+            upward.append((points[vertices, :2], vertices, mesh))
+    if len(upward) != 1:
+        what = f"{len(upward)} meshes face up at its top" if upward else "nothing faces up at its top"
         raise SuiteError(f"{path}: {what}; expected one with one picture.")
-    xy, chosen, mesh = found[0]
+    xy, vertices, mesh = upward[0]
     uv = getattr(mesh.visual, "uv", None)
     if uv is None or getattr(mesh.visual, "material", None) is None:
         raise SuiteError(f"{path}: what faces up has no texture; expected a picture as baseColorTexture.")
-    return _Top(xy, np.asarray(uv, np.float64)[chosen] * (1, -1) + (0, 1), mesh.visual.material)
+    return _Top(xy, np.asarray(uv, np.float64)[vertices] * (1, -1) + (0, 1), mesh.visual.material)
 
 
 def _seen(top: _Top, yaw: int, path: Path) -> Image.Image:
@@ -108,11 +108,11 @@ def _seen(top: _Top, yaw: int, path: Path) -> Image.Image:
     if slope[1, 1] > 0:  # rows run downwards, y away
         pixels = pixels[::-1]
     turns = (RELEASE_YAW - yaw) // 90
-    seen = Image.fromarray(np.ascontiguousarray(np.rot90(pixels, -turns)))
+    picture = Image.fromarray(np.ascontiguousarray(np.rot90(pixels, -turns)))
     across, away = np.ptp(top.xy, axis=0)[:: 1 if turns % 2 == 0 else -1]
-    longer = max(seen.size)
+    longer = max(picture.size)
     size = (round(longer * across / max(across, away)), round(longer * away / max(across, away)))
-    return seen if seen.size == size else seen.resize(size, Image.Resampling.BICUBIC)
+    return picture if picture.size == size else picture.resize(size, Image.Resampling.BICUBIC)
 
 
 def _texture(material: Any, path: Path) -> Image.Image:
@@ -127,14 +127,14 @@ def _texture(material: Any, path: Path) -> Image.Image:
 
 def _slope(top: _Top, path: Path) -> NDArray[np.float64]:
     """(2, 2): how much of the picture's width and height (u, v) passes along the tile's x and y."""
-    known = np.column_stack([top.xy, np.ones(len(top.xy))])
-    fitted, _, rank, _ = np.linalg.lstsq(known, top.uv, rcond=None)
-    off = float(np.abs(known @ fitted - top.uv).max())
+    design = np.column_stack([top.xy, np.ones(len(top.xy))])
+    fitted, _, rank, _ = np.linalg.lstsq(design, top.uv, rcond=None)
+    off = float(np.abs(design @ fitted - top.uv).max())
     slope: NDArray[np.float64] = (fitted[:2] * np.ptp(top.xy, axis=0)[:, None]).T
     # Along the sides, every row has one large entry, and not the same column.
     small, large = np.sort(np.abs(slope), axis=1).T
-    one, other = np.abs(slope).argmax(axis=1)
-    if rank < known.shape[1] or off > _STRAIGHT or (small > _STRAIGHT * large).any() or one == other:
+    of_width, of_height = np.abs(slope).argmax(axis=1)
+    if rank < design.shape[1] or off > _STRAIGHT or (small > _STRAIGHT * large).any() or of_width == of_height:
         raise SuiteError(
             f"{path}: the picture does not lie along the sides of what faces up (texture coordinates per side "
             f"{slope.round(3).tolist()}, off by {off:.3f}); expected one picture, upright or turned by quarters."

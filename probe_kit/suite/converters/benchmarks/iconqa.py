@@ -84,9 +84,9 @@ def _is_home(split: str) -> bool:
 
 def _note_sizes(problems: dict[str, Any], reading: Reading) -> None:
     for name, expected in _SUB_TASK_SIZES.items():
-        found = sum(problem.get("ques_type") == name for problem in problems.values() if isinstance(problem, dict))
-        if found != expected:
-            reading.notes.append(f"{name} has {found} problems; the published release has {expected}")
+        count = sum(problem.get("ques_type") == name for problem in problems.values() if isinstance(problem, dict))
+        if count != expected:
+            reading.notes.append(f"{name} has {count} problems; the published release has {expected}")
 
 
 def _category_of(problem: Any, skills: Sequence[str], where: str) -> str | None:
@@ -121,7 +121,7 @@ def _plain(question: str) -> str:
 
 
 def _problem_folder(base: Path, split: str, pid: str) -> Path:
-    """Where a problem lies: with the inner `iconqa/` of the newer archive, or without."""
+    """Return the folder of a problem: with the inner `iconqa/` of the newer archive, or without."""
     task, _, part = split.rpartition("_")
     inner = base / "iconqa" / part / task / pid
     return inner if inner.is_dir() else base / part / task / pid
@@ -179,9 +179,9 @@ def _counted_stem(
     if match is None or not options.cross_items or count is None:
         reading.reasons["no number from one to nine to ask for"] += 1
         return
-    things = match["things"].strip()
+    plural = match["things"].strip()
     word = _NUMBERS[count - 1]
-    noun = _singular(things) if count == 1 else things
+    noun = _singular(plural) if count == 1 else plural
     yield Candidate(
         pid,
         "counting",
@@ -189,9 +189,9 @@ def _counted_stem(
         _picture(folder / "image.png", f"{pid}/image.png", where),
         answer=word,
         wording=Wording(f"picture with {word} {noun}", "count"),
-        concept=f"{word} {things}",
+        concept=f"{word} {plural}",
         construction="cross_item",
-        family=things,
+        family=plural,
     )
 
 
@@ -207,7 +207,7 @@ def _count_of(problem: Any, where: str) -> int | None:
     return int(text) if text.isdigit() and 1 <= int(text) <= 9 else None
 
 
-def _singular(things: str) -> str:
+def _singular(noun: str) -> str:
     for plural, singular in (
         ("ies", "y"),
         ("ches", "ch"),
@@ -216,9 +216,9 @@ def _singular(things: str) -> str:
         ("sses", "ss"),
         ("s", ""),
     ):
-        if things.endswith(plural):
-            return things.removesuffix(plural) + singular
-    return things
+        if noun.endswith(plural):
+            return noun.removesuffix(plural) + singular
+    return noun
 
 
 def _picture(path: Path, name: str, where: str) -> SourcePicture:

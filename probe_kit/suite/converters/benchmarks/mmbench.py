@@ -140,11 +140,11 @@ def _candidate(index: int, row: Row, rows: Mapping[int, Row], path: Path, readin
 
 def _picture_cell(index: int, rows: Mapping[int, Row], where: str) -> tuple[int, str]:
     """The row that holds the picture, and the picture as base64; references may point to references."""
-    holder, seen = index, set()
+    holder, visited = index, set()
     while len(rows[holder]["image"].strip()) <= _LONGEST_REFERENCE:
-        seen.add(holder)
+        visited.add(holder)
         reference = rows[holder]["image"].strip()
-        if not reference.isdigit() or int(reference) not in rows or int(reference) in seen:
+        if not reference.isdigit() or int(reference) not in rows or int(reference) in visited:
             raise SuiteError(
                 f"{SOURCE}: {where}: its picture is in row {reference!r}, which holds none. Use the whole file."
             )

@@ -47,9 +47,9 @@ def read(root: Path, categories: Sequence[str], options: VlThinkOptions) -> Read
     if unknown:
         raise SuiteError(f"{SOURCE}: no boards called {unknown[0]!r}; expected one of {', '.join(_EXTRA_SETS)}.")
     for category in categories:
-        wanted = [*_SETS_OF[category], *(name for name in options.extra_boards if _EXTRA_SETS[name] == category)]
-        present = [name for name in wanted if (base / f"more_{name}").is_dir()]
-        reading.notes += [f"{category}: no boards more_{name}" for name in wanted if name not in present]
+        names = [*_SETS_OF[category], *(name for name in options.extra_boards if _EXTRA_SETS[name] == category)]
+        present = [name for name in names if (base / f"more_{name}").is_dir()]
+        reading.notes += [f"{category}: no boards more_{name}" for name in names if name not in present]
         for name in present:
             _read_set(base / f"more_{name}", name, category, options, reading)
     if not reading.candidates:
@@ -95,11 +95,11 @@ def _board(
     colors = [(label.lower(), picture, "cross_item")]
     if options.recolor and label.lower() == "black":
         colors += [(color, _repainted(picture, board, color), "recolored") for color in _RECOLORS]
-    for color, shown, construction in colors:
+    for color, board_picture, construction in colors:
         source_id = key if construction == "cross_item" else f"{key}:{color}"
         wording = Wording(f"{color} shape", "label")
         yield Candidate(
-            source_id, category, color, shown, wording=wording, concept=color, construction=construction
+            source_id, category, color, board_picture, wording=wording, concept=color, construction=construction
         )
 
 

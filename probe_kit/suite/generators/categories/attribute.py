@@ -152,7 +152,7 @@ _TREES = (
 
 
 def _forest(pen: Pen, level: float, color: RGB) -> None:
-    standing = sorted(_TREES[: 2 + round(9 * level)], key=lambda place: place[1])
+    standing = sorted(_TREES[: 2 + round(9 * level)], key=lambda tree: tree[1])
     for x, y in standing:
         pen.fill(rectangle(x - 0.04, y, x + 0.04, y + 0.26), (112, 72, 40))
         pen.fill(polygon((x, y - 0.32), (x + 0.22, y + 0.14), (x - 0.22, y + 0.14)), color)
@@ -197,8 +197,8 @@ def _window(pen: Pen, level: float, color: RGB) -> None:
         for column in range(4):
             behind = _WHITE if (row + column) % 2 else _DARK
             red, green, blue = (round(b * level + c * (1 - level)) for b, c in zip(behind, color, strict=True))
-            left, top = -0.68 + 0.34 * column, -0.68 + 0.34 * row
-            pen.fill(rectangle(left, top, left + 0.34, top + 0.34), (red, green, blue))
+            x, y = -0.68 + 0.34 * column, -0.68 + 0.34 * row
+            pen.fill(rectangle(x, y, x + 0.34, y + 0.34), (red, green, blue))
     pen.outline(rectangle(-0.68, -0.68, 0.68, 0.68), (112, 72, 40), 0.1)
 
 
@@ -244,7 +244,7 @@ _GAP = (0.45, 0.6)  # between the two levels; a smaller one vanishes on the far 
 _SCALES = (0.84, 0.89)  # so little that a smaller scale never looks like a smaller thing
 _INKS = ("red", "green", "blue", "orange", "brown", "purple", "gray")
 _LIGHTEST, _DARKEST = 0.95, 0.2  # value of a shaded thing
-_THINGS = {name: thing for thing in GRADABLES for name in (thing.more, thing.less)}
+_THINGS = {name: gradable for gradable in GRADABLES for name in (gradable.more, gradable.less)}
 
 
 @dataclass(frozen=True)
@@ -259,11 +259,11 @@ class Sample(Tile):
         _THINGS[self.thing].draw(canvas.pen(self.placement), self.level, self.ink)
 
 
-def _sample(thing: Gradable, level: float, rng: np.random.Generator) -> Sample:
+def _sample(gradable: Gradable, level: float, rng: np.random.Generator) -> Sample:
     color = COLORS[str(rng.choice(_INKS))]
-    ink = _shade(level, rng) if thing.shaded else jittered(color, rng)
-    placement = random_placement(rng, _SCALES, turn=2 if thing.upright else 10)
-    return Sample(thing.more, round(level, 3), placement, ink=ink, background=background_for(ink, rng))
+    ink = _shade(level, rng) if gradable.shaded else jittered(color, rng)
+    placement = random_placement(rng, _SCALES, turn=2 if gradable.upright else 10)
+    return Sample(gradable.more, round(level, 3), placement, ink=ink, background=background_for(ink, rng))
 
 
 def _shade(level: float, rng: np.random.Generator) -> RGB:
@@ -278,14 +278,15 @@ def _tiles(left: Concept, right: Concept, rng: np.random.Generator) -> tuple[Sam
     gap = rng.uniform(*_GAP)
     low = rng.uniform(0, 1 - gap)
     levels = {"neg": low, "pos": low + gap}
-    one, other = (_sample(_THINGS[c.name], float(levels[c.polarity]), rng) for c in (left, right))
-    return on_hues(one, other, rng)
+    left_tile, right_tile = (_sample(_THINGS[c.name], float(levels[c.polarity]), rng) for c in (left, right))
+    return on_hues(left_tile, right_tile, rng)
 
 
 ATTRIBUTE = Generator(
     category="attribute",
     pairs=tuple(
-        (Concept(thing.more, thing.more, "pos"), Concept(thing.less, thing.less, "neg")) for thing in GRADABLES
+        (Concept(gradable.more, gradable.more, "pos"), Concept(gradable.less, gradable.less, "neg"))
+        for gradable in GRADABLES
     ),
     tiles=_tiles,
 )

@@ -21,12 +21,12 @@ _REACH = 0.97
 
 
 def _tiles(left: Concept, right: Concept, rng: np.random.Generator) -> tuple[Figure, Figure]:
-    one, other = rng.choice(list(OUTLINES), size=2, replace=False)
+    left_outline, right_outline = rng.choice(list(OUTLINES), size=2, replace=False)
     if rng.integers(2):
-        other = one
+        right_outline = left_outline
     drawn = (
-        random_figure(left.name, str(one), "edged", rng),
-        random_figure(right.name, str(other), "edged", rng),
+        random_figure(left.name, str(left_outline), "edged", rng),
+        random_figure(right.name, str(right_outline), "edged", rng),
     )
     # After both, whose own backgrounds and places stay in the stream of `rng`: suite 2.0.0 is drawn in this order.
     first, second = (_among_colors(figure, (left, right), rng) for figure in drawn)
@@ -42,9 +42,9 @@ def other_color(concepts: Sequence[Concept], ink: RGB, rng: np.random.Generator)
     """A background of a basic colour that is none of the two that meet, and apart from the `ink`."""
     names = [name for name in COLORS if name not in {concept.name for concept in concepts}]
     while True:
-        found = jittered(COLORS[str(rng.choice(names))], rng)
-        if abs(lightness(found) - lightness(ink)) >= INK_CONTRAST:
-            return found
+        color = jittered(COLORS[str(rng.choice(names))], rng)
+        if abs(lightness(color) - lightness(ink)) >= INK_CONTRAST:
+            return color
 
 
 def moved(placement: Placement, rng: np.random.Generator) -> Placement:
@@ -59,5 +59,5 @@ COLOR = Generator(
     category="color",
     pairs=tuple(combinations([Concept(name, f"{name} shape") for name in COLORS], 2)),
     tiles=_tiles,
-    named=colored_outline,
+    name_of=colored_outline,
 )

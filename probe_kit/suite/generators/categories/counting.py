@@ -26,7 +26,7 @@ class Glyph:
     draw: Callable[[Pen, RGB], None]
 
     def counted(self, number_word: str) -> str:
-        """As in "one leaf" and "three leaves"."""
+        """Return the counted name, such as "one leaf" and "three leaves"."""
         return f"{number_word} {self.singular if number_word == 'one' else self.plural}"
 
 

@@ -37,7 +37,7 @@ _MOUTH_Y = 0.5
 
 @dataclass(frozen=True)
 class Expression:
-    """How a face is set; each of them 0 at rest.
+    """The settings of a face; each of them is 0 at rest.
 
     smile: corners of the mouth up (1) or down (-1). gape: mouth open, 0 to 1. wave: a trembling mouth, 0 to 1.
     frown: inner ends of the brows down (1) or up (-1). lift: brows up, 0 to 1.

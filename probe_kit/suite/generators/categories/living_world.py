@@ -96,7 +96,7 @@ _ALIVE_SHARE = 6  # one pair in six asks for what is alive or not
 
 @dataclass(frozen=True)
 class Depicted(Concept):
-    """What an icon shows."""
+    """The subject of an icon."""
 
     icon: str = ""
 

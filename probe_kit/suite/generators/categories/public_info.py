@@ -152,8 +152,8 @@ def _board(concept: Concept, style: Style, rng: np.random.Generator) -> Board:
 
 
 def _tiles(left: Concept, right: Concept, rng: np.random.Generator) -> tuple[Board, Board]:
-    one, other = (_STYLES[int(number)] for number in rng.integers(len(_STYLES), size=2))
-    return _board(left, one, rng), _board(right, other, rng)
+    left_style, right_style = (_STYLES[int(number)] for number in rng.integers(len(_STYLES), size=2))
+    return _board(left, left_style, rng), _board(right, right_style, rng)
 
 
 def _concepts(forbidden: bool) -> list[Concept]:
@@ -178,4 +178,4 @@ def _shown(board: Board) -> str:
     return f"picture of the {shows}" if shows else ""
 
 
-PUBLIC_INFO = Generator(category="public-info", pairs=_pairs(), tiles=_tiles, named=_shown)
+PUBLIC_INFO = Generator(category="public-info", pairs=_pairs(), tiles=_tiles, name_of=_shown)

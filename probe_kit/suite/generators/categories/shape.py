@@ -20,8 +20,8 @@ _CONFUSABLE = (
 _NAMES = [name for name in OUTLINES if name != "right triangle"]
 
 
-def _distinct(one: Concept, other: Concept) -> bool:
-    return not any({one.name, other.name} <= family for family in _CONFUSABLE)
+def _distinct(first: Concept, second: Concept) -> bool:
+    return not any({first.name, second.name} <= family for family in _CONFUSABLE)
 
 
 def _figure(concept: Concept, rng: np.random.Generator) -> Figure:
@@ -36,10 +36,10 @@ def _tiles(left: Concept, right: Concept, rng: np.random.Generator) -> tuple[Fig
 SHAPE = Generator(
     category="shape",
     pairs=tuple(
-        (one, other)
-        for one, other in combinations([Concept(name, name) for name in _NAMES], 2)
-        if _distinct(one, other)
+        (first, second)
+        for first, second in combinations([Concept(name, name) for name in _NAMES], 2)
+        if _distinct(first, second)
     ),
     tiles=_tiles,
-    named=colored_outline,
+    name_of=colored_outline,
 )

@@ -273,7 +273,7 @@ TWO_STATES: tuple[TwoStates, ...] = (
 )
 
 
-_THINGS = {name: thing for thing in TWO_STATES for name in (thing.first, thing.second)}
+_THINGS = {name: states for states in TWO_STATES for name in (states.first, states.second)}
 
 
 @dataclass(frozen=True)
@@ -284,8 +284,8 @@ class Condition(Tile):
     placement: Placement
 
     def _paint(self, canvas: Canvas) -> None:
-        thing = _THINGS[self.state]
-        thing.draw(canvas.pen(self.placement), self.state == thing.first, self.ink)
+        states = _THINGS[self.state]
+        states.draw(canvas.pen(self.placement), self.state == states.first, self.ink)
 
 
 def _condition(concept: Concept, rng: np.random.Generator) -> Condition:
@@ -302,8 +302,8 @@ def _tiles(left: Concept, right: Concept, rng: np.random.Generator) -> tuple[Con
 STATE = Generator(
     category="state",
     pairs=tuple(
-        (Concept(thing.first, thing.first, "pos"), Concept(thing.second, thing.second, "neg"))
-        for thing in TWO_STATES
+        (Concept(states.first, states.first, "pos"), Concept(states.second, states.second, "neg"))
+        for states in TWO_STATES
     ),
     tiles=_tiles,
 )

@@ -66,31 +66,33 @@ def mirror_overlap(one_side: tuple[float, ...], other_side: tuple[float, ...]) -
     return max(_overlap(mask, image) for image in (*images, mask.rotate(180)))
 
 
-def _overlap(one: Image.Image, other: Image.Image) -> float:
-    shared = ImageStat.Stat(ImageChops.darker(one, other)).sum[0]
-    return float(shared / ImageStat.Stat(ImageChops.lighter(one, other)).sum[0])
+def _overlap(first: Image.Image, second: Image.Image) -> float:
+    shared = ImageStat.Stat(ImageChops.darker(first, second)).sum[0]
+    return float(shared / ImageStat.Stat(ImageChops.lighter(first, second)).sum[0])
 
 
 def _sides(symmetric: bool, rng: np.random.Generator) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Half widths of both sides; drawn again until the pixels agree with the name."""
     while True:
         count = int(rng.integers(*_CORNERS))
-        one = tuple(rng.uniform(*_WIDTHS, size=count).round(3).tolist())
+        widths = tuple(rng.uniform(*_WIDTHS, size=count).round(3).tolist())
         if symmetric:
-            return one, one
+            return widths, widths
         shift = int(rng.integers(1, count))
-        other = one[shift:] + one[:shift]
-        if mirror_overlap(one, other) <= _MOST_OVERLAP:
-            return one, other
+        shifted = widths[shift:] + widths[:shift]
+        if mirror_overlap(widths, shifted) <= _MOST_OVERLAP:
+            return widths, shifted
 
 
 def _outline(concept: Concept, rng: np.random.Generator) -> Outline:
     color = str(rng.choice(list(COLORS)))
     ink = jittered(COLORS[color], rng)
-    one, other = _sides(concept.name == "symmetric", rng)
+    left_widths, right_widths = _sides(concept.name == "symmetric", rng)
     placement = random_placement(rng, (0.88, 1.0), turn=7)
     lying = bool(rng.integers(2))
-    return Outline(color, one, other, lying, placement, ink=ink, background=background_for(ink, rng))
+    return Outline(
+        color, left_widths, right_widths, lying, placement, ink=ink, background=background_for(ink, rng)
+    )
 
 
 def _tiles(left: Concept, right: Concept, rng: np.random.Generator) -> tuple[Outline, Outline]:

@@ -92,8 +92,8 @@ def _draw_dial(pen: Pen, numerals: Numerals) -> None:
 
 
 def _reading(hour: int, minute: int) -> Reading:
-    shown = f"{hour}:{minute:02d}"
-    return Reading(shown, f"clock showing {shown}", hour=hour, minute=minute)
+    time = f"{hour}:{minute:02d}"
+    return Reading(time, f"clock showing {time}", hour=hour, minute=minute)
 
 
 def _readable(reading: Reading) -> bool:
@@ -101,12 +101,12 @@ def _readable(reading: Reading) -> bool:
     return min(apart, 360 - apart) >= _LEAST_ANGLE
 
 
-def _confusable(one: Reading, other: Reading) -> bool:
+def _confusable(first: Reading, second: Reading) -> bool:
     """Whether the two differ in exactly one hand, or in which hand is which."""
-    apart = (one.hour - other.hour) % 12
-    if one.minute == other.minute:
+    apart = (first.hour - second.hour) % 12
+    if first.minute == second.minute:
         return min(apart, 12 - apart) in _HOURS_APART
-    exchanged = one.minute // 5 == other.hour % 12 and other.minute // 5 == one.hour % 12
+    exchanged = first.minute // 5 == second.hour % 12 and second.minute // 5 == first.hour % 12
     return apart == 0 or exchanged
 
 
@@ -115,8 +115,10 @@ def _tiles(left: Reading, right: Reading, rng: np.random.Generator) -> tuple[Clo
     makes = rng.integers((3, len(_RIMS), 3), size=(2, 3)).tolist()
     if rng.integers(2):
         makes[1] = makes[0]
-    one, other = (_clock(reading, rng, *make) for reading, make in zip((left, right), makes, strict=True))
-    return one, other
+    left_clock, right_clock = (
+        _clock(reading, rng, *make) for reading, make in zip((left, right), makes, strict=True)
+    )
+    return left_clock, right_clock
 
 
 def _clock(reading: Reading, rng: np.random.Generator, numerals: int, rim: int, face: int) -> Clock:
@@ -136,7 +138,9 @@ _READINGS = [_reading(hour, minute) for hour in range(1, 13) for minute in (0, 1
 TIME = Generator(
     category="time",
     pairs=tuple(
-        (one, other) for one, other in combinations(filter(_readable, _READINGS), 2) if _confusable(one, other)
+        (first, second)
+        for first, second in combinations(filter(_readable, _READINGS), 2)
+        if _confusable(first, second)
     ),
     tiles=_tiles,
 )
