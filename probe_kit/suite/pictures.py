@@ -84,9 +84,9 @@ def load_picture(path: Path, pixels: str | None = None) -> Image.Image:
     pixels: the hash its pixels must have. Raises SuiteError as `decode_picture` does, and for other pixels.
     """
     picture = decode_picture(path)
-    if pixels is not None and (actual := pixels_sha256(picture)) != pixels:
+    if pixels is not None and (other := pixels_sha256(picture)) != pixels:
         raise SuiteError(
-            f"{path}: has other pixels than its suite says (expected {pixels[:12]}, found {actual[:12]}). {RESTORE}"
+            f"{path}: has other pixels than its suite says (expected {pixels[:12]}, found {other[:12]}). {RESTORE}"
         )
     return letterboxed(picture)
 
