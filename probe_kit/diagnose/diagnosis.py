@@ -11,10 +11,10 @@ import numpy as np
 from probe_kit.diagnose.choices import FRAMES
 from probe_kit.diagnose.frames import frames_of
 from probe_kit.diagnose.importance import Importance, exit_code
-from probe_kit.diagnose.inputs import Frame
 from probe_kit.diagnose.measure import Actions, InputExchange
 from probe_kit.diagnose.passage import SitePassage, describe_passage, measure_passage
 from probe_kit.errors import UnsupportedInterventionError, UsageError
+from probe_kit.extract.sources.donors import Frame
 from probe_kit.extract.sources.inputs import with_input
 from probe_kit.hashing import sha256_json
 from probe_kit.intervene.pairs import Pair

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from probe_kit.diagnose.inputs import Frame
 from probe_kit.errors import UsageError
+from probe_kit.extract.sources.donors import Frame
 from probe_kit.hooks.contract.observation import Observation
-from probe_kit.intervene.sessions.frames import Frame as RunFrame
 from probe_kit.intervene.sessions.observed import ObservedSession
 
 if TYPE_CHECKING:
@@ -40,7 +39,7 @@ def frames_of(session: "ReplaySession", count: int, paraphrases: dict[str, str] 
 
 def _observed(session: ObservedSession, count: int) -> Iterator[Frame]:
     """Frames of recordings or of an environment: one of every group in turn, spread over its frames."""
-    groups: dict[str, list[RunFrame]] = {}
+    groups: dict[str, list[Frame]] = {}
     for frame in session.frames.index:
         groups.setdefault(frame.group, []).append(frame)
     turns = -(-count // len(groups))
@@ -49,8 +48,7 @@ def _observed(session: ObservedSession, count: int) -> Iterator[Frame]:
         for frames in groups.values()
     ]
     in_turn = [frame for turn in zip_longest(*spread) for frame in turn if frame is not None]
-    for frame in in_turn[:count]:
-        yield Frame(frame.name, session.frames.observe(frame), frame.group, frame.seed)
+    yield from in_turn[:count]
 
 
 def _drawn(session: "ReplaySession", count: int) -> Iterator[Frame]:
@@ -65,4 +63,4 @@ def _drawn(session: "ReplaySession", count: int) -> Iterator[Frame]:
         for pair in session.pairs(str(episodes.loc[row, "item_id"])):
             if pair.row == episodes.index.get_loc(row):
                 assert isinstance(pair.clean, Observation), "runs of policies hold observations"
-                yield Frame(pair.episode, pair.clean, pair.group or pair.episode, pair.seed)
+                yield Frame.of(pair.episode, pair.clean, pair.group or pair.episode, pair.seed)

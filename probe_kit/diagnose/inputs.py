@@ -1,12 +1,13 @@
 """The inputs that frames hold, their blanks and their controls. Loads no model."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
+from probe_kit.extract.sources.donors import Frame
 from probe_kit.extract.sources.inputs import (
     INSTRUCTION,
     PICTURE,
@@ -16,21 +17,6 @@ from probe_kit.extract.sources.inputs import (
     same_input,
 )
 from probe_kit.hooks.contract.observation import Observation
-
-
-@dataclass(frozen=True)
-class Frame:
-    """One observation that a policy gets, alone.
-
-    group: the unit that is resampled, such as an episode, or a couple of items. seed: of the inference.
-    other_words: the same instruction in other words; empty where the source has none.
-    """
-
-    name: str
-    observation: Observation
-    group: str
-    seed: int
-    other_words: str = ""
 
 
 def inputs_of(frames: Sequence[Frame], camera: str = "") -> tuple[str, ...]:

@@ -8,16 +8,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.diagnose.donors import draw_donors
 from probe_kit.diagnose.importance import ActionScale, Exchanges, Importance, importance_of
-from probe_kit.diagnose.inputs import Frame, blank_of, control_of, differing, inputs_of, spread_of_states
+from probe_kit.diagnose.inputs import blank_of, control_of, differing, inputs_of, spread_of_states
 from probe_kit.errors import InstructionError, UsageError
+from probe_kit.extract.sources.donors import Frame, draw_donors
 from probe_kit.extract.sources.inputs import STATE, with_input
 from probe_kit.hashing import derive_seed
 
 if TYPE_CHECKING:
     from probe_kit.hooks.contract.observation import Observation
 
+DONORS = 3
+"""For each frame: one donor alone often asks for the same action by chance."""
 Actions = NDArray[np.float32]
 Infer = Callable[[Sequence["Observation"], Sequence[int]], Actions]
 """From observations and seeds to actions (B, chunk, D), in any unit; deterministic for a seed."""
@@ -52,7 +54,8 @@ class InputExchange:
 
     def donors(self, name: str) -> list[tuple[int, int]]:
         """Pairs (frame, donor) of an input, the same at every call; see `draw_donors`."""
-        return draw_donors(self.frames, name, np.random.default_rng(derive_seed(self.seed, "donors", name)))
+        rng = np.random.default_rng(derive_seed(self.seed, "donors", name))
+        return draw_donors(self.frames, name, rng, DONORS)
 
     @cached_property
     def clean(self) -> Actions:

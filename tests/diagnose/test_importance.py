@@ -8,9 +8,10 @@ import pytest
 from numpy.typing import NDArray
 
 from probe_kit.diagnose.importance import exit_code
-from probe_kit.diagnose.inputs import PICTURE, STATE, Frame
+from probe_kit.diagnose.inputs import PICTURE, STATE
 from probe_kit.diagnose.measure import InputExchange
 from probe_kit.errors import InstructionError, UsageError
+from probe_kit.extract.sources.donors import Frame
 from probe_kit.hooks.contract.observation import Observation
 
 WORDS = ["lift the cube", "open the drawer", "push the plate", "turn the knob"]
@@ -21,7 +22,7 @@ def frames(count: int = 48, groups: int = 24, seed: int = 0) -> list[Frame]:
     """Frames whose words, colour and state are drawn independently of each other."""
     rng = np.random.default_rng(seed)
     return [
-        Frame(
+        Frame.of(
             name=f"frame {index}",
             observation=Observation(
                 (rng.integers(40, 216) + rng.integers(-4, 5, (8, 8, 3))).astype(np.uint8),
@@ -110,7 +111,7 @@ def test_words_that_mean_the_same_move_as_much_as_others_in_five_of_a_hundred_dr
 
 def test_an_input_that_all_frames_share_is_not_varied_and_the_others_are_tested() -> None:
     same = [
-        Frame(frame.name, Observation(frame.observation.image, frame.observation.state, "lift"), frame.group, 1)
+        Frame.of(frame.name, Observation(frame.observation.image, frame.observation.state, "lift"), frame.group, 1)
         for frame in frames()
     ]
     words, picture, _ = InputExchange(linear_policy([1.0, 1.0, 0.0]), same).measure()
@@ -143,7 +144,7 @@ def test_an_unknown_input_is_refused_by_name() -> None:
 def test_a_second_camera_that_is_not_read_does_not_arrive() -> None:
     rng = np.random.default_rng(1)
     two = [
-        Frame(
+        Frame.of(
             frame.name,
             Observation(
                 frame.observation.image,

@@ -12,7 +12,6 @@ from probe_kit._system.counting import counted
 from probe_kit.env import Act2AnswerEnv
 from probe_kit.errors import SceneError, UsageError
 from probe_kit.extract.plan import Row
-from probe_kit.extract.sources.pairs import Pair
 from probe_kit.extract.sources.player import Opens
 from probe_kit.extract.sources.scene import SceneSettings
 from probe_kit.extract.sources.scene_player import ScenePlayer
@@ -30,7 +29,6 @@ if TYPE_CHECKING:
 
 EPISODES = 3
 """If the scene of one episode cannot be built, so many are tried: a single one costs no run."""
-LAYOUT = "layout"
 """The input of a pair whose donor has the two pictures in each other's place."""
 
 
@@ -224,20 +222,6 @@ class SceneSource(Source[SceneSettings]):
     def play(self, played: Played) -> Opens:
         """Open a player of the scene."""
         return partial(ScenePlayer, self.settings.scene, played)
-
-    def pairs(self, vary: str, rng: np.random.Generator, rows: Sequence[Row]) -> Iterator[Pair]:
-        """Yield pairs as every source; with `layout`, the donor has the two pictures in each other's place."""
-        return self._layouts(rows) if vary == LAYOUT else super().pairs(vary, rng, rows)
-
-    def _layouts(self, rows: Sequence[Row]) -> Iterator[Pair]:
-        player = ScenePlayer(self.settings.scene)
-        try:
-            for row in rows:
-                clean = player.look(row).observation
-                donor = player.look_swapped().observation
-                yield Pair(LAYOUT, row, row, clean, donor, None, row.policy_seed)
-        finally:
-            player.close()
 
 
 def _first_items(categories: Sequence[str] | None, count: int) -> Suite:

@@ -4,7 +4,7 @@ A source knows neither what a model does with its observations nor how runs are 
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -13,8 +13,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 from probe_kit._terminal.field_options import Part
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from probe_kit.extract.plan import Row
     from probe_kit.extract.sources.player import Opens
     from probe_kit.hooks import Policy
@@ -174,12 +172,3 @@ class Source[Chosen: SourceSettings](ABC):
     def targets(self) -> tuple[str, ...]:
         """The built-in targets of probes that the rows have, such as `side.correct` or `env.left`."""
         return ()
-
-    def pairs(self, vary: str, rng: "np.random.Generator", rows: "Sequence[Row]") -> "Iterator[Any]":
-        """Pairs of observations of some rows that differ in one input, see `probe_kit.extract.sources.pairs`.
-
-        vary: `instruction`, `state`, or `picture.NAME` of a camera. Raises UsageError for an input without pairs.
-        """
-        from probe_kit.extract.sources.pairs import frames_of, pairs_of
-
-        return pairs_of(frames_of(self.play(Played()), rows), vary, rng)

@@ -2,46 +2,24 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from probe_kit.errors import OtherFramesError, UsageError
+from probe_kit.extract.sources.donors import Frame
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.observation import Observation
-from probe_kit.intervene.pairs import Chunk
 from probe_kit.intervene.sessions.session import ReplaySource, sources_of
 from probe_kit.intervene.settings import why_not_replayed
 from probe_kit.runs import Run
 from probe_kit.runs.layout import DATASET
 
-if TYPE_CHECKING:
-    from probe_kit.hooks import Policy
-
-
-@dataclass(frozen=True, eq=False)
-class Frame:
-    """One inference of a run. number: of the recorded frame; 0 of an environment. state: (D,) as it was stored."""
-
-    row: int
-    number: int
-    item: str
-    group: str
-    category: str
-    episode: str
-    instruction: str
-    seed: int
-    state: NDArray[np.float64]
-    stored: Chunk | None
-
-    @property
-    def name(self) -> str:
-        """Return the episode and the number of the frame."""
-        return f"{self.episode}@{self.number}"
+CACHED = 256
+"""Observations that are kept: those of the nearest frames are compared again and again."""
 
 
 class Frames(ABC):
@@ -49,8 +27,8 @@ class Frames(ABC):
 
     def __init__(self, run: Run) -> None:
         self.run = run
+        self._cached = lru_cache(maxsize=CACHED)(self.observe)
         self.index = list(self._listed())
-        self.observe = lru_cache(maxsize=64)(self.observe)  # type: ignore[method-assign]
 
     @property
     @abstractmethod
@@ -59,7 +37,7 @@ class Frames(ABC):
 
     @abstractmethod
     def observe(self, frame: Frame) -> Observation:
-        """Return the observation of a frame. Raises OtherFramesError if it is not the run's."""
+        """Read the observation of a frame. Raises OtherFramesError if it is not the run's."""
 
     @abstractmethod
     def _numbers(self, row: int) -> Sequence[int]:
@@ -77,12 +55,19 @@ class Frames(ABC):
         for row, record in enumerate(self.run.episodes.to_dict("records")):
             for call, number in enumerate(self._numbers(row)):
                 yield Frame(
-                    row, number, str(record["item_id"]), str(record["group_id"]), str(record["category"]),
-                    str(record["episode_id"]), str(record["instruction"]),
-                    derive_seed(int(record["policy_seed"]), "inference", number),
-                    np.zeros(0) if states is None else states[row, call],
-                    None if actions is None else np.asarray(actions[row, call], np.float32),
-                )  # fmt: skip
+                    name=f"{record['episode_id']}@{number}",
+                    group=str(record["group_id"]),
+                    seed=derive_seed(int(record["policy_seed"]), "inference", number),
+                    instruction=str(record["instruction"]),
+                    state=np.zeros(0) if states is None else states[row, call],
+                    observe=self._cached,
+                    row=row,
+                    number=number,
+                    item=str(record["item_id"]),
+                    episode=str(record["episode_id"]),
+                    category=str(record["category"]),
+                    stored=None if actions is None else np.asarray(actions[row, call], np.float32),
+                )
 
 
 class RecordedFrames(Frames):
@@ -187,11 +172,6 @@ def frames_of(run: Run, source: ReplaySource) -> Frames:
     if reason := why_not_replayed(run):
         raise UsageError(f"{run.location}: {reason}")
     return (RecordedFrames if run.recorded else EnvironmentFrames)(run, source)
-
-
-def with_cameras(policy: "Policy", frames: Frames) -> "Policy":
-    """Return the policy as it is given these cameras."""
-    return policy.with_cameras(list(frames.cameras))
 
 
 def _folder_of(run: Run, source: ReplaySource) -> str:

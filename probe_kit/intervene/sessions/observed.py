@@ -4,18 +4,19 @@ A donor is another frame of another group. The source of a pair is the clean fra
 """
 
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
+from probe_kit.extract.sources.donors import Frame, draw_donors
 from probe_kit.extract.sources.inputs import (
     INSTRUCTION,
     PICTURE,
     STATE,
     hardly_changed,
-    same_input,
     with_input,
 )
 from probe_kit.hashing import derive_seed
@@ -23,7 +24,7 @@ from probe_kit.hooks.checkpoints.containment import copied
 from probe_kit.hooks.checkpoints.third_party import while_acting
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.intervene.pairs import Chunk, Given, Pair
-from probe_kit.intervene.sessions.frames import Frame, Frames
+from probe_kit.intervene.sessions.frames import Frames
 from probe_kit.intervene.sessions.session import ReplaySession
 from probe_kit.intervene.settings import PairChoice, PairRow
 from probe_kit.intervene.spread import directions_of, spread_of
@@ -70,7 +71,7 @@ class ObservedSession(ReplaySession):
         """Return the pairs of an item's frames; frames without a donor are left out."""
         pairs = []
         for frame, donor in self._donors(item):
-            clean, other = self.frames.observe(frame), self.frames.observe(donor)
+            clean, other = frame.observation, donor.observation
             pairs.append(
                 Pair(
                     clean=clean,
@@ -90,45 +91,28 @@ class ObservedSession(ReplaySession):
         return pairs
 
     def _donors(self, item: str) -> list[tuple[Frame, Frame]]:
+        """Return frames of an item with the donor of each: of the table, or drawn."""
         if self.table:
-            by_name = {(frame.item, frame.number): frame for frame in self.frames.index}
-            by_name |= {(frame.episode, frame.number): frame for frame in self.frames.index}
-            rows = [(by_name.get(row[:2]), by_name.get(row[2:])) for row in self.table]
-            for row, (frame, donor) in zip(self.table, rows, strict=True):
-                if frame is None or donor is None:
-                    episode, number = row[:2] if frame is None else row[2:]
-                    raise UsageError(
-                        f"the run has no frame {number} of {episode!r}, which the table of pairs names"
-                    )
-            return [(frame, donor) for frame, donor in rows if frame and donor and frame.item == item]
-        frames = [frame for frame in self.frames.index if frame.item == item]
-        indices = np.unique(
-            np.linspace(0, len(frames) - 1, min(self.frames_each, len(frames))).round().astype(int)
-        )
-        donors = [(frames[at], self._donor(frames[at])) for at in indices]
-        return [(frame, donor) for frame, donor in donors if donor is not None]
+            return [(frame, donor) for frame, donor in self._tabled if frame.item == item]
+        index = self.frames.index
+        rows = [at for at, frame in enumerate(index) if frame.item == item]
+        spaced = np.linspace(0, len(rows) - 1, min(self.frames_each, len(rows))).round().astype(int)
+        donors = []
+        for row in (rows[at] for at in np.unique(spaced)):
+            # A draw of its own for every frame: items are replayed one by one, and resumed at any of them.
+            rng = np.random.default_rng(derive_seed("donor", self.vary, index[row].name))
+            donors += [(index[row], index[donor]) for _, donor in draw_donors(index, self.vary, rng, of=[row])]
+        return donors
 
-    def _donor(self, frame: Frame) -> Frame | None:
-        """Return another group's frame: of the nearest state, and of another instruction if that varies."""
-        candidates: list[Frame] = [other for other in self.frames.index if other.group != frame.group]
-        if self.vary == INSTRUCTION:
-            candidates = [other for other in candidates if other.instruction != frame.instruction]
-        draw = np.random.default_rng(derive_seed("donor", self.vary, frame.name))
-        if self.vary == INSTRUCTION and candidates:
-            texts = sorted({other.instruction for other in candidates})
-            text = texts[int(draw.integers(len(texts)))]
-            candidates = [other for other in candidates if other.instruction == text]
-        if not candidates:
-            return None
-        if self.vary == STATE:
-            return candidates[int(draw.integers(len(candidates)))]
-        apart = [float(np.linalg.norm((other.state - frame.state) / self._spread)) for other in candidates]
-        clean = self.frames.observe(frame)
-        for at in np.argsort(apart, kind="stable"):
-            donor = self.frames.observe(candidates[int(at)])
-            if not same_input(clean, donor, self.vary):
-                return candidates[int(at)]
-        return None
+    @cached_property
+    def _tabled(self) -> list[tuple[Frame, Frame]]:
+        """Frames and donors of the user's own table. Raises UsageError for a frame that the run does not have."""
+        by_name = {(frame.item, frame.number): frame for frame in self.frames.index}
+        by_name |= {(frame.episode, frame.number): frame for frame in self.frames.index}
+        for episode, number in (part for row in self.table for part in (row[:2], row[2:])):
+            if (episode, number) not in by_name:
+                raise UsageError(f"the run has no frame {number} of {episode!r}, which the table of pairs names")
+        return [(by_name[row[:2]], by_name[row[2:]]) for row in self.table]
 
     def check_vary(self) -> None:
         """Raise UsageError for an input that the frames do not have, or that no frame of another group varies."""

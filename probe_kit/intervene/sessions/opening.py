@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING
 
 from probe_kit.intervene.pairs import Pair
-from probe_kit.intervene.sessions.frames import frames_of, with_cameras
+from probe_kit.intervene.sessions.frames import frames_of
 from probe_kit.intervene.sessions.observed import ObservedSession
 from probe_kit.intervene.sessions.scene import SceneSession
 from probe_kit.intervene.sessions.session import (
@@ -38,7 +38,7 @@ def open_session(
         session = SceneSession.of(run, source, policy)
     else:
         frames = frames_of(run, source)
-        session = ObservedSession(run, with_cameras(policy(), frames), frames)
+        session = ObservedSession(run, policy().with_cameras(list(frames.cameras)), frames)
         session.choose(choice)
     try:
         check_policy(run, session.policy)
