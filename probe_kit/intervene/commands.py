@@ -256,9 +256,9 @@ def _run(run: "Run", intervention: "Intervention", source: "ReplaySource") -> "I
     from probe_kit.intervene import run_intervention
     from probe_kit.intervene.outcomes import is_stored
     from probe_kit.intervene.places import unread_note
-    from probe_kit.intervene.results.verdict import groups_for_not_used
     from probe_kit.intervene.runner import check_supported, too_few_groups, unread_sites
     from probe_kit.intervene.settings import check_run_fits, key_of, settings_of
+    from probe_kit.statistics.sufficiency import groups_for_not_used
 
     check_run_fits(run)
     check_supported(run, intervention)
@@ -267,7 +267,8 @@ def _run(run: "Run", intervention: "Intervention", source: "ReplaySource") -> "I
     if few:
         counts = ", ".join(f"{name} has {count}" for name, count in few.items())
         needed = groups_for_not_used()
-        say(marked("[yellow]note:[/] the verdict “not used” needs {} groups of items; {}", needed, counts))
+        text = "[yellow]note:[/] “not used” needs {} groups of items and cannot be found: {}. Extract more items."
+        say(marked(text, needed, counts))
     unread = () if was_stored else unread_sites(run, intervention)
     if unread:
         say(marked("[yellow]note:[/] {}", unread_note(unread)))

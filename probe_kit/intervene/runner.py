@@ -16,7 +16,6 @@ from probe_kit.intervene.outcomes import DONOR, IMAGE_SWAP, ConditionOutcomes, i
 from probe_kit.intervene.places import check_roles_have_tokens, resolve_sites, unread_places
 from probe_kit.intervene.replay import Condition, ReplayBatch
 from probe_kit.intervene.results.results import InterventionResult, effects_csv, load_effects
-from probe_kit.intervene.results.verdict import groups_for_not_used
 from probe_kit.intervene.rollout import evaluate_per_step
 from probe_kit.intervene.sessions.opening import open_session
 from probe_kit.intervene.sessions.session import LoadPolicy, Progress, ReplaySession, ReplaySource
@@ -26,6 +25,7 @@ from probe_kit.runs.layout import INTERVENTIONS
 from probe_kit.runs.results import tidy_bundle
 from probe_kit.runs.resume_pieces import Pieces
 from probe_kit.runs.run import Run
+from probe_kit.statistics.sufficiency import groups_for_not_used
 
 REDO = "the same `probe-kit intervene` then plays it again"
 

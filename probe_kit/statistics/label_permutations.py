@@ -8,10 +8,13 @@ label permutation is as likely as the real labels, which makes the p-values exac
 
 from collections.abc import Hashable, Iterator, Mapping, Sequence
 from itertools import groupby, islice, permutations, product
-from math import factorial, prod
+from math import factorial, floor, prod
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from probe_kit.statistics.significance import SIGNIFICANCE
 
 
 def flip_items(labels: NDArray[np.bool_], items: ArrayLike, count: int, seed: int) -> NDArray[np.bool_]:
@@ -185,6 +188,25 @@ def possible_flips(groups: int) -> int:
 def smallest_p(permutations: int) -> float:
     """The smallest p-value that so many label permutations can give; 1 without any."""
     return 1 / (1 + permutations)
+
+
+def permutations_for(tests: int = 1) -> int:
+    """Fewest label permutations with which p can be below the level: 19 give 1/20, which is not.
+
+    tests: the number that p is corrected for.
+    """
+    return floor(tests / SIGNIFICANCE + 1e-9)
+
+
+def shortage(least_p: float, permutations: int, tests: int = 1) -> Literal["", "permutations", "groups"]:
+    """Return what is too few for any p below the level; empty where there is enough.
+
+    least_p: the smallest p that is possible. permutations: the number that was asked for; where so many would
+    give a smaller p, the groups are too few. tests: the number that p is corrected for.
+    """
+    if round(tests * least_p, 12) < SIGNIFICANCE:
+        return ""
+    return "groups" if least_p > 1.001 * smallest_p(permutations) else "permutations"
 
 
 def pointwise_p(observed: NDArray[np.float64], null: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,13 +1,14 @@
 """The conclusions that a number of groups is enough for: one definition for plans and for later refusals."""
 
 from collections.abc import Callable
-from functools import lru_cache
+from functools import cache, lru_cache
 from itertools import count
 from math import sqrt
 from statistics import NormalDist
 
 import numpy as np
 
+from probe_kit.statistics.bootstrap import GAINS, group_bootstrap
 from probe_kit.statistics.estimates.balanced import CHANCE, GroupSums
 from probe_kit.statistics.estimates.crossfit import FEWEST_GROUPS
 from probe_kit.statistics.estimates.verdict import ABSENT_BELOW, at_most, findable
@@ -20,6 +21,8 @@ GROUPS_FOR_PROBES = OUTER_FOLDS
 """With fewer, `train` refuses the category."""
 GROUPS_FOR_RETENTION = FEWEST_GROUPS
 """With fewer there are no cross-fitted scores."""
+SMALLEST_EFFECT_OF_INTEREST = 0.25
+"""Net share of episodes below which a category is not acted on, and an edit or erasure is without effect."""
 
 
 def least_probe_p(groups: int) -> float:
@@ -35,6 +38,18 @@ def groups_for_signal() -> int:
 def groups_for_interventions() -> int:
     """Fewest groups of which an effect can be beyond chance."""
     return _fewest(lambda groups: smallest_flip_p(groups) < SIGNIFICANCE, 1)
+
+
+@cache
+def groups_for_not_used() -> int:
+    """Fewest groups with which an image swap can find *not used* at all, in episodes that never follow."""
+    return _fewest(lambda groups: _net_limit_of_none(groups) < SMALLEST_EFFECT_OF_INTEREST, 2)
+
+
+def _net_limit_of_none(groups: int) -> float:
+    """How far from zero the interval of a net follow rate reaches if no episode follows."""
+    low, high = group_bootstrap(np.zeros((groups, 1)), np.arange(groups), 0, bounds=GAINS)
+    return float(max(-low[0], high[0]))
 
 
 @lru_cache

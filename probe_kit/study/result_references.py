@@ -6,7 +6,7 @@ from probe_kit.errors import ProbeKitError
 from probe_kit.hooks.contract.declared import DeclaredStream
 from probe_kit.hooks.contract.views import resolve_view, view_names
 from probe_kit.hooks.registry import get_family
-from probe_kit.statistics.label_permutations import smallest_p
+from probe_kit.statistics.label_permutations import permutations_for, shortage, smallest_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.study.expansion import Member, members
 from probe_kit.study.mistakes import Mistake, Place, each_unknown
@@ -74,7 +74,7 @@ def _probes(study: Study, suite: PlannedSuite) -> Iterator[Mistake]:
                 said = f"block {block.name!r} asks with tokens none, which leaves nothing to probe"
                 yield Mistake((*place, "runs"), said)
             yield from _enough_items(study, block, suite, (*place, "runs"))
-            yield from _enough_permutations(table, _chosen(study, block, suite), place)
+            yield from _enough_permutations(table, place)
             for model in (study.models[one] for one in block.models if one in study.models):
                 yield from _views((*place, "views"), table.views, model)
         if "untrained" in table.controls:
@@ -98,12 +98,10 @@ def _enough_items(study: Study, block: BlockTable, suite: PlannedSuite, place: P
         yield Mistake(place, f"{said}, which are too few groups for five folds", absent=True)
 
 
-def _enough_permutations(table: ProbesTable, categories: tuple[str, ...], place: Place) -> Iterator[Mistake]:
-    least = smallest_p(table.permutations) * len(categories)
-    if table.permutations and least > SIGNIFICANCE:
-        needed = round(len(categories) / SIGNIFICANCE) - 1
-        said = f"{table.permutations} are too few for {len(categories)} categories: no corrected p can be below"
-        yield Mistake((*place, "permutations"), f"{said} {least:.2f}. Give at least {needed}", absent=True)
+def _enough_permutations(table: ProbesTable, place: Place) -> Iterator[Mistake]:
+    if table.permutations and shortage(smallest_p(table.permutations), table.permutations):
+        message = f"{table.permutations} are too few: no p can be below {SIGNIFICANCE}. Give at least"
+        yield Mistake((*place, "permutations"), f"{message} {permutations_for()}", absent=True)
 
 
 def _views(place: Place, views: list[str], model: ModelTable) -> Iterator[Mistake]:

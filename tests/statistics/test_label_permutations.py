@@ -1,13 +1,17 @@
 import numpy as np
+import pytest
 
 from probe_kit.statistics.label_permutations import (
     exchange_groups,
     flip_groups,
     flip_items,
     max_statistic_p,
+    permutations_for,
     pointwise_p,
+    shortage,
     smallest_p,
 )
+from probe_kit.statistics.significance import SIGNIFICANCE
 
 ITEMS = np.repeat(np.arange(200), 2)
 LAYOUTS = np.tile(["original", "swapped"], 200)
@@ -88,3 +92,17 @@ def test_family_wise_p_compares_with_the_best_site() -> None:
 def test_p_is_missing_without_permuted_labels() -> None:
     assert np.isnan(pointwise_p(np.array([0.9]), np.empty((1, 0)))).all()
     assert np.isnan(max_statistic_p(np.array([0.9]), np.empty((1, 0)))).all()
+
+
+@pytest.mark.parametrize("tests", [1, 2, 3, 7, 12, 40])
+def test_one_permutation_fewer_than_needed_can_show_nothing_after_a_correction(tests: int) -> None:
+    needed = permutations_for(tests)
+    assert tests * smallest_p(needed) < SIGNIFICANCE <= tests * smallest_p(needed - 1) + 1e-12
+    assert shortage(smallest_p(needed), needed, tests) == ""
+    assert shortage(smallest_p(needed - 1), needed - 1, tests) == "permutations"
+
+
+def test_groups_are_too_few_where_they_allow_fewer_permutations_than_were_asked_for() -> None:
+    assert shortage(smallest_p(15), 200) == "groups"
+    assert shortage(smallest_p(15), 15) == "permutations"
+    assert shortage(smallest_p(0), 0) == "permutations"

@@ -19,6 +19,7 @@ from probe_kit.statistics.sufficiency import (
     GROUPS_FOR_RETENTION,
     groups_for_absence,
     groups_for_interventions,
+    groups_for_not_used,
     groups_for_signal,
     least_probe_p,
 )
@@ -103,8 +104,9 @@ def test_the_fewest_groups_are_those_of_the_page() -> None:
     page = (Path(__file__).parents[2] / "docs/statistics.md").read_text(encoding="utf-8")
     lines = dict(re.findall(r"^\| ([a-z ]+) \| .* \| (\d+)[^|]*\|$", page, re.MULTILINE))
     found = {
-        "probes": GROUPS_FOR_PROBES, "retention": GROUPS_FOR_RETENTION, "verdict shown": groups_for_signal(),
-        "verdict absent": groups_for_absence(4), "interventions": groups_for_interventions(),
+        "probes": GROUPS_FOR_PROBES, "retention": GROUPS_FOR_RETENTION, "shown": groups_for_signal(),
+        "absent": groups_for_absence(4), "interventions": groups_for_interventions(),
+        "not used": groups_for_not_used(),
     }  # fmt: skip
     assert {name: int(lines[name]) for name in found} == found
     assert f"± 10 points take {items_for_width(0.2)} items" in page

@@ -39,7 +39,7 @@ from probe_kit.intervene.kinds.base import (
     test_against_controls,
     text_of,
 )
-from probe_kit.intervene.kinds.image_swap import SMALLEST_EFFECT_OF_INTEREST, net_interval
+from probe_kit.intervene.kinds.image_swap import net_interval
 from probe_kit.intervene.kinds.interchange import patch_of, patches_within
 from probe_kit.intervene.kinds.site_maps import best_patch_targets
 from probe_kit.intervene.outcomes import CLEAN, ConditionOutcomes
@@ -57,6 +57,7 @@ from probe_kit.intervene.tokens import TILES, role_tokens
 from probe_kit.runs.run import Run
 from probe_kit.statistics.paired_tests import sign_p
 from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.statistics.sufficiency import SMALLEST_EFFECT_OF_INTEREST
 
 if TYPE_CHECKING:
     from probe_kit._tables.table import Table

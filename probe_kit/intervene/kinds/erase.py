@@ -35,7 +35,7 @@ from probe_kit.intervene.kinds.base import (
     test_against_controls,
     text_of,
 )
-from probe_kit.intervene.kinds.image_swap import SMALLEST_EFFECT_OF_INTEREST, net_interval
+from probe_kit.intervene.kinds.image_swap import net_interval
 from probe_kit.intervene.kinds.interchange import cells_at
 from probe_kit.intervene.outcomes import CLEAN, ERASE, PROBE_ACCURACY, ConditionOutcomes
 from probe_kit.intervene.patching.attribution import LOCALISATION_SHARE
@@ -48,6 +48,7 @@ from probe_kit.runs.run import Run
 from probe_kit.statistics.folds import Fold
 from probe_kit.statistics.paired_tests import paired_greater_p
 from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.statistics.sufficiency import SMALLEST_EFFECT_OF_INTEREST
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -32,6 +32,7 @@ from probe_kit.statistics.bootstrap import GAINS, group_bootstrap, units_seed
 from probe_kit.statistics.paired_tests import paired_greater_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.statistics.student import unbounded_student_interval
+from probe_kit.statistics.sufficiency import SMALLEST_EFFECT_OF_INTEREST
 from probe_kit.suite.categories import category_of
 from probe_kit.train.data.run_reader import RunReader, seed_text_of
 
@@ -46,8 +47,6 @@ SMALLEST_REACH = 0.02
 """Metres. Two sides that are nearer to each other are no choice between tiles."""
 REACHED = 0.25
 """Share of the reach from which a side counts as reached."""
-SMALLEST_EFFECT_OF_INTEREST = 0.25
-"""Net follow rate below which a category is not acted on; of the closed loop and the erasure too."""
 SMALLEST_SHARE_OF_INTEREST = 0.10
 """Of the reach. A displacement below it is a trace."""
 FOLLOWS, REVERSES = 1, -1

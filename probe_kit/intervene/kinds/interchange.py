@@ -209,7 +209,12 @@ def _finding(rows: Sequence[PatchEffect]) -> str:
             f"edits that move the action at least {100 * SMALLEST_REACH:g} cm to the target side, beyond their "
             f"controls: {count_edits(names, len(edits))}"
         )
-    localised = sorted((row for row in edits if row.is_localised), key=lambda row: -(row.effect or 0.0))
+    # Of what carries the swap in every policy, the sentence says so apart: it locates nothing (`*` in the table).
+    open_ = [row for row in edits if not (row.is_localised and row.is_by_construction)]
+    localised = sorted((row for row in open_ if row.is_localised), key=lambda row: -(row.effect or 0.0))
     names = [f"{row.name} {row.effect:.2f}" for row in localised]
     verb = "have" if any(row.is_dose for row in edits) else "carry"
-    return f"edits that {verb} half of the image swap's effect: {count_edits(names, len(edits))}"
+    apart = len(edits) - len(open_)
+    by_construction = f"; {apart} more {verb} it by construction and locate nothing (*)" * (apart > 0)
+    found = count_edits(names, len(open_))
+    return f"edits that {verb} half of the image swap's effect: {found}{by_construction}"

@@ -172,8 +172,8 @@ class InterventionResult:
 
     @property
     def findings(self) -> tuple[str, ...]:
-        """The last lines of the command: a short sentence per category."""
-        return tuple(self._kind.findings(self.effects, self._context))
+        """The last lines of the command: a short sentence per category, and one that says which layer matters."""
+        return *self._kind.findings(self.effects, self._context), *self.layers.values()
 
     @property
     def sentences(self) -> tuple[str, ...]:

@@ -6,16 +6,12 @@ the place (of interchanges) and the tie (is what probes read the thing that is u
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from math import inf
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
-import numpy as np
-
 from probe_kit.hooks.contract.sites import KV_STREAM
 from probe_kit.intervene.kinds.image_swap import (
-    SMALLEST_EFFECT_OF_INTEREST,
     SMALLEST_SHARE_OF_INTEREST,
     ImageSwapEffect,
     Swapped,
@@ -23,8 +19,8 @@ from probe_kit.intervene.kinds.image_swap import (
 )
 from probe_kit.intervene.places import list_places
 from probe_kit.intervene.settings import FIRST_CHUNK, PER_STEP
-from probe_kit.statistics.bootstrap import GAINS, group_bootstrap
 from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.statistics.sufficiency import SMALLEST_EFFECT_OF_INTEREST, groups_for_not_used
 from probe_kit.suite.items import Side
 
 if TYPE_CHECKING:
@@ -284,16 +280,6 @@ def is_bounded(effect: ImageSwapEffect) -> bool:
     (low, high), (least, most) = effect.net_follow_rate_ci, effect.reach_share_ci
     flips, share = SMALLEST_EFFECT_OF_INTEREST, SMALLEST_SHARE_OF_INTEREST
     return -flips < low and high < flips and -share < least and most < share
-
-
-@cache
-def groups_for_not_used() -> int:
-    """The fewest groups of items with which *not used* can be found at all, in episodes that never follow."""
-    for count in range(2, 1000):
-        low, high = group_bootstrap(np.zeros((count, 1)), np.arange(count), 0, bounds=GAINS)
-        if max(-low[0], high[0]) < SMALLEST_EFFECT_OF_INTEREST:
-            return count
-    raise AssertionError("no number of groups bounds the net follow rate")
 
 
 def _measured(effect: ImageSwapEffect) -> str:

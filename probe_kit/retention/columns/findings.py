@@ -11,10 +11,11 @@ from collections.abc import Sequence
 from probe_kit._tables.numbers import whole
 from probe_kit.intervene.results.verdict import UseVerdict
 from probe_kit.retention.behaviour.success_rate import Regime
-from probe_kit.retention.columns.sentences import is_probed, knows
+from probe_kit.retention.columns.sentences import is_probed, knows, unprobed
 from probe_kit.retention.columns.text import can_be_probed, is_vlm
 from probe_kit.retention.rows.parts import StreamPart
 from probe_kit.retention.rows.row import MEAN, RetentionRow
+from probe_kit.statistics.label_permutations import permutations_for
 from probe_kit.train.results.control_scores import RANDOM_FEATURES, UNTRAINED
 
 MOST_WORDS = 25
@@ -81,9 +82,11 @@ _READ = "probes read the answer in the backbone"
 
 
 def _in_action(row: RetentionRow) -> str:
+    """Return what probes show of the action stream, in the words of its verdict; *not shown* claims no absence."""
     if row.action.verdict is None:
         return ""
-    return f" and the {row.run.action_name}" if _holds(row.action) else f", not in the {row.run.action_name}"
+    words = " and" if _holds(row.action) else f", {'absent' if row.action.verdict == 'absent' else 'not shown'} in"
+    return f"{words} the {row.run.action_name}"
 
 
 def _head(row: RetentionRow, asked: RetentionRow | None, used: str) -> str:
@@ -129,7 +132,7 @@ def _read_and(row: RetentionRow, action: str) -> list[str]:
 def _missing(row: RetentionRow, answer: str = "it") -> list[str]:
     """Return why the answer is not known to be in the backbone; nothing where it is."""
     if not is_probed(row):
-        return ["the backbone was not probed"]
+        return [unprobed(row)]
     if _is_encoded(row):
         return []
     return [f"probes do not show {answer} in the backbone"]
@@ -142,8 +145,9 @@ def _unread(row: RetentionRow) -> str:
         return "too few groups of items to measure the answer in the backbone"
     if part.verdict == "absent":
         return f"probes of {items} items do not find the answer in the backbone"
-    if part.exceeds.get("chance") is None:
-        return "probes of the backbone were fitted without label permutations"
+    if part.remedy:
+        few = "permutations" if "permutations" in part.remedy else "groups"
+        return f"too few {few} to show it, {part.remedy}"
     missed = [_CONTROLS.get(name, name) for name, better in part.exceeds.items() if better is False]
     if part.exceeds["chance"]:
         return f"probes of the backbone do no better than {' and '.join(missed)}"
@@ -176,11 +180,11 @@ def _without_swap(row: RetentionRow, asked: RetentionRow | None) -> str:
     if is_probed(row):
         return _sentence(_without_signal(row, asked), _unread(row), row=row)
     if row.success.sr is None:
-        return f"not measured: {_success(row)}, and the backbone was not probed."
+        return f"not measured: {_success(row)}, and {unprobed(row)}."
     words = {Regime.KNOWLEDGE: "success", Regime.FAILURE: "failure"}
     head = words.get(row.success.regime or Regime.NO_RELIABLE_KNOWLEDGE, "success not shown")
     beside = "" if head == "success" else f", {_against_guessing(row)}"
-    return f"{head}: the cube ends right in {whole(row.success.sr)} %{beside}; the backbone was not probed."
+    return f"{head}: the cube ends right in {whole(row.success.sr)} %{beside}; {unprobed(row)}."
 
 
 # -- what to do next ----------------------------------------------------------------------------------------------
@@ -198,6 +202,9 @@ def next_step(rows: Sequence[RetentionRow]) -> str:
         return f"next: probe-kit train {run}  where inside the answer can be read"
     if has_activations and any(row.image_swap.use is None for row in own) and not own[0].run.capture_only:
         return f"next: probe-kit intervene {run}  whether the action follows the answer"
+    if any("permutations" in row.backbone.remedy for row in own):
+        fewest = permutations_for()
+        return f"next: probe-kit train {run} --permutations 200  because fewer than {fewest} show nothing"
     if any(is_probed(row) and not _is_encoded(row) and row.backbone.verdict != "absent" for row in own):
         return "next: probe-kit power  how many items would show what is open"
     return f"next: probe-kit view {run}  episode by episode, in a browser"

@@ -149,7 +149,7 @@ def conclusion(row: RetentionRow) -> str:
     is_later = use is not None and use.is_bounded and use.is_of_first_chunk and knows(row)
     parts = [_finding(row) if use is None else _used(row, use), _LATER * is_later]
     if not is_probed(row):
-        parts.append(f"The backbone was not probed{': run `probe-kit train`' * can_be_probed(row)}.")
+        parts.append(f"{_capital(unprobed(row))}{': run `probe-kit train`' * can_be_probed(row)}.")
     return " ".join(filter(None, parts))
 
 
@@ -183,14 +183,14 @@ def _unprobed(row: RetentionRow) -> str:
 
 def _nothing_shown(row: RetentionRow) -> str:
     """Of a backbone without signal: what is decided first, then what is open."""
-    absent, untested = row.backbone.verdict == "absent", row.backbone.exceeds["chance"] is None
+    absent = row.backbone.verdict == "absent"
     behaviour = _behaviour(row)
     backbone = _backbone(row)
     parts = [backbone, behaviour] if absent or behaviour == _NOT_SHOWN else [behaviour, backbone]
     said = "; ".join(filter(None, parts))
     remedy = ""
     if not absent:
-        remedy = f": {'train probes with permutations' if untested else _MORE_ITEMS}"
+        remedy = f": {row.backbone.remedy or _MORE_ITEMS}"
     elif behaviour == _NOT_SHOWN:
         remedy = f": {_MORE_ITEMS}"
     return f"{_capital(said)}{remedy}."
@@ -221,6 +221,11 @@ def _behaviour(row: RetentionRow) -> str:
 def is_probed(row: RetentionRow) -> bool:
     """Whether probes of the backbone are stored."""
     return bool(row.backbone.exceeds)
+
+
+def unprobed(row: RetentionRow) -> str:
+    """Return why there are no numbers of the backbone: no probes are stored, or those of other categories are."""
+    return "the backbone was not probed" if row.run.probes is None else "the probes are not of this category"
 
 
 # -- answers and success rates ---------------------------------------------------------------------------------
@@ -288,8 +293,8 @@ def _in_stream(name: str, part: StreamPart, what: str) -> str:
         return f"{name} holds {what} ({_accuracy(part)})"
     if part.verdict == "absent":
         return f"a linear probe of so many items does not find {what} in {name} ({score}; at most {most})"
-    if part.exceeds.get("chance") is None:
-        return f"whether {name} holds {what} was not tested against chance ({open_to})"
+    if part.remedy:
+        return f"whether {name} holds {what} cannot be tested against chance: {part.remedy} ({open_to})"
     missed = [_CONTROLS.get(name, name) for name, better in part.exceeds.items() if better is False]
     beyond = f" beyond {' and '.join(missed)}" if part.exceeds["chance"] else ""
     return f"{name} is not shown to hold {what}{beyond} ({open_to})"

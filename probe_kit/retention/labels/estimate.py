@@ -114,7 +114,7 @@ def measure_label_retention(
         _peak(results, (category, view), of_part, scores, number) for number, of_part in enumerate(rows.values())
     )
     ratio: Ratio = retention(scores)
-    note, reason = _refusal(results, category, backbone)
+    note, reason = _refusal(results, (category, view), backbone)
     return LabelRetention(
         view=view,
         category=category,
@@ -133,14 +133,17 @@ def measure_label_retention(
 
 
 def with_corrected_p(
-    estimate: LabelRetention, results: ProbeResults, backbone: float | None, action: float | None
+    estimate: LabelRetention, results: ProbeResults, backbone: float | None, action: float | None, tests: int
 ) -> LabelRetention:
-    """The same with p of both streams corrected for further tests; None for no p. results: what it is made of."""
+    """Return the same with p of both streams corrected for so many tests; None for no p.
+
+    results: what it is made of.
+    """
     peaks = [
         peak if p is None else replace(peak, p_fwe=p)
         for peak, p in ((estimate.backbone, backbone), (estimate.action, action))
     ]
-    note, reason = _refusal(results, estimate.category, peaks[0])
+    note, reason = _refusal(results, (estimate.category, estimate.view), peaks[0], tests)
     return replace(estimate, backbone=peaks[0], action=peaks[1], note=note, reason=reason)
 
 
@@ -176,8 +179,11 @@ def _peak(
     )
 
 
-def _refusal(results: ProbeResults, category: str, backbone: LabelPeak) -> tuple[str, str]:
-    """Why there is nothing to retain, in few words and in full; two empty texts where there is."""
+def _refusal(
+    results: ProbeResults, curve_of: tuple[str, str], backbone: LabelPeak, tests: int = 1
+) -> tuple[str, str]:
+    """Return why there is nothing to retain, in few words and in full; two empty texts where there is."""
+    category, _ = curve_of
     settings, score = results.settings, METRICS[results.settings.task]
     best = f"the backbone's best site {backbone.site} has {score} {backbone.score:.2f}"
     if backbone.p_fwe != backbone.p_fwe:
@@ -198,9 +204,12 @@ def _refusal(results: ProbeResults, category: str, backbone: LabelPeak) -> tuple
         }
         facts = [f"chance {backbone.chance:.2f}, p {backbone.p_fwe:.3f}"]
         facts += [f"{name} {scores[name]:.2f}" for name in missed if name in scores]
+        advice = "Label more groups, or choose a label that these controls do not decode"
+        if remedy := results.remedy(*curve_of, tests):
+            advice = f"No p can be below it: {remedy}"
         return f"n/a (backbone not shown to exceed {_listed(missed)})", (
             f"{best} ({'; '.join(facts)}). Expected p < {SIGNIFICANCE} and more than every control that was run. "
-            "Label more groups, or choose a label that these controls do not decode"
+            f"{advice}"
         )
     if settings.task == "continuous" and backbone.above < LEAST_EXCESS:
         return f"n/a (backbone {backbone.above:.2f} above chance)", (

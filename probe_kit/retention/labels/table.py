@@ -279,7 +279,7 @@ def _corrected(rows: Sequence[LabelRow], results: Mapping[tuple[str, str], Probe
         for position, estimate, backbone, action in zip(members, estimates, *p, strict=True):
             probes = results[rows[position].location, estimate.target]
             corrected[position] = replace(
-                rows[position], retention=with_corrected_p(estimate, probes, backbone, action)
+                rows[position], retention=with_corrected_p(estimate, probes, backbone, action, len(members))
             )
     return corrected
 

@@ -161,7 +161,10 @@ def _with_probes(
         name: results.controls.exceeds(row.category, row.view, str(peak.site), peak.p_fwe)
         for name, peak in peaks.items()
     }
-    probed = _ProbedCategory(results.controls, row.category, row.view, curve, peaks, exceeds, streams, settings)
+    remedy = results.remedy(row.category, row.view)
+    probed = _ProbedCategory(
+        results.controls, row.category, row.view, curve, peaks, exceeds, streams, settings, remedy
+    )
     row = replace(
         row,
         backbone=probed.backbone(),
@@ -235,6 +238,7 @@ class _ProbedCategory:
     exceeds: dict[str, Exceeds]
     streams: StreamScores | None
     settings: RowSettings
+    remedy: str
 
     def backbone(self) -> BackbonePart:
         """Return the part of the backbone's best site."""
@@ -273,6 +277,7 @@ class _ProbedCategory:
             "selectivity": self._selectivity(peak),
             "minus_untrained": None if untrained is None else untrained.difference,
             "minus_untrained_ci": None if untrained is None else untrained.ci,
+            "remedy": self.remedy,
         }
 
     def _verdict(self, name: str, exceeds: Exceeds, scored: StreamScores) -> Verdict:

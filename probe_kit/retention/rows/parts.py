@@ -122,7 +122,7 @@ class StreamPart:
     p_fwe: of that site, family-wise. exceeds: whether
     it is better than `chance` and each control; None for one that was not run. selectivity: its accuracy above
     that of the same probe on random labels of items. minus_untrained: how much more accurate it is than the
-    untrained network's best.
+    untrained network's best. remedy: what to do where no p can be below 0.05; empty where one can.
     """
 
     score: float | None = None
@@ -139,6 +139,7 @@ class StreamPart:
     selectivity: float | None = None
     minus_untrained: float | None = None
     minus_untrained_ci: Limits | None = None
+    remedy: str = ""
 
     @property
     def has_signal(self) -> bool:

@@ -14,6 +14,7 @@ from probe_kit.statistics.sufficiency import (
     GROUPS_FOR_RETENTION,
     groups_for_absence,
     groups_for_interventions,
+    groups_for_not_used,
     groups_for_signal,
     least_probe_p,
 )
@@ -103,10 +104,11 @@ def sufficiencies(suite: Suite, scored: bool, probed: bool) -> Iterator[Sufficie
     yield Sufficiency("probes", *smallest.has(GROUPS_FOR_PROBES, "`train` refuses it"))
     yield Sufficiency("retention", *smallest.has(GROUPS_FOR_RETENTION, "no score"))
     reachable, words = smallest.has(groups_for_signal(), f"no p below {SIGNIFICANCE}")
-    yield Sufficiency("verdict shown", reachable, words + (_chances(smallest.groups) if reachable else ""))
+    yield Sufficiency("shown", reachable, words + (_chances(smallest.groups) if reachable else ""))
     absent = groups_for_absence(round(len(LAYOUTS) * smallest.items / smallest.groups))
-    yield Sufficiency("verdict absent", *smallest.has(absent, "limits too wide", at_best=True))
+    yield Sufficiency("absent", *smallest.has(absent, "limits too wide", at_best=True))
     yield Sufficiency("interventions", *smallest.has(groups_for_interventions(), f"no p below {SIGNIFICANCE}"))
+    yield Sufficiency("not used", *smallest.has(groups_for_not_used(), "limits too wide", at_best=True))
 
 
 def _chances(groups: int) -> str:

@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING
 from probe_kit.errors import UnknownSiteError
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.contract.sites import Site
+from probe_kit.statistics.label_permutations import permutations_for, shortage
 from probe_kit.train.data.run_reader import RunReader
+from probe_kit.train.data.samples import is_token_view
 from probe_kit.train.results.best_sites import results_html
 from probe_kit.train.results.control_scores import Controls
 from probe_kit.train.results.probe_curve import ProbeCurve
@@ -43,6 +45,20 @@ class ProbeResults:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "label", self.label or self.settings.model)
+
+    def remedy(self, category: str, view: str, tests: int = 1) -> str:
+        """Return what to do where no p of a view can be below the level; empty where one can.
+
+        tests: the number that p is corrected for.
+        """
+        own, is_token = self.settings, is_token_view(view)
+        asked = own.token_permutations if is_token else own.permutations
+        match shortage(self.curves[category, view].least_p, asked, tests):
+            case "permutations":
+                return f"train with --{'token-' * is_token}permutations {permutations_for(tests)} or more"
+            case "groups":
+                return "extract more items" if own.is_side else "label more groups"
+        return ""
 
     def __repr__(self) -> str:
         settings = self.settings

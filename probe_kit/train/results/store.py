@@ -37,6 +37,7 @@ from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_directions import StoredDirections, save_directions
 from probe_kit.train.results.probe_results import ProbeResults, episodes_sha256
 from probe_kit.train.settings import FORMAT, ProbeSettings
+from probe_kit.train.target_samples import EVERYWHERE
 
 SCORES, DECISIONS = "scores.csv", "decisions.npz"
 DIRECTIONS, CONTROLS = PROBE_DIRECTIONS, "controls.json"
@@ -190,9 +191,14 @@ def how_to_probe(run: RunReader) -> str:
     )
 
 
-def _rank(bundle: Bundle) -> tuple[str, str, str]:
-    """Return a key to sort by: the newest results have the highest."""
-    return bundle.times.get("requested", ""), bundle.times.get("created", ""), bundle.key
+def _rank(bundle: Bundle) -> tuple[bool, str, str, str]:
+    """Return a key to sort by: the newest results have the highest.
+
+    Probes of a side on all categories together come behind others: what is said by category has no number of them.
+    """
+    settings = settings_of(bundle)
+    by_category = not settings.is_side or settings.categories != (EVERYWHERE,)
+    return by_category, bundle.times.get("requested", ""), bundle.times.get("created", ""), bundle.key
 
 
 def _now() -> str:

@@ -166,10 +166,11 @@ def _findings(results: ProbeResults, rows: "Sequence[pd.Series]") -> Iterator[st
     decodable: list[str] = []
     open_: dict[str, list[str]] = {}
     for row in rows:
-        stream, (met, missed) = f"the {label_of(row['stream'])}", _exceeded(results, row)
+        stream, (_, missed) = f"the {label_of(row['stream'])}", _exceeded(results, row)
         score = f"{100 * row['score']:.0f} %" if results.settings.is_side else f"{row['score']:.2f}"
-        if "chance" not in (*met, *missed):
-            open_.setdefault("not tested in {}: fit with permutations", []).append(stream)
+        if remedy := results.remedy(row["category"], row["view"]):
+            # Without enough of them nothing can be shown, whatever the network holds.
+            open_.setdefault(f"not testable in {{}}: {remedy}", []).append(stream)
         elif missed:
             open_.setdefault(f"not shown in {{}} beyond {' and '.join(missed)}", []).append(stream)
         else:
@@ -193,9 +194,9 @@ def _subject(results: ProbeResults, category: str, view: str, row: "pd.Series") 
 
 def _in_stream(results: ProbeResults, row: "pd.Series") -> str:
     where, numbers = f"in the {label_of(row['stream'])}", _numbers(results, row)
-    met, missed = _exceeded(results, row)
-    if "chance" not in (*met, *missed):
-        return f"not tested {where} {numbers}" + (": fit with permutations" if results.settings.is_side else "")
+    _, missed = _exceeded(results, row)
+    if remedy := results.remedy(row["category"], row["view"]):
+        return f"not testable {where} {numbers}: {remedy}"
     if missed:
         beyond = " and ".join(filter(None, [", ".join(missed[:-1]), missed[-1]]))
         return f"not shown {where} beyond {beyond} {numbers}"

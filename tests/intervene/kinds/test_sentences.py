@@ -102,6 +102,10 @@ HAVE = "edits that have half of the image swap's effect"
         ),
         ([patch("backbone.01", 0.2, 0.001)], f"{CARRY}: none of 1."),
         (
+            [patch("backbone.00", 1.0, 0.001), patch("backbone.02", 0.6, 0.01), patch("expert.01", 1.0, 0.001)],
+            f"{CARRY}: 1 of 1 (backbone.02 image 0.60); 2 more carry it by construction and locate nothing (*).",
+        ),
+        (
             [patch("backbone.01", None, 0.001), patch("backbone.02", None, 0.2)],
             f"{MOVE}: 1 of 2 (backbone.01 image +3.0 cm).",
         ),

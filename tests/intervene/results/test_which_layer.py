@@ -72,7 +72,9 @@ def store(run: ArrayRun, moves: Mapping[str, float], kind: str = "interchange", 
 
 def line(run: ArrayRun) -> str:
     """The line below the newest intervention's table."""
-    (text,) = load_effects(run).layers.values()
+    result = load_effects(run)
+    (text,) = result.layers.values()
+    assert result.findings[-1] == result.sentences[-1] == text
     assert text.startswith("Which layer, Color: ")
     return text.removeprefix("Which layer, Color: ").removesuffix(".")
 

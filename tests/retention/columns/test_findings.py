@@ -21,12 +21,15 @@ def stream(verdict: str, exceeds: dict[str, bool | None]) -> dict[str, Any]:
     return {"score": score, "ci": (0.4, 1.0), "at_most": 0.78, "verdict": verdict, "exceeds": exceeds}
 
 
+MORE_PERMUTATIONS = "train with --permutations 20 or more"
 STREAMS: dict[str, dict[str, Any]] = {
     "shown": stream("shown", {"chance": True, "random-features": True}),
     "absent": stream("absent", {"chance": False}),
     "not shown": stream("not shown", {"chance": False, "random-features": None}),
     "as random features": stream("not shown", {"chance": True, "random-features": False}),
-    "not tested": stream("not shown", {"chance": None}),
+    "no permutations": stream("not shown", {"chance": None}) | {"remedy": MORE_PERMUTATIONS},
+    "few permutations": stream("not shown", {"chance": False}) | {"remedy": MORE_PERMUTATIONS},
+    "few groups": stream("not shown", {"chance": False}) | {"remedy": "extract more items"},
     "no score": {"exceeds": {"chance": True}},
     "not probed": {},
 }
@@ -89,9 +92,11 @@ def test_each_combination_of_verdicts_has_this_sentence(
 
 
 def test_the_sentences_say_where_the_answer_is_lost_between_backbone_and_action() -> None:
-    held, lost = (finding(policy("shown", action, "not used", "guessing")) for action in ("shown", "absent"))
+    actions = ("shown", "absent", "not shown")
+    held, lost, open_ = (finding(policy("shown", action, "not used", "guessing")) for action in actions)
     assert "in the backbone and the action expert, the action does not follow it" in held
-    assert "in the backbone, not in the action expert, the action does not follow it" in lost
+    assert "in the backbone, absent in the action expert, the action does not follow it" in lost
+    assert "in the backbone, not shown in the action expert, the action does not follow it" in open_
 
 
 @pytest.mark.parametrize(
@@ -110,10 +115,12 @@ def test_the_next_step_is_the_command_for_what_is_open() -> None:
         policy("not probed", "not probed", "no swap", "success"),
         policy("shown", "shown", "no swap", "success"),
     )
-    unshown, decided = (policy(name, name, "not used", "success") for name in ("not shown", "shown"))
-    assert [next_step([one]).partition("  ")[0] for one in (unprobed, untested, unshown, decided)] == [
+    names = ("not shown", "few permutations", "shown")
+    unshown, untestable, decided = (policy(name, name, "not used", "success") for name in names)
+    rows = (unprobed, untested, unshown, untestable, decided)
+    assert [next_step([one]).partition("  ")[0] for one in rows] == [
         "next: probe-kit train acts", "next: probe-kit intervene acts", "next: probe-kit power",
-        "next: probe-kit view acts",
+        "next: probe-kit train acts --permutations 200", "next: probe-kit view acts",
     ]  # fmt: skip
     assert next_step([answers("color")]) == ""
     scripted = replace(unprobed, run=replace(unprobed.run, action_stream=None, location="my run"))

@@ -53,7 +53,8 @@ PARTS: dict[str, dict[str, Any]] = {
     "shown, no control": part("shown", 0.98, 1.0, chance=True),
     "at chance": part("not shown", 0.52, 0.78),
     "no better than controls": part("not shown", 0.9, 0.97, **{"chance": True, "random-features": False}),
-    "no permutations": part("not shown", 0.9, 0.97, chance=None),
+    "no permutations": part("not shown", 0.9, 0.97, chance=None)
+    | {"remedy": "train with --permutations 20 or more"},
     "absent": part("absent", 0.5, 0.62),
     "no score": {"peak": 0.9, "exceeds": {"chance": True, "random-features": None, "untrained": None}},
     "not probed": {},
@@ -189,7 +190,7 @@ def test_absence_is_said_of_a_bounded_backbone_only_and_more_items_are_asked_for
         if "more items would tell" in text:
             guessed = RATES[rate_].regime == OPEN and swapped == "no swap"
             assert backbone in ("at chance", "no better than controls") or swapped == "open" or guessed, text
-        assert ("train probes with permutations" in text) <= (backbone == "no permutations"), text
+        assert ("train with --permutations 20 or more" in text) <= (backbone == "no permutations"), text
 
 
 @pytest.mark.parametrize(
@@ -258,7 +259,7 @@ none | at chance | no swap | not shown
 Not shown in the backbone: more items would tell.
 
 none | no permutations | no swap | not shown
-Not shown in the backbone: train probes with permutations.
+Not shown in the backbone: train with --permutations 20 or more.
 
 none | shown | no swap | shown
 Shown in the backbone.

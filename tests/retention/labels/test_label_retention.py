@@ -274,7 +274,7 @@ def test_a_site_that_is_above_chance_alone_may_not_be_among_several_labels() -> 
     results = label_results({BACKBONE[0]: (0.8, 0.3), ACTION[0]: (0.5, 0.4)}, GROUPS, EACH)
     found = measure_label_retention(results)
     assert found.defined
-    corrected = with_corrected_p(found, results, 0.06, None)
+    corrected = with_corrected_p(found, results, 0.06, None, 2)
     assert not corrected.defined
     assert corrected.note == "n/a (backbone not shown to exceed chance)"
     assert "p 0.060" in corrected.reason

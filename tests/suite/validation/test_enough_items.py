@@ -11,6 +11,7 @@ from probe_kit.statistics.sufficiency import (
     GROUPS_FOR_PROBES,
     groups_for_absence,
     groups_for_interventions,
+    groups_for_not_used,
     groups_for_signal,
 )
 from probe_kit.suite import Suite
@@ -27,12 +28,13 @@ def test_every_use_is_enough_exactly_from_its_number_of_groups(items: int, small
     groups = min(len({one.group_id for one in suite.items if one.category == name}) for name in suite.categories)
     said = by_name(suite)
     assert list(said) == [
-        "success rate", "probes", "retention", "verdict shown", "verdict absent", "interventions",
+        "success rate", "probes", "retention", "shown", "absent", "interventions", "not used",
     ]  # fmt: skip
     assert said["probes"].enough == said["retention"].enough == (groups >= GROUPS_FOR_PROBES)
-    assert said["verdict shown"].enough == (groups >= groups_for_signal())
+    assert said["shown"].enough == (groups >= groups_for_signal())
     assert said["interventions"].enough == (groups >= groups_for_interventions())
-    assert said["verdict absent"].enough == (groups >= groups_for_absence(round(2 * items / groups)))
+    assert said["not used"].enough == (groups >= groups_for_not_used())
+    assert said["absent"].enough == (groups >= groups_for_absence(round(2 * items / groups)))
     assert said["success rate"].enough is (False if items < 4 else None)
     for one in said.values():
         if one.enough is False and one.name != "success rate":

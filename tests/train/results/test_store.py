@@ -165,3 +165,13 @@ def test_the_beginning_of_a_key_will_do(planted_run: PlantedRun) -> None:
     assert load_results(run, key[:6]).key == key
     with pytest.raises(UsageError, match="no probe results ''"):
         load_results(run, "")
+
+
+def test_probes_of_all_categories_together_do_not_hide_those_by_category(planted_run: PlantedRun) -> None:
+    run = planted_run({Site("backbone", 1): 1.0}, categories=("color", "shape"))
+    by_category = train_probes(run, permutations=2, controls=())
+    pooled = train_probes(run, ["all"], permutations=2, controls=())
+    assert load_results(run).key == by_category.key
+    assert load_results(run, pooled.key).settings.categories == ("all",)
+    only_color = train_probes(run, ["color"], permutations=2, controls=())
+    assert load_results(run).key == only_color.key, "the newest of those by category"

@@ -8,7 +8,7 @@ import pytest
 from probe_kit.hooks import Site
 from probe_kit.train import ProbeCurve, ProbeResults, ProbeSettings
 from probe_kit.train.results.best_sites import best_sites, site_cells
-from probe_kit.train.results.summary import best_sites_table
+from probe_kit.train.results.summary import best_sites_findings, best_sites_sentences, best_sites_table
 
 SITES = {
     Site("backbone", 0): 0.5, Site("backbone", 1): 0.9, Site("backbone", 2): 0.9,
@@ -59,3 +59,20 @@ def test_categories_do_not_mix(results: ProbeResults) -> None:
     assert [round(row["score"], 2) for row in rows] == [0.9, 0.8, 0.7, 0.6]
     assert [row["ties"] for row in rows] == [1, 0, 1, 0]
     assert [row[0] for row in best_sites_table([both]).texts] == ["color", "color", "shape", "shape"]
+
+
+@pytest.mark.parametrize(
+    ("asked", "sentence"),
+    [
+        (9, "not testable in the backbone and the action expert: train with --permutations 20 or more"),
+        (200, "not testable in the backbone and the action expert: extract more items"),
+    ],
+)
+def test_what_no_p_can_show_says_whether_permutations_or_groups_are_too_few(
+    results: ProbeResults, asked: int, sentence: str
+) -> None:
+    """The null of these probes has nine columns: of as many as were asked for, or of all that the groups allow."""
+    stored = replace(results, settings=replace(results.settings, permutations=asked))
+    assert best_sites_findings(stored) == [f"Color  {sentence}."]
+    (line,) = best_sites_sentences(stored)
+    assert line.count(sentence.rpartition(": ")[2]) == 2, line

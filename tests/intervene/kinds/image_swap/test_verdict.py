@@ -10,7 +10,8 @@ import pytest
 import probe_kit
 from probe_kit.intervene import ImageSwapEffect, classify_all, classify_use
 from probe_kit.intervene.kinds.image_swap import image_swap_effects
-from probe_kit.intervene.results.verdict import classify_behaviour, groups_for_not_used
+from probe_kit.intervene.results.verdict import classify_behaviour
+from probe_kit.statistics.sufficiency import groups_for_not_used
 from tests.intervene.answers import Cell, follower, habit, outcomes_of
 
 SUITE = "suite@1#0123456789ab"
