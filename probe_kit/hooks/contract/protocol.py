@@ -34,7 +34,7 @@ class ProtocolRow:
 
     @property
     def rows(self) -> "tuple[ProtocolRow, ...]":
-        """This row and its alternatives."""
+        """The row itself and its alternatives."""
         return (self, *self.alternatives)
 
     def of(self, checkpoint: str | None) -> "ProtocolRow":

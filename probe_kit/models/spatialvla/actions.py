@@ -83,7 +83,7 @@ class ActionBins:
         """What an identity of these bins is computed over."""
         return [self.first, [edges.tolist() for edges in self.edges], self.spherical]
 
-    def known(self, ids: Ids) -> NDArray[np.bool_]:
+    def is_action(self, ids: Ids) -> NDArray[np.bool_]:
         """Which of the ids (…, 3) name something in their slot."""
         starts, stops = np.array([[slot.start, slot.stop] for slot in self.slots]).T
         return np.asarray((ids >= starts) & (ids < stops))

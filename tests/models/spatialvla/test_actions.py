@@ -60,9 +60,9 @@ def test_an_id_outside_its_slot_counts_as_the_nearest_and_is_not_known() -> None
     below, above = np.array([0, 0, 0]), np.array([slot[-1] for slot in own.slots])
     np.testing.assert_array_equal(own.values(below), own.values(inside))
     np.testing.assert_array_equal(own.values(above + 100), own.values(above))
-    assert own.known(inside).all()
-    assert not own.known(below).any()
-    assert own.known(np.stack([inside, inside[::-1]])).tolist() == [[True] * 3, [False, True, False]]
+    assert own.is_action(inside).all()
+    assert not own.is_action(below).any()
+    assert own.is_action(np.stack([inside, inside[::-1]])).tolist() == [[True] * 3, [False, True, False]]
 
 
 def test_the_gripper_is_closed_or_open() -> None:

@@ -71,19 +71,21 @@ class Eo1(DenoisingPolicy):
         config = super().parse_config(folder, evaluation)
         saved = {step.name: step.config for step in saved_steps(folder, PREPROCESSOR)}
         template = saved.get(TEMPLATE, {})
-        keys = [key for key, own in (template.get("input_features") or {}).items() if own["type"] == "VISUAL"]
-        wanted = {"chunk_size": config.chunk_size, "pictures": list(config.image_features)}
+        keys = [
+            key for key, feature in (template.get("input_features") or {}).items() if feature["type"] == "VISUAL"
+        ]
+        expected = {"chunk_size": config.chunk_size, "pictures": list(config.image_features)}
         packed = {
             "chunk_size": template.get("chunk_size", config.chunk_size),
-            "pictures": keys or wanted["pictures"],
+            "pictures": keys or expected["pictures"],
         }
-        if packed != wanted:
-            raise CheckpointError(f"{folder}: its step {TEMPLATE} packs {packed}; config.json says {wanted}")
+        if packed != expected:
+            raise CheckpointError(f"{folder}: its step {TEMPLATE} packs {packed}; config.json says {expected}")
         names = ("image_min_pixels", "image_max_pixels", "use_fast_processor")
         config.packing = {name: getattr(config, name) for name in names} | dict(saved.get(PROCESSOR, {}))
-        named = str(config.packing.get("processor_name", config.vlm_base))
-        inside = folder / named
-        config.place = inside if inside.is_dir() else checkpoint_folder(named, SMALL_FILES)
+        processor = str(config.packing.get("processor_name", config.vlm_base))
+        inside = folder / processor
+        config.processor_folder = inside if inside.is_dir() else checkpoint_folder(processor, SMALL_FILES)
         return config
 
     @classmethod
@@ -97,22 +99,22 @@ class Eo1(DenoisingPolicy):
 
     @classmethod
     def current_keys(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Of the tied embeddings a file may hold either name."""
-        named = dict(tensors)
-        if _HEAD in named:
-            named.setdefault(_EMBEDDING, named[_HEAD])
-        return named
+        """Return tensors by current names: of the tied embeddings a file may hold either name."""
+        renamed = dict(tensors)
+        if _HEAD in renamed:
+            renamed.setdefault(_EMBEDDING, renamed[_HEAD])
+        return renamed
 
     def side_files(self) -> dict[str, Path]:
-        """Also the processor's."""
-        return {**super().side_files(), **side_files(self.config.place, "vlm/")}
+        """The files, and those of the processor."""
+        return {**super().side_files(), **side_files(self.config.processor_folder, "vlm/")}
 
     # -- the prompt --------------------------------------------------------------------------------------
 
     @cached_property
     def packing(self) -> Packing:
         """lerobot's packing."""
-        return Packing(self.config.place, int(self.config.chunk_size), self.config.packing)
+        return Packing(self.config.processor_folder, int(self.config.chunk_size), self.config.packing)
 
     @cached_property
     def tokenizer(self) -> Any:
@@ -122,17 +124,17 @@ class Eo1(DenoisingPolicy):
     def batch(
         self, observations: Sequence[Observation], state: NDArray[np.float32] | None = None
     ) -> dict[str, Tensor]:
-        """In lerobot's keys. state: (B, numbers) as the network reads them."""
+        """Return a batch in lerobot's keys. state: (B, numbers) as the network reads them."""
         numbers = torch.from_numpy(self.state(observations) if state is None else state)
         packed = {**self._packed_of(observations), STATE: numbers}
-        return {name: own.to(self.config.device) for name, own in packed.items()}
+        return {name: tensor.to(self.config.device) for name, tensor in packed.items()}
 
     def _packed_of(self, observations: Sequence[Observation]) -> dict[str, Tensor]:
         """The chats of observations; see `_packed`."""
         pictures = {
             f"{IMAGES}{camera}": self._pictures(camera, observations).cpu() for camera in self.shown_cameras
         }
-        return self._packed(pictures, [one.instruction for one in observations])
+        return self._packed(pictures, [observation.instruction for observation in observations])
 
     def _packed(self, pictures: Mapping[str, Tensor], tasks: Sequence[str]) -> dict[str, Tensor]:
         """Raises InstructionError for a text that holds one of the chat's own marks, or none."""
@@ -143,13 +145,13 @@ class Eo1(DenoisingPolicy):
                     f"{task!r} holds {marks[0] if marks else 'no word'}; give it in plain words"
                 )
         packed = self.packing.batch(pictures, tasks)
-        return {name: torch.as_tensor(own) for name, own in packed.items()}
+        return {name: torch.as_tensor(values) for name, values in packed.items()}
 
     def token_ids(self, instructions: Sequence[str]) -> list[tuple[int, ...]]:
         """The ids of each chat without its picture."""
         blank = {f"{IMAGES}{self.cameras[0]}": torch.zeros(len(instructions), 3, 56, 56)}
         rows = self._labelled(self._packed(blank, instructions))
-        return [tuple(one for one, label in row if label in ("language", "special")) for row in rows]
+        return [tuple(token for token, label in row if label in ("language", "special")) for row in rows]
 
     def _labelled(self, packed: Mapping[str, Tensor]) -> list[list[tuple[int, str]]]:
         """Ids and roles of every row, up to the actions."""
@@ -160,13 +162,13 @@ class Eo1(DenoisingPolicy):
         for ids, valid in zip(packed["input_ids"].tolist(), packed["attention_mask"].tolist(), strict=True):
             row: list[tuple[int, str]] = []
             words, cameras = False, iter(self.shown_cameras)
-            for one, real in zip(ids[: ids.index(action)], valid, strict=False):
-                if one == picture and (not row or row[-1][0] != picture):
+            for token, real in zip(ids[: ids.index(action)], valid, strict=False):
+                if token == picture and (not row or row[-1][0] != picture):
                     camera = next(cameras)
-                role = f"image.{camera}" if one == picture else "state" if one == state else "special"
-                words = words and one != ends
-                row.append((one, PADDING if not real else "language" if words else role))
-                words = words or one == begins
+                role = f"image.{camera}" if token == picture else "state" if token == state else "special"
+                words = words and token != ends
+                row.append((token, PADDING if not real else "language" if words else role))
+                words = words or token == begins
             rows.append(row)
         return rows
 
@@ -176,7 +178,7 @@ class Eo1(DenoisingPolicy):
         cls._text_reader(checkpoint, evaluation).token_ids(instructions)
 
     def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
-        """From the packing itself."""
+        """Roles from the packing itself."""
         rows = self._labelled(self._packed_of(observations))
         prompts = [Roles.from_labels([label for _, label in row]) for row in rows]
         return {"backbone": prompts, "expert": [Roles.from_labels(self.suffix_labels())] * len(rows)}

@@ -47,7 +47,7 @@ class DiffusersStack(Stack):
     """Blocks of diffusers: what each adds is its one attention, to the prompt or itself, and its MLP."""
 
     def tap(self, site: Site) -> Tap:
-        """As in other stacks, under diffusers' names."""
+        """Return the tap as in other stacks, under diffusers' names."""
         fires = self.iterations or 1
         if site.layer == len(self.layers):
             return super().tap(site)
@@ -59,7 +59,7 @@ class DiffusersStack(Stack):
         return Tap(block.attn1.to_out[0], fires) if site.quantity == HEADS else super().tap(site)
 
     def stream(self, name: str) -> Stream:
-        """What is stored of it."""
+        """The stored stream."""
         heads = int(self.layers[0].attn1.heads)  # type: ignore[union-attr, arg-type]
         return Stream(name, len(self.layers) + 1, self.width, self.iterations, heads=heads)
 
@@ -72,7 +72,7 @@ class BridgeStack(DiffusersStack):
         return Tap(self.norm, 1, "output") if site.layer == len(self.layers) else super().tap(site)
 
     def stream(self, name: str) -> Stream:
-        """What is stored of it."""
+        """The stored stream."""
         return Stream(name, len(self.layers) + 1, self.width, part="bridge", quantities=BRIDGE)
 
 
@@ -92,7 +92,7 @@ class TowerStack(Stack):
         return tower_tap(self.norm, site.layer, lambda patches: patches[None])
 
     def stream(self, name: str) -> Stream:
-        """What enters each block, and the merger."""
+        """The input of each block, and of the merger."""
         return Stream(name, len(self.layers) + 1, self.width, part="vision", quantities=("residual",))
 
 
@@ -135,41 +135,43 @@ class Groot(DenoisingPolicy):
     @classmethod
     def parse_config(cls, folder: Path, evaluation: Evaluation) -> Any:
         """lerobot's configuration, also for NVIDIA's layout. Raises UsageError for an option that has no use."""
-        chosen = evaluation if isinstance(evaluation, GrootChoice) else GrootChoice()
+        choice = evaluation if isinstance(evaluation, GrootChoice) else GrootChoice()
         if is_nvidias(folder):
-            config = nvidias_config(folder, chosen.embodiment)
-        elif chosen.embodiment is not None:
+            config = nvidias_config(folder, choice.embodiment)
+        elif choice.embodiment is not None:
             raise UsageError(
-                f"-M embodiment={chosen.embodiment} belongs to NVIDIA's layout; {folder} is lerobot's, which "
+                f"-M embodiment={choice.embodiment} belongs to NVIDIA's layout; {folder} is lerobot's, which "
                 "names its own. Leave it out"
             )
         else:
             config = super().parse_config(folder, evaluation)
-        config.vlm, config.resize, config.letterbox = chosen.vlm, chosen.resize, chosen.letterbox
+        config.vlm, config.resize, config.letterbox = choice.vlm, choice.resize, choice.letterbox
         return config
 
     @classmethod
     def build(cls, config: Any, folder: Path) -> nn.Module:
         """lerobot's policy of the size that the base model's configuration has. Raises CheckpointError."""
-        if (asked := getattr(config, "dtype", None)) is not None:
-            config.use_bf16 = asked == "bfloat16"
-            config.model_params_fp32 = config.model_params_fp32 or asked == "float32"
+        if (dtype := getattr(config, "dtype", None)) is not None:
+            config.use_bf16 = dtype == "bfloat16"
+            config.model_params_fp32 = config.model_params_fp32 or dtype == "float32"
         config.dtype = "bfloat16" if config.use_bf16 else "float32"
         config.places = Places.of(folder, config.base_model_path, config.vlm)
         if (folder / config.base_model_path).is_dir():
             config.base_model_path = str(config.places.base)
         network: nn.Module = build_groot(
-            config, network_config(config.places.network, config, config.places.named)
+            config, network_config(config.places.network, config, config.places.model_name)
         )
         return network
 
     @classmethod
     def current_keys(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """As lerobot stores them, also of NVIDIA's files; of the tied embeddings a file may hold either name."""
-        named = {name if name.startswith(_MODEL) else f"{_MODEL}{name}": own for name, own in tensors.items()}
-        if _HEAD in named and _EMBEDDING not in named:
-            named[_EMBEDDING] = named[_HEAD]
-        return named
+        """Return tensors under lerobot's names, also of NVIDIA's files; a file may hold either of tied embeddings."""
+        renamed = {
+            name if name.startswith(_MODEL) else f"{_MODEL}{name}": tensor for name, tensor in tensors.items()
+        }
+        if _HEAD in renamed and _EMBEDDING not in renamed:
+            renamed[_EMBEDDING] = renamed[_HEAD]
+        return renamed
 
     def side_files(self) -> dict[str, Path]:
         """Also those of the base model and of the vision-language model."""
@@ -177,7 +179,7 @@ class Groot(DenoisingPolicy):
         return {**super().side_files(), **side_files(places.base, "base/"), **side_files(places.vlm, "vlm/")}
 
     def further_settings(self) -> dict[str, str]:
-        """Whose statistics and weights are read, and how pictures are resized."""
+        """The embodiment whose statistics and weights are read, and how pictures are resized."""
         encode = self._steps.encode
         return {
             "embodiment": str(self.config.embodiment_tag),
@@ -190,7 +192,7 @@ class Groot(DenoisingPolicy):
         return read_steps(self.folder, self.config, self.config.resize, self.config.letterbox)
 
     def own_units(self, feature: str, kind: str) -> BoundedUnits | StateUnits:
-        """As the processors have them. Raises CheckpointError."""
+        """The units in the processors. Raises CheckpointError."""
         del feature
         steps = self._steps
         if kind == "STATE":
@@ -217,8 +219,8 @@ class Groot(DenoisingPolicy):
         """Actions of an inference that have a meaning for this embodiment."""
         widest = torch.empty(1, self._head.action_horizon, 1)
         length = int(self.network._resolve_prediction_horizon(widest))
-        own = (getattr(self._steps.decode, "modality_config", None) or {}).get("action", {}).get("delta_indices")
-        return min(length, len(own)) if own else length
+        steps = (getattr(self._steps.decode, "modality_config", None) or {}).get("action", {}).get("delta_indices")
+        return min(length, len(steps)) if steps else length
 
     @property
     def _head(self) -> Any:
@@ -231,7 +233,7 @@ class Groot(DenoisingPolicy):
     def batch(
         self, observations: Sequence[Observation], state: NDArray[np.float32] | None = None
     ) -> dict[str, Tensor]:
-        """What lerobot's processors pack of one observation. state: (1, numbers) as the network reads them."""
+        """Return lerobot's packing of one observation. state: (1, numbers) as the network reads them."""
         (row,) = self._rows(observations, self.state(observations) if state is None else state)
         return {name: tensor.to(self.config.device) for name, tensor in row.inputs.items()}
 
@@ -258,20 +260,22 @@ class Groot(DenoisingPolicy):
 
     def _rows(self, observations: Sequence[Observation], state: NDArray[np.float32]) -> list[PackedRow]:
         pictures = [
-            {camera: checked_picture(one.image if camera == self.cameras[0] else one.cameras[camera])
+            {camera: checked_picture(o.image if camera == self.cameras[0] else o.cameras[camera])
              for camera in self.shown_cameras}
-            for one in observations
+            for o in observations
         ]  # fmt: skip
         rows = zip(pictures, observations, state, strict=True)
-        return [self.packing.row(shown, one.instruction, own) for shown, one, own in rows]
+        return [
+            self.packing.row(images, observation.instruction, numbers) for images, observation, numbers in rows
+        ]
 
     def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
-        """From the packing itself; the bridge has the backbone's tokens."""
+        """Roles from the packing itself; the bridge has the backbone's tokens."""
         rows = self._rows(observations, np.zeros((len(observations), self._state_numbers), np.float32))
         prompt = [Roles.from_labels(labels) for labels in padded_labels(rows)]
         suffix = [Roles.from_labels(self.suffix_labels())] * len(rows)
-        found = {"backbone": prompt, "bridge": prompt, "expert": suffix}
-        return {name: found[name] for name in self.streams}
+        roles = {"backbone": prompt, "bridge": prompt, "expert": suffix}
+        return {name: roles[name] for name in self.streams}
 
     def prefix_labels(self, language: Sequence[str]) -> list[str]:
         """The packing says every position."""
@@ -295,8 +299,8 @@ class Groot(DenoisingPolicy):
         rows = [self.packing.row(blank, text, np.zeros(self._state_numbers, np.float32)) for text in instructions]
         return [
             tuple(
-                one
-                for one, label in zip(row.inputs["input_ids"][0].tolist(), row.labels, strict=True)
+                token
+                for token, label in zip(row.inputs["input_ids"][0].tolist(), row.labels, strict=True)
                 if label == "language"
             )
             for row in rows
@@ -361,8 +365,8 @@ def load_groot(
     or `lerobot`, whose code resizes pictures; None for the layout's own. letterbox: whether black bars make
     pictures square first; None for what the files say.
     """
-    chosen = GrootChoice(embodiment=embodiment, vlm=vlm, resize=resize, letterbox=letterbox)
-    return Groot.load(checkpoint, device, dtype, random_weights, weights_seed, chosen)
+    choice = GrootChoice(embodiment=embodiment, vlm=vlm, resize=resize, letterbox=letterbox)
+    return Groot.load(checkpoint, device, dtype, random_weights, weights_seed, choice)
 
 
 def check_groot_words(

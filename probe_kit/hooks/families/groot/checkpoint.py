@@ -23,7 +23,7 @@ _AGAIN = "Download the checkpoint again"
 
 @dataclass(frozen=True)
 class GrootChoice(Evaluation):
-    """What the files of GR00T do not say. embodiment: of NVIDIA's layout. vlm: folder or hub id.
+    """The choices that GR00T's files leave open. embodiment: of NVIDIA's layout. vlm: folder or hub id.
 
     resize: whose code brings pictures to their size. letterbox: whether they are made square with bars first.
     """
@@ -36,15 +36,15 @@ class GrootChoice(Evaluation):
 
 @dataclass(frozen=True)
 class Places:
-    """Where the parts of a checkpoint lie. network: content of the network's `config.json`. base, vlm: folders.
+    """The folders of a checkpoint's parts. network: content of the network's `config.json`. base, vlm: folders.
 
-    named: the vision-language model as the network's configuration is to name it.
+    model_name: the vision-language model as the network's configuration is to name it.
     """
 
     network: Mapping[str, Any]
     base: Path
     vlm: Path
-    named: str
+    model_name: str
 
     @classmethod
     def of(cls, folder: Path, base: str, vlm: str | None) -> "Places":
@@ -52,17 +52,17 @@ class Places:
 
         Raises CheckpointError for what is not there.
         """
-        place = inside_or_hub(folder, base)
-        content = read_json_object(place / CONFIG_FILE, CheckpointError, _AGAIN)
-        named = str(content.get("model_name", VLM))
-        files = inside_or_hub(place, vlm or named)
-        return cls(content, place, files, VLM if named.rstrip("/") == VLM else str(files))
+        base_folder = inside_or_hub(folder, base)
+        content = read_json_object(base_folder / CONFIG_FILE, CheckpointError, _AGAIN)
+        model_name = str(content.get("model_name", VLM))
+        files = inside_or_hub(base_folder, vlm or model_name)
+        return cls(content, base_folder, files, VLM if model_name.rstrip("/") == VLM else str(files))
 
 
-def inside_or_hub(folder: Path, named: str) -> Path:
+def inside_or_hub(folder: Path, name: str) -> Path:
     """A folder in `folder`, one anywhere, or the small files of a hub id."""
-    inside = folder / named
-    return inside if inside.is_dir() else checkpoint_folder(named, SMALL_FILES)
+    inside = folder / name
+    return inside if inside.is_dir() else checkpoint_folder(name, SMALL_FILES)
 
 
 def is_nvidias(folder: Path) -> bool:
@@ -85,15 +85,15 @@ def nvidias_config(folder: Path, embodiment: str | None) -> GrootConfig:
     tags = sorted(set(modalities) & set(statistics) & set(numbers))
     tag = tags[0] if embodiment is None and len(tags) == 1 else embodiment
     if tag is None or tag not in tags:
-        asked = "no embodiment was chosen" if embodiment is None else f"there is no embodiment {embodiment!r}"
-        raise UsageError(f"{folder}: {asked}. Choose with -M embodiment=TAG; it has {', '.join(tags) or 'none'}")
+        problem = "no embodiment was chosen" if embodiment is None else f"there is no embodiment {embodiment!r}"
+        raise UsageError(f"{folder}: {problem}. Choose with -M embodiment=TAG; it has {', '.join(tags) or 'none'}")
     network = read_json_object(folder / CONFIG_FILE, CheckpointError, _AGAIN)
     read_state_fields(folder, settings, tag)
     check_widths(folder, settings, network)
     widths = {
-        feature: sum(stat_dim_from_entry(statistics[tag].get(feature, {}).get(key, {})) for key in own)
+        feature: sum(stat_dim_from_entry(statistics[tag].get(feature, {}).get(key, {})) for key in keys)
         for feature in ("state", "action")
-        for own in [modalities[tag].get(feature, {}).get("modality_keys", [])]
+        for keys in [modalities[tag].get(feature, {}).get("modality_keys", [])]
     }
     if not all(widths.values()):
         raise CheckpointError(f"{folder}: statistics.json has no numbers for state or action of {tag!r}. {_AGAIN}")

@@ -1,4 +1,4 @@
-"""What GR00T reads: lerobot's own processor steps, from the files of a checkpoint, without remote code."""
+"""The inputs of GR00T: lerobot's own processor steps, from the files of a checkpoint, without remote code."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -62,8 +62,8 @@ class Steps:
 
     def __post_init__(self) -> None:
         if (tag := self.pack.embodiment_tag) not in self.pack.embodiment_mapping:
-            known = ", ".join(sorted(self.pack.embodiment_mapping))
-            raise CheckpointError(f"{self.source} gives {tag!r} no number; it has {known}")
+            tags = ", ".join(sorted(self.pack.embodiment_mapping))
+            raise CheckpointError(f"{self.source} gives {tag!r} no number; it has {tags}")
 
 
 def read_steps(
@@ -86,8 +86,8 @@ def read_steps(
 def _nvidias_steps(folder: Path, config: GrootConfig, settings: Mapping[str, Any]) -> Steps:
     fields = read_state_fields(folder, settings, str(config.embodiment_tag))
     before, behind = make_groot_pre_post_processors(config)
-    found = _chosen([*before.steps, *behind.steps], "processor_config.json and statistics.json")
-    return replace(found, fields=fields)
+    read = _chosen([*before.steps, *behind.steps], "processor_config.json and statistics.json")
+    return replace(read, fields=fields)
 
 
 def _lerobots_steps(folder: Path, config: GrootConfig) -> Steps:
@@ -134,10 +134,10 @@ def _chosen(steps: Sequence[Any], source: str) -> Steps:
         GrootN17VLMEncodeStep,
         (GrootN17ActionDecodeStep, GrootActionUnpackUnnormalizeStep),
     )
-    found: list[Any] = [next((step for step in steps if isinstance(step, kind)), None) for kind in kinds]
-    if None in found:
+    selected: list[Any] = [next((step for step in steps if isinstance(step, kind)), None) for kind in kinds]
+    if None in selected:
         raise CheckpointError(f"{source} lack a step that packs, encodes or decodes")
-    pack, encode, decode = found
+    pack, encode, decode = selected
     return Steps(pack, encode, decode, source)
 
 
@@ -162,22 +162,22 @@ class Packing:
     @cached_property
     def processor(self) -> Any:
         """transformers' processor of Qwen3-VL, as lerobot puts it together. Raises CheckpointError."""
-        place = str(self.vlm)
+        folder = str(self.vlm)
         try:
-            tokenizer = load_pretrained(AutoTokenizer, place)
+            tokenizer = load_pretrained(AutoTokenizer, folder)
             processor = Qwen3VLProcessor(
-                image_processor=load_pretrained(Qwen2VLImageProcessor, place),
+                image_processor=load_pretrained(Qwen2VLImageProcessor, folder),
                 tokenizer=tokenizer,
-                video_processor=load_pretrained(Qwen3VLVideoProcessor, place),
+                video_processor=load_pretrained(Qwen3VLVideoProcessor, folder),
                 chat_template=tokenizer.chat_template,
             )
         except (OSError, ValueError) as error:
             raise CheckpointError(
-                f"{place} lacks the tokenizer or processor of the vision-language model ({error}). Pass its "
+                f"{folder} lacks the tokenizer or processor of the vision-language model ({error}). Pass its "
                 "folder as -M vlm=FOLDER"
             ) from error
         if tokenizer.chat_template is None:
-            raise CheckpointError(f"the tokenizer in {place} has no chat template, and GR00T reads a chat")
+            raise CheckpointError(f"the tokenizer in {folder} has no chat template, and GR00T reads a chat")
         self.encode._proc = processor
         return processor
 
@@ -198,20 +198,22 @@ class Packing:
             f"{IMAGES}{camera}": torch.from_numpy(picture).permute(2, 0, 1)[None]
             for camera, picture in pictures.items()
         }
-        shown = self.order(list(pictures))
-        given: Any = {
+        cameras = self.order(list(pictures))
+        transition: Any = {
             TransitionKey.OBSERVATION: {**observation, STATE: torch.from_numpy(state[None])},
             TransitionKey.COMPLEMENTARY_DATA: {self.pack.language_key: [task]},
         }
-        packed: Any = self.pack(given)
+        packed: Any = self.pack(transition)
         if not packed[TransitionKey.COMPLEMENTARY_DATA]["language"][0].strip() or not task.strip():
             raise InstructionError(f"{task!r} has no word that GR00T reads: lerobot leaves out punctuation")
         packed = self.encode(packed)
         content = packed[TransitionKey.COMPLEMENTARY_DATA]
         inputs = {name: content[name] for name in _READ if name in content}
         inputs["state"] = packed[TransitionKey.OBSERVATION]["state"]
-        frames = len(inputs["image_grid_thw"]) // len(shown)
-        return PackedRow(inputs, self._labels(inputs, [f"image.{camera}" for camera in shown] * frames, processor))
+        frames = len(inputs["image_grid_thw"]) // len(cameras)
+        return PackedRow(
+            inputs, self._labels(inputs, [f"image.{camera}" for camera in cameras] * frames, processor)
+        )
 
     def _labels(self, inputs: Mapping[str, Tensor], pictures: Sequence[str], processor: Any) -> list[str]:
         """Each patch is its camera's; `language` stands between the last picture and the end of the turn."""
@@ -226,8 +228,8 @@ class Packing:
         end = ids.index(end_of_turn, begin)
         image = self.tokenizer.convert_tokens_to_ids(processor.image_token)
         return [
-            next(patches) if one == image else "language" if begin <= index < end else "special"
-            for index, one in enumerate(ids)
+            next(patches) if token == image else "language" if begin <= index < end else "special"
+            for index, token in enumerate(ids)
         ]
 
 

@@ -1,4 +1,4 @@
-"""How GR00T's pictures come to the network's resolution: as NVIDIA's newest code, or as lerobot."""
+"""The resizing of GR00T's pictures: as NVIDIA's newest code does it, or as lerobot."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
@@ -44,7 +44,7 @@ class NvidiasPictures(GrootN17VLMEncodeStep):  # type: ignore[misc]
         del target_device
         pictures = np.asarray(video)
         return [
-            [self.resized(np.ascontiguousarray(one)) for frames in pictures[row] for one in frames]
+            [self.resized(np.ascontiguousarray(picture)) for frames in pictures[row] for picture in frames]
             for row in range(batch_size)
         ]
 
@@ -65,8 +65,8 @@ class NvidiasPictures(GrootN17VLMEncodeStep):  # type: ignore[misc]
         fraction = crop[0] / target[0] if self.crop_fraction is None else self.crop_fraction
         first = self._one_size(picture)
         height, width = (max(1, int(side * fraction)) for side in first.shape[:2])
-        top, left = (first.shape[0] - height) // 2, (first.shape[1] - width) // 2
-        return self._one_size(first[top : top + height, left : left + width])
+        top, column = (first.shape[0] - height) // 2, (first.shape[1] - width) // 2
+        return self._one_size(first[top : top + height, column : column + width])
 
     def _one_size(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The shortest edge at its length, or squashed where there is none."""
@@ -82,7 +82,7 @@ class NvidiasPictures(GrootN17VLMEncodeStep):  # type: ignore[misc]
 
     @property
     def rule(self) -> str:
-        """In words, for the card."""
+        """The rule in words, for the card."""
         size = " x ".join(map(str, self.image_target_size or ()))
         if not self.use_albumentations:
             return f"squashed to {size} bilinearly, as {NVIDIAS_VERSION}; lerobot is bicubic (-M resize=lerobot)"
@@ -96,16 +96,16 @@ def nvidias_pictures(step: GrootN17VLMEncodeStep, settings: Mapping[str, Any] | 
 
     settings: of its processor file, whose missing fields have NVIDIA's values; None in lerobot's layout.
     """
-    own = {field.name: getattr(step, field.name) for field in fields(GrootN17VLMEncodeStep) if field.init}
+    values = {field.name: getattr(step, field.name) for field in fields(GrootN17VLMEncodeStep) if field.init}
     if settings is not None:
-        own |= {name: settings.get(name) for name in ("image_target_size", "image_crop_size")}
-        own["shortest_image_edge"] = settings.get("shortest_image_edge", _EDGE)
-        own["crop_fraction"] = settings.get("crop_fraction", _FRACTION)
-    return NvidiasPictures(**own)
+        values |= {name: settings.get(name) for name in ("image_target_size", "image_crop_size")}
+        values["shortest_image_edge"] = settings.get("shortest_image_edge", _EDGE)
+        values["crop_fraction"] = settings.get("crop_fraction", _FRACTION)
+    return NvidiasPictures(**values)
 
 
 def lerobots_rule(step: GrootN17VLMEncodeStep) -> str:
-    """How lerobot's own step resizes, for the card."""
+    """The resizing of lerobot's own step in words, for the card."""
     kind = "by area" if step.use_albumentations else "squashed, bicubic"
     return f"{kind}, as lerobot {version('lerobot')}; NVIDIA's code differs (-M resize=nvidia)"
 

@@ -78,18 +78,20 @@ def processor_settings(folder: Path) -> dict[str, Any]:
 
 
 def read_state_fields(folder: Path, settings: Mapping[str, Any], tag: str) -> StateFields:
-    """What the settings of the processor file say of the state of embodiment `tag`.
+    """The settings of the processor file for the state of embodiment `tag`.
 
     Raises CheckpointError for several frames of the state, and for a field that may change numbers unseen.
     """
     path = folder / PROCESSOR_FILE
     modalities = settings.get("modality_configs", {}).get(tag, {})
     check_values(modalities, _MODALITIES, f"{path}: {tag}")
-    for name, own in modalities.items():
-        if not isinstance(own, dict):
-            raise CheckpointError(f"{path}: {name} of {tag} is {own!r}; expected fields such as modality_keys")
-        check_values(own, _MODALITY, f"{path}: {name} of {tag}")
-        for action in own.get("action_configs") or ():
+    for name, modality in modalities.items():
+        if not isinstance(modality, dict):
+            raise CheckpointError(
+                f"{path}: {name} of {tag} is {modality!r}; expected fields such as modality_keys"
+            )
+        check_values(modality, _MODALITY, f"{path}: {name} of {tag}")
+        for action in modality.get("action_configs") or ():
             check_values(action, _ACTION, f"{path}: an action of {tag}")
     state, action = modalities.get("state", {}), modalities.get("action", {})
     if (frames := state.get("delta_indices", [0])) != [0]:
@@ -110,10 +112,10 @@ def read_state_fields(folder: Path, settings: Mapping[str, Any], tag: str) -> St
 def check_widths(folder: Path, settings: Mapping[str, Any], network: Mapping[str, Any]) -> None:
     """Raise CheckpointError where processor and network say different widths of state or action."""
     for name in ("max_state_dim", "max_action_dim"):
-        own, other = settings.get(name), network.get(name)
-        if own is not None and other is not None and own != other:
+        width, other = settings.get(name), network.get(name)
+        if width is not None and other is not None and width != other:
             raise CheckpointError(
-                f"{folder / PROCESSOR_FILE} says {name}: {own}, config.json {other}. The network reads the "
+                f"{folder / PROCESSOR_FILE} says {name}: {width}, config.json {other}. The network reads the "
                 "latter: take the original files"
             )
 

@@ -72,10 +72,10 @@ class BoundedUnits:
     def slope(self, numbers: int) -> NDArray[np.float32]:
         """(D,) of `restore`, where it does not clamp; 0 for a number that jumps."""
         scores = np.where(self.high == 0, 1, self.high)
-        own = np.where(self._scored, scores, (self.high - self.low) / 2).astype(np.float32)[:numbers]
+        slopes = np.where(self._scored, scores, (self.high - self.low) / 2).astype(np.float32)[:numbers]
         if self.sign is not None:
-            own[self.sign] = 0
-        return own
+            slopes[self.sign] = 0
+        return slopes
 
     def slopes(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """(..., D) of `restore` at these outputs of the network; 0 where it clamps."""
@@ -117,20 +117,20 @@ class StateUnits:
 
     @property
     def numbers(self) -> int:
-        """How many the network reads."""
+        """The count of numbers that the network reads."""
         return len(self.bounded.low) + sum(end - begin for begin, end in self.angles)
 
     def normalise(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """Physical units to the numbers the network reads; (..., D) to (..., numbers)."""
         if self.excluded:
             return np.zeros((*values.shape[:-1], self.numbers), np.float32)
-        mapped, done = self.bounded.normalise(values), 0
+        mapped, position = self.bounded.normalise(values), 0
         parts = []
         for begin, end in self.angles:
-            own = values[..., begin:end]
-            parts += [mapped[..., done:begin], np.sin(own), np.cos(own)]
-            done = end
-        return np.asarray(np.concatenate([*parts, mapped[..., done:]], -1), np.float32)
+            angles = values[..., begin:end]
+            parts += [mapped[..., position:begin], np.sin(angles), np.cos(angles)]
+            position = end
+        return np.asarray(np.concatenate([*parts, mapped[..., position:]], -1), np.float32)
 
     def restore(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """Raise CheckpointError for numbers that have no way back to a state."""
@@ -160,7 +160,7 @@ class StateUnits:
 def state_units(
     step: GrootN17PackInputsStep, numbers: int, source: str, fields: StateFields | None = None
 ) -> BoundedUnits | StateUnits:
-    """Of lerobot's packing step; as NVIDIA's processor has them where its `fields` are there.
+    """The units of lerobot's packing step, or of NVIDIA's processor where its `fields` are there.
 
     Raises CheckpointError where it would let the state pass unchanged.
     """
@@ -178,7 +178,7 @@ def action_units(
     source: str,
     fields: StateFields | None = None,
 ) -> BoundedUnits:
-    """Of lerobot's step that decodes actions. fields: of NVIDIA's processor file, where it is there.
+    """The units of lerobot's step that decodes actions. fields: of NVIDIA's processor file, if it is there.
 
     Raises CheckpointError for statistics that are missing, and for actions relative to the state: they have no
     unit of their own.
@@ -230,10 +230,10 @@ def _side_by_side(
     flags: list[bool] = []
     ends: dict[str, tuple[int, int]] = {}
     for key in keys:
-        entry, own = statistics.get(key, {}), ("mean", "std") if key in scored else names
-        if missing := [name for name in own if name not in entry]:
+        entry, statistic_names = statistics.get(key, {}), ("mean", "std") if key in scored else names
+        if missing := [name for name in statistic_names if name not in entry]:
             raise CheckpointError(f"{subject} {key!r} has no statistics {', '.join(missing)}")
-        low, high = (np.atleast_1d(np.asarray(entry[name], np.float32)) for name in own)
+        low, high = (np.atleast_1d(np.asarray(entry[name], np.float32)) for name in statistic_names)
         for part, side in zip(parts, (low, high), strict=True):
             part.append(side)
         ends[key] = (len(flags), len(flags) + len(low))
@@ -244,8 +244,8 @@ def _side_by_side(
 
 
 def _mode(names: tuple[str, str], scored: NDArray[np.bool_]) -> str:
-    own = "QUANTILES" if names[0] == "q01" else "MIN_MAX"
-    return own if not scored.any() else "MEAN_STD" if scored.all() else f"{own} and MEAN_STD"
+    bounds_mode = "QUANTILES" if names[0] == "q01" else "MIN_MAX"
+    return bounds_mode if not scored.any() else "MEAN_STD" if scored.all() else f"{bounds_mode} and MEAN_STD"
 
 
 def _grouped(
@@ -255,8 +255,8 @@ def _grouped(
 
     scored: groups that are mapped by mean and deviation.
     """
-    own = (step.modality_config or {}).get("action", {})
-    keys, kinds = own.get("modality_keys", []), own.get("action_configs", [])
+    action = (step.modality_config or {}).get("action", {})
+    keys, kinds = action.get("modality_keys", []), action.get("action_configs", [])
     statistics = (step.raw_stats or {}).get("action", {})
     names = ("q01", "q99") if step.use_percentiles else ("min", "max")
     for index, key in enumerate(keys):
@@ -281,10 +281,10 @@ def _bounds(
     statistics: Mapping[str, Any], numbers: int, feature: str, source: str
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Raises CheckpointError for statistics that are missing or of another length: lerobot fills them up."""
-    found = [np.asarray(statistics.get(name, []), np.float32).reshape(-1) for name in ("min", "max")]
-    if any(len(own) != numbers for own in found):
+    bounds = [np.asarray(statistics.get(name, []), np.float32).reshape(-1) for name in ("min", "max")]
+    if any(len(bound) != numbers for bound in bounds):
         raise CheckpointError(
-            f"{source} has min and max of {[len(own) for own in found]} numbers for {feature}, which has "
+            f"{source} has min and max of {[len(bound) for bound in bounds]} numbers for {feature}, which has "
             f"{numbers}: its units are unknown. Take the statistics of the data set it was trained on"
         )
-    return found[0], found[1]
+    return bounds[0], bounds[1]

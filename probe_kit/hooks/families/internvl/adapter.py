@@ -49,11 +49,11 @@ class InternVL(VisionLanguageModel):
 
     @cached_property
     def pictures(self) -> TiledPictures:
-        """How pictures become tiles."""
+        """The processor of pictures into tiles."""
         return TiledPictures.from_folder(self.loaded.folder, self._side, self.tiles == "auto")
 
     def picture_ids(self, height: int, width: int) -> list[int]:
-        """As many per tile as are left of its patches after their neighbours were joined."""
+        """Ids of a picture: per tile its patches after neighbours were joined."""
         config = self.network.config
         patches = self._side // int(config.vision_config.patch_size[0])
         joined = int(patches * float(config.downsample_ratio)) ** 2

@@ -119,7 +119,7 @@ class InternVLA(QwenVLA):
         else:
             note = f"cannot act: {units}"
             settings = {"unnorm_key": "none", "action_statistics": "none"}
-        files = side_files(self.parts.place) | side_files(self.parts.vlm, "vlm/")
+        files = side_files(self.parts.run) | side_files(self.parts.vlm, "vlm/")
         if tokenizer is not None:
             files |= side_files(Path(tokenizer).expanduser(), "tokenizer/")
         return ModelCard(
@@ -155,9 +155,9 @@ class InternVLA(QwenVLA):
 
     @cached_property
     def units(self) -> ActionUnits:
-        """What gives actions their units. Raises CheckpointError, UsageError."""
-        place = str(self.parts.place / STATISTICS_FILE)
-        return ActionUnits.choose(self.parts.statistics(), self._unnorm_key, place)
+        """The statistics that give actions their units. Raises CheckpointError, UsageError."""
+        source = str(self.parts.run / STATISTICS_FILE)
+        return ActionUnits.choose(self.parts.statistics(), self._unnorm_key, source)
 
     def text(self, instruction: str) -> str:
         """Qwen's chat around the prompt the run was trained with."""
@@ -275,10 +275,10 @@ class InternVLA(QwenVLA):
 def internvla_units(checkpoint: str, *, unnorm_key: str | None = None, vlm: str | None = None, **_: Any) -> str:
     """See `Family.units`; a checkpoint without statistics says so, since it can be captured."""
     parts = find_parts(checkpoint, vlm, unread=True)
-    if not (known := parts.statistics()):
-        return f"none: {parts.place} has no {STATISTICS_FILE}"
-    place = str(parts.place / STATISTICS_FILE)
-    return f"{ActionUnits.choose(known, unnorm_key, place).key}, from {place}"
+    if not (statistics := parts.statistics()):
+        return f"none: {parts.run} has no {STATISTICS_FILE}"
+    source = str(parts.run / STATISTICS_FILE)
+    return f"{ActionUnits.choose(statistics, unnorm_key, source).key}, from {source}"
 
 
 def load_internvla(
@@ -308,8 +308,8 @@ def load_internvla(
     if not np.isfinite(guidance) or guidance < 0:
         raise UsageError(f"guidance is {guidance}; expected a scale such as 1.5")
 
-    def build(kind: torch.dtype, place: str) -> InternVLANetwork:
-        return build_internvla(parts.config, kind, place)
+    def build(kind: torch.dtype, device: str) -> InternVLANetwork:
+        return build_internvla(parts.config, kind, device)
 
     if random_weights:
         filled = twin(build, name, dtype, weights_seed)

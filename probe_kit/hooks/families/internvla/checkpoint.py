@@ -37,39 +37,37 @@ _DEVELOPMENT = "qwen2_5_vl_config"
 
 @dataclass(frozen=True)
 class Parts:
-    """Where everything lies.
+    """The files and folders of a checkpoint.
 
-    place: of config.yaml and the statistics. weights: a .pt file, or a folder of safetensors. vlm: the folder of
-    the vision-language model's configuration, tokenizer and processor.
+    run: the folder of config.yaml and the statistics. weights: a .pt file, or a folder of safetensors. vlm: the
+    folder of the vision-language model's configuration, tokenizer and processor.
     """
 
     config: InternVLAConfig
-    place: Path
+    run: Path
     weights: Path
     vlm: Path
 
     def read(self) -> Weights:
         """The tensors. Raises WeightsError, and CheckpointError for an adapter beside a `.pt` file."""
-        adapter = adapter_in(self.place)
+        adapter = adapter_in(self.run)
         if adapter is None:
             return _read(self.weights)
         if self.weights.is_file():
             raise CheckpointError(
-                f"{self.place} holds a LoRA adapter beside {self.weights.name}: nothing says whether that file is "
+                f"{self.run} holds a LoRA adapter beside {self.weights.name}: nothing says whether that file is "
                 "merged. Merge the adapter with peft and pass the merged folder, or remove the adapter's files"
             )
         base = adapter.base_folder()
-        return (
-            read_weights(base) if base == self.place else with_adapter(_read(_weights(base, None, None)), adapter)
-        )
+        return read_weights(base) if base == self.run else with_adapter(_read(_weights(base, None, None)), adapter)
 
     def statistics(self) -> Mapping[str, Any]:
         """Per data set, what un-normalises its actions; empty without the file."""
-        return stored_statistics((self.place,), {}, str(self.place))[0]
+        return stored_statistics((self.run,), {}, str(self.run))[0]
 
 
-def _read(place: Path) -> Weights:
-    return read_pickle(place) if place.is_file() else read_weights(place)
+def _read(path: Path) -> Weights:
+    return read_pickle(path) if path.is_file() else read_weights(path)
 
 
 def find_parts(checkpoint: str, vlm: str | None, weights: str | None = None, unread: bool = False) -> Parts:
@@ -80,58 +78,59 @@ def find_parts(checkpoint: str, vlm: str | None, weights: str | None = None, unr
     unread: nothing is looked for, since no weights will be read.
     Raises CheckpointError naming what is missing or ambiguous.
     """
-    given = Path(checkpoint).expanduser()
-    if given.is_file():
-        folder, file = given.parent, given
+    path = Path(checkpoint).expanduser()
+    if path.is_file():
+        folder, file = path.parent, path
     else:
         folder = checkpoint_folder(checkpoint, (*PATTERNS, "*.yaml"))
-        file = folder if unread else _weights(folder, weights, None if given.is_dir() else checkpoint)
-    values, place = find_config(folder)
-    where, content = _vlm(values, place, vlm)
-    return Parts(InternVLAConfig.from_values(values, content, str(place)), place, file, where)
+        file = folder if unread else _weights(folder, weights, None if path.is_dir() else checkpoint)
+    values, run = find_config(folder)
+    where, content = _vlm(values, run, vlm)
+    return Parts(InternVLAConfig.from_values(values, content, str(run)), run, file, where)
 
 
-def _weights(folder: Path, chosen: str | None, hub: str | None) -> Path:
+def _weights(folder: Path, file_name: str | None, hub: str | None) -> Path:
     """Safetensors beside the configuration, or a .pt file there or in `checkpoints/`; of `hub` if it is given."""
-    if chosen is None and hub is None and adapter_in(folder) is not None and not any(folder.glob("**/*.pt")):
+    if file_name is None and hub is None and adapter_in(folder) is not None and not any(folder.glob("**/*.pt")):
         return folder
-    for place in (folder, folder / WEIGHTS_FOLDER):
-        if chosen is None and ((place / SINGLE_FILE).is_file() or (place / INDEX_FILE).is_file()):
-            return place
+    for candidate in (folder, folder / WEIGHTS_FOLDER):
+        if file_name is None and ((candidate / SINGLE_FILE).is_file() or (candidate / INDEX_FILE).is_file()):
+            return candidate
     if hub is not None:
-        name = _chosen([name for name in hub_files(hub) if name.endswith(".pt")], chosen, hub)
+        name = _chosen([name for name in hub_files(hub) if name.endswith(".pt")], file_name, hub)
         return checkpoint_folder(hub, (name,)) / name
     inside = folder.glob(f"{WEIGHTS_FOLDER}/*.pt")
     files = sorted(path.relative_to(folder).as_posix() for path in (*folder.glob("*.pt"), *inside))
-    return folder / _chosen(files, chosen, str(folder))
+    return folder / _chosen(files, file_name, str(folder))
 
 
-def _chosen(files: Sequence[str], chosen: str | None, place: str) -> str:
+def _chosen(files: Sequence[str], name: str | None, location: str) -> str:
     """The path of one .pt file among `files`, by its name. Raises CheckpointError for none and for several."""
     by_name = {Path(file).name: file for file in files}
     listed = ", ".join(sorted(by_name))
     if not files:
         raise CheckpointError(
-            f"no weights in {place} or its {WEIGHTS_FOLDER}/: expected {SINGLE_FILE} or a .pt file"
+            f"no weights in {location} or its {WEIGHTS_FOLDER}/: expected {SINGLE_FILE} or a .pt file"
         )
-    if chosen is not None:
-        if chosen not in by_name:
-            raise CheckpointError(f"{place} has no weights {chosen!r}; choose -M weights among {listed}")
-        return by_name[chosen]
+    if name is not None:
+        if name not in by_name:
+            raise CheckpointError(f"{location} has no weights {name!r}; choose -M weights among {listed}")
+        return by_name[name]
     if len(files) == 1:
         return files[0]
     if RELEASED_STEP not in by_name:
         raise CheckpointError(
-            f"{place} holds several weights: {listed}. Name one with -M weights=FILE, or pass one as --checkpoint"
+            f"{location} holds several weights: {listed}. Name one with "
+            "-M weights=FILE, or pass one as --checkpoint"
         )
     return by_name[RELEASED_STEP]
 
 
-def _vlm(values: Mapping[str, Any], place: Path, chosen: str | None) -> tuple[Path, Mapping[str, Any]]:
+def _vlm(values: Mapping[str, Any], run: Path, vlm: str | None) -> tuple[Path, Mapping[str, Any]]:
     """Folder and configuration of the vision-language model."""
-    if chosen is None and _DEVELOPMENT in values:
-        return place, values[_DEVELOPMENT]
-    folder = place if chosen is None and _is_vlm(place) else _vlm_folder(values, place, chosen)
+    if vlm is None and _DEVELOPMENT in values:
+        return run, values[_DEVELOPMENT]
+    folder = run if vlm is None and _is_vlm(run) else _vlm_folder(values, run, vlm)
     if not _is_vlm(folder):
         raise CheckpointError(
             f"{folder} has no config.json of a {_VLM_TYPE} model; InternVLA-M1 is made of Qwen2.5-VL. "
@@ -140,12 +139,12 @@ def _vlm(values: Mapping[str, Any], place: Path, chosen: str | None) -> tuple[Pa
     return folder, load_json(folder / "config.json")
 
 
-def _vlm_folder(values: Mapping[str, Any], place: Path, chosen: str | None) -> Path:
+def _vlm_folder(values: Mapping[str, Any], run: Path, vlm: str | None) -> Path:
     """`chosen`, or what config.yaml names: a folder, which may be relative to the run, or a model of the hub."""
-    base = chosen or str(((values.get("framework") or {}).get("qwenvl") or {}).get("base_vlm", ""))
+    base = vlm or str(((values.get("framework") or {}).get("qwenvl") or {}).get("base_vlm", ""))
     if not base:
-        raise CheckpointError(f"{place} names no vision-language model; pass its folder with -M vlm=DIR")
-    for folder in (Path(base).expanduser(), place / base):
+        raise CheckpointError(f"{run} names no vision-language model; pass its folder with -M vlm=DIR")
+    for folder in (Path(base).expanduser(), run / base):
         if folder.is_dir():
             return folder
     # The authors' own folders end in the name the model has on the hub.

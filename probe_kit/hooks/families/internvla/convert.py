@@ -56,8 +56,8 @@ def _write(parts: Parts, weights: Weights, folder: Path) -> None:
     for name, file in side_files(parts.vlm).items():
         shutil.copyfile(file, folder / name)
     for name in _RUN_FILES:
-        if (parts.place / name).is_file():
-            shutil.copyfile(parts.place / name, folder / name)
+        if (parts.run / name).is_file():
+            shutil.copyfile(parts.run / name, folder / name)
 
 
 def main(arguments: list[str]) -> int:

@@ -30,9 +30,11 @@ def internvla_outputs(load: Callable[..., InternVLA], folder: Path, recorded: Ar
     """
     steps = len(recorded["ddim_timestep_map"]) if "ddim_timestep_map" in recorded else 10
     guidance = float(recorded["cfg_scale"]) if "cfg_scale" in recorded else 1.5
-    place = str(folder / "checkpoint")
-    units = next(iter(find_parts(place, None, unread=True).statistics()), None)  # nothing compared depends on them
-    policy = load(place, dtype="float32", steps=steps, guidance=guidance, unnorm_key=units)
+    checkpoint = str(folder / "checkpoint")
+    units = next(
+        iter(find_parts(checkpoint, None, unread=True).statistics()), None
+    )  # nothing compared depends on them
+    policy = load(checkpoint, dtype="float32", steps=steps, guidance=guidance, unnorm_key=units)
     inputs, pixels = recorded_inputs(policy, recorded), _pixels(policy, recorded)
     network, noise = policy.network, torch.from_numpy(recorded["in_noise"])
     modules = {

@@ -29,9 +29,9 @@ class ActionUnits:
 
     @classmethod
     def choose(
-        cls, statistics: Mapping[str, Any], key: str | None, place: str = "the checkpoint"
+        cls, statistics: Mapping[str, Any], key: str | None, source: str = "the checkpoint"
     ) -> "ActionUnits":
-        """Those of data set `key`; without one, of the only data set there is. place: what holds them.
+        """The units of data set `key`; without one, of the only data set. source: the file that holds them.
 
         Raises UsageError for a key that is not there or has to be chosen, CheckpointError for bad statistics.
         """
@@ -40,12 +40,12 @@ class ActionUnits:
                 "the checkpoint has no dataset_statistics.json: its actions have no physical unit. "
                 "Take the file that the run was released with"
             )
-        chosen = chosen_name(statistics, key, "unnorm_key", place)
-        return cls.of(chosen, statistics[chosen].get("action") or {})
+        name = chosen_name(statistics, key, "unnorm_key", source)
+        return cls.of(name, statistics[name].get("action") or {})
 
     @classmethod
     def of(cls, key: str, action: Mapping[str, Any]) -> "ActionUnits":
-        """From q01, q99 and, if there is one, mask. Raises CheckpointError if they do not fit each other."""
+        """Read q01, q99 and, if there is one, mask. Raises CheckpointError if they do not fit each other."""
         if missing := [name for name in ("q01", "q99") if name not in action]:
             raise CheckpointError(f"the action statistics of {key} lack {' and '.join(missing)}")
         low, high = np.asarray(action["q01"], np.float64), np.asarray(action["q99"], np.float64)
@@ -57,7 +57,7 @@ class ActionUnits:
 
     @property
     def sha256(self) -> str:
-        """Of the numbers."""
+        """The hash of the numbers."""
         return sha256_json([self.low.tolist(), self.high.tolist(), self.mask.tolist()])
 
     def restore(self, actions: NDArray[np.float32]) -> NDArray[np.float64]:

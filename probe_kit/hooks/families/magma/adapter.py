@@ -154,30 +154,30 @@ class Magma(Policy, AnswerModel):
 
     @cached_property
     def pictures(self) -> PictureSettings:
-        """How pictures become crops."""
+        """The settings of cutting pictures into crops."""
         return PictureSettings.of(self.config.vision, self.loaded.folder)
 
     @cached_property
     def text(self) -> ChatText:
-        """How the model is spoken to. Raises CheckpointError naming the files that are missing."""
+        """The chat text. Raises CheckpointError naming the files that are missing."""
         return ChatText.of(self._text_folder, self.config, self.order == "act2answer")
 
     @cached_property
     def action_tokens(self) -> ActionTokens:
-        """Which ids name which values: the last ones before the added tokens."""
+        """The ids that name values: the last ones before the added tokens."""
         return ActionTokens(self.text.vocabulary, BINS)
 
     def prompt(self, instruction: str) -> TokenPrompt:
-        """What the model is asked to act on an instruction."""
+        """The question with which the model acts on an instruction."""
         return self.text.prompt(ACTION_QUESTION.format(instruction=instruction))
 
     def picture(self, image: NDArray[np.uint8]) -> Picture:
         """Crops of a (H, W, 3) uint8 picture. Raises ObservationError."""
-        whole = checked_picture(image)
-        return prepare_picture(shrink_picture(whole, self.shrink) if self.shrink else whole, self.pictures)
+        checked = checked_picture(image)
+        return prepare_picture(shrink_picture(checked, self.shrink) if self.shrink else checked, self.pictures)
 
     def span(self, ids: Sequence[int], image: NDArray[np.uint8]) -> PictureSpan:
-        """Where the picture's tokens stand among those of a prompt, without preparing it."""
+        """The positions of the picture's tokens among those of a prompt, without preparing it."""
         height, width = (self.shrink, self.shrink) if self.shrink else checked_picture(image).shape[:2]
         return self.network.span(ids, choose_grid(width, height, self.pictures), self.pictures.base)
 
@@ -211,7 +211,7 @@ class Magma(Policy, AnswerModel):
 
     @property
     def statistics(self) -> ActionStatistics:
-        """What gives actions their units. Raises UsageError where none were chosen."""
+        """The statistics that give actions their units. Raises UsageError where none were chosen."""
         if isinstance(self._units, str):
             raise UsageError(self._units)
         return self._units
@@ -240,16 +240,16 @@ class Magma(Policy, AnswerModel):
         prompts = [self.prompt(observation.instruction).ids for observation in observations]
         decoded = self.generate(prompts, [self.picture(observation.image) for observation in observations], choose)
         ids: NDArray[np.int64] = decoded.ids.cpu().numpy()
-        self.flagged = ~self._whole(ids, decoded, choose)
+        self.flagged = ~self._is_action(ids, decoded, choose)
         return ids
 
-    def _whole(self, ids: NDArray[np.int64], decoded: Decoded, choose: Choose) -> NDArray[np.bool_]:
+    def _is_action(self, ids: NDArray[np.int64], decoded: Decoded, choose: Choose) -> NDArray[np.bool_]:
         """(B,) which rows put out seven tokens that name bins, and then the end of the turn."""
-        named = np.asarray(self.action_tokens.known(ids).all(axis=1))
-        if not named.any():
-            return named
+        names_bins = np.asarray(self.action_tokens.is_action(ids).all(axis=1))
+        if not names_bins.any():
+            return names_bins
         ends = np.isin(choose(self._behind(decoded)).cpu().numpy(), list(self.text.ends))
-        return np.asarray(named & ends)
+        return np.asarray(names_bins & ends)
 
     def _behind(self, decoded: Decoded) -> Tensor:
         """(B, V) logits behind the seven tokens, from modules without hooks."""
@@ -272,11 +272,14 @@ class Magma(Policy, AnswerModel):
         self.check([question.observation for question in questions])
         prompts = [self._question(question).ids for question in questions]
         options = [
-            [self.text.option(own.text, own.begun, option, own.pictured) for option in own.options]
-            for own in questions
+            [
+                self.text.option(question.text, question.begun, option, question.pictured)
+                for option in question.options
+            ]
+            for question in questions
         ]
-        shown = self.shows_pictures(questions)
-        pictures = [self.picture(question.observation.image) for question in questions] if shown else None
+        pictured = self.shows_pictures(questions)
+        pictures = [self.picture(question.observation.image) for question in questions] if pictured else None
         decoded = self.generate(prompts, pictures)
         return Reading.of(decoded.logits[:, 0].float().cpu().numpy(), options, Answer(decoded))
 
@@ -298,13 +301,18 @@ class Magma(Policy, AnswerModel):
 
     def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
         """Frames are `special`, the question is `language`; the ends of a picture's rows stand apart from it."""
-        return self._roles([self._labels(self.prompt(one.instruction), one.image) for one in observations])
+        return self._roles(
+            [self._labels(self.prompt(observation.instruction), observation.image) for observation in observations]
+        )
 
     def asked_roles(self, questions: Sequence[Prompt]) -> dict[str, list[Roles]]:
-        """As `roles`, of other questions than what to do; how an answer has begun is `special`."""
-        shown = self.shows_pictures(questions)
+        """Roles of questions other than what to do; how an answer has begun is `special`."""
+        pictured = self.shows_pictures(questions)
         return self._roles(
-            [self._labels(self._question(own), own.observation.image if shown else None) for own in questions]
+            [
+                self._labels(self._question(question), question.observation.image if pictured else None)
+                for question in questions
+            ]
         )
 
     def _roles(self, rows: Sequence[list[str]]) -> dict[str, list[Roles]]:
@@ -313,8 +321,8 @@ class Magma(Policy, AnswerModel):
         return {"backbone": backbone, "action": [Roles.from_labels(["action"])] * len(rows)}
 
     def _labels(self, prompt: TokenPrompt, image: NDArray[np.uint8] | None) -> list[str]:
-        """Of every position but the last, which belongs to the stream `action`."""
-        labels = ["language" if asked else "special" for asked in prompt.question]
+        """The labels of every position but the last, which belongs to the stream `action`."""
+        labels = ["language" if is_question else "special" for is_question in prompt.question]
         if image is None:
             return labels[:-1]
         span = self.span(prompt.ids, image)
@@ -366,22 +374,22 @@ def check_magma_words(
 ) -> None:
     """See `Family.words`."""
     folder = checkpoint_folder(checkpoint, SMALL_FILES)
-    own = folder if tokenizer is None else Path(tokenizer).expanduser()
-    text = ChatText.of(own, MagmaConfig.from_folder(folder), prompt == "act2answer")
+    text_folder = folder if tokenizer is None else Path(tokenizer).expanduser()
+    text = ChatText.of(text_folder, MagmaConfig.from_folder(folder), prompt == "act2answer")
     for instruction in instructions:
         text.prompt(ACTION_QUESTION.format(instruction=instruction))
 
 
 def magma_units(checkpoint: str, *, unnorm_key: str | None = None, statistics: str | None = None, **_: Any) -> str:
     """See `Family.units`; without a choice, why there are none: a Magma may be asked, and not act."""
-    known, place = magma_statistics(checkpoint_folder(checkpoint, SMALL_FILES), statistics)
-    units = _units(known, place, unnorm_key)
-    return f"none: {units}" if isinstance(units, str) else f"{units.key}, from {place}"
+    by_data_set, source = magma_statistics(checkpoint_folder(checkpoint, SMALL_FILES), statistics)
+    units = _units(by_data_set, source, unnorm_key)
+    return f"none: {units}" if isinstance(units, str) else f"{units.key}, from {source}"
 
 
-def _units(statistics: Mapping[str, Any], place: str, key: str | None) -> ActionStatistics | str:
+def _units(statistics: Mapping[str, Any], source: str, key: str | None) -> ActionStatistics | str:
     try:
-        return ActionStatistics.choose(statistics, magma_key(statistics, place, key), place)
+        return ActionStatistics.choose(statistics, magma_key(statistics, source, key), source)
     except UsageError as error:
         if key is not None:
             raise
@@ -414,12 +422,12 @@ def load_magma(
     inference, for comparisons with other than seven; only seven are an action.
     Raises UsageError, and what `load_checkpoint` raises.
     """
-    for name, value, known in (
+    for name, value, choices in (
         ("prompt", prompt, PROMPTS),
         ("layer_scale", layer_scale, (None, "gamma", "weight")),
     ):
-        if value not in known:
-            raise UsageError(f"{name} is {value!r}; expected {' or '.join(filter(None, known))}")
+        if value not in choices:
+            raise UsageError(f"{name} is {value!r}; expected {' or '.join(filter(None, choices))}")
     if shrink < 0:
         raise UsageError(f"shrink is {shrink}; expected a side in pixels, or 0 for whole pictures")
     chooser(temperature, ())
@@ -434,7 +442,7 @@ def load_magma(
     )
     return Magma(
         loaded,
-        _units(loaded.statistics, loaded.statistics_place, unnorm_key),
+        _units(loaded.statistics, loaded.statistics_source, unnorm_key),
         shrink=shrink,
         prompt=prompt,
         temperature=temperature,

@@ -26,7 +26,7 @@ class LoadedMagma:
     """A loaded network and what belongs to it.
 
     checkpoint: as asked for. folder: where its other files lie. statistics: per data set, what un-normalises its
-    actions. statistics_place: what holds them.
+    actions. statistics_source: the file that holds them.
     dtype: of the weights, as the card says it. weights_seed: of a random twin. layer_scale: under which
     name the file holds the layer scales, `gamma` or `weight`.
     """
@@ -36,7 +36,7 @@ class LoadedMagma:
     config: MagmaConfig
     folder: Path
     statistics: Mapping[str, Any]
-    statistics_place: str
+    statistics_source: str
     audit: WeightsAudit
     dtype: str
     device: str
@@ -68,24 +68,24 @@ def load_checkpoint(
     if random_weights:
         network, audit = _random(config, _DTYPES[name], checkpoint, weights_seed)
         notes: tuple[str, ...] = ()
-        named = "gamma"
+        stored_name = "gamma"
     else:
-        network, audit, notes, named = _stored(config, folder, _DTYPES[name], layer_scale)
+        network, audit, notes, stored_name = _stored(config, folder, _DTYPES[name], layer_scale)
     network.requires_grad_(False)
-    known, place = magma_statistics(folder, statistics)
+    by_data_set, statistics_source = magma_statistics(folder, statistics)
     return LoadedMagma(
         checkpoint=checkpoint,
         network=network.to(device),
         config=config,
         folder=folder,
-        statistics=known,
-        statistics_place=place,
+        statistics=by_data_set,
+        statistics_source=statistics_source,
         audit=audit,
         dtype=name,
         device=device,
         notes=notes,
         weights_seed=weights_seed if random_weights else None,
-        layer_scale=layer_scale or named,
+        layer_scale=layer_scale or stored_name,
     )
 
 
@@ -106,7 +106,7 @@ def _stored(
     config: MagmaConfig, folder: Path, dtype: torch.dtype, layer_scale: str | None
 ) -> tuple[MagmaNetwork, WeightsAudit, tuple[str, ...], str]:
     weights = read_weights(folder, unlisted=UNUSED_WEIGHTS)
-    tensors, notes, named = _with_layer_scales(weights, layer_scale)
+    tensors, notes, stored_name = _with_layer_scales(weights, layer_scale)
     unread = [name for name in UNUSED_WEIGHTS if tensors.pop(name, None) is not None]
     if unread:
         notes += (f"{len(unread)} tensors of the contrastive head are in the file and never read",)
@@ -118,18 +118,20 @@ def _stored(
         network.language_model.tie_weights()
     if empty := [key for key, tensor in network.state_dict().items() if tensor.is_meta]:
         raise WeightsError(f"weights in {folder}: {len(empty)} tensors were never filled: {', '.join(empty[:8])}")
-    return network, audit, notes, named
+    return network, audit, notes, stored_name
 
 
-def _with_layer_scales(weights: Weights, asked: str | None) -> tuple[dict[str, Tensor], tuple[str, ...], str]:
+def _with_layer_scales(
+    weights: Weights, layer_scale: str | None
+) -> tuple[dict[str, Tensor], tuple[str, ...], str]:
     """The tensors under the network's names, a note if some were stored as `.weight`, and the stored name.
 
     Loaders before transformers 5 rename every `gamma` to `weight`. The released file names them so; a file that
     such a loader saved later holds the initial constant, which is refused.
     """
-    found = {name: match for name in weights.tensors if (match := _BLOCK.fullmatch(name))}
-    renamed = {name: match["block"] + ".gamma" for name, match in found.items() if match["name"] == "weight"}
-    if renamed and asked == "gamma":
+    scales = {name: match for name in weights.tensors if (match := _BLOCK.fullmatch(name))}
+    renamed = {name: match["block"] + ".gamma" for name, match in scales.items() if match["name"] == "weight"}
+    if renamed and layer_scale == "gamma":
         raise WeightsError(
             f"weights in {weights.source} hold {len(renamed)} layer scales of the vision tower as .weight instead "
             f"of .gamma, such as {min(renamed)}. Leave -M layer_scale=gamma out to accept them"
@@ -163,25 +165,25 @@ def _check_trained(tensors: Mapping[str, Tensor], source: str) -> None:
 PACKAGED = "the package (its statistics.json says whence)"
 
 
-def magma_statistics(folder: Path, chosen: str | None) -> tuple[Mapping[str, Any], str]:
-    """Those of the file that was asked for, of the checkpoint, or of the package, and what holds them.
+def magma_statistics(folder: Path, file: str | None) -> tuple[Mapping[str, Any], str]:
+    """The statistics of `file`, of the checkpoint, or of the package, and the name of their source.
 
     The released checkpoint has none: the evaluation client holds them. Raises CheckpointError for a bad file.
     """
-    if chosen is not None:
-        return read_statistics(Path(chosen).expanduser()), chosen
+    if file is not None:
+        return read_statistics(Path(file).expanduser()), file
     return stored_statistics((folder,), shipped_statistics(), PACKAGED)
 
 
-def magma_key(statistics: Mapping[str, Any], place: str, key: str | None) -> str:
+def magma_key(statistics: Mapping[str, Any], source: str, key: str | None) -> str:
     """The data set whose units the actions get. Raises UsageError where it has to be chosen.
 
     The packaged statistics are of one data set, with which a checkpoint without a file may have nothing to do.
     """
-    if key is None and place == PACKAGED:
+    if key is None and source == PACKAGED:
         raise UsageError(
             f"the checkpoint has no {STATISTICS_FILE}: nothing says whose units its actions get. Put that file "
             f"into its folder, name one with -M statistics=FILE, or choose -M unnorm_key={', '.join(statistics)} "
             "of the package"
         )
-    return chosen_name(statistics, key, "unnorm_key", place)
+    return chosen_name(statistics, key, "unnorm_key", source)

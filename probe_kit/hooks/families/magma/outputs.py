@@ -86,7 +86,7 @@ class _Reference:
         return choose
 
     def valid(self) -> dict[str, NDArray[np.bool_]]:
-        """Which positions of the recorded batch are no padding."""
+        """The positions of the recorded batch that are no padding."""
         if "batch_attention_mask" not in self.recorded or "batch_logits" not in self.recorded:
             return {}
         mask = np.zeros(self.recorded["batch_logits"].shape[:2], bool)
@@ -95,7 +95,7 @@ class _Reference:
         return dict.fromkeys(("batch_hidden_states", "batch_logits"), mask)
 
     def produced(self) -> dict[str, Produce]:
-        """How to make every output the adapter can make, whether recorded or not."""
+        """Functions that make every output the adapter can make, whether recorded or not."""
         return {**self._pictures(), **self._streams(), **self._passes(), **self._actions()}
 
     def _pictures(self) -> dict[str, Produce]:
@@ -114,10 +114,10 @@ class _Reference:
         }
 
     def _grids(self) -> NDArray[np.int64]:
-        chosen = [
+        grids = [
             choose_grid(width, height, _RELEASED) for width, height in self.recorded["crop_sizes_wh"].tolist()
         ]
-        return np.array([(grid.rows, grid.columns) for grid in chosen])
+        return np.array([(grid.rows, grid.columns) for grid in grids])
 
     def _map(self, stream: str, layer: int) -> NDArray[Any]:
         """(N, C, h, w) of the tokens that a vision stream's tap gives; maps have the shape of what was shown."""
@@ -135,10 +135,10 @@ class _Reference:
 
     def _streams(self) -> dict[str, Produce]:
         _, decoded, tape = self.first
-        made = generation_outputs(self.model, "action", tape, decoded)
+        outputs = generation_outputs(self.model, "action", tape, decoded)
         return {
-            **made,
-            "merged_embeds": lambda: made["hidden_states"]()[0],
+            **outputs,
+            "merged_embeds": lambda: outputs["hidden_states"]()[0],
             "hidden_states_2": lambda: self.second[1]["hidden_states"](),
             "logits_2": lambda: self.second[1]["logits"](),
         }
@@ -165,7 +165,7 @@ class _Reference:
     @cached_property
     def _batch_prompts(self) -> list[list[int]]:
         ids, mask = self.recorded["batch_input_ids"], self.recorded["batch_attention_mask"].astype(bool)
-        return [row[seen].tolist() for row, seen in zip(ids, mask, strict=True)]
+        return [row[is_token].tolist() for row, is_token in zip(ids, mask, strict=True)]
 
     @cached_property
     def _batch_pictures(self) -> list[Picture]:
@@ -187,7 +187,7 @@ class _Reference:
 
     @cached_property
     def _batch(self) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Of the recorded batch, packed as the adapter packs it and reordered to padding in front of every row."""
+        """The pass over the recorded batch, packed by the adapter, reordered to padding in front of every row."""
         states, logits = forward_outputs(self.model.network, self._batch_prompts, self._batch_pictures)
         for row, length in enumerate(self._batch_lengths):
             for values in (states[:, row], logits[None, row]):

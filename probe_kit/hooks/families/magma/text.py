@@ -37,7 +37,7 @@ class ChatText:
 
     @classmethod
     def of(cls, folder: Path, config: MagmaConfig, user_first: bool = False) -> "ChatText":
-        """From the tokenizer in `folder`. Raises CheckpointError for missing files and another model's."""
+        """Read the tokenizer in `folder`. Raises CheckpointError for missing files and another model's."""
         if not (folder / _FILE).is_file():
             raise CheckpointError(
                 f"{_FILE} and tokenizer_config.json are missing in {folder}. They come with the checkpoint: copy "
@@ -53,14 +53,14 @@ class ChatText:
 
     @cached_property
     def _settings(self) -> dict[str, Any]:
-        beside = self.folder / "tokenizer_config.json"
-        return dict(load_json(beside)) if beside.is_file() else {}
+        file = self.folder / "tokenizer_config.json"
+        return dict(load_json(file)) if file.is_file() else {}
 
     @cached_property
     def _template(self) -> str | None:
         """The checkpoint's chat template in Jinja, None if it has none."""
-        beside = self.folder / "chat_template.jinja"
-        stored = read_regular_text(beside) if beside.is_file() else self._settings.get("chat_template")
+        file = self.folder / "chat_template.jinja"
+        stored = read_regular_text(file) if file.is_file() else self._settings.get("chat_template")
         if stored is not None and not isinstance(stored, str):
             raise CheckpointError(
                 f"{self.folder} has {len(stored)} chat templates; expected one. Keep the one the model was "
@@ -70,16 +70,16 @@ class ChatText:
 
     @cached_property
     def _beginning(self) -> dict[str, str]:
-        named = self._settings.get("bos_token")
-        token = named.get("content") if isinstance(named, dict) else named
+        bos_token = self._settings.get("bos_token")
+        token = bos_token.get("content") if isinstance(bos_token, dict) else bos_token
         return {"beginning": token} if token else {}
 
     def check(self) -> None:
         """Refuse a tokenizer that belongs to another model. Raises CheckpointError."""
-        known = self.vocabulary, self.config.base_vocabulary
-        if known[1] not in (None, known[0]):
+        counts = self.vocabulary, self.config.base_vocabulary
+        if counts[1] not in (None, counts[0]):
             raise CheckpointError(
-                f"{self.folder / _FILE} has {known[0]} ids before the added ones, config.json says {known[1]} "
+                f"{self.folder / _FILE} has {counts[0]} ids before the added ones, config.json says {counts[1]} "
                 "(tokenizer_vocab_size): every action would be decoded wrongly. Take the checkpoint's tokenizer"
             )
         highest = max(self._tokenizer.get_vocab(with_added_tokens=True).values())
@@ -99,8 +99,8 @@ class ChatText:
         """Ids that end the assistant's turn."""
         file = self.folder / "generation_config.json"
         stored = load_json(file).get("eos_token_id") if file.is_file() else None
-        named: list[Any] = [self.config.text.eos_token_id, stored, self._tokenizer.token_to_id("<|eot_id|>")]
-        flat = [number for entry in named for number in (entry if isinstance(entry, list) else [entry])]
+        stored_ends: list[Any] = [self.config.text.eos_token_id, stored, self._tokenizer.token_to_id("<|eot_id|>")]
+        flat = [number for entry in stored_ends for number in (entry if isinstance(entry, list) else [entry])]
         return frozenset(int(number) for number in flat if number is not None)
 
     def prompt(self, question: str, begun: str = "", pictured: bool = True) -> TokenPrompt:
@@ -123,15 +123,15 @@ class ChatText:
         return TokenPrompt(tuple(encoding.ids), inside)
 
     def _place(self, turn: str, frames: str) -> tuple[int, int]:
-        """Where in `frames` what the user says begins and ends."""
-        said = turn.strip()  # as templates do
-        place = frames.find(said)
-        if place < 0:
+        """The beginning and end of the user's words in `frames`."""
+        words = turn.strip()  # as templates do
+        start = frames.find(words)
+        if start < 0:
             raise CheckpointError(
-                f"the chat template in {self.folder} changes the words of a turn: {said!r} is not in {frames!r}. "
+                f"the chat template in {self.folder} changes the words of a turn: {words!r} is not in {frames!r}. "
                 "Take the template the model was trained with"
             )
-        return place, place + len(said)
+        return start, start + len(words)
 
     def _check_markers(self, text: str) -> None:
         for token in self._tokenizer.get_added_tokens_decoder().values():
@@ -153,5 +153,5 @@ class ChatText:
 
     def decode(self, ids: Sequence[int]) -> str:
         """The text of ids up to the end of the turn, without special tokens."""
-        end = next((place for place, number in enumerate(ids) if number in self.ends), len(ids))
+        end = next((position for position, number in enumerate(ids) if number in self.ends), len(ids))
         return str(self._tokenizer.decode(list(ids[:end]), skip_special_tokens=True)).strip()

@@ -47,7 +47,7 @@ class ExpertStack(Stack):
     """The expert: what a block adds is read behind its gates, and its end in front of the last modulation."""
 
     def tap(self, site: Site) -> Tap:
-        """As in other stacks, with two attentions in a block."""
+        """Return the tap as in other stacks, with two attentions in a block."""
         if site.quantity in ("attention", "cross_attention", "mlp") and site.layer < len(self.layers):
             gate = getattr(self.layers[site.layer], f"{site.quantity}_gate")
             return Tap(gate, self.iterations or 1, "output")
@@ -62,7 +62,7 @@ class TowerStack(Stack):
     """The vision tower, whose last blocks are read in two places and meet no final norm."""
 
     def stream(self, name: str) -> Stream:
-        """What enters each block."""
+        """The input of each block."""
         return Stream(name, len(self.layers), self.width, part="vision", quantities=("residual",))
 
 
@@ -94,15 +94,15 @@ class MolmoAct2(DenoisingPolicy):
     @classmethod
     def current_values(cls, values: dict[str, Any], path: Path) -> dict[str, Any]:
         """A newer lerobot calls the precision of the weights `dtype`. Raises CheckpointError for two of them."""
-        found = {name: value for name, value in values.items() if name != _PRECISION}
+        renamed = {name: value for name, value in values.items() if name != _PRECISION}
         if (newer := values.get(_PRECISION)) is None:
-            return found
-        if found.setdefault("model_dtype", newer) != newer:
+            return renamed
+        if renamed.setdefault("model_dtype", newer) != newer:
             raise CheckpointError(
-                f"{path} says model_dtype: {found['model_dtype']!r} and dtype: {newer!r}. Keep the one that its "
+                f"{path} says model_dtype: {renamed['model_dtype']!r} and dtype: {newer!r}. Keep the one that its "
                 "weights were trained in"
             )
-        return found
+        return renamed
 
     @classmethod
     def parse_config(cls, folder: Path, evaluation: Evaluation) -> Any:
@@ -123,21 +123,21 @@ class MolmoAct2(DenoisingPolicy):
             raise CheckpointError(f"{folder} was trained for discrete actions only; the flow expert acts here")
         config.model_dtype = config.dtype = getattr(config, "dtype", None) or config.model_dtype
         config.inference_action_mode = "continuous"
-        place = network_folder(folder, config.checkpoint_path)
+        vlm_folder = network_folder(folder, config.checkpoint_path)
         try:
-            network: nn.Module = build_molmoact2(config, network_config(place), place)
+            network: nn.Module = build_molmoact2(config, network_config(vlm_folder), vlm_folder)
         except (FileNotFoundError, ValueError) as error:
             if not config.norm_tag:
                 raise
             raise CheckpointError(
-                f"{folder} names the statistics {config.norm_tag!r}, which {place} does not have ({error}). Put "
-                "its norm_stats.json there"
+                f"{folder} names the statistics {config.norm_tag!r}, which {vlm_folder} does not have ({error}). "
+                "Put its norm_stats.json there"
             ) from error
         return network
 
     @classmethod
     def current_keys(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """As lerobot stores them."""
+        """Return the tensors under lerobot's names."""
         return dict(tensors)
 
     def side_files(self) -> dict[str, Path]:
@@ -145,7 +145,7 @@ class MolmoAct2(DenoisingPolicy):
         return {**super().side_files(), **side_files(Path(self.config.checkpoint_path), "vlm/")}
 
     def own_units(self, feature: str, kind: str) -> SteppedUnits | None:
-        """As lerobot's steps have them: numbers that a mask leaves as they are, clamps, and frames of joints."""
+        """The units of lerobot's steps: numbers that a mask leaves unscaled, clamps, and frames of joints."""
         units, steps = super().own_units(feature, kind), self.config.steps
         if units is None:
             return None
@@ -163,7 +163,7 @@ class MolmoAct2(DenoisingPolicy):
     def batch(
         self, observations: Sequence[Observation], state: NDArray[np.float32] | None = None
     ) -> dict[str, Tensor]:
-        """In lerobot's keys; see `Packing`. state: (B, numbers) as the network reads them."""
+        """Return a batch in lerobot's keys; see `Packing`. state: (B, numbers) as the network reads them."""
         packed = self.packing.batch(self._rows(observations, self.state(observations) if state is None else state))
         return {name: tensor.to(self.config.device) for name, tensor in packed.items()}
 
@@ -208,15 +208,17 @@ class MolmoAct2(DenoisingPolicy):
 
     def _rows(self, observations: Sequence[Observation], state: NDArray[np.float32]) -> list[PackedRow]:
         pictures = [
-            {camera: checked_picture(one.image if camera == self.cameras[0] else one.cameras[camera])
+            {camera: checked_picture(o.image if camera == self.cameras[0] else o.cameras[camera])
              for camera in self.shown_cameras}
-            for one in observations
+            for o in observations
         ]  # fmt: skip
         rows = zip(pictures, observations, state, strict=True)
-        return [self.packing.row(shown, one.instruction, own) for shown, one, own in rows]
+        return [
+            self.packing.row(images, observation.instruction, numbers) for images, observation, numbers in rows
+        ]
 
     def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
-        """From the packing itself."""
+        """Roles from the packing itself."""
         state = self.read_state(observations)
         rows = self._rows(
             observations,
@@ -251,8 +253,8 @@ class MolmoAct2(DenoisingPolicy):
         rows = [self.packing.row(blank, text, state) for text in instructions]
         return [
             tuple(
-                one
-                for one, label in zip(row.inputs["input_ids"][0].tolist(), row.labels, strict=True)
+                token
+                for token, label in zip(row.inputs["input_ids"][0].tolist(), row.labels, strict=True)
                 if label in ("language", "special")
             )
             for row in rows
@@ -296,13 +298,13 @@ class MolmoAct2(DenoisingPolicy):
         return {"backbone_resid": lambda: stacked(run.tape, self.streams["backbone"])[0, :-1]}
 
 
-def _on_the_prompt(attention: Any, inputs: tuple[Any, ...], given: dict[str, Any], _: Any) -> Tensor:
+def _on_the_prompt(attention: Any, inputs: tuple[Any, ...], keywords: dict[str, Any], _: Any) -> Tensor:
     """(B, H, chunk, T): weights of the expert's actions on the prompt, whose kernel returns none."""
     queries = attention.q_proj(inputs[0]).unflatten(-1, (attention.num_heads, -1)).transpose(1, 2)
     if attention.q_norm is not None:
         queries = attention.q_norm(queries)
-    keys = attention._as_heads(given["kv_k"]).transpose(1, 2)
-    return shares(queries, keys, attention.head_dim**-0.5, {"attention_mask": given.get("attn_mask")})
+    keys = attention._as_heads(keywords["kv_k"]).transpose(1, 2)
+    return shares(queries, keys, attention.head_dim**-0.5, {"attention_mask": keywords.get("attn_mask")})
 
 
 def _of_width(marked: NDArray[np.bool_], numbers: int) -> NDArray[np.bool_]:
@@ -310,10 +312,10 @@ def _of_width(marked: NDArray[np.bool_], numbers: int) -> NDArray[np.bool_]:
     return marked if marked.shape == (numbers,) else np.zeros(numbers, bool)
 
 
-def network_folder(folder: Path, named: str) -> Path:
-    """Where the VLM's configuration and tokenizer lie: in the checkpoint, or on the hub, without its weights."""
-    inside = folder / named
-    return inside if inside.is_dir() else checkpoint_folder(named, SMALL_FILES)
+def network_folder(folder: Path, name: str) -> Path:
+    """The folder of the VLM's configuration and tokenizer: in the checkpoint, or on the hub without weights."""
+    inside = folder / name
+    return inside if inside.is_dir() else checkpoint_folder(name, SMALL_FILES)
 
 
 def load_molmoact2(

@@ -1,4 +1,4 @@
-"""What MolmoAct2 reads: lerobot's packing of each observation alone, then padding behind it.
+"""The inputs of MolmoAct2: lerobot's packing of each observation alone, then padding behind it.
 
 lerobot pads in front and counts positions from the padding on. The expert reads rotated keys, so that an action
 there depends on the longest prompt of its batch. Here each row is what it is alone.
@@ -91,8 +91,8 @@ class Packing:
         )
         patch = self.step.processor.image_token_ids[0]
         return [
-            next(patches) if one == patch else label
-            for one, label in zip(inputs["input_ids"][0].tolist(), labels, strict=True)
+            next(patches) if token == patch else label
+            for token, label in zip(inputs["input_ids"][0].tolist(), labels, strict=True)
         ]
 
     def batch(self, rows: Sequence[PackedRow]) -> dict[str, Tensor]:
@@ -108,8 +108,10 @@ class Packing:
             )
             for name in _TEXT
         }
-        rest = {name: torch.cat([row.inputs[name] for row in rows]) for name in (*_PICTURES, "action_dim_is_pad")}
-        return text | rest
+        unpadded = {
+            name: torch.cat([row.inputs[name] for row in rows]) for name in (*_PICTURES, "action_dim_is_pad")
+        }
+        return text | unpadded
 
 
 def padded_labels(rows: Sequence[PackedRow]) -> list[list[str]]:

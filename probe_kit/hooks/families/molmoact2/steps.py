@@ -1,4 +1,4 @@
-"""What lerobot's processor files of MolmoAct2 say besides statistics: packing, joint frames, clamps."""
+"""The settings in lerobot's processor files of MolmoAct2 besides statistics: packing, joint frames, clamps."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -35,7 +35,7 @@ _SAME = {
 
 @dataclass(frozen=True)
 class MolmoAct2Steps:
-    """Of one checkpoint. packing: fields that count over those of the configuration.
+    """The processor steps of one checkpoint. packing: fields that count over those of the configuration.
 
     state_frame, action_frame: of the joints. clamps_state, clamps_action: whether numbers are moved to -1 to 1.
     unclamped: (D,) True for numbers of the state that the clamp leaves out; None for those without statistics.
@@ -56,8 +56,8 @@ def read_steps(folder: Path, config: Any) -> MolmoAct2Steps:
     """
     saved = {step.name: step.config for step in every_step(folder)}
     if _PACK not in saved:
-        own = _frame(vars(config), folder)
-        return MolmoAct2Steps({}, own, own, clamps_state=True, clamps_action=True, unclamped=None)
+        frame = _frame(vars(config), folder)
+        return MolmoAct2Steps({}, frame, frame, clamps_state=True, clamps_action=True, unclamped=None)
     own_fields = saved[_PACK]
     wrong = [
         f"{name}: {own_fields[name]!r} ({theirs}: {getattr(config, theirs)!r})"
@@ -99,5 +99,7 @@ def in_packed_order(config: Any, folder: Path) -> dict[str, Any]:
     if missing := [key for key in config.image_keys if key not in config.input_features]:
         raise CheckpointError(f"{folder} packs {', '.join(missing)}, which its configuration does not have")
     pictures = {key: config.input_features[key] for key in config.image_keys}
-    others = {key: own for key, own in config.input_features.items() if key not in config.image_features}
-    return {**pictures, **others}
+    other_features = {
+        key: feature for key, feature in config.input_features.items() if key not in config.image_features
+    }
+    return {**pictures, **other_features}

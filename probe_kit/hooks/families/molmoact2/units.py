@@ -21,15 +21,15 @@ class JointFrame:
 
     def entered(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """(..., D) of the data set from (..., D) of the robot."""
-        found, joints = np.array(values, np.float32), len(self.signs)
-        found[..., :joints] = self.signs * found[..., :joints] + self.offsets
-        return found
+        mapped, joints = np.array(values, np.float32), len(self.signs)
+        mapped[..., :joints] = self.signs * mapped[..., :joints] + self.offsets
+        return mapped
 
     def left(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """(..., D) of the robot from (..., D) of the data set."""
-        found, joints = np.array(values, np.float32), len(self.signs)
-        found[..., :joints] = self.signs * (found[..., :joints] - self.offsets)
-        return found
+        mapped, joints = np.array(values, np.float32), len(self.signs)
+        mapped[..., :joints] = self.signs * (mapped[..., :joints] - self.offsets)
+        return mapped
 
 
 SAME_FRAME = JointFrame(np.zeros(0, np.float32), np.zeros(0, np.float32))
@@ -85,9 +85,9 @@ class SteppedUnits:
 
     def slope(self, numbers: int) -> NDArray[np.float32]:
         """(D,) of `restore`, where it does not clip."""
-        own = np.where(self.unscaled, 1, self.units.slope(numbers)).astype(np.float32)
-        own[: len(self.frame.signs)] *= self.frame.signs
-        return own
+        slopes = np.where(self.unscaled, 1, self.units.slope(numbers)).astype(np.float32)
+        slopes[: len(self.frame.signs)] *= self.frame.signs
+        return slopes
 
     def slopes(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """(..., D) of `restore` at these outputs of the network; 0 where it clips."""

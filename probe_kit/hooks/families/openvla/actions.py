@@ -33,14 +33,14 @@ class ActionTokens:
         """Normalised values of ids of any shape; an id outside the range counts as the nearest bin."""
         return np.asarray(self.centres[np.clip(self.vocabulary - 1 - ids, 0, self.bins - 2)])
 
-    def known(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Which ids name a bin."""
+    def is_action(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return, per id, True where it names a bin."""
         return np.asarray((ids >= self.vocabulary - self.bins) & (ids < self.vocabulary))
 
 
 @dataclass(frozen=True)
 class ActionStatistics:
-    """What turns normalised values into a data set's units: per dimension its 1 % and 99 % quantiles.
+    """The statistics that give values a data set's units: per dimension its 1 % and 99 % quantiles.
 
     mask: False for dimensions that stay as decoded, such as a gripper that is 0 or 1 in the data.
     sha256: of the numbers.
@@ -54,9 +54,9 @@ class ActionStatistics:
 
     @classmethod
     def choose(
-        cls, statistics: Mapping[str, Any], key: str | None, place: str = "the checkpoint"
+        cls, statistics: Mapping[str, Any], key: str | None, source: str = "the checkpoint"
     ) -> "ActionStatistics":
-        """Those of data set `key`; without one, of the only data set there is. place: what holds them.
+        """The statistics of data set `key`; without one, of the only data set. source: the file that holds them.
 
         Raises UsageError for a key that is not there or has to be chosen, CheckpointError for bad statistics.
         """
@@ -65,8 +65,8 @@ class ActionStatistics:
                 "the checkpoint has no norm_stats in its config.json and no dataset_statistics.json: its actions "
                 "have no physical unit. Take the statistics of the data set it was trained on"
             )
-        chosen = chosen_name(statistics, key, "unnorm_key", place)
-        return cls._read(chosen, statistics[chosen])
+        name = chosen_name(statistics, key, "unnorm_key", source)
+        return cls._read(name, statistics[name])
 
     @classmethod
     def _read(cls, key: str, entry: Mapping[str, Any]) -> "ActionStatistics":

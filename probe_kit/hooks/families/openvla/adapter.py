@@ -138,10 +138,10 @@ class OpenVLA(PrismaticModel, Policy):
         rows = [self.prompt(observation.instruction) for observation in observations]
         pixels = self.pixel_values(self._look(observation.image) for observation in observations)
         tokens = self.action_tokens
-        named = range(tokens.vocabulary - tokens.bins, tokens.vocabulary)
-        choose = chooser(self.temperature, seeds, self.top, named)
+        action_ids = range(tokens.vocabulary - tokens.bins, tokens.vocabulary)
+        choose = chooser(self.temperature, seeds, self.top, action_ids)
         ids: NDArray[np.int64] = self.generate(pixels, rows, choose).ids.cpu().numpy()
-        self.flagged = ~np.asarray(self.action_tokens.known(ids).all(axis=1))
+        self.flagged = ~np.asarray(self.action_tokens.is_action(ids).all(axis=1))
         return ids
 
     def pixel_values(self, images: Iterable[NDArray[np.uint8]]) -> Tensor:
@@ -178,7 +178,7 @@ class OpenVLA(PrismaticModel, Policy):
         return ids if ids[-1] == empty else [*ids, empty]
 
     def _check_other_ids(self, ids: list[int]) -> None:
-        """Of Llama's tokenizer it is known how it splits the prompt; another split would go unnoticed."""
+        """Compare the ids with Llama's recorded split of the prompt; another split would go unnoticed."""
         llama = self.config.text.model_type == "llama" and self.config.action_vocabulary == _LLAMA_VOCABULARY
         if llama and self.template == PROMPTS["openvla"] and ids[: len(_LLAMA_PROMPT)] != _LLAMA_PROMPT:
             raise CheckpointError(
@@ -217,7 +217,7 @@ def load_openvla(
     loaded = load_checkpoint(checkpoint or DEFAULT_CHECKPOINT, device, dtype, random_weights, bits, weights_seed)
     if loaded.config.model_type != "openvla":
         raise CheckpointError(f"{checkpoint} is a Prismatic model without actions; pass --model prismatic")
-    statistics = ActionStatistics.choose(loaded.statistics, unnorm_key, loaded.statistics_place)
+    statistics = ActionStatistics.choose(loaded.statistics, unnorm_key, loaded.statistics_source)
     template = _template(prompt, loaded.config)
     top = top_of(top_k, loaded.folders)
     return OpenVLA(loaded, statistics, template, centre_crop, tokenizer, temperature, resize, top)
@@ -226,8 +226,8 @@ def load_openvla(
 def openvla_units(checkpoint: str, *, unnorm_key: str | None = None, **_: Any) -> str:
     """See `Family.units`."""
     folders = checkpoint_folders(checkpoint, SMALL_FILES)
-    known, place = prismatic_statistics(PrismaticConfig.from_folder(folders[-1]), folders)
-    return f"{ActionStatistics.choose(known, unnorm_key, place).key}, from {place}"
+    by_data_set, source = prismatic_statistics(PrismaticConfig.from_folder(folders[-1]), folders)
+    return f"{ActionStatistics.choose(by_data_set, unnorm_key, source).key}, from {source}"
 
 
 def check_openvla_words(

@@ -22,9 +22,9 @@ def openvla_outputs(load: Callable[..., OpenVLA], folder: Path, recorded: Arrays
     The adapter adds the empty token to ids that are recorded without it.
     """
     checkpoint = folder / "checkpoint"
-    known = PrismaticConfig.from_folder(checkpoint).statistics
-    keys = [key for key in known if _ACTION + key in recorded]
-    policy = load(str(checkpoint), unnorm_key=next(iter(keys or known), None))
+    by_data_set = PrismaticConfig.from_folder(checkpoint).statistics
+    keys = [key for key in by_data_set if _ACTION + key in recorded]
+    policy = load(str(checkpoint), unnorm_key=next(iter(keys or by_data_set), None))
     added = _WITHOUT_EMPTY in recorded
     ids: list[int] = recorded[_WITHOUT_EMPTY if added else "input_ids"].ravel().tolist()
     reference = Reference(policy, recorded, policy.with_empty_token(ids) if added else ids)

@@ -70,11 +70,11 @@ class Ovis25(VisionLanguageModel):
 
     @cached_property
     def pictures(self) -> OvisPictures:
-        """How pictures become patches. Raises CheckpointError naming the missing file."""
+        """The processor of pictures into patches. Raises CheckpointError naming the missing file."""
         return OvisPictures.from_folder(self.loaded.folder, self.network.config.vision)
 
     def picture_ids(self, height: int, width: int) -> list[int]:
-        """As many as the picture's size demands, between the marks of its beginning and end."""
+        """Ids at a picture's positions, as many as its size demands, between two marks."""
         return [PICTURE_BEGINS, *[PICTURE] * self.pictures.tokens(height, width), PICTURE_ENDS]
 
     def picture_inputs(self, pictures: Pictures) -> dict[str, Tensor]:
@@ -91,8 +91,8 @@ class Ovis25(VisionLanguageModel):
 
         @torch.inference_mode()
         def words() -> NDArray[Any]:
-            shown = self.picture_inputs([first.observation.image])
-            probabilities = self.network.visual_tokenizer(shown["pixel_values"], shown["image_grid_thw"])
+            inputs = self.picture_inputs([first.observation.image])
+            probabilities = self.network.visual_tokenizer(inputs["pixel_values"], inputs["image_grid_thw"])
             missing = self.network.config.words - probabilities.shape[1]
             return np.pad(numpy_of(probabilities), ((0, 0), (0, missing)))
 
@@ -100,7 +100,7 @@ class Ovis25(VisionLanguageModel):
 
 
 def _windows_first(model: Ovis25) -> NDArray[np.intp]:
-    """Where the patches of the pictures under way stand in the order of the authors' code, window by window."""
+    """The order of the current pictures' patches in the authors' code, window by window."""
     vision = model.network.config.vision
     side = vision.window // vision.stride // vision.patch
     assert model._grid is not None

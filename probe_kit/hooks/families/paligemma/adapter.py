@@ -42,11 +42,11 @@ class PaliGemma(VisionLanguageModel):
 
     @cached_property
     def pictures(self) -> SquarePictures:
-        """How pictures become squares."""
+        """The processor of pictures into squares."""
         return SquarePictures.from_folder(self.loaded.folder, int(self.network.config.vision_config.image_size))
 
     def picture_ids(self, height: int, width: int) -> list[int]:
-        """As many for every size: a picture is shrunk to the tower's square."""
+        """Ids at a picture's positions, as many for every size: a picture is shrunk to the tower's square."""
         del height, width
         vision = self.network.config.vision_config
         return [int(self.network.config.image_token_id)] * (vision.image_size // vision.patch_size) ** 2
@@ -55,9 +55,9 @@ class PaliGemma(VisionLanguageModel):
         """pixel_values (B, 3, S, S)."""
         return {"pixel_values": self.pictures.pixels(pictures).to(self.loaded.device)}
 
-    def positions(self, packed: LeftPacked, shown: dict[str, Tensor]) -> Tensor:
+    def positions(self, packed: LeftPacked, picture_inputs: dict[str, Tensor]) -> Tensor:
         """(B, T), counted from one."""
-        del shown
+        del picture_inputs
         return packed.positions(_FIRST_POSITION)
 
     def other_inputs(self, packed: LeftPacked) -> dict[str, Tensor]:
@@ -73,7 +73,7 @@ def load_vlm_tiny(
     weights_seed: int = 0,
 ) -> PaliGemma:
     """The embedded VLM: PaliGemma at 0.61 million parameters, trained on the prompts of `probe-kit ask`."""
-    place = checkpoint or str(embedded_checkpoint("vlm-tiny"))
-    vlm = PaliGemma.load(place, device, dtype, random_weights, weights_seed=weights_seed)
+    location = checkpoint or str(embedded_checkpoint("vlm-tiny"))
+    vlm = PaliGemma.load(location, device, dtype, random_weights, weights_seed=weights_seed)
     vlm.card = replace(vlm.card, family="vlm-tiny", checkpoint=checkpoint or EMBEDDED)
     return vlm

@@ -124,8 +124,8 @@ def load_pi0_tiny(
 
     name: of the embedded checkpoint.
     """
-    place = checkpoint or str(embedded_checkpoint(name))
-    policy = Pi0.load(place, device, dtype, random_weights, weights_seed)
+    location = checkpoint or str(embedded_checkpoint(name))
+    policy = Pi0.load(location, device, dtype, random_weights, weights_seed)
     policy.card = replace(policy.card, family=name, checkpoint=checkpoint or EMBEDDED)
     return policy
 

@@ -26,7 +26,7 @@ EVALUATED_WITH: Mapping[str, str] = {"juexzz/INTACT-pi0-finetune-bridge": "bridg
 
 
 class EvaluatedPi0(LerobotFlow):
-    """What `Evaluation` decides of a pi0, and what follows where it decides nothing."""
+    """The settings that `Evaluation` decides of a pi0, and their defaults."""
 
     @classmethod
     def current_values(cls, values: dict[str, Any], path: Path) -> dict[str, Any]:
@@ -34,35 +34,35 @@ class EvaluatedPi0(LerobotFlow):
         return current_config(values, str(path)) if is_old_layout(values) else values
 
     def further_settings(self) -> dict[str, str]:
-        """What the evaluation decides, as far as it decides anything."""
-        evaluation, said = self.evaluation, {}
+        """The settings that the evaluation decides."""
+        evaluation, settings = self.evaluation, {}
         if (file := self._statistics) is not None:
-            said["statistics"] = file.sha256
+            settings["statistics"] = file.sha256
         elif evaluation.statistics is not None:
-            said["statistics"] = evaluation.statistics
+            settings["statistics"] = evaluation.statistics
         if self.picture != "padded":
-            said["picture"] = self.picture
+            settings["picture"] = self.picture
         if evaluation.openness != "measured":
-            said["openness"] = evaluation.openness
-        return said
+            settings["openness"] = evaluation.openness
+        return settings
 
     def units_of(self, feature: str, kind: str) -> Units:
         """The checkpoint's own; where it has none, those of its evaluation. Raises CheckpointError for both."""
-        given = self.evaluation.statistics
-        if given is not None and (own := self._own(feature, kind)) is not None and own.mode != "IDENTITY":
+        requested = self.evaluation.statistics
+        if requested is not None and (units := self._own(feature, kind)) is not None and units.mode != "IDENTITY":
             raise CheckpointError(
-                f"{self.checkpoint} holds the statistics of its {feature} itself ({own.source}), and {given} were "
-                "given too; leave -M statistics out"
+                f"{self.checkpoint} holds the statistics of its {feature} itself ({units.source}), and "
+                f"{requested} were given too; leave -M statistics out"
             )
-        if given == NO_STATISTICS:
+        if requested == NO_STATISTICS:
             nothing = np.zeros(0, np.float32)
             return Normaliser("IDENTITY", nothing, nothing, 0.0, "-M statistics=none")
         if self._statistics is not None:
             part: Literal["proprio", "action"] = "proprio" if kind == "STATE" else "action"
             action_numbers = int(self.config.output_features["action"].shape[0])
             return self._statistics.bounds(part, self._state_numbers if kind == "STATE" else action_numbers)
-        if (own := self.own_units(feature, kind)) is not None:
-            return own
+        if (units := self.own_units(feature, kind)) is not None:
+            return units
         raise CheckpointError(
             f"{self.checkpoint} leaves the units of its {feature} to its evaluation and has no "
             f"{' or '.join(FILES)}. Pass -M statistics=bridge, or a FILE with p01 and p99 of action and "
@@ -77,15 +77,15 @@ class EvaluatedPi0(LerobotFlow):
 
     @cached_property
     def _statistics(self) -> StatisticsFile | None:
-        """As given; or, for a checkpoint without own ones, from its folder or its evaluation. Else None."""
-        given = self.evaluation.statistics
-        if given is None and self._own(STATE, "STATE") is None and self._own("action", "ACTION") is None:
-            given = statistics_in(self.folder) or EVALUATED_WITH.get(str(without_revision(self.checkpoint)))
-        return None if given in (None, NO_STATISTICS) else StatisticsFile.read(str(given))
+        """The chosen statistics; for a checkpoint without own ones, its folder's or evaluation's. Else None."""
+        source = self.evaluation.statistics
+        if source is None and self._own(STATE, "STATE") is None and self._own("action", "ACTION") is None:
+            source = statistics_in(self.folder) or EVALUATED_WITH.get(str(without_revision(self.checkpoint)))
+        return None if source in (None, NO_STATISTICS) else StatisticsFile.read(str(source))
 
     @cached_property
     def picture(self) -> Picture:
-        """How pictures come to the network's resolution: as asked, or as the checkpoint's layout implies."""
+        """The way pictures get their size: as requested, or as the checkpoint's layout implies."""
         if self.evaluation.picture is not None:
             return self.evaluation.picture
         if self._statistics is not None:

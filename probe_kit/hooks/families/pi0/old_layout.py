@@ -35,7 +35,7 @@ def current_config(config: Mapping[str, Any], source: str) -> dict[str, Any]:
             "states and actions and is not supported; use a checkpoint without it"
         )
     dropped = {*_WITHOUT_EFFECT, *_FIXED}
-    found = {_RENAMED.get(name, name): value for name, value in config.items() if name not in dropped}
-    if found.get("image_resolution", True) is None:
-        del found["image_resolution"]  # pictures as they are given; they are given at today's default
-    return found
+    current = {_RENAMED.get(name, name): value for name, value in config.items() if name not in dropped}
+    if current.get("image_resolution", True) is None:
+        del current["image_resolution"]  # pictures as they are given; they are given at today's default
+    return current

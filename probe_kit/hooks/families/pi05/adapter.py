@@ -28,7 +28,7 @@ class GatedStack(Stack):
     """The expert, whose blocks add what they compute through a gate."""
 
     def tap(self, site: Site) -> Tap:
-        """What a block adds is read behind its gate."""
+        """Return the tap; a block's addition is read behind its gate."""
         if site.quantity in ("attention", "mlp") and site.layer < len(self.layers):
             return Tap(getattr(self.layers[site.layer], f"{site.quantity}_gate"), self.iterations or 1, "output")
         return super().tap(site)

@@ -71,25 +71,27 @@ class FastTokenizer:
         surplus ones are cut, as in lerobot's relaxed decoding. Each is a problem: lerobot says so only in its log.
         """
         problems = []
-        known = [own for own in ids if 0 <= own < self.size]
-        if len(known) < len(ids):
-            problems.append(f"{len(ids) - len(known)} of {len(ids)} tokens name no FAST token")
-        text = self.pieces.decode(known, skip_special_tokens=False)
+        fast_ids = [number for number in ids if 0 <= number < self.size]
+        if len(fast_ids) < len(ids):
+            problems.append(f"{len(ids) - len(fast_ids)} of {len(ids)} tokens name no FAST token")
+        text = self.pieces.decode(fast_ids, skip_special_tokens=False)
         if broken := text.count(_BROKEN):
             problems.append(f"the tokens break {broken} characters apart")
-        found = np.array([ord(one) for one in text if one != _BROKEN], np.int64) + self.least
-        wanted = horizon * dimensions
-        if len(found) != wanted:
-            problems.append(f"{len(found)} coefficients; a chunk has {horizon} x {dimensions}")
-        whole = np.zeros(wanted)
-        whole[: len(found)] = found[:wanted]
-        values = idct(whole.reshape(horizon, dimensions) / self.scale, axis=0, norm="ortho")
+        coefficients = (
+            np.array([ord(character) for character in text if character != _BROKEN], np.int64) + self.least
+        )
+        count = horizon * dimensions
+        if len(coefficients) != count:
+            problems.append(f"{len(coefficients)} coefficients; a chunk has {horizon} x {dimensions}")
+        filled = np.zeros(count)
+        filled[: len(coefficients)] = coefficients[:count]
+        values = idct(filled.reshape(horizon, dimensions) / self.scale, axis=0, norm="ortho")
         return DecodedChunk(np.asarray(values), tuple(problems))
 
 
 @dataclass(frozen=True)
 class ActionText:
-    """Where FAST's tokens are in what the network puts out: behind `begin`, before `end`.
+    """The place of FAST's tokens in the network's output: behind `begin`, before `end`.
 
     fast: the tokenizer. last: the id of its token 0; the others lie below. begin: ids of "Action: ". end: the id
     that ends a chunk. checked: whether a row must begin with `begin`.
@@ -103,7 +105,7 @@ class ActionText:
 
     @classmethod
     def of(cls, text: Any, fast: FastTokenizer, skipped: int, checked: bool) -> "ActionText":
-        """Of PaliGemma's tokenizer. skipped: ids at its end that stay free. Raises CheckpointError."""
+        """Read PaliGemma's tokenizer. skipped: ids at its end that stay free. Raises CheckpointError."""
         last = int(text.vocab_size) - 1 - skipped
         if last - fast.size < 0:
             raise CheckpointError(
@@ -114,35 +116,37 @@ class ActionText:
         return cls(fast, last, begin, int(text.convert_tokens_to_ids("|")), checked)
 
     def ids(self, fast: Sequence[int]) -> list[int]:
-        """What the network puts out for FAST's tokens: "Action: ", they, and the end."""
-        return [*self.begin, *(self.last - own for own in fast), self.end]
+        """The network's ids for FAST's tokens: "Action: ", the tokens, and the end."""
+        return [*self.begin, *(self.last - number for number in fast), self.end]
 
     def decode(self, ids: Sequence[int], horizon: int, dimensions: int) -> DecodedChunk:
         """The chunk in one row of ids. Also a problem: another beginning, and no end."""
-        own, problems = list(ids), []
-        if self.end in own:
-            own = own[: own.index(self.end)]
+        tokens, problems = list(ids), []
+        if self.end in tokens:
+            tokens = tokens[: tokens.index(self.end)]
         else:
-            problems.append(f"no end of the actions in {len(own)} tokens")
-        if self.checked and tuple(own[: len(self.begin)]) != self.begin:
+            problems.append(f"no end of the actions in {len(tokens)} tokens")
+        if self.checked and tuple(tokens[: len(self.begin)]) != self.begin:
             problems.append('the tokens do not begin with "Action: "')
-        chunk = self.fast.decode([self.last - one for one in self._without_begin(own)], horizon, dimensions)
+        chunk = self.fast.decode(
+            [self.last - number for number in self._without_begin(tokens)], horizon, dimensions
+        )
         return DecodedChunk(chunk.values, (*problems, *chunk.problems))
 
     def _without_begin(self, ids: Sequence[int]) -> list[int]:
         """Every "Action: " is left out, as lerobot does it."""
-        kept, at, length = [], 0, len(self.begin)
+        remaining, at, length = [], 0, len(self.begin)
         while at < len(ids):
             if tuple(ids[at : at + length]) == self.begin:
                 at += length
             else:
-                kept.append(ids[at])
+                remaining.append(ids[at])
                 at += 1
-        return kept
+        return remaining
 
 
 def fast_folder(checkpoint: Path, name: str) -> Path:
-    """Where the FAST tokenizer lies that a configuration names: in the checkpoint, or on the hub.
+    """The folder of the FAST tokenizer that a configuration names: in the checkpoint, or on the hub.
 
     Only its two data files are fetched, never its code. Raises CheckpointError.
     """

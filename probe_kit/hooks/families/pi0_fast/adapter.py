@@ -45,7 +45,7 @@ _LAST = slice(-1, None)
 
 @dataclass(frozen=True)
 class Decoding(Evaluation):
-    """How action tokens are put out. captured: those that are sites. temperature: None for the checkpoint's.
+    """The decoding of action tokens. captured: those that are sites. temperature: None for the checkpoint's.
 
     lowercase: the instruction in lower case, as openpi has it; lerobot keeps its case.
     """
@@ -102,17 +102,17 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
 
     @property
     def decoding(self) -> Decoding:
-        """How tokens are put out: as chosen, or as the checkpoint says."""
+        """The decoding, as chosen or as the checkpoint has it."""
         return self.evaluation if isinstance(self.evaluation, Decoding) else Decoding()
 
     @property
     def temperature(self) -> float:
         """0 for the likeliest token."""
-        asked = self.decoding.temperature
-        return float(self.config.temperature if asked is None else asked)
+        requested = self.decoding.temperature
+        return float(self.config.temperature if requested is None else requested)
 
     def further_settings(self) -> dict[str, str]:
-        """How the instruction is written and how tokens are put out."""
+        """The settings of instruction and decoding."""
         return {
             "captured_tokens": str(self.decoding.captured),
             "lowercase": str(self.decoding.lowercase),
@@ -120,7 +120,7 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
         }
 
     def prompts(self, instructions: Sequence[str], state: NDArray[np.float32]) -> list[str]:
-        """As lerobot words it, in lower case where that is chosen."""
+        """Return prompts as lerobot words them, in lower case where that is chosen."""
         return super().prompts([text.lower() if self.decoding.lowercase else text for text in instructions], state)
 
     def _notes(self) -> tuple[str, ...]:
@@ -149,7 +149,7 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
 
     @cached_property
     def action_text(self) -> ActionText:
-        """What the network's tokens mean."""
+        """The meaning of the network's tokens."""
         fast, checked = FastTokenizer.from_folder(self._fast_folder), self.config.validate_action_token_prefix
         return ActionText.of(self.tokenizer, fast, self.config.fast_skip_tokens, checked)
 

@@ -88,7 +88,7 @@ class PrismaticModel(Model):
         )
 
     def _settings(self, tokenizer: str | None) -> dict[str, str]:
-        """By content: what lies beside the weights, and a tokenizer from elsewhere."""
+        """The content of files beside the weights, and of a tokenizer from elsewhere."""
         files: dict[str, Path] = {}
         for number, folder in enumerate(self.loaded.folders):
             files |= side_files(folder, "" if number == len(self.loaded.folders) - 1 else "adapter/")
@@ -102,7 +102,7 @@ class PrismaticModel(Model):
 
     @cached_property
     def pictures(self) -> PictureSettings:
-        """How pictures are resized and normalised."""
+        """The settings of resizing and normalising pictures."""
         return PictureSettings.of(self.config, self.loaded.folders[-1])
 
     def pixel_values(self, images: Iterable[NDArray[np.uint8]]) -> Tensor:
@@ -219,7 +219,7 @@ class Prismatic(PrismaticModel, AnswerModel):
 
     @cached_property
     def frame(self) -> TextFrame:
-        """What the language model was trained to find around a question."""
+        """The text around a question with which the language model was trained."""
         return frame_of(self.config.language_id)
 
     def prompt(self, instruction: str) -> list[int]:
@@ -255,17 +255,17 @@ class Prismatic(PrismaticModel, AnswerModel):
         return self.frame.around(question.text) + question.begun
 
     def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
-        """Of the observations' instructions as questions."""
-        return self.asked_roles([Prompt(one, one.instruction) for one in observations])
+        """Roles of the observations' instructions as questions."""
+        return self.asked_roles([Prompt(observation, observation.instruction) for observation in observations])
 
     def asked_roles(self, questions: Sequence[Prompt]) -> dict[str, list[Roles]]:
         """Everything around picture and question is `special`, how an answer has begun too."""
-        shown = self.network.patches if self.shows_pictures(questions) else 0
-        image = [f"image.{CAMERA}"] * shown
+        patches = self.network.patches if self.shows_pictures(questions) else 0
+        image = [f"image.{CAMERA}"] * patches
         rows = []
         for question in questions:
             inside = self.tokenizer.inside(self._asked(question), *self.frame.place(question.text))
-            labels = ["language" if asked else "special" for asked in inside]
+            labels = ["language" if is_question else "special" for is_question in inside]
             rows.append([*labels[:1], *image, *labels[1:-1]])
         longest = max(map(len, rows))
         backbone = [Roles.from_labels(labels + [PADDING] * (longest - len(labels))) for labels in rows]
@@ -277,8 +277,8 @@ class Prismatic(PrismaticModel, AnswerModel):
             raise UsageError("this reading does not come from this model; pass what its read() returned")
         with torch.inference_mode():
             ids = reading.state.speak(tokens, self.ends)
-        said = [list(takewhile(lambda number: number not in self.ends, row)) for row in ids.tolist()]
-        return [self.tokenizer.decode(row) for row in said]
+        answers = [list(takewhile(lambda number: number not in self.ends, row)) for row in ids.tolist()]
+        return [self.tokenizer.decode(row) for row in answers]
 
     @cached_property
     def ends(self) -> frozenset[int]:
@@ -307,6 +307,10 @@ def load_prismatic(
     """
     loaded = load_checkpoint(checkpoint or DEFAULT_CHECKPOINT, device, dtype, random_weights, bits, weights_seed)
     elsewhere = loaded.config.tokenizer_id
-    if tokenizer is None and elsewhere and not any((own / "tokenizer.json").is_file() for own in loaded.folders):
+    if (
+        tokenizer is None
+        and elsewhere
+        and not any((folder / "tokenizer.json").is_file() for folder in loaded.folders)
+    ):
         loaded = replace(loaded, text=checkpoint_folder(elsewhere, _TOKENIZER_FILES))
     return Prismatic(loaded, steps, tokenizer)

@@ -65,7 +65,7 @@ class _Asked:
         return self.model.pixel_values(question.observation.image for question in self.questions)
 
     def produced(self) -> dict[str, Produce]:
-        """How to make every output the adapter can make."""
+        """Functions that make every output the adapter can make."""
         model, padding = self.model, int(self.model.config.text.pad_token_id or 0)
         lengths = [len(row) for row in self.prompts]
         bare = replace(self.questions[0], pictured=False)
@@ -121,5 +121,5 @@ class _Asked:
     def _greedy(self) -> NDArray[np.int64]:
         length, text = self.recorded["greedy_ids"].shape[1], self.model.config.text
         with torch.inference_mode():
-            said = [prefill.speak(length, self.model.ends)[0].numpy() for _, prefill in self.captured]
-        return padded_answers(said, length, self.model.ends, int(text.pad_token_id or 0))
+            answers = [prefill.speak(length, self.model.ends)[0].numpy() for _, prefill in self.captured]
+        return padded_answers(answers, length, self.model.ends, int(text.pad_token_id or 0))

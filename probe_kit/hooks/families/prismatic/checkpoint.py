@@ -31,7 +31,7 @@ class LoadedPrismatic:
     """A loaded network and what belongs to it.
 
     checkpoint: as asked for. folders: where its other files may lie, an adapter's own before that of its base.
-    statistics: per data set, what un-normalises its actions. statistics_place: what holds them.
+    statistics: per data set, what un-normalises its actions. statistics_source: the file that holds them.
     dtype: of the weights, as the card says it. text: the
     folder of a tokenizer that does not come with the checkpoint.
     """
@@ -41,7 +41,7 @@ class LoadedPrismatic:
     config: PrismaticConfig
     folders: tuple[Path, ...]
     statistics: Mapping[str, Any]
-    statistics_place: str
+    statistics_source: str
     audit: WeightsAudit
     dtype: str
     device: str
@@ -52,12 +52,12 @@ class LoadedPrismatic:
 
     @property
     def text_folders(self) -> tuple[Path, ...]:
-        """Where the tokenizer may lie."""
+        """The folders that may hold the tokenizer."""
         return self.folders if self.text is None else (*self.folders, self.text)
 
 
 def checkpoint_folders(checkpoint: str, files: Sequence[str] = FILES) -> tuple[Path, ...]:
-    """Where the files of a checkpoint may lie: an adapter's own folder before that of its base."""
+    """The folders that may hold a checkpoint's files: an adapter's own before that of its base."""
     folder = checkpoint_folder(checkpoint, files)
     adapter = adapter_in(folder)
     return (folder,) if adapter is None else tuple(dict.fromkeys((folder, adapter.base_folder(files))))
@@ -94,14 +94,14 @@ def load_checkpoint(
         quantise(network, bits)
         notes += (f"not exact: language model in {bits} bits",)
     folders = tuple(dict.fromkeys((folder, base)))
-    statistics, place = prismatic_statistics(config, folders)
+    statistics, statistics_source = prismatic_statistics(config, folders)
     return LoadedPrismatic(
         checkpoint=checkpoint,
         network=network.to(device),
         config=config,
         folders=folders,
         statistics=statistics,
-        statistics_place=place,
+        statistics_source=statistics_source,
         audit=audit,
         dtype=name if bits is None else f"{name}, {bits}-bit",
         device=device,
@@ -114,9 +114,9 @@ def load_checkpoint(
 def _check_other_heads(folders: tuple[Path, ...]) -> None:
     for folder in folders:
         for pattern in _OTHER_HEADS:
-            if found := sorted(folder.glob(pattern)):
+            if files := sorted(folder.glob(pattern)):
                 raise CheckpointError(
-                    f"{found[0]} belongs to OpenVLA-OFT, which does not decode its actions as tokens: "
+                    f"{files[0]} belongs to OpenVLA-OFT, which does not decode its actions as tokens: "
                     "running it as OpenVLA would give other actions than its authors'"
                 )
 
@@ -152,5 +152,5 @@ def _as_dtype(tensors: Mapping[str, Tensor], dtype: torch.dtype) -> dict[str, Te
 
 
 def prismatic_statistics(config: PrismaticConfig, folders: tuple[Path, ...]) -> tuple[Mapping[str, Any], str]:
-    """What fine-tuning wrote beside the weights, or else those of the base's config; see `stored_statistics`."""
+    """The statistics beside the weights, or else those of the base's config; see `stored_statistics`."""
     return stored_statistics(folders, config.statistics, f"config.json in {folders[-1]}")

@@ -27,7 +27,7 @@ class TextFrame:
         return f"{self.before}{question.strip()}{self.behind}"
 
     def place(self, question: str) -> tuple[int, int]:
-        """Where the question begins and ends in it."""
+        """The beginning and end of the question in the text."""
         return len(self.before), len(self.before) + len(question.strip())
 
 

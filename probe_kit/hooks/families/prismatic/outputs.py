@@ -36,11 +36,11 @@ INPUTS = (
 
 def prismatic_outputs(load: Callable[..., Any], folder: Path, recorded: Arrays) -> Outputs:
     """Compare a reference of a vision-language model: of one prompt, or of several questions."""
-    place = str(folder / "checkpoint")
+    checkpoint = str(folder / "checkpoint")
     if "in_rows_picture" in recorded:
-        return asked_outputs(load(place, dtype="float32"), folder, recorded)
+        return asked_outputs(load(checkpoint, dtype="float32"), folder, recorded)
     steps = recorded["generated_ids"].size if "generated_ids" in recorded else 1
-    reference = Reference(load(place, steps=steps), recorded, recorded["input_ids"].ravel().tolist())
+    reference = Reference(load(checkpoint, steps=steps), recorded, recorded["input_ids"].ravel().tolist())
     return reference.outputs((*INPUTS, "input_ids"))
 
 
@@ -52,7 +52,7 @@ class Reference:
         self.pixels = model.pixel_values([recorded["image_uint8"]])
         self.decoded, self.tape, _ = watch(model, lambda: model.generate(self.pixels, [prompt]))
 
-    def outputs(self, inputs: Collection[str], **further: Produce) -> Outputs:
+    def outputs(self, inputs: Collection[str], **family_outputs: Produce) -> Outputs:
         """Everything that the adapter can make, whether recorded or not. inputs: recorded names that went in."""
         valid: dict[str, NDArray[np.bool_]] = {}
         if "batch_attention_mask" in self.recorded:
@@ -60,7 +60,7 @@ class Reference:
             patches = np.ones((len(mask), self.model.network.patches), bool)
             positions = np.concatenate([mask[:, :1], patches, mask[:, 1:]], axis=1)
             valid = dict.fromkeys(("batch_hidden_states", "batch_logits"), positions)
-        return Outputs({**self._produced(), **further}, TOLERANCE, inputs, valid=valid)
+        return Outputs({**self._produced(), **family_outputs}, TOLERANCE, inputs, valid=valid)
 
     def _produced(self) -> dict[str, Produce]:
         forced = [*self.prompt, *self.decoded.ids[0].tolist()]
@@ -87,9 +87,9 @@ class Reference:
             return numpy_of(torch.stack(tower.get_intermediate_layers(channels, n=len(tower.blocks))))
 
         @torch.inference_mode()
-        def patches(*further: Callable[[Any], Any]) -> NDArray[Any]:
-            found = network.vision_backbone(self.pixels)
-            return numpy_of(further[0](found) if further else found)
+        def patches(*functions: Callable[[Any], Any]) -> NDArray[Any]:
+            features = network.vision_backbone(self.pixels)
+            return numpy_of(functions[0](features) if functions else features)
 
         def pixels(**changes: Any) -> NDArray[Any]:
             return prepare_picture(image, replace(settings, **changes))[None]

@@ -35,16 +35,16 @@ def read_release(file: Path, config: PrismaticConfig) -> Weights:
     """
     content = unpickled(file)
     parts = content.get("model") if isinstance(content, dict) else None
-    named = {name for name, part in parts.items() if part} if isinstance(parts, dict) else set()
-    if not isinstance(parts, dict) or not named >= _PARTS or named - _PARTS - {_TOWERS}:
+    filled = {name for name, part in parts.items() if part} if isinstance(parts, dict) else set()
+    if not isinstance(parts, dict) or not filled >= _PARTS or filled - _PARTS - {_TOWERS}:
         raise WeightsError(
-            f"{file} holds {', '.join(sorted(named)) or type(content).__name__} under `model`; expected "
+            f"{file} holds {', '.join(sorted(filled)) or type(content).__name__} under `model`; expected "
             f"{', '.join(sorted(_PARTS))} and perhaps {_TOWERS}. Download the checkpoint again"
         )
     tensors = dict(_renamed(parts["projector"], _LAYERS, file))
     tensors |= _renamed(parts["llm_backbone"], {"llm.": "language_model."}, file)
     source = str(file)
-    if _TOWERS in named:
+    if _TOWERS in filled:
         tensors |= _renamed(parts[_TOWERS], _tower_names(parts[_TOWERS], config, file), file)
     else:
         for name, tower in zip(_FEATURIZERS, config.towers, strict=False):
@@ -69,14 +69,14 @@ def _renamed(part: Any, names: Mapping[str, str], file: Path) -> Iterator[tuple[
 
 
 def _tower_names(part: Any, config: PrismaticConfig, file: Path) -> dict[str, str]:
-    """What the towers of a fully fine-tuned model are called in its file, and here."""
-    found = dict.fromkeys(str(name).partition(".")[0] for name in part)
-    if len(found) != len(config.towers):
+    """The towers' names in the file of a fully fine-tuned model, and here."""
+    towers = dict.fromkeys(str(name).partition(".")[0] for name in part)
+    if len(towers) != len(config.towers):
         raise WeightsError(
-            f"{file} holds the towers {', '.join(found)}; {config.vision_id} has {len(config.towers)} of them"
+            f"{file} holds the towers {', '.join(towers)}; {config.vision_id} has {len(config.towers)} of them"
         )
     # The first of two is DINOv2's, whatever the order in the file.
-    order = sorted(found, key=lambda name: not name.startswith("dino"))
+    order = sorted(towers, key=lambda name: not name.startswith("dino"))
     return {f"{theirs}.": f"vision_backbone.{ours}." for theirs, ours in zip(order, _FEATURIZERS, strict=False)}
 
 

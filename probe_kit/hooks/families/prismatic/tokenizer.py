@@ -20,7 +20,7 @@ BYTES = "bytes"
 
 
 class TextTokenizer(Protocol):
-    """What an adapter needs. special: ids that stand for no text."""
+    """The methods that an adapter needs. special: ids that stand for no text."""
 
     @property
     def special(self) -> frozenset[int]:
@@ -41,13 +41,13 @@ def id_behind(tokenizer: TextTokenizer, prompt: str, answer: str) -> int:
 
     Raises UsageError if the answer changes the prompt's own ids: its logit would be that of another prompt.
     """
-    before, whole = tokenizer.encode(prompt), tokenizer.encode(prompt + answer)
-    if whole[: len(before)] != before or len(whole) == len(before):
+    before, extended = tokenizer.encode(prompt), tokenizer.encode(prompt + answer)
+    if extended[: len(before)] != before or len(extended) == len(before):
         raise UsageError(
-            f"the answer {answer!r} merges with the end of the prompt: {whole[len(before) - 2 :]} instead of "
+            f"the answer {answer!r} merges with the end of the prompt: {extended[len(before) - 2 :]} instead of "
             f"{before[len(before) - 2 :]} and more. Give the option as it stands behind the prompt, such as ' A'"
         )
-    return whole[len(before)]
+    return extended[len(before)]
 
 
 @dataclass(frozen=True)
@@ -64,15 +64,15 @@ class FileTokenizer:
     @cached_property
     def _beginning(self) -> int | None:
         """The beginning-of-sequence id, from the tokenizer's own files before the model's configuration."""
-        named = self._config.get("bos_token")
-        content = named.get("content") if isinstance(named, dict) else named
-        found: int | None = self._tokenizer.token_to_id(content) if content else None
-        return self.beginning if found is None else found
+        bos_token = self._config.get("bos_token")
+        content = bos_token.get("content") if isinstance(bos_token, dict) else bos_token
+        number: int | None = self._tokenizer.token_to_id(content) if content else None
+        return self.beginning if number is None else number
 
     @cached_property
     def _config(self) -> dict[str, Any]:
-        beside = self.file.with_name("tokenizer_config.json")
-        return dict(load_json(beside)) if beside.is_file() else {}
+        file = self.file.with_name("tokenizer_config.json")
+        return dict(load_json(file)) if file.is_file() else {}
 
     @cached_property
     def special(self) -> frozenset[int]:
@@ -96,11 +96,11 @@ class FileTokenizer:
     def inside(self, text: str, start: int, stop: int) -> list[bool]:
         """Per id whether it holds any of these characters, by the offsets that the tokenizer gives."""
         encoding = self._tokenizer.encode(text)
-        found = [
+        flags = [
             first < stop and last > start and not special
             for (first, last), special in zip(encoding.offsets, encoding.special_tokens_mask, strict=True)
         ]
-        return [False] * (len(self.encode(text)) - len(found)) + found
+        return [False] * (len(self.encode(text)) - len(flags)) + flags
 
     def decode(self, ids: Sequence[int]) -> str:
         """The text of ids, without special tokens."""
@@ -127,8 +127,8 @@ class ByteTokenizer:
 
     def inside(self, text: str, start: int, stop: int) -> list[bool]:
         """Per id whether it is a byte of these characters."""
-        before, held = (len(part.encode()) for part in (text[:start], text[start:stop]))
-        return [False] + [before <= place < before + held for place in range(len(text.encode()))]
+        before, length = (len(part.encode()) for part in (text[:start], text[start:stop]))
+        return [False] + [before <= position < before + length for position in range(len(text.encode()))]
 
     def decode(self, ids: Sequence[int]) -> str:
         """The bytes among the ids as text."""
@@ -136,20 +136,20 @@ class ByteTokenizer:
 
 
 def find_tokenizer(
-    folders: Sequence[Path], chosen: str | None, beginning: int | None, vocabulary: int
+    folders: Sequence[Path], tokenizer: str | None, beginning: int | None, vocabulary: int
 ) -> TextTokenizer:
     """The checkpoint's tokenizer, or the one in the folder `chosen`, or bytes if that is asked for.
 
     vocabulary: the number of text ids the model has. Raises CheckpointError naming the missing files.
     """
-    if chosen == BYTES:
+    if tokenizer == BYTES:
         if vocabulary < 259:
             raise CheckpointError(f"bytes need 259 text ids; this checkpoint has {vocabulary}")
         return ByteTokenizer(1 if beginning is None else beginning)
-    places = list(folders) if chosen is None else [Path(chosen).expanduser()]
-    for place in places:
-        if (place / "tokenizer.json").is_file():
-            return FileTokenizer(place / "tokenizer.json", beginning)
+    places = list(folders) if tokenizer is None else [Path(tokenizer).expanduser()]
+    for folder in places:
+        if (folder / "tokenizer.json").is_file():
+            return FileTokenizer(folder / "tokenizer.json", beginning)
     raise CheckpointError(
         f"tokenizer.json and tokenizer_config.json are missing in {' and '.join(map(str, places))}. The tokenizer "
         "comes with the checkpoint: copy these files from the model's page, or from the model it was fine-tuned "

@@ -76,15 +76,15 @@ class SmolVLA(LerobotFlow):
 
     @cached_property
     def tokenizer(self) -> Any:
-        """That of the saved step, or else the VLM's, found by its name where there is no network yet."""
+        """The tokenizer of the saved step, or else the VLM's, by its name where there is no network yet."""
         from transformers import AutoTokenizer
 
         if (saved := tokenizer_folder(self.folder)) is not None:
             return load_pretrained(AutoTokenizer, saved)
-        named = tokenizer_name(self.folder)
+        name = tokenizer_name(self.folder)
         vlm = getattr(self.config, "vlm_named", None) or locate_vlm(self.config, self.folder)
-        if named is not None and named != vlm and is_on_hub(named) and is_on_hub(vlm):
-            return load_pretrained(AutoTokenizer, checkpoint_folder(named, SMALL_FILES))
+        if name is not None and name != vlm and is_on_hub(name) and is_on_hub(vlm):
+            return load_pretrained(AutoTokenizer, checkpoint_folder(name, SMALL_FILES))
         if hasattr(self, "network"):
             return self._joint.processor.tokenizer
         return load_pretrained(AutoTokenizer, _folder_of(vlm))
@@ -96,7 +96,7 @@ class SmolVLA(LerobotFlow):
 
     @property
     def masked_cameras(self) -> int:
-        """Of the cameras that are not shown, `empty_cameras` are masked and the rest left out, as lerobot does."""
+        """The count of masked cameras: of those not shown, `empty_cameras` are masked and the others left out."""
         return min(len(self.config.image_features) - len(self.shown_cameras), int(self.config.empty_cameras))
 
     def prefix_labels(self, language: Sequence[str]) -> list[str]:
@@ -133,8 +133,8 @@ class SmolVLA(LerobotFlow):
             if call < 0:
                 prompt = keys.shape[1]
             else:
-                given = {"attention_mask": mask[:, None]}
-                weights = shares(queries.transpose(1, 2), keys.transpose(1, 2), head_dim**-0.5, given)
+                keywords = {"attention_mask": mask[:, None]}
+                weights = shares(queries.transpose(1, 2), keys.transpose(1, 2), head_dim**-0.5, keywords)
                 note(acting[call % len(acting)], call // len(acting), weights[..., :prompt])
             read: Tensor = plain(mask, batch, head_dim, queries, keys, values)
             return read
@@ -166,7 +166,7 @@ def check_smolvla_words(checkpoint: str, instructions: Sequence[str]) -> None:
 
 
 def _folder_of(vlm: str) -> Path:
-    """Where the small files of the vision-language model are, a folder or a hub id."""
+    """The folder with the small files of a vision-language model, a folder or a hub id."""
     return checkpoint_folder(vlm, SMALL_FILES) if is_on_hub(vlm) else Path(vlm)
 
 

@@ -142,13 +142,13 @@ class SpatialVLA(Policy):
         )
 
     def _settings(self) -> dict[str, str]:
-        """By content: what lies beside the weights, a tokenizer from elsewhere, and every choice."""
-        files, chosen = side_files(self.loaded.folder), self.speech.tokenizer_choice
-        if chosen is not None and Path(chosen).is_dir():
-            files |= side_files(Path(chosen), "tokenizer/")
+        """The content of files beside the weights and of a tokenizer from elsewhere, and every choice."""
+        files, tokenizer = side_files(self.loaded.folder), self.speech.tokenizer_choice
+        if tokenizer is not None and Path(tokenizer).is_dir():
+            files |= side_files(Path(tokenizer), "tokenizer/")
         return {
             **content_hashes(files),
-            "tokenizer": chosen or "the checkpoint's",
+            "tokenizer": tokenizer or "the checkpoint's",
             "unnorm_key": self.statistics.key,
             "action_statistics": self.statistics.sha256,
             "action_bins": sha256_json(self.bins.content),
@@ -178,17 +178,20 @@ class SpatialVLA(Policy):
 
     @cached_property
     def picture_settings(self) -> PictureSettings:
-        """How pictures are resized."""
+        """The settings of resizing pictures."""
         return PictureSettings.of(self.config, self.loaded.folder)
 
     def pictures(self, observations: Sequence[Observation]) -> Tensor:
         """(B, 3, S, S) float32 in [0, 1]. Raises ObservationError."""
-        rows = [prepare_picture(checked_picture(one.image), self.picture_settings) for one in observations]
+        rows = [
+            prepare_picture(checked_picture(observation.image), self.picture_settings)
+            for observation in observations
+        ]
         return torch.from_numpy(np.stack(rows)).to(self.loaded.device)
 
     def cameras(self, observations: Sequence[Observation]) -> Tensor:
         """(B, 3, 3) float32 intrinsics for the pictures as the model sees them. Raises ObservationError."""
-        rows = [self._camera(one).at(self.config.side) for one in observations]
+        rows = [self._camera(observation).at(self.config.side) for observation in observations]
         return torch.from_numpy(np.stack(rows)).to(self.loaded.device)
 
     def _camera(self, observation: Observation) -> Intrinsics:
@@ -229,7 +232,7 @@ class SpatialVLA(Policy):
         rows = [self.prompt(observation.instruction) for observation in observations]
         ids = self.generate(self.pictures(observations), self.cameras(observations), rows).ids.cpu().numpy()
         ids = ids.reshape(len(observations), -1, STEP_TOKENS)
-        self.flagged = ~np.asarray(self.bins.known(ids[:, 0]).all(axis=-1))
+        self.flagged = ~np.asarray(self.bins.is_action(ids[:, 0]).all(axis=-1))
         if self.flagged.any():
             _say_unknown()
         actions = self.actions(ids)
@@ -323,10 +326,10 @@ def _vision_tap(tower: Any, site: Site) -> Tap:
 def _preset(loaded: LoadedSpatialVLA, camera: str) -> Intrinsics | None:
     if camera == SCENE:
         return None
-    known = known_cameras(loaded.processor, loaded.processor_file)
-    if camera not in known:
-        raise UsageError(f"camera {camera!r} is neither {SCENE} nor one of the checkpoint's: {', '.join(known)}")
-    return known[camera]
+    presets = known_cameras(loaded.processor, loaded.processor_file)
+    if camera not in presets:
+        raise UsageError(f"camera {camera!r} is neither {SCENE} nor one of the checkpoint's: {', '.join(presets)}")
+    return presets[camera]
 
 
 def check_spatialvla_words(
@@ -390,17 +393,17 @@ def load_spatialvla(
 def spatialvla_units(checkpoint: str, *, unnorm_key: str | None = None, **_: Any) -> str:
     """See `Family.units`."""
     folder = checkpoint_folder(checkpoint, SMALL_FILES)
-    known, place = _statistics(folder, read_processor(folder))
-    return f"{ActionStatistics.choose(known, unnorm_key, place).key}, from {place}"
+    by_data_set, source = _statistics(folder, read_processor(folder))
+    return f"{ActionStatistics.choose(by_data_set, unnorm_key, source).key}, from {source}"
 
 
 def choose_statistics(loaded: LoadedSpatialVLA, key: str | None) -> ActionStatistics:
-    """Those of data set `key`; without one, of the only data set there is.
+    """The statistics of data set `key`; without one, of the only data set there is.
 
     Raises UsageError for a key that is not there or has to be chosen, CheckpointError for bad statistics.
     """
-    known, place = _statistics(loaded.folder, loaded.processor)
-    statistics = ActionStatistics.choose(known, key, place)
+    by_data_set, source = _statistics(loaded.folder, loaded.processor)
+    statistics = ActionStatistics.choose(by_data_set, key, source)
     if len(statistics.low) != 7:
         raise CheckpointError(
             f"{statistics.key} has actions of {len(statistics.low)} dimensions; SpatialVLA's tokens name 7. "
@@ -412,10 +415,10 @@ def choose_statistics(loaded: LoadedSpatialVLA, key: str | None) -> ActionStatis
 def _statistics(folder: Path, processor: Mapping[str, Any]) -> tuple[Mapping[str, Any], str]:
     """Per data set, what un-normalises its actions, and what holds it. Raises CheckpointError for none."""
     file = str(folder / PROCESSOR_FILE)
-    known, place = stored_statistics((folder,), processor.get("statistics") or {}, file)
-    if not known:
+    by_data_set, source = stored_statistics((folder,), processor.get("statistics") or {}, file)
+    if not by_data_set:
         raise CheckpointError(
             f"{file} has no statistics: its actions have no physical unit. Copy the file from the model's page, "
             "or take the one that fine-tuning wrote"
         )
-    return known, place
+    return by_data_set, source

@@ -43,7 +43,7 @@ class LoadedSpatialVLA:
 
     @property
     def processor_file(self) -> str:
-        """What errors about bins, statistics and cameras name."""
+        """The file named by errors about bins, statistics and cameras."""
         return str(self.folder / PROCESSOR_FILE)
 
     @property

@@ -75,7 +75,7 @@ class _Reference:
         return SpatialVLA(loaded, speech, choose_statistics(loaded, None), camera, steps, steps, constrained=False)
 
     def produced(self) -> dict[str, Produce]:
-        """How to make every output the adapter can make, whether recorded or not."""
+        """Functions that make every output the adapter can make, whether recorded or not."""
         return {**self._sight(), **self._language(), **self._tokens()}
 
     # -- picture, depth, space ---------------------------------------------------------------------------
@@ -112,15 +112,15 @@ class _Reference:
     def _depth(self) -> Any:
         return self._seen.depth
 
-    def _thinned(self, whole: Tensor, name: str) -> NDArray[Any]:
-        """Of a large map only every n-th pixel is recorded."""
-        every = max(1, round(whole.shape[-1] / self.recorded[name].shape[-1]))
-        return _numpy(whole[..., ::every, ::every])
+    def _thinned(self, full_map: Tensor, name: str) -> NDArray[Any]:
+        """Every n-th pixel of a large map, as it is recorded."""
+        every = max(1, round(full_map.shape[-1] / self.recorded[name].shape[-1]))
+        return _numpy(full_map[..., ::every, ::every])
 
     # -- language model ----------------------------------------------------------------------------------
 
     def _run(self, policy: SpatialVLA, fed: Tensor | None = None) -> tuple[dict[str, Produce], ActivationCache]:
-        """What comes of the prompt, and of output tokens `fed` in the place of the policy's own."""
+        """The quantities of the prompt, and of output tokens `fed` in the place of the policy's own."""
         decoded, tape, _ = watch(policy, lambda: policy.generate(self.pictures, self.cameras, [self.prompt], fed))
         return generation_outputs(policy, "action", tape, decoded), tape
 

@@ -16,7 +16,7 @@ _END = "\n"
 
 @dataclass(frozen=True)
 class Speech:
-    """How an instruction becomes ids.
+    """The way from an instruction to ids.
 
     template: with a place for the instruction. lowercase: as in training; the released evaluation does not.
     tokenizer_choice: None for the checkpoint's, a folder, or `bytes`.
@@ -32,7 +32,7 @@ class Speech:
     def of(
         cls, config: SpatialVLAConfig, folder: Path, prompt: str | None, lowercase: bool, tokenizer: str | None
     ) -> "Speech":
-        """With a prompt by name or template. Raises UsageError for one without a place for the instruction."""
+        """Choose a prompt by name or template. Raises UsageError for one without a place for the instruction."""
         name = prompt or "bare"
         template = PROMPTS.get(name, name)
         if SLOT not in template:
@@ -43,15 +43,15 @@ class Speech:
     def tokenizer(self) -> TextTokenizer:
         """Raises CheckpointError naming files that are missing, or ids that are not this model's."""
         config = self.config
-        found = find_tokenizer([self.folder], self.tokenizer_choice, config.beginning, config.image_token)
+        tokenizer = find_tokenizer([self.folder], self.tokenizer_choice, config.beginning, config.image_token)
         if self.tokenizer_choice != BYTES:
             for token, expected in (("<image>", config.image_token), ("<ACTION00000>", config.first_action)):
-                if (ids := found.encode(token)[1:]) != [expected]:
+                if (ids := tokenizer.encode(token)[1:]) != [expected]:
                     raise CheckpointError(
                         f"the tokenizer reads {token} as {ids}; the model expects {expected}. It belongs to "
                         "another checkpoint: take the tokenizer files from the model's own page"
                     )
-        return found
+        return tokenizer
 
     def prompt(self, instruction: str) -> list[int]:
         """Ids of the whole prompt: the picture's places, beginning of sequence, text, new line.

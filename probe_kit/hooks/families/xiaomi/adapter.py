@@ -149,12 +149,12 @@ class Xiaomi(QwenVLA):
 
     @cached_property
     def units(self) -> ActionUnits:
-        """What gives actions their units and the chunk its length. Raises CheckpointError, UsageError."""
+        """The statistics that give actions units and the chunk its length. Raises CheckpointError, UsageError."""
         return read_units(self.folder, self._robot, self.config.action_dim)
 
     @cached_property
     def robot(self) -> Robot:
-        """How its scene is shown; the default one's way where no statistics name a robot.
+        """The robot as whose scene pictures are shown; the default one where no statistics name a robot.
 
         Raises UsageError for one that Act2Answer's arm cannot stand in for.
         """
@@ -197,9 +197,9 @@ class Xiaomi(QwenVLA):
         numbers = self.config.action_dim
         used = np.ones((self.card.chunk, numbers), np.float32) if isinstance(units, str) else units.used
         noise = seeded_noise(seeds, (self.card.chunk, numbers), self.device)
-        meant = torch.from_numpy(used).expand_as(noise.cpu()).to(self.device)
+        mask = torch.from_numpy(used).expand_as(noise.cpu()).to(self.device)
         output: NDArray[np.float32] = (
-            self.infer(self.inputs(observations), self.state(observations), meant, noise).cpu().numpy()
+            self.infer(self.inputs(observations), self.state(observations), mask, noise).cpu().numpy()
         )
         return output
 
@@ -207,8 +207,8 @@ class Xiaomi(QwenVLA):
         """(B, 1, state numbers) float32: the robot's own layout, filled up with zeros. Raises ObservationError."""
         rows = torch.zeros(len(observations), self.config.state_length, self.config.state_dim)
         for row, observation in zip(rows, observations, strict=True):
-            own = laid_out(np.asarray(observation.state, np.float32), ARM_NUMBERS, self.openness)
-            numbers = self.robot.state(own)
+            arm_state = laid_out(np.asarray(observation.state, np.float32), ARM_NUMBERS, self.openness)
+            numbers = self.robot.state(arm_state)
             if len(numbers) > self.config.state_dim:
                 raise ObservationError(
                     f"the state has {len(numbers)} numbers; this checkpoint reads {self.config.state_dim}"
@@ -234,13 +234,13 @@ class Xiaomi(QwenVLA):
     def record_attention(self, note: Note) -> AbstractContextManager[None]:
         """Computed once more from what a layer of the expert is given, under the block whose keys it reads."""
         layers: Any = self.network.dit.layers
-        first, own = len(self.language.layers) - len(layers), 1 + self.config.state_length
+        first, first_action = len(self.language.layers) - len(layers), 1 + self.config.state_length
 
         def acting(layer: int, iteration: int, weights: Tensor) -> None:
-            note(first + layer, iteration, weights[:, :, own:, : weights.shape[-1] - weights.shape[2]])
+            note(first + layer, iteration, weights[:, :, first_action:, : weights.shape[-1] - weights.shape[2]])
 
         return recording_weights(
-            [layer.attn for layer in layers], acting, lambda module, given, _, __: module.weights(*given)
+            [layer.attn for layer in layers], acting, lambda module, inputs, _, __: module.weights(*inputs)
         )
 
     def tap(self, site: Site) -> Tap:
@@ -299,8 +299,8 @@ def load_xiaomi(
     folder = checkpoint_folder(name)
     config = XiaomiConfig.from_folder(folder)
 
-    def build(kind: torch.dtype, place: str) -> XiaomiNetwork:
-        return build_xiaomi(config, kind, place)
+    def build(kind: torch.dtype, device: str) -> XiaomiNetwork:
+        return build_xiaomi(config, kind, device)
 
     kind = chosen_dtype(dtype, config.dtype, DTYPES) if dtype or config.dtype else None
     if random_weights:

@@ -83,7 +83,7 @@ def _valid(policy: Xiaomi, mask: NDArray[np.bool_]) -> dict[str, NDArray[np.bool
 
 
 def _restored(policy: Xiaomi, actions: NDArray[Any], recorded: Arrays) -> NDArray[Any]:
-    """With the recorded statistics, where there are some; else with the checkpoint's."""
+    """Actions in units of the recorded statistics, where there are some; else of the checkpoint's."""
     if not set(_NORMS) <= set(recorded):
         return policy.units.restore(actions)
     mean, deviation = (np.asarray(recorded[name], np.float64) for name in _NORMS)

@@ -44,7 +44,7 @@ SOFT_PROMPT = "soft_prompt"
 
 @dataclass(frozen=True)
 class XvlaChoice(Evaluation):
-    """What the files of X-VLA may not say. domain: the robot's number."""
+    """The choices that X-VLA's files may leave open. domain: the robot's number."""
 
     domain: int | None = None
 
@@ -64,7 +64,7 @@ class PostNormStack(Stack):
         return Tap(block, 1)
 
     def stream(self, name: str) -> Stream:
-        """What is stored of it."""
+        """The stored stream."""
         heads = int(self.layers[0].self_attn.num_heads)  # type: ignore[union-attr, arg-type]
         return Stream(name, len(self.layers) + 1, self.width, quantities=BLOCK, sums=False, heads=heads)
 
@@ -83,7 +83,7 @@ class SoftPromptedStack(Stack):
         return Tap(block.attn.proj if site.quantity == HEADS else block.norm1, fires)
 
     def stream(self, name: str) -> Stream:
-        """What is stored of it."""
+        """The stored stream."""
         heads = int(self.layers[0].attn.num_heads)  # type: ignore[union-attr, arg-type]
         return Stream(name, len(self.layers) + 1, self.width, self.iterations, quantities=BLOCK, heads=heads)
 
@@ -137,12 +137,12 @@ class Xvla(DenoisingPolicy):
 
     @property
     def steps(self) -> XvlaSteps:
-        """What the processor files say besides units."""
-        found: XvlaSteps = self.config.steps
-        return found
+        """The settings in the processor files besides units."""
+        steps: XvlaSteps = self.config.steps
+        return steps
 
     def further_settings(self) -> dict[str, str]:
-        """Whose soft prompts are read, and how pictures come to their size."""
+        """The robot whose soft prompts are read, and how pictures come to their size."""
         return {"domain": str(self.steps.domain), "picture": str(self.config.picture)}
 
     def _notes(self) -> tuple[str, ...]:
@@ -159,23 +159,25 @@ class Xvla(DenoisingPolicy):
         """(B, 3, H, W) in [0, 1]: squashed where that is chosen; lerobot's network pads any other."""
         if self.config.picture == "squashed":
             size = tuple(self.config.resize_imgs_with_padding)
-            images = [np.asarray(Image.fromarray(own).resize(size, Image.Resampling.BICUBIC)) for own in images]
+            images = [
+                np.asarray(Image.fromarray(image).resize(size, Image.Resampling.BICUBIC)) for image in images
+            ]
         return super().look(camera, images)
 
     def side_files(self) -> dict[str, Path]:
         """Also the tokenizer, where it is another folder's."""
-        place = self._tokenizer_folder
-        return {**super().side_files(), **({} if place == self.folder else side_files(place, "tokenizer/"))}
+        folder = self._tokenizer_folder
+        return {**super().side_files(), **({} if folder == self.folder else side_files(folder, "tokenizer/"))}
 
     @property
     def _tokenizer_folder(self) -> Path:
-        named = self.steps.tokenizer or self.config.tokenizer_name
-        inside = (self.folder / "tokenizer.json").is_file() and not Path(named).is_dir()
-        return self.folder if inside else checkpoint_folder(named, SMALL_FILES)
+        name = self.steps.tokenizer or self.config.tokenizer_name
+        inside = (self.folder / "tokenizer.json").is_file() and not Path(name).is_dir()
+        return self.folder if inside else checkpoint_folder(name, SMALL_FILES)
 
     @cached_property
     def tokenizer(self) -> Any:
-        """Of the folder itself, or the one it names."""
+        """The tokenizer of the folder itself, or the one it names."""
         from transformers import AutoTokenizer
 
         return load_pretrained(AutoTokenizer, self._tokenizer_folder)
@@ -190,7 +192,7 @@ class Xvla(DenoisingPolicy):
     def batch(
         self, observations: Sequence[Observation], state: NDArray[np.float32] | None = None
     ) -> dict[str, Tensor]:
-        """In lerobot's keys, as its processors leave them. state: (B, numbers) as the network reads them."""
+        """Return a batch as lerobot's processors leave it. state: (B, numbers) as the network reads them."""
         batch = super().batch(observations, state)
         mean, deviation = (torch.tensor(IMAGENET_STATS[name]).view(3, 1, 1) for name in ("mean", "std"))
         for camera in self.shown_cameras:
@@ -262,8 +264,8 @@ class Xvla(DenoisingPolicy):
             self.prefix_labels(self.text_labels(row, valid))
             for row, valid in zip(tokens.tolist(), mask.tolist(), strict=True)
         ]
-        further = [f"image.{camera}" for camera in self.shown_cameras[1:]] + ["special"] * self.masked_cameras
-        views = [label for label in further for _ in range(self.tokens_per_camera)]
+        other_views = [f"image.{camera}" for camera in self.shown_cameras[1:]] + ["special"] * self.masked_cameras
+        views = [label for label in other_views for _ in range(self.tokens_per_camera)]
         ends = [*views, *[SOFT_PROMPT] * int(self.config.len_soft_prompts)]
         return {
             "backbone": [Roles.from_labels(prompt) for prompt in prompts],
@@ -313,8 +315,8 @@ def load_xvla(
     domain: number of the robot's soft prompts; None for the one that the processor files name. picture: `padded`
     as lerobot or `squashed` as the authors; None for what `config.json` says.
     """
-    chosen = XvlaChoice(domain=domain, picture=picture)
-    return Xvla.load(checkpoint, device, dtype, random_weights, weights_seed, chosen)
+    choice = XvlaChoice(domain=domain, picture=picture)
+    return Xvla.load(checkpoint, device, dtype, random_weights, weights_seed, choice)
 
 
 def check_xvla_words(checkpoint: str, instructions: Sequence[str], domain: int | None = None, **_: Any) -> None:

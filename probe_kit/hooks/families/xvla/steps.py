@@ -1,4 +1,4 @@
-"""What lerobot's processor files of X-VLA say besides units: robot, tokenizer, ImageNet's mean."""
+"""The settings in lerobot's processor files of X-VLA besides units: robot, tokenizer, ImageNet's mean."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ STEPS = ("xvla_image_to_float", _MEAN, _DOMAIN)
 
 @dataclass(frozen=True)
 class XvlaSteps:
-    """Of one checkpoint. domain: the robot's number. tokenizer: name of its tokenizer, None where no file says.
+    """The settings of one checkpoint. domain: the robot's number. tokenizer: its name, None where no file has one.
 
     imagenet: whether pictures are normalised with ImageNet's mean and deviation. length: positions of the text.
     """
@@ -35,26 +35,26 @@ class XvlaSteps:
 
 
 def read_steps(folder: Path, domain: int | None, pictures: Sequence[str] = ()) -> XvlaSteps:
-    """From the processor files; `domain` counts over theirs. pictures: keys of all. Raises CheckpointError.
+    """Read the processor files; `domain` counts over theirs. pictures: keys of all. Raises CheckpointError.
 
     lerobot takes robot 0 where nothing names one: here it is an error, and so is a step that changes numbers in
     another way.
     """
     check_pipelines(folder)
     check_steps(folder, POSTPROCESSOR, (*NORMALISERS, *STEPS))
-    found: dict[str, Mapping[str, Any]] = {step.name: step.config for step in every_step(folder)}
+    configs: dict[str, Mapping[str, Any]] = {step.name: step.config for step in every_step(folder)}
     for name in STEPS:
-        keys = found.get(name, {}).get("image_keys")
-        if keys is not None and (others := sorted(set(pictures) - set(keys))):
+        keys = configs.get(name, {}).get("image_keys")
+        if keys is not None and (left_out := sorted(set(pictures) - set(keys))):
             raise CheckpointError(
-                f"{folder}: the step {name!r} leaves out {', '.join(others)} (image_keys); every picture is "
+                f"{folder}: the step {name!r} leaves out {', '.join(left_out)} (image_keys); every picture is "
                 "treated alike here. Take a checkpoint whose image_keys are null or name all"
             )
-    if domain is None and _DOMAIN not in found:
+    if domain is None and _DOMAIN not in configs:
         raise CheckpointError(f"{folder} names no robot; say whose soft prompts are read with -M domain=N")
-    text, length = found.get(TOKENIZER, {}), text_length(folder)
+    text, length = configs.get(TOKENIZER, {}), text_length(folder)
     if text.get("padding", "max_length") != "max_length":
         raise CheckpointError(f"{folder} pads its text in another way than behind its end up to a fixed length")
-    named = str(saved) if (saved := tokenizer_folder(folder)) is not None else text.get("tokenizer_name")
-    own = found.get(_DOMAIN, {}).get("domain_id", 0) if domain is None else domain
-    return XvlaSteps(int(own), _MEAN in found, named, length)
+    tokenizer = str(saved) if (saved := tokenizer_folder(folder)) is not None else text.get("tokenizer_name")
+    robot = configs.get(_DOMAIN, {}).get("domain_id", 0) if domain is None else domain
+    return XvlaSteps(int(robot), _MEAN in configs, tokenizer, length)

@@ -30,7 +30,7 @@ def test_the_run_its_folder_of_weights_and_the_file_are_the_same_checkpoint(run:
     places = (run, run / "checkpoints", run / "checkpoints" / NAME)
     parts = [find_parts(str(place), None) for place in places]
     assert {part.weights for part in parts} == {run / "checkpoints" / NAME}
-    assert {part.place for part in parts} == {run}
+    assert {part.run for part in parts} == {run}
     assert {part.vlm for part in parts} == {run.parent / "vlm"}
 
 
@@ -150,7 +150,7 @@ def test_a_converted_folder_is_whole_and_has_the_same_hash_and_actions(
     original = load_internvla(str(run), steps=5, unnorm_key="bridge_dataset")
     assert convert(str(run), tmp_path / "out") == original.card.weights_sha256
     copy = load_internvla(str(tmp_path / "out"), steps=5, unnorm_key="bridge_dataset")
-    assert copy.parts.vlm == copy.parts.place == tmp_path / "out"
+    assert copy.parts.vlm == copy.parts.run == tmp_path / "out"
     assert copy.card.weights_sha256 == original.card.weights_sha256
     np.testing.assert_array_equal(copy.act([observation], [3]), original.act([observation], [3]))
     with pytest.raises(UsageError, match="exists"):

@@ -20,13 +20,13 @@ def test_encoding_as_in_training_and_decoding_stays_within_half_a_bin() -> None:
     """Training digitises the action against 256 edges and subtracts the number from the vocabulary."""
     actions = np.linspace(-1, 1, 1001)
     ids = 32000 - np.digitize(actions, np.linspace(-1, 1, 256))
-    assert TOKENS.known(ids).all()
+    assert TOKENS.is_action(ids).all()
     assert np.abs(TOKENS.values(ids) - actions).max() <= 1 / 255 + 1e-12
 
 
 def test_ids_that_name_no_bin_are_known_as_such_and_count_as_the_nearest() -> None:
     ids = np.array([5, 31743, 32010])
-    assert not TOKENS.known(ids).any()
+    assert not TOKENS.is_action(ids).any()
     np.testing.assert_allclose(TOKENS.values(ids), [1 - 1 / 255, 1 - 1 / 255, -1 + 1 / 255])
 
 

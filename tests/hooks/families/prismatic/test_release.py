@@ -66,7 +66,7 @@ def test_a_folder_of_the_release_loads_as_the_id_does(cache: Path) -> None:
     assert load_prismatic(str(folder)).card.weights_sha256 == load_prismatic().card.weights_sha256
     assert checkpoint_folder(RELEASED_ID) == folder
     find_family("prismatic").check(str(folder))
-    assert find_family("prismatic").place(None) == RELEASED_ID
+    assert find_family("prismatic").location(None) == RELEASED_ID
 
 
 def test_no_other_model_of_the_repository_is_asked_for(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:

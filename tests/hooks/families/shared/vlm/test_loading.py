@@ -99,8 +99,8 @@ def test_a_configuration_that_describes_no_network_is_refused(tmp_path: Path) ->
 
 def test_a_size_stands_for_a_checkpoint(tmp_path: Path) -> None:
     family = find_family("qwen3-vl")
-    assert family.place(None, "4B") == "Qwen/Qwen3-VL-4B-Instruct"
-    assert family.place(None) == family.default_checkpoint == "Qwen/Qwen3-VL-8B-Instruct"
+    assert family.location(None, "4B") == "Qwen/Qwen3-VL-4B-Instruct"
+    assert family.location(None) == family.default_checkpoint == "Qwen/Qwen3-VL-8B-Instruct"
     with pytest.raises(UsageError, match="leave one of them out"):
         load_model("qwen3-vl", str(write_qwen3_vl(tmp_path)), size="4B")
     with pytest.raises(UsageError, match="expected one of 8B, 32B, 4B"):
