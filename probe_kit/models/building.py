@@ -17,8 +17,10 @@ def without_precision(values: Mapping[str, Any]) -> dict[str, Any]:
 
     transformers builds every part in the precision its own configuration names, whatever is asked for around it.
     """
-    kept = {name: value for name, value in values.items() if name not in ("dtype", "torch_dtype")}
-    return {name: without_precision(value) if isinstance(value, dict) else value for name, value in kept.items()}
+    remaining = {name: value for name, value in values.items() if name not in ("dtype", "torch_dtype")}
+    return {
+        name: without_precision(value) if isinstance(value, dict) else value for name, value in remaining.items()
+    }
 
 
 class _WithoutFilling(TorchFunctionMode):
@@ -35,7 +37,7 @@ class _WithoutFilling(TorchFunctionMode):
 def build_empty[Network: nn.Module](
     make: Callable[[], Network], dtype: torch.dtype, device: str = "meta"
 ) -> Network:
-    """What `make` makes, in eval mode, with parameters of `dtype`; without memory where only sizes are needed.
+    """Return the network of `make` in eval mode, with parameters of `dtype`; without memory where sizes suffice.
 
     device: `meta` for parameters that have names and shapes but no memory, to be filled with
     `load_weights(…, assign=True)`; `cpu` for uninitialised weights. The rotary frequencies, which no

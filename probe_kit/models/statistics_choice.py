@@ -25,39 +25,40 @@ def read_statistics(file: Path) -> dict[str, Any]:
 
 
 def stored_statistics(
-    folders: Sequence[Path], otherwise: Mapping[str, Any], named: str
+    folders: Sequence[Path], otherwise: Mapping[str, Any], source: str
 ) -> tuple[Mapping[str, Any], str]:
-    """The statistics that count for a checkpoint, and the place that holds them, for messages.
+    """The statistics that count for a checkpoint, and the name of their source, for messages.
 
     `dataset_statistics.json` of the first folder that has one stands alone: fine-tuning wrote it, and a
-    configuration still lists the data sets of the base. otherwise: those that count without the file, and `named`
+    configuration still lists the data sets of the base. otherwise: those that count without the file, and `source`
     where they stand. Raises CheckpointError for a file that cannot be read.
     """
     for folder in folders:
         if (file := folder / STATISTICS_FILE).is_file():
             return read_statistics(file), str(file)
-    return otherwise, named
+    return otherwise, source
 
 
-def chosen_name(known: Collection[str], chosen: str | None, option: str, place: str) -> str:
+def chosen_name(available: Collection[str], requested: str | None, option: str, source: str) -> str:
     """The data set, or robot, whose statistics are used: as chosen, or the only one.
 
-    option: of `-M`, for messages. place: what holds them. Raises UsageError for a name that is not there, and for
-    several without a choice: no file says whose units the actions get.
+    option: of `-M`, for messages. source: the file that holds them. Raises UsageError for a name that is not
+    there, and for several without a choice: no file says whose units the actions get.
     """
-    names = sorted(known)
+    names = sorted(available)
     listed = ", ".join(names[:_SHOWN]) + (f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else "")
-    if chosen is None:
+    if requested is None:
         if len(names) == 1:
             return names[0]
         raise UsageError(
-            f"{place} has several action statistics, and nothing says whose units the actions get. Choose one "
+            f"{source} has several action statistics, and nothing says whose units the actions get. Choose one "
             f"with -M {option}=NAME: {listed}"
         )
-    if chosen not in known:
-        near = get_close_matches(chosen, names, n=1)
+    if requested not in available:
+        near = get_close_matches(requested, names, n=1)
         hint = f" Did you mean {near[0]}?" if near else ""
         raise UsageError(
-            f"{place} has no action statistics of {chosen!r}. Choose one with -M {option}=NAME: {listed}.{hint}"
+            f"{source} has no action statistics of {requested!r}. Choose one with "
+            f"-M {option}=NAME: {listed}.{hint}"
         )
-    return chosen
+    return requested

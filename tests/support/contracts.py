@@ -147,8 +147,8 @@ class OfWholePictures(PolicySubject):
 class BegunAnswers(AnswerSubject):
     """A begun answer stands behind the frames."""
 
-    def questions_of(self, seen: Sequence[Observation]) -> list[Prompt]:
-        return [replace(asked, begun="It is ") for asked in super().questions_of(seen)]
+    def questions_of(self, observations: Sequence[Observation]) -> list[Prompt]:
+        return [replace(asked, begun="It is ") for asked in super().questions_of(observations)]
 
 
 _GOLDEN_WORDS = ("open the drawer", "pick up the red cube and place it on the tray", "open the tray")

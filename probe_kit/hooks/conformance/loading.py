@@ -120,7 +120,7 @@ def weights_of_a_file_have_no_seed(subject: Subject) -> None:
 def weights_that_are_not_exactly_the_models_are_refused(subject: Subject) -> None:
     """One tensor is missing, extra, of another shape, or NaN."""
     for damage, words in _DAMAGES.items():
-        copied = _copy(subject, damage)
+        copied = _copy(subject)
         _damage(copied, damage)
         with refused(f"a checkpoint in which {words}", WeightsError, CheckpointError):
             subject.load(copied)
@@ -143,11 +143,18 @@ def recorded_outputs_are_reproduced(subject: Subject) -> None:
     )
 
 
-def _copy(subject: Subject, name: str = "copy") -> Path:
-    """A copy of the checkpoint. Raises SkipTest where the family loads by no name."""
-    source = subject.checkpoint
+def _copy(subject: Subject) -> Path:
+    """Return a copy of the checkpoint, beside links to what lies beside the original.
+
+    Some layouts name files outside their folder, such as sizes, a tokenizer or a vision-language model at
+    `../vlm`. Raises SkipTest where the family loads by no name.
+    """
+    source, folder = subject.checkpoint, subject.folder
     assert subject.family
-    return Path(shutil.copytree(source, subject.folder / name))
+    for path in source.parent.iterdir():
+        if path.name != source.name:
+            (folder / path.name).symlink_to(path.resolve())
+    return Path(shutil.copytree(source, folder / source.name))
 
 
 def _damage(folder: Path, damage: str) -> None:

@@ -84,7 +84,7 @@ def _config() -> PaliGemmaConfig:
 def _pictures() -> dict[str, Any]:
     """SigLIP's own settings, and what part of a picture is looked at."""
     height, width = CAMERA_PICTURE
-    top, left, rows, columns = LOOKED_AT
+    top, column, rows, columns = LOOKED_AT
     return {
         "image_processor_type": "SiglipImageProcessor",
         "do_resize": True,
@@ -95,5 +95,5 @@ def _pictures() -> dict[str, Any]:
         "image_std": [0.5, 0.5, 0.5],
         "resample": 2,
         "size": {"height": IMAGE_SIDE, "width": IMAGE_SIDE},
-        CROP: [top / height, left / width, rows / height, columns / width],
+        CROP: [top / height, column / width, rows / height, columns / width],
     }

@@ -18,7 +18,7 @@ _OPTIONAL = ("do_resize", "do_rescale", "rescale_factor", "do_normalize", "resam
 
 @dataclass(frozen=True)
 class TiledPictures:
-    """How pictures become tiles.
+    """The processor of pictures into tiles.
 
     settings: the part of the checkpoint's file that the processor reads. tiled: cut into a grid, as the released
     processor does whatever its file says; False shows the whole picture as one tile.
@@ -31,8 +31,8 @@ class TiledPictures:
     def from_folder(cls, folder: Path, side: int, tiled: bool = True) -> "TiledPictures":
         """Read `preprocessor_config.json`. side: pixels the network expects. Raises CheckpointError."""
         values = processor_settings(folder, _NEEDED, _OPTIONAL)
-        if (found := square_side(values, folder)) != side:
-            raise CheckpointError(f"{folder} makes tiles of {found} pixels; config.json expects {side}")
+        if (stored_side := square_side(values, folder)) != side:
+            raise CheckpointError(f"{folder} makes tiles of {stored_side} pixels; config.json expects {side}")
         return cls(values, tiled)
 
     @property
@@ -48,6 +48,6 @@ class TiledPictures:
 
     def pixels(self, pictures: list[NDArray[np.uint8]]) -> Tensor:
         """(tiles of all pictures, 3, S, S) float32 of (H, W, 3) uint8 pictures."""
-        made = self._processor(images=pictures, input_data_format="channels_last", return_tensors="pt")
-        pixels: Tensor = made["pixel_values"]
+        processed = self._processor(images=pictures, input_data_format="channels_last", return_tensors="pt")
+        pixels: Tensor = processed["pixel_values"]
         return pixels

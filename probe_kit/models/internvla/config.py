@@ -82,11 +82,11 @@ class InternVLAConfig:
 
     @classmethod
     def from_values(cls, values: Mapping[str, Any], vlm: Mapping[str, Any], source: str) -> "InternVLAConfig":
-        """From the content of the files; vlm: of Qwen2.5-VL's config.json. Raises CheckpointError."""
+        """Read the content of the files; vlm: of Qwen2.5-VL's config.json. Raises CheckpointError."""
         framework = values.get("framework") or {}
-        if (found := framework.get("framework_py")) not in FRAMEWORKS:
+        if (framework_name := framework.get("framework_py")) not in FRAMEWORKS:
             raise CheckpointError(
-                f"{source} describes {found!r}; expected {FRAMEWORKS[0]}. Pass the right --model"
+                f"{source} describes {framework_name!r}; expected {FRAMEWORKS[0]}. Pass the right --model"
             )
         data = (values.get("datasets") or {}).get("vla_data") or {}
         size = data.get("image_size")
@@ -108,16 +108,16 @@ def find_config(folder: Path) -> tuple[dict[str, Any], Path]:
 
     Raises CheckpointError if neither has a `config.yaml`, a `config.json` of a run, or `dims.json`.
     """
-    for place in (folder, folder.parent):
-        files = [place / name for name in (DIMS_FILE, RUN_FILE) if (place / name).is_file()]
+    for candidate in (folder, folder.parent):
+        files = [candidate / name for name in (DIMS_FILE, RUN_FILE) if (candidate / name).is_file()]
         values: dict[str, Any] = {}
         for file in files:
             values |= _read(file)
-        if not (place / RUN_FILE).is_file() and (place / JSON_FILE).is_file():
-            run = _read(place / JSON_FILE)
+        if not (candidate / RUN_FILE).is_file() and (candidate / JSON_FILE).is_file():
+            run = _read(candidate / JSON_FILE)
             values |= run if "framework" in run else {}
         if values:
-            return values, place
+            return values, candidate
     raise CheckpointError(
         f"{RUN_FILE} or {JSON_FILE} of a run is missing in {folder} and in {folder.parent}; this is not an "
         "InternVLA-M1 checkpoint. A release has it beside the folder checkpoints/"

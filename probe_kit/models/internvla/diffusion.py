@@ -73,7 +73,7 @@ class Block(nn.Module):
 
 
 class FinalLayer(nn.Module):
-    """From the stream to the noise in every position."""
+    """The map from the stream to the noise in every position."""
 
     def __init__(self, width: int, outputs: int) -> None:
         super().__init__()
@@ -141,10 +141,10 @@ class Schedule:
         return len(self.moments)
 
     def back(self, index: int, path: Tensor, noise: Tensor) -> Tensor:
-        """From step `index` to the one below it, without new noise; below the lowest there is signal only."""
-        here = float(self.signal[index])
+        """Return the path one step below `index`, without new noise; below the lowest there is signal only."""
+        signal = float(self.signal[index])
         below = float(self.signal[index - 1]) if index else 1.0
-        clean = math.sqrt(1 / here) * path - math.sqrt(1 / here - 1) * noise
+        clean = math.sqrt(1 / signal) * path - math.sqrt(1 / signal - 1) * noise
         return clean * math.sqrt(below) + math.sqrt(1 - below) * noise
 
 

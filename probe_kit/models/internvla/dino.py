@@ -81,8 +81,8 @@ class DinoV2(nn.Module):
         trained = round((self.pos_embed.shape[1] - 1) ** 0.5)
         if rows == columns == trained:
             return self.pos_embed
-        whole = self.pos_embed.float()
-        grid = whole[:, 1:].reshape(1, trained, trained, -1).permute(0, 3, 1, 2)
+        embeddings = self.pos_embed.float()
+        grid = embeddings[:, 1:].reshape(1, trained, trained, -1).permute(0, 3, 1, 2)
         factors = ((rows + _OFFSET) / trained, (columns + _OFFSET) / trained)
         stretched = functional.interpolate(grid, scale_factor=factors, mode="bicubic")
-        return torch.cat([whole[:, :1], stretched.flatten(2).transpose(1, 2)], dim=1)
+        return torch.cat([embeddings[:, :1], stretched.flatten(2).transpose(1, 2)], dim=1)

@@ -65,9 +65,9 @@ class InternVLANetwork(nn.Module):
         keywords = inputs.keywords(self.vlm.model)
         states = self.vlm.model(**keywords, output_hidden_states=True, use_cache=False).hidden_states
         features = self.dino_encoder.body(views.to(self.dino_pro.weight.dtype))
-        seen = self.dino_pro(features.reshape(len(inputs.ids), -1, features.shape[-1]))
-        chosen = states[self.config.query.first : self.config.query.last]
-        condition: Tensor = self.layer_qformer([torch.cat([state, seen], dim=1) for state in chosen])
+        projected = self.dino_pro(features.reshape(len(inputs.ids), -1, features.shape[-1]))
+        read_states = states[self.config.query.first : self.config.query.last]
+        condition: Tensor = self.layer_qformer([torch.cat([state, projected], dim=1) for state in read_states])
         return condition
 
     def denoise(self, condition: Tensor, noise: Tensor, schedule: Schedule, scale: float) -> Tensor:
@@ -83,12 +83,12 @@ class InternVLANetwork(nn.Module):
         path = noise.float()
         for index in reversed(range(len(schedule))):
             steps = torch.full((len(rows),), int(schedule.moments[index]), device=path.device)
-            seen = path.repeat(len(rows) // len(path), 1, 1).to(condition.dtype)
-            found = self.head(seen, steps, rows).float()
+            noisy = path.repeat(len(rows) // len(path), 1, 1).to(condition.dtype)
+            predicted = self.head(noisy, steps, rows).float()
             if guided(scale):
-                with_condition, without_it = found.chunk(2)
-                found = without_it + scale * (with_condition - without_it)
-            path = schedule.back(index, path, found)
+                with_condition, without_it = predicted.chunk(2)
+                predicted = without_it + scale * (with_condition - without_it)
+            path = schedule.back(index, path, predicted)
         return path
 
 

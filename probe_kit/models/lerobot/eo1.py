@@ -36,12 +36,12 @@ def build_eo1(config: EO1Config, device: str = "cpu") -> EO1Policy:
     vlm: Any = policy.model.vlm_backbone
     vlm.to(getattr(torch, config.dtype))
     fill_rotary(vlm)
-    kept = PromptKV(int(vlm.config.text_config.num_hidden_layers))
-    policy.model.prompt_kv = kept
+    prompt_kv = PromptKV(int(vlm.config.text_config.num_hidden_layers))
+    policy.model.prompt_kv = prompt_kv
 
-    def send(_: nn.Module, __: Any, given: Mapping[str, Any], output: Any) -> None:
-        if given.get("pixel_values") is not None:  # the prompt; steps of the flow read no picture
-            kept(output.past_key_values.layers)
+    def send(_: nn.Module, __: Any, keywords: Mapping[str, Any], output: Any) -> None:
+        if keywords.get("pixel_values") is not None:  # the prompt; steps of the flow read no picture
+            prompt_kv(output.past_key_values.layers)
 
     vlm.model.register_forward_hook(send, with_kwargs=True)
     return policy
@@ -59,27 +59,29 @@ def full_size_eo1() -> EO1Policy:
 
 
 class Packing:
-    """lerobot's chat of pictures, state, instruction and actions. place: of the processor's files.
+    """lerobot's chat of pictures, state, instruction and actions. folder: of the processor's files.
 
     Raises CheckpointError for files without a chat template.
     """
 
-    def __init__(self, place: Path, chunk: int, fields: Mapping[str, Any]) -> None:
+    def __init__(self, folder: Path, chunk: int, fields: Mapping[str, Any]) -> None:
         self.chunk = chunk
         logging.getLogger("transformers.processing_utils").addFilter(_is_news)
         safely = SimpleNamespace(from_pretrained=partial(load_pretrained, Qwen2_5_VLProcessor))
         with replaced(processor_eo1, {"Qwen2_5_VLProcessor": safely}):
-            self.step = EO1QwenProcessorStep(**{**fields, "processor_name": str(place)})
+            self.step = EO1QwenProcessorStep(**{**fields, "processor_name": str(folder)})
         processor: Any = self.step._processor
         if processor.chat_template is None:
             raise CheckpointError(
-                f"{place} has no chat_template, and EO-1 reads a chat. Take Qwen2.5-VL's own files"
+                f"{folder} has no chat_template, and EO-1 reads a chat. Take Qwen2.5-VL's own files"
             )
         self.tokenizer: Any = processor.tokenizer
 
     def batch(self, pictures: Mapping[str, Tensor], tasks: Sequence[str]) -> dict[str, Any]:
-        """What the network reads besides the state. pictures: (B, 3, H, W) in [0, 1] by lerobot's key."""
-        features = {key: PolicyFeature(FeatureType.VISUAL, tuple(own.shape[1:])) for key, own in pictures.items()}
+        """The inputs of the network besides the state. pictures: (B, 3, H, W) in [0, 1] by lerobot's key."""
+        features = {
+            key: PolicyFeature(FeatureType.VISUAL, tuple(picture.shape[1:])) for key, picture in pictures.items()
+        }
         data = TransitionKey.COMPLEMENTARY_DATA
         transition: Any = {TransitionKey.OBSERVATION: dict(pictures), data: {"task": list(tasks)}}
         packed = self.step(EO1ConversationTemplateStep(features, self.chunk)(transition))[data]

@@ -35,15 +35,15 @@ def network_config(values: Mapping[str, Any], config: GrootConfig, vlm: str) -> 
     vlm: `VLM`, or the folder of the vision-language model's configuration. Raises CheckpointError for another kind
     of backbone.
     """
-    own = GR00TN17Config.from_dict(dict(values))
-    if own.backbone_model_type != "qwen":
+    network = GR00TN17Config.from_dict(dict(values))
+    if network.backbone_model_type != "qwen":
         raise CheckpointError(
-            f"the backbone is {own.backbone_model_type!r}; lerobot's GR00T N1.7 has a Qwen3-VL, 'qwen'"
+            f"the backbone is {network.backbone_model_type!r}; lerobot's GR00T N1.7 has a Qwen3-VL, 'qwen'"
         )
-    own.model_name, own.use_flash_attention, own.load_bf16 = vlm, False, False
+    network.model_name, network.use_flash_attention, network.load_bf16 = vlm, False, False
     if config.num_inference_timesteps is not None:
-        own.num_inference_timesteps = config.num_inference_timesteps
-    return own
+        network.num_inference_timesteps = config.num_inference_timesteps
+    return network
 
 
 def build_groot(config: GrootConfig, network: GR00TN17Config, device: str = "cpu") -> GrootPolicy:
@@ -82,17 +82,17 @@ def flow_actions(policy: Any, inputs: Mapping[str, Tensor], noise: Tensor) -> Te
     inputs: what lerobot's processors pack. H, D: the network's own horizon and widest action.
     """
     model, head = policy._groot_model, policy._groot_model.action_head
-    given = {name: _placed(tensor, model) for name, tensor in inputs.items()}
+    placed = {name: _placed(tensor, model) for name, tensor in inputs.items()}
     with _precision(policy, noise.device.type):
-        prompt = model.backbone(BatchFeature(given))
-        features = head._encode_features(prompt, BatchFeature(given))
+        prompt = model.backbone(BatchFeature(placed))
+        features = head._encode_features(prompt, BatchFeature(placed))
         read, state = features.backbone_features, features.state_features
         masks = {"image_mask": prompt.image_mask, "backbone_attention_mask": prompt.backbone_attention_mask}
         actions = noise.to(read.dtype)
         for step in range(head.num_inference_timesteps):
             time = int(step / float(head.num_inference_timesteps) * head.num_timestep_buckets)
             times = torch.full((len(noise),), time, device=noise.device)
-            noisy = head.action_encoder(actions, times, given["embodiment_id"])
+            noisy = head.action_encoder(actions, times, placed["embodiment_id"])
             if head.config.add_pos_embed:
                 noisy = noisy + head.position_embedding(torch.arange(noisy.shape[1], device=noise.device))[None]
             read_by = head.model(
@@ -101,16 +101,16 @@ def flow_actions(policy: Any, inputs: Mapping[str, Tensor], noise: Tensor) -> Te
                 timestep=times,
                 **(masks if head.config.use_alternate_vl_dit else {}),
             )
-            velocity = head.action_decoder(read_by, given["embodiment_id"])[:, -head.action_horizon :]
+            velocity = head.action_decoder(read_by, placed["embodiment_id"])[:, -head.action_horizon :]
             actions = actions + 1.0 / head.num_inference_timesteps * velocity
     return actions
 
 
 def _placed(tensor: Tensor, model: Any) -> Tensor:
-    """As the network's own `prepare_input`: numbers in the precision of its weights."""
+    """Return a tensor as the network's own `prepare_input` does: numbers in the precision of its weights."""
     return tensor.to(model.device, model.dtype if tensor.is_floating_point() else tensor.dtype)
 
 
 def _precision(policy: Any, device: str) -> AbstractContextManager[Any]:
-    """As lerobot runs a checkpoint whose configuration says `use_bf16`."""
+    """The precision in which lerobot runs a checkpoint whose configuration says `use_bf16`."""
     return torch.autocast(device_type=device, dtype=torch.bfloat16, enabled=policy.config.use_bf16)

@@ -58,26 +58,26 @@ _PARTS = ("msa", "mca", "mlp")
 """What a block of the expert adds: self-attention, attention to the prompt, MLP."""
 
 
-def network_config(place: Path | None = None) -> NetworkConfig:
+def network_config(folder: Path | None = None) -> NetworkConfig:
     """The configuration in the VLM's own folder; without one, that of the released sizes."""
     with warnings.catch_warnings():
         # lerobot calls a check that transformers announces to remove; no user can change that.
         warnings.filterwarnings("ignore", "`rope_config_validation`", FutureWarning)
-        found: NetworkConfig = (
-            NetworkConfig(**RELEASED) if place is None else load_pretrained(NetworkConfig, place)
+        config: NetworkConfig = (
+            NetworkConfig(**RELEASED) if folder is None else load_pretrained(NetworkConfig, folder)
         )
-    return found
+    return config
 
 
 def build_molmoact2(
-    config: MolmoAct2Config, network: NetworkConfig, place: Path, device: str = "cpu"
+    config: MolmoAct2Config, network: NetworkConfig, folder: Path, device: str = "cpu"
 ) -> MolmoAct2Policy:
     """lerobot's policy as `lerobots_policy` builds it, with modules that lerobot has not.
 
     Each block of the expert gets one per part that it adds: `attention_gate`, `cross_attention_gate`, `mlp_gate`.
     The prompt's keys and values pass through `prompt_kv`. Results stay lerobot's, bit for bit.
     """
-    policy = lerobots_policy(config, network, place, device)
+    policy = lerobots_policy(config, network, folder, device)
     backbone: Any = policy._backbone()
     backbone.prompt_kv = PromptKV(len(backbone.transformer.blocks))
     for block in backbone.action_expert.blocks:
@@ -86,21 +86,21 @@ def build_molmoact2(
 
 
 def lerobots_policy(
-    config: MolmoAct2Config, network: NetworkConfig, place: Path, device: str = "cpu"
+    config: MolmoAct2Config, network: NetworkConfig, folder: Path, device: str = "cpu"
 ) -> MolmoAct2Policy:
     """A `MolmoAct2Policy` in eval mode with uninitialised weights and CUDA graphs off.
 
-    network: the configuration in the VLM's own folder `place`.
+    network: the configuration in the VLM's own folder `folder`.
     """
     device = building_device(device)
-    config.device, config.checkpoint_path = device, str(place)
+    config.device, config.checkpoint_path = device, str(folder)
     dtype = DTYPES[config.model_dtype]
 
     def built(*_: Any, **__: Any) -> Any:
         return build_empty(lambda: MolmoAct2ForConditionalGeneration(network), dtype, device)
 
     replacements = {
-        "_resolve_checkpoint_location": lambda *_, **__: str(place),
+        "_resolve_checkpoint_location": lambda *_, **__: str(folder),
         "HFMolmoAct2Config": SimpleNamespace(from_pretrained=lambda *_, **__: network),
         "MolmoAct2ForConditionalGeneration": SimpleNamespace(from_pretrained=built),
         "_strict_load_safetensors_weights": lambda *_: None,
@@ -161,15 +161,15 @@ def flow_actions(policy: Any, inputs: Mapping[str, Tensor], noise: Tensor, padde
 
     inputs: what lerobot's processor packs. padded: (B, 32) True for numbers that no action has.
     """
-    backbone, given = policy._backbone(), policy._model_inputs(inputs)
+    backbone, model_inputs = policy._backbone(), policy._model_inputs(inputs)
     steps = int(policy.config.num_inference_steps or backbone.config.flow_matching_num_steps)
     with _precision(policy):
-        outputs = backbone(**given, use_cache=True)
+        outputs = backbone(**model_inputs, use_cache=True)
         backbone.prompt_kv(outputs.past_key_values.layers)
         states = backbone._extract_kv_states(outputs.past_key_values)
-        mask = backbone._get_encoder_attention_mask(given["input_ids"], given.get("attention_mask"))
+        mask = backbone._get_encoder_attention_mask(model_inputs["input_ids"], model_inputs.get("attention_mask"))
         gate, depth = backbone._depth_gate_from_condition(
-            input_ids=given["input_ids"], encoder_attention_mask=mask, layer_kv_states=states
+            input_ids=model_inputs["input_ids"], encoder_attention_mask=mask, layer_kv_states=states
         )
         states = backbone._apply_depth_gate_to_layer_kv_states(states, depth, gate)
         expert, rows, device = backbone._require_action_expert(), len(noise), noise.device
@@ -194,7 +194,7 @@ def flow_actions(policy: Any, inputs: Mapping[str, Tensor], noise: Tensor, padde
 
 
 def _precision(policy: Any) -> AbstractContextManager[Any]:
-    """As lerobot runs a checkpoint whose weights are in half precision."""
+    """The precision in which lerobot runs a checkpoint with weights in half precision."""
     dtype = DTYPES[policy.config.model_dtype]
     device = next(policy.parameters()).device.type
     return nullcontext() if dtype == torch.float32 else torch.autocast(device_type=device, dtype=dtype)

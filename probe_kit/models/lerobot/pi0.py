@@ -116,7 +116,7 @@ def resized(module: ModuleType, size: Pi0Size | None) -> Iterator[None]:
 def sized_paligemma(
     module: Any, vlm: GemmaSize, vision: SiglipSize, vocab_size: int, image_side: int | None = None
 ) -> Callable[..., Any]:
-    """What stands for lerobot's PaliGemma in `module` while a network of these sizes is built.
+    """A stand-in for lerobot's PaliGemma in `module` while a network of these sizes is built.
 
     image_side: in pixels, where lerobot leaves it at that of the released tower.
     """

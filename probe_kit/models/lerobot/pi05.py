@@ -19,7 +19,7 @@ from probe_kit.models.sizes_only import building_device
 
 
 class Gate(nn.Module):
-    """What half a block adds to the stream: its output, times the gate of the norm in front of it."""
+    """The addition of half a block to the stream: its output, times the gate of the norm in front of it."""
 
     def forward(self, computed: Tensor, gate: Tensor) -> Tensor:
         """(B, T, D) of (B, T, D) and (B, 1, D)."""

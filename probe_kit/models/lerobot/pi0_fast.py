@@ -91,7 +91,7 @@ def sized(size: Pi0FastSize | None, config: PI0FastConfig) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class TokenPrompt:
-    """What is read before the first action token. bos: id that begins the actions; end: id that ends them.
+    """The inputs before the first action token. bos: id that begins the actions; end: id that ends them.
 
     images: (B, 3, H, W) in [-1, 1] of every camera. image_masks: (B,) of every camera. tokens, mask: (B, T).
     """
@@ -114,9 +114,9 @@ def decode_tokens(
     """
     joint = model.paligemma_with_expert
     rows, device = len(prompt.tokens), prompt.tokens.device
-    one = torch.ones((rows, 1), dtype=torch.bool, device=device)
+    always = torch.ones((rows, 1), dtype=torch.bool, device=device)
     begin = torch.full((rows, 1), prompt.bos, dtype=torch.long, device=device)
-    tokens, mask = torch.cat([prompt.tokens, begin], dim=1), torch.cat([prompt.mask, one], dim=1)
+    tokens, mask = torch.cat([prompt.tokens, begin], dim=1), torch.cat([prompt.mask, always], dim=1)
     entering, valid, attends, _, _ = model.embed_prefix_fast(prompt.images, prompt.image_masks, tokens, mask)
     entering = entering.to(_dtype(joint, entering))
     places, past = torch.cumsum(valid, dim=1) - 1, None
@@ -139,7 +139,7 @@ def decode_tokens(
             return torch.stack(ids, dim=1)
         entering = joint.embed_language_tokens(ids[-1][:, None])
         entering = entering.to(_dtype(joint, entering))
-        valid = torch.cat([valid, one], dim=1)
+        valid = torch.cat([valid, always], dim=1)
         places, attends = valid.sum(dim=1, keepdim=True) - 1, valid[:, None]
 
 

@@ -35,17 +35,19 @@ def current_pi05_keys(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 def current_pi0_fast_keys(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """The same tensors of a pi0-FAST, whose head puts out tokens; head and embedding may be stored as one."""
-    found = _renamed(tensors, _MOVED)
-    if _EMBEDDING in found:
-        found.setdefault(_LM_HEAD, found[_EMBEDDING])
-    return found
+    renamed = _renamed(tensors, _MOVED)
+    if _EMBEDDING in renamed:
+        renamed.setdefault(_LM_HEAD, renamed[_EMBEDDING])
+    return renamed
 
 
 def _renamed(tensors: Mapping[str, Tensor], names: Sequence[tuple[str, str]]) -> dict[str, Tensor]:
-    found = {_current(name, names): tensor for name, tensor in tensors.items() if not name.startswith(STATISTICS)}
-    if _LM_HEAD in found:
-        found.setdefault(_EMBEDDING, found[_LM_HEAD])
-    return found
+    renamed = {
+        _current(name, names): tensor for name, tensor in tensors.items() if not name.startswith(STATISTICS)
+    }
+    if _LM_HEAD in renamed:
+        renamed.setdefault(_EMBEDDING, renamed[_LM_HEAD])
+    return renamed
 
 
 def _current(name: str, names: Sequence[tuple[str, str]]) -> str:

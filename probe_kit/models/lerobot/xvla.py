@@ -70,13 +70,13 @@ def current_xvla_keys(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
     Files of 2025 have Florence-2 in its authors' layout. Of the tied embeddings a file may hold either.
     """
-    named = dict(tensors)
-    if _is_vendored_florence_state_dict(named):
-        named = _remap_vendored_florence_state_dict(named)
-    for own, other in (_EMBEDDINGS, _EMBEDDINGS[::-1]):
-        if own in named:
-            named.setdefault(other, named[own])
-    return named
+    renamed = dict(tensors)
+    if _is_vendored_florence_state_dict(renamed):
+        renamed = _remap_vendored_florence_state_dict(renamed)
+    for name, other in (_EMBEDDINGS, _EMBEDDINGS[::-1]):
+        if name in renamed:
+            renamed.setdefault(other, renamed[name])
+    return renamed
 
 
 def denoised_actions(policy: Any, inputs: Mapping[str, Tensor], noise: Tensor) -> Tensor:
@@ -85,16 +85,18 @@ def denoised_actions(policy: Any, inputs: Mapping[str, Tensor], noise: Tensor) -
     inputs: in lerobot's keys. The network predicts actions, not a velocity: every step mixes them with the noise.
     """
     model, steps = policy.model, max(1, int(policy.config.num_denoising_steps))
-    given = policy._build_model_inputs(dict(inputs))
+    model_inputs = policy._build_model_inputs(dict(inputs))
     dtype = model._get_target_dtype()
-    proprio, noise = given["proprio"].to(dtype), noise.to(dtype)
-    prompt = model.forward_vlm(given["input_ids"], given["image_input"].to(dtype), given["image_mask"])
+    proprio, noise = model_inputs["proprio"].to(dtype), noise.to(dtype)
+    prompt = model.forward_vlm(
+        model_inputs["input_ids"], model_inputs["image_input"].to(dtype), model_inputs["image_mask"]
+    )
     actions = torch.zeros_like(noise)
-    for left in range(steps, 0, -1):
-        time = torch.full((len(noise),), left / steps, device=noise.device, dtype=dtype)
+    for remaining in range(steps, 0, -1):
+        time = torch.full((len(noise),), remaining / steps, device=noise.device, dtype=dtype)
         share = time.view(-1, 1, 1)
         state, noisy = model.action_space.preprocess(proprio, noise * share + actions * (1 - share))
         actions = model.transformer(
-            domain_id=given["domain_id"], action_with_noise=noisy, proprio=state, t=time, **prompt
+            domain_id=model_inputs["domain_id"], action_with_noise=noisy, proprio=state, t=time, **prompt
         )
     return cast(Tensor, model.action_space.postprocess(actions))

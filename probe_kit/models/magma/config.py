@@ -68,7 +68,7 @@ class MagmaConfig:
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any], source: str = "config") -> "MagmaConfig":
-        """From the content of a `config.json`. Raises CheckpointError naming `source`."""
+        """Read the content of a `config.json`. Raises CheckpointError naming `source`."""
         if values.get("model_type") != "magma":
             raise CheckpointError(
                 f"{source} holds a {values.get('model_type')!r} model; expected 'magma'. Pass the right --model"
@@ -93,9 +93,11 @@ def _text_config(values: Mapping[str, Any], source: str) -> Any:
     stored = values.get("text_config")
     if stored is None:
         stored = {name: value for name, value in values.items() if name not in ("model_type", "vision_config")}
-    found = stored.get("model_type", "llama")
-    if found != "llama":
-        raise CheckpointError(f"{source}: text_config describes a {found} model; Magma reads with a llama model")
+    model_type = stored.get("model_type", "llama")
+    if model_type != "llama":
+        raise CheckpointError(
+            f"{source}: text_config describes a {model_type} model; Magma reads with a llama model"
+        )
     return LlamaConfig.from_dict({**stored, "model_type": "llama"})
 
 
@@ -105,15 +107,15 @@ def _vision_config(values: Mapping[str, Any], width: int, source: str) -> Vision
     strategy = values.get("img_anyres_strategy", "crop")
     layer = values.get("vision_feature_layer", "clip_vis_dense")
     match = _PROJECTOR.fullmatch(projector)
-    for name, value, known in (
+    for name, value, supported in (
         ("vision_backbone", backbone, tuple(_BACKBONES)),
         ("img_anyres_strategy", strategy, STRATEGIES),
         ("vision_feature_layer", layer, ("clip_vis_dense",)),
         ("hidden_size", values.get("hidden_size", width), (width,)),
     ):
-        if value not in known:
+        if value not in supported:
             raise CheckpointError(
-                f"{source}: vision_config.{name} {value!r} is not {' or '.join(map(str, known))}"
+                f"{source}: vision_config.{name} {value!r} is not {' or '.join(map(str, supported))}"
             )
     if match is None:
         raise CheckpointError(f"{source}: vision_config.mm_projector_type {projector!r}; expected mlp2x_gelu")

@@ -36,7 +36,7 @@ def greedy(logits: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Decoded:
-    """What decoding put out: ids (B, N) int64, the logits (B, N, V) that chose them, and the cache."""
+    """The output of decoding: ids (B, N) int64, the logits (B, N, V) that chose them, and the cache."""
 
     ids: Tensor
     logits: Tensor
@@ -59,19 +59,19 @@ class MagmaNetwork(nn.Module):
     # -- pictures ----------------------------------------------------------------------------------------
 
     def span(self, ids: Sequence[int], grid: Grid, side: int) -> PictureSpan:
-        """Where the tokens of a picture of `grid` crops of `side` pixels stand. Raises CheckpointError."""
+        """The positions of the tokens of a picture of `grid` crops of `side` pixels. Raises CheckpointError."""
         rows, columns = map_size(grid, side, self.vision_tower.reduction, self.config.vision.strategy)
         return PictureSpan(placeholder(ids, self.config.image_token), rows, columns)
 
-    def shown(self, picture: Picture) -> Tensor:
-        """What the trunk sees of a picture: its crops (N, 3, S, S), or the whole of it (1, 3, H, W)."""
+    def trunk_input(self, picture: Picture) -> Tensor:
+        """The trunk's input of a picture: its crops (N, 3, S, S), or all of it (1, 3, H, W)."""
         return whole_picture(picture) if self.config.vision.strategy == "global" else picture.crops
 
     def look(self, pictures: Sequence[Picture]) -> list[Tensor]:
         """Per picture its tokens (h · (w + 1), D), separators at the end of every row of its map."""
         reference = self.multi_modal_projector.row_seperator
         if self.config.vision.strategy == "global":
-            maps = [self._projected(self.shown(picture).to(reference))[0] for picture in pictures]
+            maps = [self._projected(self.trunk_input(picture).to(reference))[0] for picture in pictures]
         else:
             crops = self._projected(torch.cat([picture.crops for picture in pictures]).to(reference))
             parts = torch.split(crops, [len(picture.crops) for picture in pictures])
@@ -93,8 +93,8 @@ class MagmaNetwork(nn.Module):
             return Packed.of([embedding(torch.tensor(ids, device=device)) for ids in prompts])
         rows = []
         for ids, tokens in zip(prompts, self.look(pictures), strict=True):
-            place = placeholder(ids, self.config.image_token)
-            before, behind = (torch.tensor(part, device=device) for part in (ids[:place], ids[place + 1 :]))
+            position = placeholder(ids, self.config.image_token)
+            before, behind = (torch.tensor(part, device=device) for part in (ids[:position], ids[position + 1 :]))
             rows.append(torch.cat([embedding(before.long()), tokens, embedding(behind.long())]))
         return Packed.of(rows)
 

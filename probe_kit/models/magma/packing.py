@@ -16,7 +16,7 @@ from probe_kit.errors import CheckpointError
 
 @dataclass(frozen=True)
 class PictureSpan:
-    """Where a picture's tokens stand in its row: `start`, then `rows` times `columns` places and a separator."""
+    """The positions of a picture's tokens in its row: `start`, then `rows` times `columns` and a separator."""
 
     start: int
     rows: int
@@ -49,8 +49,8 @@ class Packed:
 
 
 def placeholder(ids: Sequence[int], image_token: int) -> int:
-    """Where the placeholder stands. Raises CheckpointError unless there is exactly one."""
-    places = [place for place, number in enumerate(ids) if number == image_token]
+    """The position of the placeholder. Raises CheckpointError unless there is exactly one."""
+    places = [position for position, number in enumerate(ids) if number == image_token]
     if len(places) != 1:
         raise CheckpointError(
             f"the prompt has {len(places)} picture placeholders (id {image_token}); expected one. The tokenizer "

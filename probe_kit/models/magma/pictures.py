@@ -25,7 +25,7 @@ _DEVIATION: Colour = (0.26862954, 0.26130258, 0.27577711)
 
 @dataclass(frozen=True)
 class Grid:
-    """How many crops a picture makes: rows from top to bottom, columns from left to right."""
+    """The crops of a picture: rows from top to bottom, columns from left to right."""
 
     rows: int
     columns: int
@@ -41,7 +41,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class PictureSettings:
-    """How pictures are prepared. base: side S of a crop in pixels; crops: the most crops of one picture."""
+    """The preparation of pictures. base: side S of a crop in pixels; crops: the most crops of one picture."""
 
     base: int
     crops: int
@@ -50,7 +50,7 @@ class PictureSettings:
 
     @classmethod
     def of(cls, vision: VisionConfig, folder: Path) -> "PictureSettings":
-        """From `folder/preprocessor_config.json`, or where there is none from the configuration.
+        """Read `folder/preprocessor_config.json`, or where there is none the configuration.
 
         Recorded references hold the same fields in `action_config.json`.
         Raises CheckpointError for a file that lacks a field.
@@ -63,7 +63,7 @@ class PictureSettings:
 
     @classmethod
     def from_json(cls, values: dict[str, object], source: str) -> "PictureSettings":
-        """From the content of a `preprocessor_config.json`. Raises CheckpointError naming `source`."""
+        """Read the content of a `preprocessor_config.json`. Raises CheckpointError naming `source`."""
         missing = [name for name in ("base_img_size", "num_crops") if name not in values]
         if missing:
             raise CheckpointError(f"{source} lacks {' and '.join(missing)}; it does not belong to Magma")
@@ -93,8 +93,8 @@ def choose_grid(width: int, height: int, settings: PictureSettings) -> Grid:
     def merit(grid: Grid) -> tuple[int, int]:
         wide, high = grid.columns * settings.base, grid.rows * settings.base
         scale = min(wide / width, high / height)
-        kept = min(int(width * scale) * int(height * scale), width * height)
-        return kept, kept - wide * high
+        pixels = min(int(width * scale) * int(height * scale), width * height)
+        return pixels, pixels - wide * high
 
     return max(grids, key=merit)
 
@@ -110,11 +110,11 @@ def prepare_picture(picture: NDArray[np.uint8], settings: PictureSettings) -> Pi
     grid, side = choose_grid(width, height, settings), settings.base
     pixels = torch.from_numpy(np.ascontiguousarray(picture.transpose(2, 0, 1))).float().div(255)
     mean, deviation = (torch.tensor(colour)[:, None, None] for colour in (settings.mean, settings.deviation))
-    whole = torch.nn.functional.interpolate(
+    stretched = torch.nn.functional.interpolate(
         pixels.sub(mean).div(deviation)[None],
         size=(grid.rows * side, grid.columns * side),
         mode="bilinear",
         align_corners=False,
     )
-    crops = whole.reshape(3, grid.rows, side, grid.columns, side).permute(1, 3, 0, 2, 4)
+    crops = stretched.reshape(3, grid.rows, side, grid.columns, side).permute(1, 3, 0, 2, 4)
     return Picture(crops.reshape(-1, 3, side, side).contiguous(), grid)

@@ -46,7 +46,7 @@ class VisionTower(nn.Module):
 
     @property
     def stem(self) -> Any:
-        """What makes the first map."""
+        """The module that makes the first map."""
         return self.clip_vision_model.trunk.stem
 
     def forward(self, pixels: Tensor) -> Tensor:

@@ -31,7 +31,7 @@ class VisionConfig:
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> "VisionConfig":
-        """Of `vit_config`. Raises CheckpointError for towers that no released checkpoint has."""
+        """Read `vit_config`. Raises CheckpointError for towers that no released checkpoint has."""
         expected = {
             "fullatt_block_indexes": None,
             "use_rope": True,
@@ -76,7 +76,7 @@ class OvisConfig:
 
     @classmethod
     def from_values(cls, values: Mapping[str, Any]) -> "OvisConfig":
-        """Of the content of config.json. Raises CheckpointError."""
+        """Read the content of config.json. Raises CheckpointError."""
         text = dict(values["llm_config"])
         if text.get("model_type") != "qwen3":
             raise CheckpointError(

@@ -28,7 +28,7 @@ class Tower(nn.Module):
 
 
 class VisualTokenizer(nn.Module):
-    """From patches to distributions over visual words."""
+    """The map from patches to distributions over visual words."""
 
     def __init__(self, config: OvisConfig) -> None:
         super().__init__()
@@ -67,8 +67,8 @@ class OvisNetwork(nn.Module):
             return embeddings
         words = self.vte.weight
         probabilities = self.visual_tokenizer(pixel_values, grid)
-        seen = probabilities.to(words.dtype) @ words[:-_MARKS]
-        embeddings = embeddings.masked_scatter((ids == PICTURE)[..., None], seen)
+        visual = probabilities.to(words.dtype) @ words[:-_MARKS]
+        embeddings = embeddings.masked_scatter((ids == PICTURE)[..., None], visual)
         for number, row in ((PICTURE_BEGINS, -_MARKS), (PICTURE_ENDS, 1 - _MARKS)):
             embeddings = torch.where((ids == number)[..., None], words[row], embeddings)
         return embeddings
@@ -78,10 +78,10 @@ class OvisNetwork(nn.Module):
         input_ids: Tensor,
         pixel_values: Tensor | None = None,
         image_grid_thw: Tensor | None = None,
-        **further: Any,
+        **keywords: Any,
     ) -> Any:
-        """transformers' output of the language model. further: its keywords, such as masks and positions."""
-        return self.llm(inputs_embeds=self.embed(input_ids, pixel_values, image_grid_thw), **further)
+        """transformers' output of the language model. keywords: its own, such as masks and positions."""
+        return self.llm(inputs_embeds=self.embed(input_ids, pixel_values, image_grid_thw), **keywords)
 
 
 def build_ovis2_5(config: OvisConfig, dtype: torch.dtype, device: str = "meta") -> OvisNetwork:

@@ -23,7 +23,7 @@ _NEEDED = ("image_mean", "image_std", "resample", "rescale_factor")
 
 @dataclass(frozen=True)
 class OvisPictures:
-    """How pictures become patches. settings: of the checkpoint's file. patch, stride: see `VisionConfig`."""
+    """The processor of pictures into patches. patch, stride: see `VisionConfig`."""
 
     settings: dict[str, Any]
     patch: int

@@ -50,8 +50,8 @@ class Attention(nn.Module):
         )
         query, key = _rotated(query, rotation), _rotated(key, rotation)
         pictures = zip(*(part.transpose(0, 1).split(lengths, dim=1) for part in (query, key, value)), strict=True)
-        seen = [functional.scaled_dot_product_attention(q[None], k[None], v[None])[0] for q, k, v in pictures]
-        mixed: Tensor = self.out_proj(torch.cat(seen, dim=1).transpose(0, 1).flatten(1))
+        read = [functional.scaled_dot_product_attention(q[None], k[None], v[None])[0] for q, k, v in pictures]
+        mixed: Tensor = self.out_proj(torch.cat(read, dim=1).transpose(0, 1).flatten(1))
         return mixed
 
 

@@ -20,7 +20,7 @@ _OPTIONAL = ("do_resize", "do_rescale", "rescale_factor", "do_normalize", "resam
 
 @dataclass(frozen=True)
 class SquarePictures:
-    """How pictures become squares.
+    """The processor of pictures into squares.
 
     settings: the part of the checkpoint's file that the processor reads. crop: what is looked at, as shares of the
     picture: top, left, height, width; None for all of it. It is `CROP` in the file, which the processor skips.
@@ -33,40 +33,40 @@ class SquarePictures:
     def from_folder(cls, folder: Path, side: int) -> "SquarePictures":
         """Read `preprocessor_config.json`. side: pixels the network expects. Raises CheckpointError."""
         values = processor_settings(folder, _NEEDED, (*_OPTIONAL, CROP))
-        if (found := square_side(values, folder)) != side:
-            raise CheckpointError(f"{folder} makes pictures of {found} pixels; config.json expects {side}")
+        if (stored_side := square_side(values, folder)) != side:
+            raise CheckpointError(f"{folder} makes pictures of {stored_side} pixels; config.json expects {side}")
         return cls({name: value for name, value in values.items() if name != CROP}, _crop(values, folder))
 
     def pixels(self, pictures: list[NDArray[np.uint8]]) -> Tensor:
         """(B, 3, S, S) float32 of (H, W, 3) uint8 pictures."""
-        parts = [self._looked_at(picture) for picture in pictures]
-        made = SiglipImageProcessor(**self.settings)(
+        parts = [self._window(picture) for picture in pictures]
+        processed = SiglipImageProcessor(**self.settings)(
             images=parts, input_data_format="channels_last", return_tensors="pt"
         )
-        pixels: Tensor = made["pixel_values"]
+        pixels: Tensor = processed["pixel_values"]
         return pixels
 
-    def _looked_at(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def _window(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
         if self.crop is None:
             return picture
-        whole = np.array(picture.shape[:2])
-        top, left = np.rint(whole * self.crop[:2]).astype(int)
-        height, width = np.rint(whole * self.crop[2:]).astype(int)
-        return picture[top : top + max(1, height), left : left + max(1, width)]
+        size = np.array(picture.shape[:2])
+        top, column = np.rint(size * self.crop[:2]).astype(int)
+        height, width = np.rint(size * self.crop[2:]).astype(int)
+        return picture[top : top + max(1, height), column : column + max(1, width)]
 
 
 def _crop(values: Mapping[str, Any], folder: Path) -> tuple[float, float, float, float] | None:
     """Raises CheckpointError for what is no part of a picture."""
-    found = values.get(CROP)
-    if found is None:
+    stored = values.get(CROP)
+    if stored is None:
         return None
     try:
-        top, left, height, width = (float(share) for share in found)
+        top, column, height, width = (float(share) for share in stored)
     except (TypeError, ValueError):
-        top = left = height = width = float("nan")
-    if not (0 <= top < top + height <= 1 and 0 <= left < left + width <= 1):
+        top = column = height = width = float("nan")
+    if not (0 <= top < top + height <= 1 and 0 <= column < column + width <= 1):
         raise CheckpointError(
-            f"{folder / PROCESSOR_FILE} has {CROP} {found}; expected top, left, height and width of the part that "
-            "is looked at, as shares of the picture between 0 and 1"
+            f"{folder / PROCESSOR_FILE} has {CROP} {stored}; expected top, left, height and width of the part "
+            "that is looked at, as shares of the picture between 0 and 1"
         )
-    return top, left, height, width
+    return top, column, height, width

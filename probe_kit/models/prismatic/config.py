@@ -126,12 +126,12 @@ class PrismaticConfig:
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any], source: str = "config") -> "PrismaticConfig":
-        """From the content of a `config.json`. Raises CheckpointError naming `source`."""
+        """Read the content of a `config.json`. Raises CheckpointError naming `source`."""
         if (run := values.get("model")) is not None:
             if not isinstance(run, Mapping):
                 raise CheckpointError(f"{source} has no fields under `model`; download the checkpoint again")
-            found = cls.from_json(_of_run(run, source), source)
-            return replace(found, tokenizer_id=_TOKENIZERS[found.text.model_type])
+            config = cls.from_json(_of_run(run, source), source)
+            return replace(config, tokenizer_id=_TOKENIZERS[config.text.model_type])
         model_type = values.get("model_type")
         if model_type not in MODEL_TYPES:
             raise CheckpointError(
@@ -141,13 +141,13 @@ class PrismaticConfig:
         vision = values.get("vision_backbone_id", "siglip-vit-so400m")
         language = values.get("llm_backbone_id", "vicuna-v15-7b")
         resize = values.get("image_resize_strategy", "letterbox")
-        for name, value, known in (
+        for name, value, supported in (
             ("vision_backbone_id", vision, _TOWERS),
             ("llm_backbone_id", language, _LANGUAGE),
             ("image_resize_strategy", resize, RESIZE_STRATEGIES),
         ):
-            if value not in known:
-                raise CheckpointError(f"{source}: {name} {value!r} is not one of {', '.join(known)}")
+            if value not in supported:
+                raise CheckpointError(f"{source}: {name} {value!r} is not one of {', '.join(supported)}")
         text = _text_config(values, _LANGUAGE[language], source)
         return cls(
             model_type=model_type,
@@ -181,12 +181,12 @@ def _of_run(run: Mapping[str, Any], source: str) -> dict[str, Any]:
 
 
 def _towers(values: Mapping[str, Any], vision: str, source: str) -> tuple[TowerConfig, ...]:
-    named = _TOWERS[vision]
-    count = len(named)
+    defaults = _TOWERS[vision]
+    count = len(defaults)
     columns: list[list[Any]] = [
-        values.get("timm_model_ids") or [timm_id for timm_id, _, _ in named],
-        values.get("image_sizes") or [size for _, size, _ in named],
-        values.get("timm_override_act_layers") or [act_layer for _, _, act_layer in named],
+        values.get("timm_model_ids") or [timm_id for timm_id, _, _ in defaults],
+        values.get("image_sizes") or [size for _, size, _ in defaults],
+        values.get("timm_override_act_layers") or [act_layer for _, _, act_layer in defaults],
         values.get("timm_model_overrides") or [{}] * count,
     ]
     fused = values.get("use_fused_vision_backbone")
@@ -205,10 +205,10 @@ def _text_config(values: Mapping[str, Any], model_type: str, source: str) -> Any
     # Its own precision would win over the one that is asked for.
     ignored = ("dtype", "torch_dtype")
     stored = {name: value for name, value in (values.get("text_config") or {}).items() if name not in ignored}
-    found = stored.setdefault("model_type", model_type)
-    if found != model_type:
+    stored_type = stored.setdefault("model_type", model_type)
+    if stored_type != model_type:
         raise CheckpointError(
             f"{source}: llm_backbone_id {values.get('llm_backbone_id')!r} is a {model_type} model, "
-            f"but text_config describes a {found} model"
+            f"but text_config describes a {stored_type} model"
         )
     return CONFIG_MAPPING[model_type].from_dict(stored)

@@ -44,7 +44,7 @@ def likeliest(logits: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Decoded:
-    """What greedy decoding put out: ids (B, N) int64, and the logits (B, N, V) that chose them.
+    """The output of greedy decoding: ids (B, N) int64, and the logits (B, N, V) that chose them.
 
     Before the last of them is fed: mask (B, S + N - 1), positions (B, 1) of the last tokens, keys and values.
     """
@@ -77,10 +77,10 @@ class PrismaticNetwork(nn.Module):
         if pixel_values is None:
             return embeddings, mask
         patches = self.projector(self.vision_backbone(pixel_values.to(embeddings.dtype)))
-        seen = torch.ones(patches.shape[:2], dtype=mask.dtype, device=mask.device)
+        patch_mask = torch.ones(patches.shape[:2], dtype=mask.dtype, device=mask.device)
         return (
             torch.cat([embeddings[:, :1], patches, embeddings[:, 1:]], dim=1),
-            torch.cat([mask[:, :1], seen, mask[:, 1:]], dim=1),
+            torch.cat([mask[:, :1], patch_mask, mask[:, 1:]], dim=1),
         )
 
     def forward(self, ids: Tensor, mask: Tensor, pixel_values: Tensor | None) -> Any:
@@ -107,7 +107,7 @@ class PrismaticNetwork(nn.Module):
         embeddings, mask = self.embed(ids, mask, pixel_values)
         cache = DynamicCache(config=self.language_model.config)
         positions = _positions(mask)
-        chosen: list[Tensor] = []
+        tokens: list[Tensor] = []
         logits: list[Tensor] = []
         while True:
             output = self.language_model(
@@ -118,16 +118,16 @@ class PrismaticNetwork(nn.Module):
                 use_cache=True,
                 logits_to_keep=1,
             )
-            if not chosen:  # the prompt is read; the tokens behind it read what is kept of it
+            if not tokens:  # the prompt is read; the tokens behind it read what is kept of it
                 self.prompt_kv(cache.layers)
             logits.append(output.logits[:, -1])
-            chosen.append(choose(logits[-1]))
-            if len(chosen) == steps:
+            tokens.append(choose(logits[-1]))
+            if len(tokens) == steps:
                 break
-            embeddings = self.language_model.get_input_embeddings()(chosen[-1][:, None])
+            embeddings = self.language_model.get_input_embeddings()(tokens[-1][:, None])
             positions = positions[:, -1:] + 1
             mask = torch.cat([mask, torch.ones_like(mask[:, :1])], dim=1)
-        return Decoded(torch.stack(chosen, dim=1), torch.stack(logits, dim=1), mask, positions[:, -1:], cache)
+        return Decoded(torch.stack(tokens, dim=1), torch.stack(logits, dim=1), mask, positions[:, -1:], cache)
 
 
 def _positions(mask: Tensor) -> Tensor:

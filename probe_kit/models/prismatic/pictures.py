@@ -24,7 +24,7 @@ CROP_AREA = 0.9
 
 @dataclass(frozen=True)
 class PictureSettings:
-    """How pictures are prepared: per tower its side, colour means, deviations and resampling."""
+    """The preparation of pictures: per tower its side, colour means, deviations and resampling."""
 
     strategy: str
     sides: tuple[int, ...]
@@ -34,7 +34,7 @@ class PictureSettings:
 
     @classmethod
     def of(cls, config: PrismaticConfig, folder: Path) -> "PictureSettings":
-        """From `folder/preprocessor_config.json`, or where there is none from the towers timm names.
+        """Read `folder/preprocessor_config.json`, or where there is none the settings of timm's towers.
 
         Raises CheckpointError for what is not known here.
         """
@@ -60,13 +60,13 @@ class PictureSettings:
 
     @classmethod
     def _from_timm(cls, config: PrismaticConfig) -> "PictureSettings":
-        known = [require("timm", "openvla").get_pretrained_cfg(tower.timm_id) for tower in config.towers]
+        cards = [require("timm", "openvla").get_pretrained_cfg(tower.timm_id) for tower in config.towers]
         return cls(
             config.resize,
             tuple(tower.image_size for tower in config.towers),
-            tuple(_colour(card.mean) for card in known),
-            tuple(_colour(card.std) for card in known),
-            tuple(card.interpolation for card in known),
+            tuple(_colour(card.mean) for card in cards),
+            tuple(_colour(card.std) for card in cards),
+            tuple(card.interpolation for card in cards),
         )
 
 
@@ -110,18 +110,18 @@ def _scaled_and_cropped(image: Image.Image, side: int, resampling: Image.Resampl
         width, height = side, int(side * height / width)
     else:
         width, height = int(side * width / height), side
-    left, top = round((width - side) / 2), round((height - side) / 2)
+    column, top = round((width - side) / 2), round((height - side) / 2)
     scaled = image if image.size == (width, height) else image.resize((width, height), resampling)
-    return scaled.crop((left, top, left + side, top + side))
+    return scaled.crop((column, top, column + side, top + side))
 
 
 def _padded_to_square(image: Image.Image, mean: Colour) -> Image.Image:
     """Centred on the mean colour; a pixel short of square where the sides differ by an odd number."""
     longer = max(image.size)
-    left, top = ((longer - side) // 2 for side in image.size)
+    column, top = ((longer - side) // 2 for side in image.size)
     red, green, blue = (int(255 * value) for value in mean)
-    square = Image.new("RGB", (image.width + 2 * left, image.height + 2 * top), (red, green, blue))
-    square.paste(image, (left, top))
+    square = Image.new("RGB", (image.width + 2 * column, image.height + 2 * top), (red, green, blue))
+    square.paste(image, (column, top))
     return square
 
 

@@ -103,7 +103,7 @@ def full_size_qwen3_vl(size: str) -> Any:
         },
     }
     tied = size in _TIED
-    seen = _QWEN3_SMALL_VISION if tied else _QWEN3_VISION
-    vision = {**seen, "out_hidden_size": text["hidden_size"], "patch_size": 16}
+    vision_sizes = _QWEN3_SMALL_VISION if tied else _QWEN3_VISION
+    vision = {**vision_sizes, "out_hidden_size": text["hidden_size"], "patch_size": 16}
     config = Qwen3VLConfig(text_config=text, vision_config=vision, tie_word_embeddings=tied)
     return build_qwen3_vl(config, torch.float32)

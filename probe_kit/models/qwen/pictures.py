@@ -21,7 +21,7 @@ _LONGEST_RATIO = 200
 
 @dataclass(frozen=True)
 class QwenPictures:
-    """How pictures become patches.
+    """The processor of pictures into patches.
 
     settings: the part of the checkpoint's file that transformers' Qwen image processor reads, with the smallest
     and the largest number of pixels as `size`. patch, merge: pixels per patch side, patches per token side.
@@ -52,14 +52,14 @@ class QwenPictures:
         values = load_json(file)
         if missing := [name for name in _NEEDED if name not in values]:
             raise CheckpointError(f"{file} lacks {', '.join(missing)}")
-        found = tuple(int(values[name]) for name in _NEEDED[:3])
-        if found != (patch, temporal, merge):
+        stored_sizes = tuple(int(values[name]) for name in _NEEDED[:3])
+        if stored_sizes != (patch, temporal, merge):
             raise CheckpointError(
-                f"{file} cuts pictures with patch_size, temporal_patch_size, merge_size {found}; "
+                f"{file} cuts pictures with patch_size, temporal_patch_size, merge_size {stored_sizes}; "
                 f"config.json expects {(patch, temporal, merge)}"
             )
-        kept = {name: values[name] for name in (*_NEEDED, *_OPTIONAL) if name in values}
-        return cls({**kept, "size": _size(values, file)}, patch, merge, fast)
+        settings = {name: values[name] for name in (*_NEEDED, *_OPTIONAL) if name in values}
+        return cls({**settings, "size": _size(values, file)}, patch, merge, fast)
 
     def grid(self, height: int, width: int) -> tuple[int, int]:
         """Rows and columns of patches of a picture of that size."""
@@ -78,8 +78,8 @@ class QwenPictures:
             if max(picture.shape[:2]) > _LONGEST_RATIO * min(picture.shape[:2]):
                 raise ObservationError(f"the picture is {picture.shape}: too long for this model's patches")
         kind: Any = Qwen2VLImageProcessor if self.fast else Qwen2VLImageProcessorPil
-        made = kind(**self.settings)(images=pictures, input_data_format="channels_last", return_tensors="pt")
-        return made["pixel_values"].float(), made["image_grid_thw"]
+        processed = kind(**self.settings)(images=pictures, input_data_format="channels_last", return_tensors="pt")
+        return processed["pixel_values"].float(), processed["image_grid_thw"]
 
 
 def merged_tokens(grid: tuple[int, int], merge: int) -> int:

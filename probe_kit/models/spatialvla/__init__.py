@@ -8,7 +8,7 @@ from probe_kit.models.spatialvla.actions import STEP_TOKENS, ActionBins, equal_m
 from probe_kit.models.spatialvla.config import SpatialVLAConfig
 from probe_kit.models.spatialvla.depth import Depth, depth_input, estimate_depth
 from probe_kit.models.spatialvla.full_size import full_size_spatialvla
-from probe_kit.models.spatialvla.network import Decoded, Seen, SpatialVLANetwork, build_spatialvla
+from probe_kit.models.spatialvla.network import Decoded, Sight, SpatialVLANetwork, build_spatialvla
 from probe_kit.models.spatialvla.pictures import Intrinsics, PictureSettings, known_cameras, prepare_picture
 from probe_kit.models.spatialvla.space import PositionEmbedding3D, back_project, point_places
 
@@ -20,7 +20,7 @@ __all__ = [
     "Intrinsics",
     "PictureSettings",
     "PositionEmbedding3D",
-    "Seen",
+    "Sight",
     "SpatialVLAConfig",
     "SpatialVLANetwork",
     "back_project",

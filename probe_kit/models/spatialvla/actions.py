@@ -38,7 +38,7 @@ class ActionBins:
 
     @classmethod
     def of(cls, values: Mapping[str, Any], first: int, actions: int, source: str) -> "ActionBins":
-        """From the content of a `processor_config.json`.
+        """Read the content of a `processor_config.json`.
 
         first, actions: the ids the model has for actions. Edges come from `bin_policy`, where that is missing from
         the Gaussians in `gs_params`, or are even if `action_config` says that the distribution is uniform.
@@ -54,11 +54,11 @@ class ActionBins:
             for axis in axes
         )
         bins = cls(first, edges, bool(settings.get("use_spherical", True)))
-        found = (bins.slots[-1].stop - first, int(counts["gripper"]))
-        if found != (actions, _GRIPPER):
+        counted = (bins.slots[-1].stop - first, int(counts["gripper"]))
+        if counted != (actions, _GRIPPER):
             raise CheckpointError(
-                f"{source}: its bins make {found[0]} action tokens with {found[1]} for the gripper; the model has "
-                f"{actions} with {_GRIPPER}. The file belongs to another checkpoint"
+                f"{source}: its bins make {counted[0]} action tokens with {counted[1]} for the gripper; the model "
+                f"has {actions} with {_GRIPPER}. The file belongs to another checkpoint"
             )
         return bins
 
@@ -80,11 +80,11 @@ class ActionBins:
 
     @property
     def content(self) -> list[Any]:
-        """What an identity of these bins is computed over."""
+        """The values over which an identity of these bins is computed."""
         return [self.first, [edges.tolist() for edges in self.edges], self.spherical]
 
     def is_action(self, ids: Ids) -> NDArray[np.bool_]:
-        """Which of the ids (…, 3) name something in their slot."""
+        """Return, per id of (…, 3), True where it names something in its slot."""
         starts, stops = np.array([[slot.start, slot.stop] for slot in self.slots]).T
         return np.asarray((ids >= starts) & (ids < stops))
 

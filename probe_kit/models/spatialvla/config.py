@@ -65,10 +65,10 @@ class SpatialVLAConfig:
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any], source: str = "config") -> "SpatialVLAConfig":
-        """From the content of a `config.json`. Raises CheckpointError naming `source`."""
-        if (found := values.get("model_type")) != MODEL_TYPE:
+        """Read the content of a `config.json`. Raises CheckpointError naming `source`."""
+        if (model_type := values.get("model_type")) != MODEL_TYPE:
             raise CheckpointError(
-                f"{source} holds a {found!r} model; expected {MODEL_TYPE}. Pass the right --model"
+                f"{source} holds a {model_type!r} model; expected {MODEL_TYPE}. Pass the right --model"
             )
         sees_depth = bool(values.get("use_vision_zoe", True))
         needed = (*_REQUIRED, *_ACTIONS, *(_DEPTH if sees_depth else ()), "text_config", "vision_config")
@@ -103,13 +103,13 @@ class SpatialVLAConfig:
             f"{self.points} points do not divide a patch of {patch} pixels": patch % self.points != 0,
             "text_config ties the output layer to the embeddings": self.text.tie_word_embeddings,
         }
-        if said := [sentence for sentence, is_wrong in wrong.items() if is_wrong]:
-            raise CheckpointError(f"{source}: {'; '.join(said)}. No released SpatialVLA is like this")
+        if contradictions := [sentence for sentence, is_wrong in wrong.items() if is_wrong]:
+            raise CheckpointError(f"{source}: {'; '.join(contradictions)}. No released SpatialVLA is like this")
 
 
 def _part(values: Mapping[str, Any], name: str, source: str) -> dict[str, Any]:
     stored, expected = dict(values[name]), _PARTS[name]
-    found = stored.setdefault("model_type", expected)
-    if found != expected:
-        raise CheckpointError(f"{source}: {name} describes a {found} model; expected {expected}")
+    model_type = stored.setdefault("model_type", expected)
+    if model_type != expected:
+        raise CheckpointError(f"{source}: {name} describes a {model_type} model; expected {expected}")
     return stored

@@ -18,7 +18,7 @@ DEPTH_SIDE = 384
 
 @dataclass(frozen=True)
 class Depth:
-    """What ZoeDepth says about pictures, float32.
+    """The depth of pictures by ZoeDepth, float32.
 
     metres: (B, 1, S, S). raw: (B, H, W) as predicted, with the margin. domains: (B, 2) logits for indoor and
     outdoor scenes, which choose the head that measures; None for a ZoeDepth of one head.
@@ -43,21 +43,21 @@ def estimate_depth(network: Any, pictures: Tensor, vote: bool = False) -> Depth:
     the head it would have alone, so that a row does not depend on the others in its batch.
     """
     side, dtype = pictures.shape[-1], next(network.parameters()).dtype
-    seen = depth_input(pictures).to(dtype)
-    raw, domains = _predict(network, seen)
+    pixels = depth_input(pictures).to(dtype)
+    raw, domains = _predict(network, pixels)
     if domains is not None and not vote:
-        own, common = domains.argmax(dim=-1), int(domains.sum(dim=0).argmax())
-        for domain in set(own.tolist()):
+        domain_of_row, common = domains.argmax(dim=-1), int(domains.sum(dim=0).argmax())
+        for domain in set(domain_of_row.tolist()):
             if domain != common:  # rows of one domain alone: their sum has the same largest logit
-                raw[own == domain] = _predict(network, seen[own == domain])[0]
-    whole = nn.functional.interpolate(
+                raw[domain_of_row == domain] = _predict(network, pixels[domain_of_row == domain])[0]
+    metres = nn.functional.interpolate(
         raw[:, None], size=(side + 2 * MARGIN,) * 2, mode="bicubic", align_corners=True
     )
-    return Depth(whole[..., MARGIN:-MARGIN, MARGIN:-MARGIN], raw, domains)
+    return Depth(metres[..., MARGIN:-MARGIN, MARGIN:-MARGIN], raw, domains)
 
 
-def _predict(network: Any, seen: Tensor) -> tuple[Tensor, Tensor | None]:
-    output = network(pixel_values=seen)
+def _predict(network: Any, pixels: Tensor) -> tuple[Tensor, Tensor | None]:
+    output = network(pixel_values=pixels)
     domains = output.domain_logits
     return output.predicted_depth.float(), None if domains is None else domains.float()
 

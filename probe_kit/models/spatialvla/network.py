@@ -37,23 +37,23 @@ class Projector(nn.Module):
 
 
 @dataclass(frozen=True)
-class Seen:
-    """What the model makes of pictures, step by step; depth and what follows from it is None without depth.
+class Sight:
+    """The stages of looking at pictures; depth and what follows from it is None without depth.
 
     tower: (B, P, vision width) SigLIP's normed patches. points: (B, P, 3R²) metres in the camera's frame.
-    place: (B, P, vision width) their embedding. features: (B, P, D) as the language model reads them.
+    positions: (B, P, vision width) their embedding. features: (B, P, D) as the language model reads them.
     """
 
     tower: Tensor
     depth: Depth | None
     points: Tensor | None
-    place: Tensor | None
+    positions: Tensor | None
     features: Tensor
 
 
 @dataclass(frozen=True)
 class Decoded:
-    """What greedy decoding put out: ids (B, N) int64, and the logits (B, N, V) that chose them."""
+    """The output of greedy decoding: ids (B, N) int64, and the logits (B, N, V) that chose them."""
 
     ids: Tensor
     logits: Tensor
@@ -89,8 +89,8 @@ class SpatialVLANetwork(nn.Module):
             table = self.language_model.get_input_embeddings().weight
             table[self.config.first_action :] = self.spatial_embed_tokens.weight
 
-    def look(self, pictures: Tensor, intrinsics: Tensor, vote: bool = False) -> Seen:
-        """What the model sees in (B, 3, S, S) float32 pictures in [0, 1].
+    def look(self, pictures: Tensor, intrinsics: Tensor, vote: bool = False) -> Sight:
+        """The features of (B, 3, S, S) float32 pictures in [0, 1], stage by stage.
 
         intrinsics: (3, 3) or (B, 3, 3) of cameras that take pictures of side S. vote: see `estimate_depth`.
         Pictures, depth and points are float32 whatever the weights are.
@@ -98,12 +98,12 @@ class SpatialVLANetwork(nn.Module):
         dtype = self.multi_modal_projector.linear.weight.dtype
         tower: Tensor = self.vision_tower(((pictures - 0.5) / 0.5).to(dtype)).last_hidden_state
         if self.config.depth is None:
-            return Seen(tower, None, None, None, self.multi_modal_projector(tower))
+            return Sight(tower, None, None, None, self.multi_modal_projector(tower))
         depth = estimate_depth(self.vision_zoe_model, pictures, vote)
         patch = int(self.config.vision.patch_size)
         points = back_project(depth.metres, intrinsics, patch, self.config.points)
-        place = self.position_embedding_3d(points)
-        return Seen(tower, depth, points, place, self.multi_modal_projector(tower + place))
+        positions = self.position_embedding_3d(points)
+        return Sight(tower, depth, points, positions, self.multi_modal_projector(tower + positions))
 
     def embed(self, ids: Tensor, features: Tensor | None = None) -> Tensor:
         """(B, T, D) embeddings of ids (B, T), with `features` (B, P, D) at the picture's positions.
@@ -134,11 +134,11 @@ class SpatialVLANetwork(nn.Module):
                 f"the language model's attention is {used!r}, which drops the soft cap of Gemma-2's attention "
                 f"logits: activations would be others. Set it back to {EAGER!r}"
             )
-        seen = _additive(mask, embeddings)
+        additive = _additive(mask, embeddings)
         return self.language_model(
             inputs_embeds=embeddings,
             position_ids=_positions(mask)[:, -embeddings.shape[1] :],
-            attention_mask={"full_attention": seen, "sliding_attention": seen},
+            attention_mask={"full_attention": additive, "sliding_attention": additive},
             past_key_values=past,
             use_cache=past is not None,
             logits_to_keep=keep,
@@ -162,17 +162,17 @@ class SpatialVLANetwork(nn.Module):
         """
         cache = DynamicCache(config=self.language_model.config)
         embeddings = self.embed(ids, features)
-        chosen: list[Tensor] = []
+        tokens: list[Tensor] = []
         logits: list[Tensor] = []
         for step in range(steps):
             logits.append(self(embeddings, mask, cache, keep=1).logits[:, -1])
             if step == 0:  # the prompt is read; the tokens behind it read what is kept of it
                 self.prompt_kv(cache.layers)
-            chosen.append(_best(logits[-1], None if slots is None else slots[step]))
-            following = chosen[-1] if fed is None or step == steps - 1 else fed[:, step]
+            tokens.append(_best(logits[-1], None if slots is None else slots[step]))
+            following = tokens[-1] if fed is None or step == steps - 1 else fed[:, step]
             embeddings = self.embed(following[:, None])
             mask = torch.cat([mask, torch.ones_like(mask[:, :1])], dim=1)
-        return Decoded(torch.stack(chosen, dim=1), torch.stack(logits, dim=1))
+        return Decoded(torch.stack(tokens, dim=1), torch.stack(logits, dim=1))
 
 
 def _best(logits: Tensor, allowed: range | None) -> Tensor:

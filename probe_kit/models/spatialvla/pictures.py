@@ -19,7 +19,7 @@ Colour = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class PictureSettings:
-    """How pictures are prepared.
+    """The preparation of pictures.
 
     side: in pixels, of the square they are squeezed into. resampling: PIL's number. scale: what the bytes are
     multiplied with. mean, deviation: of a normalisation, None for the released models, which normalise inside.
@@ -33,7 +33,7 @@ class PictureSettings:
 
     @classmethod
     def of(cls, config: SpatialVLAConfig, folder: Path) -> "PictureSettings":
-        """From `folder/preprocessor_config.json`, or where there is none as the released models have it.
+        """Read `folder/preprocessor_config.json`, or where there is none take the released models' settings.
 
         Raises CheckpointError for what contradicts the model or is not known here.
         """
@@ -44,7 +44,7 @@ class PictureSettings:
             raise CheckpointError(
                 f"{file} makes pictures of side {settings.side}; config.json expects {config.side}"
             )
-        if settings.resampling not in {int(known) for known in Image.Resampling}:
+        if settings.resampling not in {int(resampling) for resampling in Image.Resampling}:
             raise CheckpointError(f"{file}: resample is {settings.resampling}, which PIL does not support")
         return settings
 
@@ -98,10 +98,10 @@ def known_cameras(values: Mapping[str, Any], source: str) -> dict[str, Intrinsic
 
     Raises CheckpointError for a matrix that is not a camera's.
     """
-    found = {}
+    cameras = {}
     for key, entry in values.get("intrinsic_config", {}).items():
         matrix = np.asarray(entry["intrinsic"], np.float64)
         if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or np.linalg.det(matrix) == 0:
             raise CheckpointError(f"{source}: intrinsic_config of {key} is not an invertible 3 × 3 matrix")
-        found[key] = Intrinsics(matrix, int(entry["width"]), int(entry["height"]))
-    return found
+        cameras[key] = Intrinsics(matrix, int(entry["width"]), int(entry["height"]))
+    return cameras

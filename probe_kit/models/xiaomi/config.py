@@ -51,10 +51,10 @@ class XiaomiConfig:
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any], source: str = "config") -> "XiaomiConfig":
-        """From the content of a `config.json`. Raises CheckpointError naming `source`."""
-        if (found := values.get("model_type")) != MODEL_TYPE:
+        """Read the content of a `config.json`. Raises CheckpointError naming `source`."""
+        if (model_type := values.get("model_type")) != MODEL_TYPE:
             raise CheckpointError(
-                f"{source} holds a {found!r} model; expected {MODEL_TYPE!r} (Xiaomi-Robotics-R0). "
+                f"{source} holds a {model_type!r} model; expected {MODEL_TYPE!r} (Xiaomi-Robotics-R0). "
                 "Pass the right --model"
             )
         missing = [name for name in ("vlm_config", "state_dim", "action_dim") if name not in values]

@@ -22,7 +22,7 @@ _THOUSANDTHS = 1000
 
 @dataclass(frozen=True)
 class Prompt:
-    """What the flow transformer keeps of the prompt.
+    """The parts of the prompt that the flow transformer keeps.
 
     caches: per layer it reads, keys and values. mask: (B, P) bool. ends: (3, B, 1) int64, the last position along
     time, height and width.
@@ -52,9 +52,9 @@ class XiaomiNetwork(nn.Module):
     def read(self, inputs: QwenInputs) -> Prompt:
         """One pass of the vision-language model; its output head is not called, nothing reads it."""
         keywords = inputs.keywords(self.vlm.model)
-        seen = self.vlm.model(**keywords, use_cache=True).past_key_values
-        self.prompt_kv(seen.layers)
-        caches = [(layer.keys, layer.values) for layer in seen.layers[-len(self.dit.layers) :]]
+        cache = self.vlm.model(**keywords, use_cache=True).past_key_values
+        self.prompt_kv(cache.layers)
+        caches = [(layer.keys, layer.values) for layer in cache.layers[-len(self.dit.layers) :]]
         return Prompt(caches, inputs.mask.bool(), keywords["position_ids"].amax(dim=-1, keepdim=True))
 
     def velocity(self, prompt: Prompt, state: Tensor, actions: Tensor, moment: Tensor) -> Tensor:
@@ -66,9 +66,9 @@ class XiaomiNetwork(nn.Module):
         stream = torch.cat([self.sink.weight.expand(len(moving), -1, -1), states, moving], dim=1)
         time = self.t_projector(self.t_embedder(moment * _THOUSANDTHS)).unflatten(-1, (6, -1))
         length = stream.shape[1]
-        own = torch.arange(length, device=stream.device) + prompt.ends + 1
-        rotation = self.vlm.model.language_model.rotary_emb(stream, own)
-        stream = self.dit(stream, prompt.caches, rotation, time, _seen(prompt.mask, length))
+        positions = torch.arange(length, device=stream.device) + prompt.ends + 1
+        rotation = self.vlm.model.language_model.rotary_emb(stream, positions)
+        stream = self.dit(stream, prompt.caches, rotation, time, _mask(prompt.mask, length))
         velocity: Tensor = self.action_output_layer(stream[:, -actions.shape[1] :])
         return velocity
 
@@ -86,16 +86,16 @@ class XiaomiNetwork(nn.Module):
         path = noise.float()
         for step in range(steps):
             moment = torch.ones(len(path), device=path.device) * step / steps
-            seen = (path * used).to(dtype)
-            path = path + self.velocity(prompt, state.to(dtype), seen, moment).float() * (1.0 / steps)
+            noisy = (path * used).to(dtype)
+            path = path + self.velocity(prompt, state.to(dtype), noisy, moment).float() * (1.0 / steps)
         return path
 
 
-def _seen(prompt: Tensor, length: int) -> Tensor:
+def _mask(prompt: Tensor, length: int) -> Tensor:
     """(B, 1, T, P + T) bool: every own position sees the whole prompt, and of its own kind what stands before."""
-    own = torch.ones(length, length, dtype=torch.bool, device=prompt.device).tril()
+    causal = torch.ones(length, length, dtype=torch.bool, device=prompt.device).tril()
     before = prompt[:, None, :].expand(-1, length, -1)
-    return torch.cat([before, own.expand(len(prompt), -1, -1)], dim=-1)[:, None]
+    return torch.cat([before, causal.expand(len(prompt), -1, -1)], dim=-1)[:, None]
 
 
 def build_xiaomi(config: XiaomiConfig, dtype: torch.dtype, device: str = "meta") -> XiaomiNetwork:

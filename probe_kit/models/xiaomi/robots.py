@@ -38,7 +38,7 @@ class ActionUnits:
 
     @property
     def sha256(self) -> str:
-        """Of the numbers."""
+        """The hash of the numbers."""
         return sha256_json([self.mean.tolist(), self.deviation.tolist()])
 
     def restore(self, actions: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -54,14 +54,14 @@ def read_units(folder: Path, robot: str | None, numbers: int) -> ActionUnits:
     several without a choice.
     """
     file = folder / STATISTICS_FILE
-    known: Mapping[str, Any] = (load_json(file) if file.is_file() else {}).get("action_config") or {}
-    if not known:
+    by_robot: Mapping[str, Any] = (load_json(file) if file.is_file() else {}).get("action_config") or {}
+    if not by_robot:
         raise CheckpointError(
             f"{file} has no action_config: the actions have no physical unit and no length. "
             "Take the file that the checkpoint was released with"
         )
-    name = _choose(robot, known, str(file))
-    mean, deviation = (np.asarray(known[name].get(part, []), np.float64) for part in ("mean", "std"))
+    name = _choose(robot, by_robot, str(file))
+    mean, deviation = (np.asarray(by_robot[name].get(part, []), np.float64) for part in ("mean", "std"))
     mean, deviation = (part[0] if part.ndim == 3 and len(part) == 1 else part for part in (mean, deviation))
     if mean.ndim != 2 or mean.shape != deviation.shape or mean.shape[1] != numbers:
         raise CheckpointError(
@@ -73,14 +73,14 @@ def read_units(folder: Path, robot: str | None, numbers: int) -> ActionUnits:
     return ActionUnits(name, mean, deviation)
 
 
-def _choose(robot: str | None, known: Mapping[str, Any], place: str) -> str:
-    beginning = [] if robot is None else [name for name in known if name.startswith(robot)]
-    return chosen_name(known, beginning[0] if len(beginning) == 1 else robot, "robot", place)
+def _choose(robot: str | None, by_robot: Mapping[str, Any], source: str) -> str:
+    beginning = [] if robot is None else [name for name in by_robot if name.startswith(robot)]
+    return chosen_name(by_robot, beginning[0] if len(beginning) == 1 else robot, "robot", source)
 
 
 @dataclass(frozen=True)
 class Robot:
-    """How a robot's scene is shown and its state written.
+    """A robot's way of showing its scene and writing its state.
 
     heading: what its camera is called in the prompt. width, height: of its picture, in pixels.
     state: from the observation's eight numbers to its own.
@@ -111,7 +111,7 @@ _ROBOTS = (
 
 
 def robot_of(name: str) -> Robot:
-    """What is known of the robot whose statistics are called `name`, such as bridge_delta.
+    """The robot whose statistics are called `name`, such as bridge_delta.
 
     Raises UsageError for robots with other cameras and other states than Act2Answer's arm can have.
     """

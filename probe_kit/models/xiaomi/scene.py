@@ -19,8 +19,8 @@ def look(picture: NDArray[np.uint8], robot: Robot) -> NDArray[np.uint8]:
     size = (robot.width, robot.height)
     scaled = Image.fromarray(picture).resize(size, Image.Resampling.BICUBIC)
     width, height = (int(side * CROP) for side in size)
-    left, top = (robot.width - width) // 2, (robot.height - height) // 2
-    middle = scaled.crop((left, top, left + width, top + height))
+    column, top = (robot.width - width) // 2, (robot.height - height) // 2
+    middle = scaled.crop((column, top, column + width, top + height))
     return np.array(middle.resize(size, Image.Resampling.BILINEAR))
 
 
@@ -35,6 +35,6 @@ def prompt(instruction: str, heading: str) -> str:
 
 
 def _sentence(instruction: str) -> str:
-    """With a capital and a full stop, as in training."""
+    """Return the instruction with a capital and a full stop, as in training."""
     text = instruction.strip()
     return text[:1].upper() + text[1:] + ("" if text.endswith((".", "!", "?")) else ".")

@@ -29,6 +29,7 @@ from probe_kit.hooks.conformance.subject import (
     Subject,
 )
 from probe_kit.hooks.families.pi0.adapter import Pi0
+from tests.support.contracts import GOLDEN
 from tests.support.encoder_vla.policy import CHUNK, STEPS, WIDTH, EncoderPolicy, EncoderVLA, load, write_checkpoint
 from tests.support.parsed import parsed
 from tests.support.position_models import PositionModel, always, likes
@@ -387,6 +388,13 @@ def test_a_recorded_output_that_differs_fails_its_check(golden_pi0: Path, tmp_pa
     np.savez(folder / "reference.npz", **{**arrays, "actions": arrays["actions"] + 1})
     with pytest.raises(CheckFailedError, match="other values of actions;"):
         own(PolicySubject("pi0", folder / "checkpoint"))
+
+
+@pytest.mark.parametrize("family", ["pi0", "smolvla"])
+def test_a_checkpoint_is_copied_with_the_files_that_lie_beside_it(family: str) -> None:
+    """pi0's sizes and tokenizer lie beside the folder, and smolvla's configuration names `../vlm`."""
+    with PolicySubject(family, GOLDEN / family / "checkpoint") as subject:
+        CHECKS["every_file_that_is_read_reaches_the_card"](subject)
 
 
 # -- models that answer ----------------------------------------------------------------------------------------

@@ -165,7 +165,7 @@ class Groot(DenoisingPolicy):
 
     @classmethod
     def current_keys(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return tensors under lerobot's names, also of NVIDIA's files; a file may hold either of tied embeddings."""
+        """Return tensors by lerobot's names, also of NVIDIA's files; a file may hold either tied embedding."""
         renamed = {
             name if name.startswith(_MODEL) else f"{_MODEL}{name}": tensor for name, tensor in tensors.items()
         }

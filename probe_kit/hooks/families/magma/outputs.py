@@ -123,14 +123,14 @@ class _Reference:
         """(N, C, h, w) of the tokens that a vision stream's tap gives; maps have the shape of what was shown."""
         layers = self.model.further_streams[stream].layers
         tokens = self.first[2][Site(stream, layer % layers)]
-        height, width = self.model.network.shown(self.first[0]).shape[-2:]
+        height, width = self.model.network.trunk_input(self.first[0]).shape[-2:]
         high = round(np.sqrt(tokens.shape[1] * height / width))
         return numpy_of(tokens.transpose(1, 2).reshape(len(tokens), -1, high, tokens.shape[1] // high))
 
     @torch.inference_mode()
     def _projected(self) -> NDArray[Any]:
         network = self.model.network
-        maps = network.vision_tower(network.shown(self.first[0]))
+        maps = network.vision_tower(network.trunk_input(self.first[0]))
         return numpy_of(network.multi_modal_projector(maps.permute(0, 2, 3, 1)))
 
     def _streams(self) -> dict[str, Produce]:

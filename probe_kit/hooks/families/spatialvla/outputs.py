@@ -30,7 +30,7 @@ from probe_kit.hooks.verification.outputs import (
 )
 from probe_kit.models.spatialvla import (
     STEP_TOKENS,
-    Seen,
+    Sight,
     depth_input,
     known_cameras,
     point_places,
@@ -81,7 +81,7 @@ class _Reference:
     # -- picture, depth, space ---------------------------------------------------------------------------
 
     @cached_property
-    def _seen(self) -> Seen:
+    def _sight_of_pictures(self) -> Sight:
         with torch.inference_mode():
             return self.policy.network.look(self.pictures, self.cameras)
 
@@ -93,9 +93,9 @@ class _Reference:
             "pixel_values_224": lambda: prepare_picture(image, replace(settings, side=224))[None],
             "intrinsic": lambda: _numpy(self.cameras[0]),
             "siglip_hidden_states": lambda: stacked(self._spoken[1], self.policy.further_streams["vision"])[0],
-            "siglip_last_hidden_state": lambda: _numpy(self._seen.tower),
+            "siglip_last_hidden_state": lambda: _numpy(self._sight_of_pictures.tower),
             # The original divides by what Gemma-2 multiplies with; see `SpatialVLANetwork.embed`.
-            "image_features": lambda: _numpy(self._seen.features) / np.sqrt(config.text.hidden_size),
+            "image_features": lambda: _numpy(self._sight_of_pictures.features) / np.sqrt(config.text.hidden_size),
         }
         if config.depth is None:
             return produced
@@ -105,12 +105,12 @@ class _Reference:
             "domain_logits": lambda: _numpy(self._depth().domains),
             "depth": lambda: _numpy(self._depth().metres),
             "uv_h": lambda: _numpy(point_places(config.side, patch, config.points)),
-            "xyz": lambda: _numpy(self._seen.points),
-            "position_embedding_3d": lambda: _numpy(self._seen.place),
+            "xyz": lambda: _numpy(self._sight_of_pictures.points),
+            "position_embedding_3d": lambda: _numpy(self._sight_of_pictures.positions),
         }
 
     def _depth(self) -> Any:
-        return self._seen.depth
+        return self._sight_of_pictures.depth
 
     def _thinned(self, full_map: Tensor, name: str) -> NDArray[Any]:
         """Every n-th pixel of a large map, as it is recorded."""
@@ -146,7 +146,7 @@ class _Reference:
     @torch.inference_mode()
     def _prompt_logits(self) -> NDArray[Any]:
         packed = self.policy.pack([self.prompt])
-        embeddings = self.policy.network.embed(packed.ids, self._seen.features)
+        embeddings = self.policy.network.embed(packed.ids, self._sight_of_pictures.features)
         return _numpy(self.policy.network(embeddings, packed.mask).logits)
 
     @cached_property
