@@ -168,7 +168,7 @@ def test_a_model_without_depth_reads_sight_alone() -> None:
     values = {"use_vision_zoe": False, "vision_zoe_config": None}
     made = network(**values)
     seen = made.look(pictures(), CAMERA)
-    assert seen.depth is seen.points is seen.place is None
+    assert seen.depth is seen.points is seen.positions is None
     torch.testing.assert_close(seen.features, made.multi_modal_projector(seen.tower))
     assert not any("zoe" in name or "position_embedding_3d" in name for name in made.state_dict())
 

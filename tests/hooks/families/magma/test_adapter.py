@@ -74,13 +74,13 @@ def test_seven_action_tokens_that_the_turn_does_not_end_behind_are_flagged(tmp_p
 
 def test_flags_belong_to_their_row(loaded: Magma, monkeypatch: pytest.MonkeyPatch) -> None:
     seen = example_observations(INSTRUCTIONS)
-    known = loaded.action_tokens.__class__.known
+    is_action = loaded.action_tokens.__class__.is_action
 
     def second_is_text(self: object, ids: np.ndarray) -> np.ndarray:
-        return known(self, ids) & (np.arange(len(ids)) != 1)[:, None]
+        return is_action(self, ids) & (np.arange(len(ids)) != 1)[:, None]
 
     whole = loaded.act(seen, [0, 1])
-    monkeypatch.setattr(loaded.action_tokens.__class__, "known", second_is_text)
+    monkeypatch.setattr(loaded.action_tokens.__class__, "is_action", second_is_text)
     flagged = loaded.act(seen, [0, 1])
     assert loaded.flagged.tolist() == [False, True]
     np.testing.assert_array_equal(flagged[0], whole[0])
