@@ -137,8 +137,8 @@ def control_alarms(accuracy: float, draws: int) -> tuple[float, float]:
         reference = np.mean(layers, axis=0)
         found.append(
             [
-                better_than_reference(here, reference, groups, seed).min() < LEVEL,
-                better_than_best(here, there, groups, seed).min() < LEVEL,
+                better_than_reference(here, reference, groups, seed + OTHER).min() < LEVEL,
+                better_than_best(here, there, groups, seed + OTHER).min() < LEVEL,
             ]
         )
     random_features, untrained = np.mean(found, axis=0)

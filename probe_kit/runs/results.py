@@ -204,8 +204,12 @@ def _renamed(name: str, content_sum: Sum) -> str:
 
 def read_bundle(location: Location, home: str, key: str) -> Bundle:
     """The bundle `key`. Raises RunDamagedError if its head or times are missing, changed, or of another run."""
+    return _read_bundle(location, home, key, _identity(location))
+
+
+def _read_bundle(location: Location, home: str, key: str, run: str | None) -> Bundle:
     folder = f"{home}/{key}"
-    expected = {"key": key, "run": _identity(location)}
+    expected = {"key": key, "run": run}
     head = Head.read(location, f"{folder}/{HEAD}", advice_for(folder), **expected)
     times = Times.read(location, f"{folder}/{TIMES}", advice_for(folder), **expected)
     if strange := sorted(
@@ -247,7 +251,8 @@ def complete_key(key: str, stored: Collection[str], location: Location, kind: st
 
 def read_bundles(location: Location, home: str) -> dict[str, Bundle]:
     """Every bundle of a run by key. Raises RunDamagedError for the first that is damaged."""
-    return {key: read_bundle(location, home, key) for key in bundle_keys(location, home)}
+    run = _identity(location)
+    return {key: _read_bundle(location, home, key, run) for key in bundle_keys(location, home)}
 
 
 def _identity(location: Location) -> str | None:

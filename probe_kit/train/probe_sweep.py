@@ -211,13 +211,13 @@ class Sweep:
             raise NoProbesError(
                 f"{run.location} has no activations to probe: of {run.model!r} no stream was stored."
             )
-        target = Target.of_run(run, target, seed=seed) if isinstance(target, str) else target
+        target = Target.of_run(run, target, seed=seed) if isinstance(target, str) else target.on(run)
+        event = None if align_to is None else align_to.on(run)
         if categories is None:
             categories = tuple(dict.fromkeys(run.episodes["category"])) if target.is_side else (EVERYWHERE,)
         _check_groups_named_once(target, folds)
-        _check_windows(target, window, align_to)
-        samples = target_samples(run, target, categories, call, window, align_to, incomplete)
-        target, _ = target.on(run)  # frames that it does not show are counted among the samples
+        _check_windows(target, window, event)
+        samples = target_samples(run, target, categories, call, window, event, incomplete)
         settings = ProbeSettings(
             model=run.model,
             random_weights=run.random_weights,
@@ -241,7 +241,7 @@ class Sweep:
             exchange_within=target.exchange_within or "",
             grouping="" if target.is_side else _grouping(run, target),
             window=samples.window,
-            align_to="" if align_to is None else f"{align_to.name}#{align_to.on(run)[0].sha256[:12]}",
+            align_to="" if event is None else f"{event.name}#{event.sha256[:12]}",
         )
         return cls(run, target, samples, settings, crew, progress)
 

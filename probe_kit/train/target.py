@@ -53,6 +53,7 @@ class Target:
     None for the groups of the run. exchange_within: column within which label permutations exchange groups; None
     for everywhere. groups, strata: (n,) those columns, None where the run has them. table: where errors point to.
     of_source: whether episodes and inferences are numbers of episodes and frames of a data set; see `on`.
+    unseen: how many labels name a frame or episode that the run of `on` does not show.
     builtin: whether probe_kit computed the column.
     """
 
@@ -66,6 +67,7 @@ class Target:
     groups: tuple[str, ...] | None = None
     strata: tuple[str, ...] | None = None
     of_source: bool = False
+    unseen: int = 0
     builtin: bool = False
     null: Null = "exchange_blocks"
 
@@ -120,14 +122,14 @@ class Target:
             of_source,
         )
 
-    def on(self, run: RunReader) -> "tuple[Target, int]":
-        """Return these labels with the keys of a run, and how many frames or episodes the run does not show.
+    def on(self, run: RunReader) -> "Target":
+        """Return these labels with the keys of a run, without those of frames or episodes that it does not show.
 
         Labels that have its keys already are returned as they are. Raises UsageError for a run of scenes, for
         frames or episodes that were never recorded, and if the run shows none of the frames.
         """
         if not self.of_source:
-            return self, 0
+            return self
         if not getattr(run, "recorded", False):
             raise UsageError(
                 f"{self.table.source} has the key {SOURCE!r} of recordings, and {run.location} is of scenes; "
@@ -150,7 +152,8 @@ class Target:
             groups=None if self.groups is None else tuple(self.groups[number] for number in at),
             strata=None if self.strata is None else tuple(self.strata[number] for number in at),
             of_source=False,
-        ), sum(not matches for matches in keys)
+            unseen=sum(not matches for matches in keys),
+        )
 
     @classmethod
     def of_run(

@@ -70,7 +70,7 @@ def target_samples(
     Raises UsageError for keys that the run does not have, for groups that split an episode or items, and for an
     event that is not true or false by inference.
     """
-    target, unseen = target.on(run)
+    target = target.on(run)
     if target.per_step and call:
         raise UsageError(
             f"call={call} with {target.described}, which has a label for every inference; expected one per "
@@ -112,7 +112,7 @@ def target_samples(
         f"labels outside the window of {window}": _outside(grid[reaching], labelled[reaching])
         if target.per_step
         else 0,
-        "labels of frames or episodes that the run does not show": unseen,
+        "labels of frames or episodes that the run does not show": target.unseen,
     }
     return TargetSamples(
         rows,
@@ -157,7 +157,7 @@ def _outside(table: NDArray[np.float64], labelled: NDArray[np.bool_]) -> int:
 
 def _events(run: RunReader, target: Target, align_to: Target) -> NDArray[np.intp]:
     """(E,) the first inference at which `align_to` is true, -1 without one. Raises UsageError."""
-    event, _ = align_to.on(run)
+    event = align_to.on(run)
     if not (target.per_step and event.per_step and event.coded.classes in _TRUE_OR_FALSE):
         raise UsageError(
             f"windows of {target.described} aligned to {event.described}"

@@ -4,14 +4,13 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from probe_kit.errors import NoProbesError
 from probe_kit.runs.results import Bundle
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.control_scores import UNTRAINED
 from probe_kit.train.results.resume import unfinished_sweeps
 from probe_kit.train.results.store import (
     is_current,
-    load_results,
+    newest_bundle,
     read_controls,
     read_probes,
     settings_of,
@@ -97,20 +96,14 @@ def _in_wordings(run: Any) -> list[Any]:
 
 def stored_probes(run: Any) -> list[StoredProbes]:
     """Return every set of probe results of a run, oldest first."""
-    readers = _in_wordings(run)
-    used = {_used(reader) for reader in readers}
-    probes = [_probes(readers, bundle, used) for bundle in read_probes(run.location).values()]
+    readers, bundles = _in_wordings(run), read_probes(run.location)
+    newest = (newest_bundle(reader, bundles, "correct") for reader in readers)
+    used = {bundle.key for bundle in newest if bundle is not None}
+    probes = [_probes(readers, bundle, used) for bundle in bundles.values()]
     return sorted(probes, key=lambda stored: (stored.created, stored.key))
 
 
-def _used(run: RunReader) -> str | None:
-    try:
-        return load_results(run).key
-    except NoProbesError:
-        return None
-
-
-def _probes(readers: Sequence[RunReader], bundle: Bundle, used: Collection[str | None]) -> StoredProbes:
+def _probes(readers: Sequence[RunReader], bundle: Bundle, used: Collection[str]) -> StoredProbes:
     settings = settings_of(bundle)
     current = [run for run in readers if is_current(settings, run)]
     state = "other episodes" if not current else "other" if settings.is_side else "label"

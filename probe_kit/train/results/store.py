@@ -23,7 +23,9 @@ from probe_kit.runs.layout import PROBE_DIRECTIONS, PROBES
 from probe_kit.runs.results import (
     HEAD,
     Bundle,
+    bundle_keys,
     complete_key,
+    read_bundle,
     read_bundles,
     tidy_bundle,
     write_bundle,
@@ -104,25 +106,32 @@ def load_results(run: RunReader, key: str | None = None, target: str | None = No
     target: a side, a built-in column, or one of a table; by default the correct side. The newest of a side are of
     the first captured inference; those of later ones are read by their key.
 
-    key: as `probe-kit run show` lists it; its beginning will do. Newest: those that were asked for last, whether
-    they were fitted then or loaded. Raises NoProbesError if there are none, UsageError for a key that is not
-    there or of another target, and RunDamagedError if any results of the run were changed, lost their settings,
-    have another format, or are of other activations.
+    key: as `probe-kit run show` lists it; its beginning will do, and no other results are read. Newest: those
+    that were asked for last, whether they were fitted then or loaded. Raises NoProbesError if there are none,
+    UsageError for a key that is not there or of another target, and RunDamagedError if results that are read were
+    changed, lost their settings, have another format, or are of other activations.
     """
-    location, stored = run.location, read_probes(run.location)
+    location = run.location
     if key is not None:
-        bundle = stored[complete_key(key, stored, location, "probe results")]
+        complete = complete_key(key, bundle_keys(location, PROBES), location, "probe results")
+        bundle = _checked(read_bundle(location, PROBES, complete))
         if target not in (None, probed := settings_of(bundle).target):
             raise UsageError(
                 f"{location}: the probes {bundle.key} are of {probed!r}, not of {target!r}. Give their key with "
                 f"--target {probed}, or leave it out"
             )
         return _read(run, bundle)
-    target = target or "correct"
-    newest = {name: bundle for name, bundle in _current(run, stored).items() if _is_default(bundle, target)}
-    if not newest:
+    target, stored = target or "correct", read_probes(location)
+    newest = newest_bundle(run, stored, target)
+    if newest is None:
         raise NoProbesError(_why_none(run, target, len(stored)))
-    return _read(run, max(newest.values(), key=_rank))
+    return _read(run, newest)
+
+
+def newest_bundle(run: RunReader, stored: Mapping[str, Bundle], target: str) -> Bundle | None:
+    """Return the results of a target that `load_results` reads without a key; None without any."""
+    of_target = [bundle for bundle in _current(run, stored).values() if _is_default(bundle, target)]
+    return max(of_target, key=_rank, default=None)
 
 
 def load_side_results(run: RunReader, key: str | None = None) -> ProbeResults:
@@ -237,12 +246,14 @@ def _members(stored: Mapping[str, Any]) -> dict[str, Any]:
 
 def read_probes(run: Location) -> dict[str, Bundle]:
     """Return every complete result by key. Raises RunDamagedError for a changed one or another format."""
-    bundles = read_bundles(run, PROBES)
-    for key, bundle in bundles.items():
-        if (settings_key := sha256_json(bundle.head["settings"])[:12]) != key:
-            raise bundle.head_damaged(f"has the settings of {settings_key}")
-        bundle.check_format(FORMAT)
-    return bundles
+    return {key: _checked(bundle) for key, bundle in read_bundles(run, PROBES).items()}
+
+
+def _checked(bundle: Bundle) -> Bundle:
+    if (settings_key := sha256_json(bundle.head["settings"])[:12]) != bundle.key:
+        raise bundle.head_damaged(f"has the settings of {settings_key}")
+    bundle.check_format(FORMAT)
+    return bundle
 
 
 def settings_of(bundle: Bundle) -> ProbeSettings:

@@ -159,6 +159,17 @@ def test_probes_that_are_asked_for_again_are_the_newest(planted_run: PlantedRun)
     assert load_results(run).key == first.key
 
 
+def test_results_are_loaded_by_their_key_beside_damaged_ones(planted_run: PlantedRun) -> None:
+    run = planted_run()
+    intact, damaged = (train_probes(run, permutations=count).key for count in (0, 1))
+    (run.path / "probes" / damaged / "settings.json").write_bytes(b"{}")
+    assert load_results(run, intact).key == intact
+    with pytest.raises(RunDamagedError, match=damaged):
+        load_results(run, damaged)
+    with pytest.raises(RunDamagedError, match=damaged):
+        load_results(run)
+
+
 def test_the_beginning_of_a_key_will_do(planted_run: PlantedRun) -> None:
     run = planted_run()
     key = train_probes(run, permutations=1).key

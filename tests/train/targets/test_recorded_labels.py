@@ -165,7 +165,7 @@ def test_labels_of_whole_source_episodes_are_those_of_their_rows(shown_run: Run)
     assert labels.coded.classes == ("k0", "k1", "k2", "x")
     samples = target_samples(shown_run, labels, None, 0, None)
     np.testing.assert_array_equal(samples.values, np.arange(12) % 3)
-    assert labels.on(shown_run)[0].coded.classes == ("k0", "k1", "k2"), "no episode of the run is an x"
+    assert labels.on(shown_run).coded.classes == ("k0", "k1", "k2"), "no episode of the run is an x"
 
 
 @pytest.mark.parametrize(
