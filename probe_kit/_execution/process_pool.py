@@ -8,7 +8,9 @@ from typing import Any, Self
 
 from probe_kit._execution.child_process import Child
 from probe_kit._execution.worker import Lost, Work
+from probe_kit._system.machine import CORES, cores_here
 
+VISIBLE_GPUS = "CUDA_VISIBLE_DEVICES"
 LONGEST_WAIT_S = 1.0
 """A signal that arrives just before the system call does not end it: an endless wait would miss Ctrl-C."""
 
@@ -84,10 +86,17 @@ class ProcessPool:
 
 
 def share_of_machine(slot: int, size: int, device: str) -> dict[str, str]:
-    """Variables of process number `slot` of `size`: a share of the cores, and one GPU where there are GPUs."""
-    share = {"OMP_NUM_THREADS": str(max(1, (os.cpu_count() or 1) // size))}
+    """Variables of process number `slot` of `size`: a share of the cores, and one GPU where there are GPUs.
+
+    It is a share of what this process itself has: a worker of a pool that opens a pool divides its own share.
+    """
+    cores = str(max(1, cores_here() // size))
+    share = {"OMP_NUM_THREADS": cores, CORES: cores}
     if device.startswith("cuda"):
         import torch
 
-        share["CUDA_VISIBLE_DEVICES"] = str(slot % max(1, torch.cuda.device_count()))
+        visible = os.environ.get(VISIBLE_GPUS)
+        # Numbers of torch count the visible GPUs, those of the variable all of them.
+        gpus = visible.split(",") if visible else [str(gpu) for gpu in range(max(1, torch.cuda.device_count()))]
+        share[VISIBLE_GPUS] = gpus[slot % len(gpus)]
     return share

@@ -10,6 +10,8 @@ from pathlib import Path
 from probe_kit._system.counting import counted
 from probe_kit.errors import UsageError
 
+CORES = "PROBE_KIT_CORES"
+"""The variable by which a pool gives its workers their share of the cores."""
 _DEVICE = re.compile(r"(?P<kind>[a-z]+)(:(?P<index>\d+))?")
 _KINDS = ("cpu", "cuda", "hpu", "mps", "mtia", "xpu")
 """Of torch's kinds of devices, those that compute."""
@@ -43,8 +45,10 @@ def what_is_here() -> str:
 
 
 def cores_here() -> int:
-    """Count the cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """Count the cores that this process may use: those of the system, or its share if it is a worker of a pool."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    share = os.environ.get(CORES, "")
+    return min(cores, int(share)) if share.isdecimal() and int(share) else cores
 
 
 def _devices() -> list[str]:

@@ -20,9 +20,7 @@ from probe_kit._terminal.field_options import Part, options_of
 from probe_kit.errors import UsageError
 from probe_kit.extract.parts import ActMachine, ActTask, AskCapture, AskMachine, AskTask, Capture, ModelSettings
 from probe_kit.extract.protocols import has_network, protocol_identity, protocol_row, scene_of
-from probe_kit.extract.sources.environment import EnvSource
-from probe_kit.extract.sources.pictures import PictureFolder
-from probe_kit.extract.sources.recording import LeRobotSource
+from probe_kit.extract.sources.kinds import SOURCES, kind_of
 from probe_kit.extract.sources.scene import SceneOptions, SceneSettings
 from probe_kit.extract.sources.source import SourceSettings
 from probe_kit.extract.vqa.templates import find_template
@@ -35,19 +33,12 @@ if TYPE_CHECKING:
     from probe_kit.env import SceneSpec
     from probe_kit.suite.wording import Wording
 
-SOURCES: tuple[type[SourceSettings], ...] = (SceneSettings, LeRobotSource, EnvSource, PictureFolder)
-"""The kinds of sources, that of no option first."""
 _PARTS = ("model", "capture", "task", "machine")
 
 
 def _read_source(value: Any) -> Any:
     """Settings of a source from the part of a file, by its kind."""
-    if not isinstance(value, Mapping):
-        return value
-    kinds = {kind.model_fields["kind"].default: kind for kind in SOURCES}
-    if value.get("kind") not in kinds:
-        raise UsageError(f"source.kind is {value.get('kind')!r}; expected one of {', '.join(kinds)}")
-    return kinds[value["kind"]](**value)
+    return kind_of(value)(**value) if isinstance(value, Mapping) else value
 
 
 def _checked_label(label: str | None) -> str | None:

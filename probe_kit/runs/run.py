@@ -47,6 +47,7 @@ from probe_kit.runs.layout import (
     VectorKind,
     stored_inputs_of,
 )
+from probe_kit.runs.origin import Origin
 from probe_kit.runs.outcomes_by_rule import Watched, judged, watch, with_outcomes
 from probe_kit.runs.plans import while_growing
 from probe_kit.runs.provenance import Provenance, check_provenances, differences, read_provenances
@@ -55,7 +56,6 @@ from probe_kit.runs.root import read_root
 from probe_kit.runs.rows import Rows, TokenBlock, role_mask, token_blocks
 from probe_kit.runs.seconds import Seconds, read_seconds
 from probe_kit.runs.selection import select_items
-from probe_kit.runs.sources import RunSources
 from probe_kit.runs.store import Location, locate
 from probe_kit.runs.summary import run_html, run_text
 from probe_kit.runs.trajectories import Trajectories, names_trajectory
@@ -268,16 +268,16 @@ class Run:
         return {**certificate, "processes": processes, "mixed": list(self.mixed)}
 
     @cached_property
-    def sources(self) -> tuple[RunSources, ...]:
-        """Sources of the processes that played it, the first process's first; empty before the first episode."""
+    def origins(self) -> tuple[Origin, ...]:
+        """Origins of the processes that played it, the first process's first; empty before the first episode."""
         if not self._commits:
             return ()
         certificate, processes = self._certificates
-        sources_of_run: list[RunSources] = []
+        origins: list[Origin] = []
         for record in (certificate, *processes):
-            if (sources := RunSources.of_record(record)) not in sources_of_run:
-                sources_of_run.append(sources)
-        return tuple(sources_of_run)
+            if (origin := Origin.of_record(record)) not in origins:
+                origins.append(origin)
+        return tuple(origins)
 
     @cached_property
     def provenances(self) -> dict[str, Provenance]:

@@ -13,8 +13,9 @@ from typing import Any
 
 import pytest
 
-from probe_kit._execution.process_pool import ProcessPool
+from probe_kit._execution.process_pool import ProcessPool, share_of_machine
 from probe_kit._execution.worker import Idle, Lost, Work
+from probe_kit._system.machine import CORES, cores_here
 from probe_kit.errors import UsageError
 from tests.support.echo_work import BREAK, DIE, FAIL
 
@@ -113,7 +114,8 @@ def test_all_workers_end_with_the_pool_and_an_error_in_its_body_is_kept(echo: Wo
 def test_ctrl_c_reaches_the_parent_alone_and_ends_the_workers(tmp_path: Path) -> None:
     """A terminal sends it to the whole group; the pool's processes are in sessions of their own."""
     code = """
-from probe_kit._execution.process_pool import ProcessPool
+from probe_kit._execution.process_pool import ProcessPool, share_of_machine
+from probe_kit._system.machine import CORES, cores_here
 from echo_work import echo
 with ProcessPool(echo, None, 1) as pool:
     print(pool.pid(0), flush=True)
@@ -132,3 +134,22 @@ with ProcessPool(echo, None, 1) as pool:
     _, errors = driver.communicate(timeout=60)
     assert "KeyboardInterrupt" in errors
     assert not is_running(pid)
+
+
+def test_a_pool_inside_a_worker_divides_the_share_of_that_worker(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.sched_getaffinity", lambda _: set(range(16)), raising=False)
+    monkeypatch.delenv(CORES, raising=False)
+    outer = share_of_machine(0, 2, "cpu")
+    assert outer == {"OMP_NUM_THREADS": "8", CORES: "8"}
+    monkeypatch.setenv(CORES, outer[CORES])
+    assert cores_here() == 8
+    assert [share_of_machine(slot, 4, "cpu")["OMP_NUM_THREADS"] for slot in range(4)] == ["2"] * 4
+    assert share_of_machine(0, 99, "cpu")[CORES] == "1"
+
+
+@pytest.mark.parametrize(("visible", "gpus"), [("2,5", ["2", "5", "2"]), ("GPU-ab", ["GPU-ab"] * 3)])
+def test_workers_share_the_gpus_that_this_process_was_given(
+    visible: str, gpus: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", visible)
+    assert [share_of_machine(slot, 3, "cuda")["CUDA_VISIBLE_DEVICES"] for slot in range(3)] == gpus

@@ -1,41 +1,65 @@
-"""The source that CONTRIBUTING adds: one file, and one name in the settings."""
+"""The source that CONTRIBUTING adds: one file, and an entry point of its package."""
 
-import importlib
+import os
+import subprocess
 import sys
+from importlib.metadata import EntryPoint
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 import probe_kit as pk
-from probe_kit.extract import ExtractSettings, prepare, settings
-from probe_kit.hooks import Policy
+from probe_kit.extract.sources import kinds
 
 PAGE = Path(__file__).parents[2] / "CONTRIBUTING.md"
 
 
 @pytest.fixture
-def noise(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
-    """The module of the diff; its settings are among the sources of `extract`."""
-    diff = PAGE.read_text(encoding="utf-8").partition("+++ b/probe_kit/extract/sources/noise.py\n")[2]
-    lines = diff.partition("\n```")[0].splitlines()
-    assert all(line.startswith("+") for line in lines), "the source is one new file"
-    (tmp_path / "noise_source.py").write_text("\n".join(line[1:] for line in lines), encoding="utf-8")
-    monkeypatch.syspath_prepend(tmp_path)
-    module = importlib.import_module("noise_source")
-    monkeypatch.setattr(settings, "SOURCES", (*settings.SOURCES, module.NoisePictures))
-    monkeypatch.setattr(ExtractSettings, "sources", settings.SOURCES)
-    yield module
-    sys.modules.pop("noise_source", None)
+def package(tmp_path: Path) -> Path:
+    """A folder of the import path with the new file and what an installer makes of the entry point."""
+    page = PAGE.read_text(encoding="utf-8")
+    diff = page.partition("+++ b/noise_source.py\n")[2].partition("\n```")[0].splitlines()
+    assert all(line.startswith("+") for line in diff), "the source is one new file"
+    (tmp_path / "noise_source.py").write_text("\n".join(line[1:] for line in diff), encoding="utf-8")
+    (entry,) = [line[1:] for line in page.splitlines() if line.startswith("+noise = ")]
+    about = tmp_path / "noise_source-1.dist-info"
+    about.mkdir()
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: noise-source\nVersion: 1\n", encoding="utf-8")
+    points = f"[{kinds.ENTRY_POINTS}]\n{entry.replace(chr(34), '')}\n"
+    (about / "entry_points.txt").write_text(points, encoding="utf-8")
+    return tmp_path
 
 
-def test_a_source_is_one_file_from_its_option_to_its_run(noise: Any, pi0_tiny: Policy, tmp_path: Path) -> None:
-    typed = ExtractSettings.of_command({"model": "pi0-tiny", "noise": 3, "env_workers": 0})
-    assert typed.source == noise.NoisePictures(count=3)
-    assert ExtractSettings(**typed.config()) == typed
-    run = prepare(typed, policy=pi0_tiny).run(tmp_path / "run")
+def test_a_source_is_one_file_from_its_option_to_its_run(package: Path, tmp_path: Path) -> None:
+    line = ["extract", "--model", "pi0-tiny", "--noise", "3", "--env-workers", "0", "--out", str(tmp_path / "run")]
+    path = os.pathsep.join([str(package), *sys.path])
+    ended = subprocess.run(
+        [sys.executable, "-m", "probe_kit", *line],
+        capture_output=True, encoding="utf-8", check=False, env={**os.environ, "PYTHONPATH": path},
+    )  # fmt: skip
+    assert ended.returncode == 0, ended.stderr
+    run = pk.open_run(tmp_path / "run")
     assert len(run.episodes) == 3
     column = run.column(pk.Site("backbone", 3), "mean")
     assert np.isfinite(column).all()
     assert len(np.unique(column, axis=0)) == 3
+
+
+@pytest.mark.parametrize(
+    ("value", "problem"),
+    [
+        ("json:loads", "no class derived from SourceSettings"),
+        ("no_such_module_here:Noise", "ModuleNotFoundError"),
+        ("probe_kit.extract.sources.pictures:PictureFolder", "its kind is 'pictures'"),
+        ("probe_kit.extract.sources.source:SourceSettings", "its kind is"),
+    ],
+)
+def test_a_source_that_cannot_be_used_is_left_out_by_name(
+    value: str, problem: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    entry = EntryPoint("noise", value, kinds.ENTRY_POINTS)
+    monkeypatch.setattr(kinds, "entry_points", lambda **_: [entry])
+    with pytest.warns(kinds.BrokenSourceWarning, match="noise") as said:
+        assert list(kinds._third_party()) == []
+    assert problem in str(said[0].message)

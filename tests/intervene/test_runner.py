@@ -37,7 +37,7 @@ from probe_kit.intervene.sessions.opening import open_session
 from probe_kit.intervene.sessions.session import ReplaySession, load_policy_of
 from probe_kit.retention import retention_table
 from probe_kit.runs import Run, open_run, verify_run
-from probe_kit.runs.sources import RunSources
+from probe_kit.runs.origin import Origin
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
@@ -259,10 +259,10 @@ def test_a_folder_called_embedded_is_not_taken_for_the_checkpoint_of_the_package
 
 
 def test_the_seed_of_untrained_weights_is_that_of_the_run_unless_another_is_named(copy: Run) -> None:
-    assert copy.sources[0].random_weights
+    assert copy.origins[0].random_weights
     assert load_policy_of(copy, ReplaySource()).card.weights_sha256 == copy.weights_sha256
     run = open_run(copy.path)
-    run.__dict__["sources"] = (replace(copy.sources[0], weights_seed=7),)
+    run.__dict__["origins"] = (replace(copy.origins[0], weights_seed=7),)
     assert load_policy_of(run, ReplaySource()).card.weights_seed == 7
     assert load_policy_of(run, ReplaySource(weights_seed=8)).card.weights_seed == 8
 
@@ -275,7 +275,8 @@ def test_files_of_the_scene_are_those_of_the_run_as_long_as_they_are_there(
     scene = replace(SceneSpec.from_json(copy.settings["scene"]), rendering="visual-matching", background=photo)
     run = open_run(copy.path)
     run.settings = {**run.settings, "scene": scene.to_json()}
-    run.__dict__["sources"] = (RunSources.of(ExtractSettings("pi0-tiny", scene=scene), ""),)
+    settings = ExtractSettings("pi0-tiny", scene=scene)
+    run.__dict__["origins"] = (Origin.of(settings.model, settings.source.files(), ""),)
     with open_session(run, ReplaySource(), lambda *_: twin) as session:
         assert session.scene.background == photo
     photo.unlink()
@@ -294,7 +295,7 @@ def test_without_a_named_suite_the_embedded_one_is_found_or_drawn_again(
     if where == "found among more items":
         build_suite(default_folder(["color", "shape"]), ["color", "shape"], 14)
     run = open_run(copy.path)
-    run.__dict__["sources"] = ()  # as of a run from another machine
+    run.__dict__["origins"] = ()  # as of a run from another machine
     with open_session(
         run, ReplaySource(), lambda *_: twin
     ) as session:  # the first frames are the run's, or this raises

@@ -151,7 +151,7 @@ def test_pairs_are_refused_in_the_scene(copy: Run, table: Path) -> None:
 
 def test_recordings_that_were_changed_or_moved_are_refused(shown: Run, observed: ObservedSession) -> None:
     run = open_run(shown.path)
-    run.__dict__["sources"] = (replace(shown.sources[0], scene_files={}),)
+    run.__dict__["origins"] = (replace(shown.origins[0], files={}),)
     with pytest.raises(UsageError, match="--dataset"):
         open_session(run, ReplaySource())
     frame = observed.frames.index[0]

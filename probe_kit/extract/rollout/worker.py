@@ -22,7 +22,7 @@ from probe_kit.extract.settings import Settings
 from probe_kit.extract.sources.player import AskablePlayer, LocalPlayer, ProcessPlayer
 from probe_kit.extract.sources.source import Played, Source
 from probe_kit.runs.layout import VIDEOS
-from probe_kit.runs.sources import SOURCES, RunSources
+from probe_kit.runs.origin import ORIGIN, Origin
 from probe_kit.runs.thumbnails import as_thumbnail, thumbnail_key
 from probe_kit.runs.writer import RunWriter
 
@@ -121,15 +121,12 @@ class Worker:
         return Done(rollout.planned.index, rollout.outcome)
 
     def _certificate(self) -> dict[str, Any]:
-        """The controller's, and the sources of this process."""
+        """The controller's, and the origin of this process."""
         certificate = self._controller.certificate()
         card = certificate["policy"]
         checkpoint, repositories = str(card.get("checkpoint") or ""), card.get("repositories", {})
-        source = self._settings.source
-        files = source.files()
-        suite = files.pop("suite", None)
-        sources = RunSources.of(self._settings.model, suite, files, checkpoint, repositories)
-        return {**certificate, SOURCES: sources.to_json()}
+        origin = Origin.of(self._settings.model, self._settings.source.files(), checkpoint, repositories)
+        return {**certificate, ORIGIN: origin.to_json()}
 
     def _pictures(self, rollout: Rollout) -> dict[str, bytes]:
         """Content by key of what is kept for people."""

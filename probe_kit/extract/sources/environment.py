@@ -1,6 +1,9 @@
 """Environments of the user's own as a source: settings of what is played."""
 
+import sys
+from collections.abc import Mapping
 from functools import partial
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
 import typer
@@ -11,6 +14,7 @@ from probe_kit.extract.sources.recording import Episodes, Pixels
 from probe_kit.extract.sources.source import SourceSettings
 
 LEROBOT = "lerobot"
+_IMPORTED_FROM = "imported_from"
 MAX_STEPS = 200
 MOST_STEPS = 10_000
 _option = partial(typer.Option, rich_help_panel="Own environments")
@@ -25,7 +29,7 @@ class EnvSource(SourceSettings):
     """An environment of the user's own in place of a scene.
 
     environment: MODULE:CLASS of the contract `OwnEnvironment`, `lerobot:TYPE` for a configuration of lerobot, or
-    the name of an entry point of the group `probe_kit.sources`. options: keyword arguments of the class.
+    the name of an entry point of the group `probe_kit.environments`. options: keyword arguments of the class.
     episodes: indices among its episodes; None for all. max_steps: actions after which an episode ends. pixels:
     whether pictures at 32 × 32 are stored for controls.
     Raises UsageError for what no environment can have.
@@ -70,6 +74,21 @@ class EnvSource(SourceSettings):
     def marks(self) -> list[str]:
         """The part of a run's label that names the source."""
         return [f"in {self.name}"]
+
+    def files(self) -> dict[str, Path]:
+        """Return the folder from which the module of the environment was imported, if no package installed it."""
+        name = self.environment.partition(":")[0]
+        file = getattr(sys.modules.get(name), "__file__", None)
+        if file is None or Path(file).is_relative_to(sys.prefix):
+            return {}
+        path = Path(file).parent if Path(file).name == "__init__.py" else Path(file)
+        return {_IMPORTED_FROM: path.parents[name.count(".")]}
+
+    @classmethod
+    def find_again(cls, files: Mapping[str, str]) -> None:
+        """Let the module be imported from where a run imported it, behind all other places."""
+        if (folder := files.get(_IMPORTED_FROM)) is not None and folder not in sys.path:
+            sys.path.append(folder)
 
     def steps(self) -> int:
         """Count the actions that an episode can have."""

@@ -18,7 +18,7 @@ from probe_kit.extract.sources.environment import LEROBOT, EnvSource
 from probe_kit.extract.sources.environment_contract import SUCCESS, EnvEpisode, OwnEnvironment, Step
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 
-ENTRY_POINTS = "probe_kit.sources"
+ENTRY_POINTS = "probe_kit.environments"
 METHODS = ("episodes", "reset", "step", "close")
 MOST_EPISODES = 1_000_000
 LONGEST = 200

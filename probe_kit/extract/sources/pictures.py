@@ -88,6 +88,10 @@ class PictureFolder(SourceSettings):
         """The name of the folder; where it lies is no part of a run."""
         return Path(self.folder).expanduser().resolve().name
 
+    def files(self) -> dict[str, Path]:
+        """Return the folder of the pictures, and the table."""
+        return {"folder": Path(self.folder).expanduser(), "table": Path(self.table).expanduser()}
+
     def marks(self) -> list[str]:
         """The part of a run's label that names the source."""
         return [f"on {self.name}"]
@@ -208,7 +212,9 @@ class PictureSource(Source[PictureFolder]):
     def identity(self, execute: int) -> dict[str, Any]:
         """The table by its content; rows hold the hashes of pictures."""
         del execute
-        shapes = {"columns": [len(self.columns)], "prediction": list(self.prediction)}
+        # A table may have no numbers, and Zarr has no array without any.
+        shapes = {"columns": [len(self.columns)]} if self.columns else {}
+        shapes |= {"prediction": list(self.prediction)}
         shapes |= {"pixels": [1, SIDE, SIDE, 3]} if self.settings.pixels else {}
         data_set = {
             "kind": "pictures",
@@ -254,7 +260,8 @@ class PicturePlayer(InputsPlayer):
         self.row = row
         self._clear()
         picture = read_picture(row.content)
-        self._keep("columns", row.content.numbers)
+        if row.content.numbers:
+            self._keep("columns", row.content.numbers)
         self._keep_pictures([picture], self._pixels)
         return Observation(picture, np.zeros(ARM_NUMBERS, np.float32), row.instruction)
 

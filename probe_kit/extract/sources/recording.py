@@ -201,7 +201,7 @@ class LeRobotSource(SourceSettings):
 
     def files(self) -> dict[str, Path]:
         """Return the folder of recordings that lie here."""
-        return {"dataset": Path(self.folder).expanduser()} if self.is_local else {}
+        return {"folder": Path(self.folder).expanduser()} if self.is_local else {}
 
     def marks(self) -> list[str]:
         """The part of a run's label that names the source."""

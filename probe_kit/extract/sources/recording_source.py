@@ -288,7 +288,8 @@ class RecordingSource(Source[LeRobotSource]):
         del execute
         settings, folder = self.settings, self.folder
         state, action = folder.width(STATE), folder.width(ACTION)
-        shapes: dict[str, list[int]] = {"columns": [len(folder.columns)], "prediction": list(self.prediction)}
+        shapes: dict[str, list[int]] = {"prediction": list(self.prediction)}
+        shapes |= {"columns": [len(folder.columns)]} if folder.columns else {}
         shapes |= {} if state is None else {"state": [state]}
         shapes |= {} if action is None else {"action": [self.prediction[0], action]}
         shapes |= {"pixels": [len(settings.cameras), SIDE, SIDE, 3]} if settings.pixels else {}
@@ -465,7 +466,8 @@ class RecordingPlayer(InputsPlayer):
         if STATE in self._numbers:
             state = self._numbers[STATE][frame].astype(np.float32)
             self._keep("state", state)
-        self._keep("columns", [self._numbers[name][frame, 0] for name in recording.folder.columns])
+        if recording.folder.columns:
+            self._keep("columns", [self._numbers[name][frame, 0] for name in recording.folder.columns])
         self._keep_pictures(list(pictures.values()), recording.settings.pixels)
         return observation_of(pictures, state, self.row.instruction)
 

@@ -119,5 +119,5 @@ class SceneSettings(SourceSettings):
 
     def files(self) -> dict[str, Path]:
         """Return the suite, where it is a folder, and the files of the scene by its field."""
-        files = {"suite": self.suite, "arm_urdf": self.scene.arm_urdf, "background": self.scene.background}
-        return {name: path for name, path in files.items() if path is not None}
+        scene = {f"scene.{name}": getattr(self.scene, name) for name in ("arm_urdf", "background")}
+        return {name: path for name, path in ({"suite": self.suite} | scene).items() if path is not None}

@@ -56,8 +56,16 @@ class SourceSettings(Part):
         return 0
 
     def files(self) -> dict[str, Path]:
-        """Return the files that the source reads beside its rows, by field."""
+        """Return files and folders of this machine that the source is made of, by field.
+
+        A field of a scene is `scene.NAME`. A run records them, so that `--config RUN` finds them again.
+        """
         return {}
+
+    @classmethod
+    def find_again(cls, files: Mapping[str, str]) -> None:
+        """Prepare this process for the source of a run that recorded these `files`."""
+        del files
 
     def marks(self) -> list[str]:
         """Return the parts of a run's label that name the source."""

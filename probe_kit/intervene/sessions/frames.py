@@ -13,7 +13,7 @@ from probe_kit.errors import OtherFramesError, UsageError
 from probe_kit.extract.sources.donors import Frame
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.observation import Observation
-from probe_kit.intervene.sessions.session import ReplaySource, sources_of
+from probe_kit.intervene.sessions.session import ReplaySource, origin_of
 from probe_kit.intervene.settings import why_not_replayed
 from probe_kit.runs import Run
 from probe_kit.runs.layout import DATASET
@@ -181,7 +181,7 @@ def _folder_of(run: Run, source: ReplaySource) -> str:
         return str(source.dataset)
     if "repo" in dataset:
         return f"{dataset['repo']}@{dataset['revision']}"
-    stored = sources_of(run).scene_files.get(DATASET, "")
+    stored = origin_of(run).files.get("folder", "")
     if not stored or not Path(stored).is_dir():
         raise UsageError(
             f"the recordings of {run.location} are not where they were{f' ({stored})' if stored else ''}; name "

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,7 +15,7 @@ from probe_kit.extract.sources.scene_source import scene_row
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.intervene.pairs import Chunk, Pair
-from probe_kit.intervene.sessions.session import ReplaySession, ReplaySource, sources_of
+from probe_kit.intervene.sessions.session import ReplaySession, ReplaySource, origin_of
 from probe_kit.runs.run import Run
 from probe_kit.suite.grouping import counterparts_of
 from probe_kit.suite.items import Episode, Item, Layout
@@ -50,8 +49,7 @@ class SceneSession(ReplaySession):
     @classmethod
     def of(cls, run: Run, source: ReplaySource, load: "Callable[[], Policy]") -> "SceneSession":
         """Return that of a run. Raises SuiteError, SuiteNotFoundError, SceneError for a missing file."""
-        files = {name: Path(path) for name, path in sources_of(run).scene_files.items()}
-        files = {name: path for name, path in files.items() if path.is_file()}
+        files = {name: path for name, path in origin_of(run).scene_files.items() if path.is_file()}
         scene = SceneSpec.from_json(run.settings["scene"], {**files, **source.files})
         suite = suite_of(run, source.suite)
         return cls(run, load(), scene, {item.item_id: item for item in suite.items})

@@ -21,8 +21,8 @@ from probe_kit.hooks.contract.card import EMBEDDED
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.family import SIZE
 from probe_kit.intervene.pairs import Chunk, Given, Pair
+from probe_kit.runs.origin import Origin
 from probe_kit.runs.run import Run
-from probe_kit.runs.sources import RunSources
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -154,25 +154,25 @@ def load_policy_of(run: Run, source: ReplaySource) -> "Policy":
     """
     from probe_kit.hooks import load_policy
 
-    sources = sources_of(run)
+    origin = origin_of(run)
     checkpoint = source.checkpoint or _folder_of(run)
-    options = {name: value for name, value in sources.options.items() if checkpoint is None or name != SIZE}
+    options = {name: value for name, value in origin.options.items() if checkpoint is None or name != SIZE}
     # Branches of its vision-language model or tokenizer may have gone on since the run was made.
-    with pinned_commits(sources.repositories):
+    with pinned_commits(origin.repositories):
         return load_policy(
             run.model,
             checkpoint,
             source.device,
             run.settings["dtype"],
-            sources.random_weights,
-            sources.weights_seed if source.weights_seed is None else source.weights_seed,
+            origin.random_weights,
+            origin.weights_seed if source.weights_seed is None else source.weights_seed,
             **{**options, **source.options},
         )
 
 
-def sources_of(run: Run) -> RunSources:
+def origin_of(run: Run) -> Origin:
     """Return files and choices that the run was made of; none where it does not say."""
-    return run.sources[0] if run.sources else RunSources()
+    return run.origins[0] if run.origins else Origin()
 
 
 def _folder_of(run: Run) -> str | None:
@@ -180,7 +180,7 @@ def _folder_of(run: Run) -> str | None:
 
     A hub id of a run is never fetched.
     """
-    checkpoint = sources_of(run).checkpoint
+    checkpoint = origin_of(run).checkpoint
     if cached_folder(checkpoint) is not None:
         return checkpoint
     is_folder = checkpoint not in ("", EMBEDDED) and Path(checkpoint).expanduser().is_dir()
@@ -191,7 +191,7 @@ def check_policy(run: Run, policy: "Policy") -> None:
     """Raise SettingsMismatchError for other weights or options than the run's."""
     card = policy.card
     if card.weights_sha256 != run.weights_sha256:
-        checkpoint = sources_of(run).checkpoint or "an unknown checkpoint"
+        checkpoint = origin_of(run).checkpoint or "an unknown checkpoint"
         raise SettingsMismatchError(
             f"the weights of {card.checkpoint} are {card.weights_sha256[:12]}; {run.location} was made with "
             f"{str(run.weights_sha256)[:12]}, loaded from {checkpoint}. Give that --checkpoint (or --weights-seed)"

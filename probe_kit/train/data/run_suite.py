@@ -27,7 +27,7 @@ def suite_of(run: RunReader, folder: Path | None = None) -> "Suite":
     if folder is not None:
         return _in_folder(run, folder)
     moved = []
-    for source_folder in dict.fromkeys(sources.suite for sources in getattr(run, "sources", ()) if sources.suite):
+    for source_folder in dict.fromkeys(origin.suite for origin in getattr(run, "origins", ()) if origin.suite):
         try:
             return _in_folder(run, Path(source_folder))
         except UsageError:
