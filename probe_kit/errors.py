@@ -101,6 +101,12 @@ class OwnEnvironmentError(ProbeKitError):
     exit_code = 3
 
 
+class IgnoredInputsError(ProbeKitError):
+    """Neither another picture nor another instruction changes what a model puts out."""
+
+    exit_code = 3
+
+
 class ActionError(ProbeKitError, ValueError):
     """An action has the wrong shape or is not finite; the environment did not move."""
 

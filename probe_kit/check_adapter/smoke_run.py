@@ -34,6 +34,7 @@ def act_twice(
         env_workers=0,
         capture_only=capture_only,
         accept_units=True,  # a tiny checkpoint may have any statistics
+        accept_ignored_inputs=True,  # and untrained bins that no input moves
         max_steps=STEPS,
         **load_options,
     )

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 _ACTING = frozenset(
     {"model", "execute", "rotation", "no_act", "captured_calls", "later_views", "tokens", "frames", "video"}
-    | {"inference_limit", "early_stop", "max_steps", "epsilon", "label"}
+    | {"inference_limit", "early_stop", "max_steps", "epsilon", "label", "accept_ignored_inputs"}
 )
 """Options of runs that act, or store more than a diagnosis reads."""
 ModelOrRun = Annotated[str, typer.Argument(metavar="MODEL|RUN", help="Model to diagnose, or folder of a run.")]
@@ -112,7 +112,9 @@ def _run_of(
     in_scene = not {"dataset", "env", "pictures"} & set(typed)
     captured = {"no_act": True} if in_scene else {}
     items = {"items": ITEMS_PER_FRAME * frames} if in_scene and "items" not in typed else {}
-    settings = ExtractSettings.of_command({**typed, **items, "model": name, **captured}, None)
+    # A policy that ignores both picture and instruction is what is looked for here.
+    ignored = {"accept_ignored_inputs": True}
+    settings = ExtractSettings.of_command({**typed, **items, "model": name, **captured, **ignored}, None)
     with err.status(f"loading {settings.source.loads} and model"):
         extraction = prepare(settings, out_folder, fetch=not dry_run)
     location = locate(out_folder or Path("runs") / f"diagnose-{extraction.default_name()}")

@@ -1,7 +1,6 @@
 """The inputs that frames hold, their blanks and their controls. Loads no model."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +11,6 @@ from probe_kit.extract.sources.inputs import (
     INSTRUCTION,
     PICTURE,
     STATE,
-    Picture,
     hardly_changed,
     same_input,
 )
@@ -35,28 +33,6 @@ def differing(frames: Sequence[Frame], name: str) -> bool:
     """Whether the frames hold more than one value of an input, so that it can be exchanged between them."""
     first = frames[0].observation
     return any(not same_input(first, frame.observation, name) for frame in frames[1:])
-
-
-def blank_of(frames: Sequence[Frame]) -> Observation:
-    """An observation without content: no words, pictures of the mean colour of all frames, the mean state."""
-    observations = [frame.observation for frame in frames]
-    first = observations[0]
-    states = np.stack([observation.state for observation in observations]).astype(np.float64)
-    cameras: Mapping[str, Picture] = {
-        name: _mean_colour([observation.cameras[name] for observation in observations]) for name in first.cameras
-    }
-    return replace(
-        first,
-        image=_mean_colour([observation.image for observation in observations]),
-        state=states.mean(axis=0).astype(np.float32),
-        instruction="",
-        cameras=cameras,
-    )
-
-
-def _mean_colour(pictures: Sequence[Picture]) -> Picture:
-    colour = np.mean([picture.mean(axis=(0, 1)) for picture in pictures], axis=0)
-    return np.broadcast_to(np.rint(colour).astype(np.uint8), pictures[0].shape).copy()
 
 
 def control_of(frame: Frame, name: str, spread: NDArray[np.float64]) -> Observation:

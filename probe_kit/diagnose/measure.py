@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.diagnose.importance import ActionScale, Exchanges, Importance, importance_of
-from probe_kit.diagnose.inputs import blank_of, control_of, differing, inputs_of, spread_of_states
+from probe_kit.diagnose.inputs import control_of, differing, inputs_of, spread_of_states
 from probe_kit.errors import InstructionError, UsageError
 from probe_kit.extract.sources.donors import Frame, draw_donors
-from probe_kit.extract.sources.inputs import STATE, with_input
+from probe_kit.extract.sources.inputs import STATE, blank_of, with_input
 from probe_kit.hashing import derive_seed
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ class InputExchange:
 
     @cached_property
     def _blank(self) -> "Observation":
-        return blank_of(self.frames)
+        return blank_of(self._observations)
 
     @cached_property
     def _spread(self) -> NDArray[np.float64]:

@@ -8,7 +8,7 @@ from probe_kit._terminal import options as common
 from probe_kit._terminal.console import counter, err, marked, out, progress, say
 from probe_kit._terminal.field_options import command_with
 from probe_kit.extract import command_options as start
-from probe_kit.extract.commands import print_plan, print_sufficiency
+from probe_kit.extract.commands import print_input_notes, print_plan, print_sufficiency
 from probe_kit.extract.settings import AskSettings
 from probe_kit.extract.sources.scene import SceneOptions
 
@@ -70,6 +70,7 @@ def _print_answers(runs: "Sequence[Run]") -> None:
         reasons = f" ({', '.join(f'{name} {count}' for name, count in unread.items())})" if len(unread) else ""
         mass = float(episodes["option_mass"].mean())
         say(f"{run.label}: {counts}{reasons}; option mass {mass:.2f}")
+        print_input_notes(run)
         out.print(str(run.location), soft_wrap=True)
     places = " ".join(str(run.location) for run in runs)
     say(marked("next: [bold]probe-kit retention {}[/], with policy runs behind", places))

@@ -199,6 +199,14 @@ def _has_groups_for_probes(run: "Run") -> bool:
     return bool(run.episodes.groupby("category")["group_id"].nunique().min() >= GROUPS_FOR_PROBES)
 
 
+def print_input_notes(run: "Run") -> None:
+    """Say which inputs did not change the first output, in yellow."""
+    from probe_kit.runs.certificates import input_notes
+
+    for note in input_notes(run.certificate):
+        say(marked("[yellow]{}; [bold]probe-kit diagnose {}[/] says where it is lost[/]", note, run.location))
+
+
 def _print_outcomes(run: "Run") -> None:
     from probe_kit.runs.layout import AT_END, ONCE
 
@@ -207,6 +215,7 @@ def _print_outcomes(run: "Run") -> None:
     say(f"{counted(len(run.episodes), 'episode')}: {text}")
     if ONCE in run.episodes and (lost := int((run.episodes[ONCE] & ~run.episodes[AT_END]).sum())):
         say(f"{lost} of them had success before their end only; see the columns {ONCE} and {AT_END}")
+    print_input_notes(run)
     can_probe = bool(run.streams) and (run.inputs is not None or _has_groups_for_probes(run))
     step = "retention" if not can_probe else "labels" if run.inputs is not None else "train"
     say(marked("next: [bold]probe-kit {} {}[/]", step, run.location))

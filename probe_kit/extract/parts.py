@@ -288,6 +288,13 @@ class Machine(Part):
         Annotated[float, Field(gt=0, le=LARGEST)] | None, option_of(common.InferenceLimit)
     ] = None
     allow_mixed: common.AllowMixed = False
+    accept_ignored_inputs: Annotated[
+        bool,
+        further_option(
+            "--accept-ignored-inputs",
+            help="Accept a model that neither another picture nor another instruction changes.",
+        ),
+    ] = False
 
     def model_post_init(self, _: Any) -> None:
         """Raise UsageError for a limit in a process that nothing can end."""

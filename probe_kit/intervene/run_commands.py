@@ -117,6 +117,7 @@ def show(
     from probe_kit.extract.source_commands.action_error_table import show_action_errors
     from probe_kit.intervene.results.inventory import listed_interventions, unfinished_interventions
     from probe_kit.runs import label_run, open_run
+    from probe_kit.runs.certificates import input_notes
     from probe_kit.train.commands import facts_table
     from probe_kit.train.results.inventory import inventory
     from probe_kit.train.results.store import how_to_probe
@@ -131,11 +132,20 @@ def show(
     opened = open_run(run, allow_partial=True)
     facts, interventions = inventory(opened), listed_interventions(opened)
     unfinished = unfinished_interventions(opened.location)
+    notes = input_notes(opened.certificate) if facts.episodes else []
     if as_json:
         listed = [asdict(intervention) for intervention in interventions]
-        print_json({**asdict(facts), "interventions": listed, "unfinished_interventions": unfinished})
+        print_json(
+            {
+                **asdict(facts),
+                "interventions": listed,
+                "unfinished_interventions": unfinished,
+                "input_notes": notes,
+            }
+        )
         return
-    rows = {f"intervention {intervention.key}": intervention.words for intervention in interventions}
+    rows = {"inputs": "; ".join(notes)}
+    rows |= {f"intervention {intervention.key}": intervention.words for intervention in interventions}
     rows |= {
         f"unfinished {key}": f"an intervention, {counted(items, 'item')} so far; "
         "the same `probe-kit intervene` continues it"

@@ -18,6 +18,9 @@ from probe_kit.runs.provenance import Provenance, name_of
 from probe_kit.runs.records import NAME_DIGITS, RESTORE, Record, is_hash_name, named_by_hash
 from probe_kit.runs.root import Root
 
+INPUT_CHECK = "input_check"
+"""Entry of a certificate: by input, the last thing that changed with it at the first inference of a process."""
+
 
 class Certificate(Record):
     """The record of one process. provenance: name of its record in `provenance/`."""
@@ -27,6 +30,19 @@ class Certificate(Record):
     run: str
     provenance: Annotated[str, Field(pattern=r"^[0-9a-f]{16}$")]
     capture_check: dict[str, Any] | None = None
+
+
+def input_notes(certificate: Mapping[str, Any]) -> list[str]:
+    """Return a sentence for every input whose change did not change the first output of some process."""
+    checks = [record.get(INPUT_CHECK) or {} for record in certificate.get("processes", [certificate])]
+    notes = []
+    for name in dict.fromkeys(name for check in checks for name in check):
+        reaches = {check.get(name) for check in checks}
+        if "last layer" in reaches:
+            notes.append(f"another {name} changes the last layer and no number of the first output")
+        elif "nothing" in reaches:
+            notes.append(f"another {name} changes no number of the first output, nor the last layer before it")
+    return notes
 
 
 def write_certificate(root: Root, parts: Mapping[str, Any], provenance: Provenance) -> None:

@@ -129,6 +129,7 @@ class ConditionTable(_Table):
     wordings: Names | None = None
     no_act: bool = False
     accept_units: bool = False
+    accept_ignored_inputs: bool = False
     captured_calls: Count | Literal["all"] = 1
     later_views: LaterViews = "all"
 

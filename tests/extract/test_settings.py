@@ -27,7 +27,8 @@ EVERY = {
     "dtype": "bfloat16", "tokens": "all", "captured_calls": 4, "codec": "none", "protocol": "act2answer",
     "execute": 2, "rotation": "axis-angle", "capture_only": True, "edits": (ZERO,), "device": "cuda:1",
     "frames": "none", "env_workers": 1, "workers": 2, "ray": "auto", "inference_limit": 9.5, "allow_mixed": True,
-    "batch": 8, "video": "all", "accept_units": True, "seed": 5, "label": "after", "suite": Path("mine"),
+    "batch": 8, "video": "all", "accept_units": True, "accept_ignored_inputs": True,
+    "seed": 5, "label": "after", "suite": Path("mine"),
     "categories": ("color",), "items": 6, "wordings": ("named",), "max_steps": 7, "arm": "panda",
 }  # fmt: skip
 """Another value than the default for every field of settings that play a scene."""

@@ -14,6 +14,8 @@ Liking = Callable[[str, str], float]
 class PositionModel(AnswerModel):
     """Says what it likes best. liking: logit of every option. said: the text that is spoken, by question."""
 
+    absent_inputs = frozenset({"instruction", "picture"})
+
     def __init__(self, liking: Liking, said: Callable[[str], str]) -> None:
         self.card = ModelCard(
             "stub", "none", "0" * 64, False, 1, "float32", "cpu", "none", ("primary",), 0, 0, settings={}

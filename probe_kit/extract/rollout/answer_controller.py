@@ -15,7 +15,9 @@ from probe_kit.errors import PolicyFailedError, UsageError
 from probe_kit.extract.plan import Row
 from probe_kit.extract.rollout.capturing import SMALL, Capturer, stored_streams
 from probe_kit.extract.rollout.controllers import Inference, Turn
+from probe_kit.extract.rollout.input_check import Reach, check_inputs, check_not_ignored, varied
 from probe_kit.extract.settings import AskSettings
+from probe_kit.extract.sources.inputs import PICTURE
 from probe_kit.extract.sources.scene_source import SceneSource
 from probe_kit.extract.vqa.letter_lens import letter_margins
 from probe_kit.extract.vqa.parsing import Said, read_answer
@@ -26,6 +28,7 @@ from probe_kit.extract.vqa.templates import Order, sides
 from probe_kit.hooks.checkpoints.containment import copied
 from probe_kit.hooks.checkpoints.third_party import while_acting
 from probe_kit.hooks.contract.observation import Observation
+from probe_kit.runs.certificates import INPUT_CHECK
 from probe_kit.runs.layout import StoredStream
 from probe_kit.suite.wording import side_words
 
@@ -89,6 +92,7 @@ class AnswerController:
             "dtype": card.dtype,
             **({"policy": dict(card.settings)} if card.settings else {}),
         }
+        self._input_check: dict[str, Reach] | None = None
         self._form = self._choose_form(blank)
         if self._form is not None:
             self.identity["begun"] = self._form.begun
@@ -99,6 +103,7 @@ class AnswerController:
             "policy": self.model.card.to_json(),
             "fires_per_inference": self._capturer.fires,
             "capture_check": self._capturer.check,
+            INPUT_CHECK: dict(self._input_check or {}),
         }
 
     def infer(self, turns: Sequence[Turn]) -> list[Inference]:
@@ -121,6 +126,8 @@ class AnswerController:
             if buffers and order == "original":
                 self._record_lens(turns, reading)
         first = self._questions(observations, phrases_asked, "original")
+        if self._input_check is None:
+            self._input_check = self._check_inputs(first[0])
         sizes = self._sizes(first)
         return [
             self._outcome(
@@ -132,7 +139,26 @@ class AnswerController:
 
     def instruction_ids(self, instruction: str) -> tuple[int, ...] | None:
         """The ids of the words around a picture, where the prompt is the instruction; None for a question."""
-        ids = self.model.token_ids([instruction]) if self.template.is_instruction else None
+        return self._ids_of(instruction) if self.template.is_instruction else None
+
+    def _check_inputs(self, question: "Prompt") -> dict[str, Reach]:
+        """How far changes of a question come. Raises IgnoredInputsError if none comes anywhere."""
+        asked = replace(question.observation, instruction=question.text)
+        others = (other.text for other in self._blank_questions(question.observation))
+        absent = self.model.absent_inputs | (set() if question.pictured else {PICTURE})
+        variants = {
+            name: (replace(question, observation=changed, text=changed.instruction) for changed in observations)
+            for name, observations in varied(asked, others, self._ids_of, absent).items()
+        }
+        reaches = check_inputs(
+            self.model, lambda prompt: self.model.read([prompt]).option_logits, question, variants
+        )
+        if not self._settings.machine.accept_ignored_inputs:
+            check_not_ignored(reaches, self.identity["model"])
+        return reaches
+
+    def _ids_of(self, text: str) -> tuple[int, ...] | None:
+        ids = self.model.token_ids([text])
         return None if ids is None else tuple(map(int, ids[0]))
 
     def _choose_positions(self) -> None:

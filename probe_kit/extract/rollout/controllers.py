@@ -14,6 +14,7 @@ from probe_kit.errors import PolicyFailedError, ProbeKitError
 from probe_kit.extract.plan import Row
 from probe_kit.extract.rollout.capturing import SMALL, Capturer, stored_streams
 from probe_kit.extract.rollout.executed_actions import executed_actions
+from probe_kit.extract.rollout.input_check import Reach, check_inputs, check_not_ignored, varied
 from probe_kit.extract.settings import ExtractSettings
 from probe_kit.extract.sources.source import Source
 from probe_kit.extract.sources.units import check_predictions
@@ -22,6 +23,7 @@ from probe_kit.hooks.checkpoints.containment import begin_randomness, copied
 from probe_kit.hooks.checkpoints.third_party import while_acting
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.protocol import PLAIN, Rotation
+from probe_kit.runs.certificates import INPUT_CHECK
 from probe_kit.runs.layout import StoredStream
 
 if TYPE_CHECKING:
@@ -171,6 +173,8 @@ class PolicyController:
             self.identity["zeros_for"] = list(deaf)
         self._instruction_ids: dict[str, tuple[int, ...] | None] = {}
         self._edit_log: list[dict[str, Any]] = []
+        self._accepts_ignored = settings.machine.accept_ignored_inputs
+        self._input_check: dict[str, Reach] | None = None
 
     def infer(self, turns: Sequence[Turn]) -> list[Inference]:
         """Per turn the first `execute` actions of a fresh chunk, from one call of the policy.
@@ -178,6 +182,8 @@ class PolicyController:
         Where the policy's card asks for it, one action averaged over the plans of this and earlier chunks.
         """
         with self._acting():
+            if self._input_check is None:
+                self._input_check = self._check_inputs(turns[0])
             begin_randomness(derive_seed("global", *(turn.derived_seed("call") for turn in turns)))
             chunks = self._captured(turns)
         flags = _own_flags(self.policy.flagged, len(turns))
@@ -219,6 +225,25 @@ class PolicyController:
         acts = policy.infer_without_acting if self.capture_only else policy.act
         return (policy.predict if self._source.own_units else acts)(copied(observations), list(seeds))
 
+    def _check_inputs(self, turn: Turn) -> dict[str, Reach]:
+        """How far changes of a turn's inputs come. Raises IgnoredInputsError if none comes anywhere."""
+        seed = turn.derived_seed("inference")
+
+        def infer(observation: Observation) -> NDArray[np.float32]:
+            begin_randomness(derive_seed("global", turn.derived_seed("call")))
+            return np.array(self._called([observation], [seed]))
+
+        (observation,) = copied([turn.observation])
+        variants = varied(observation, self._source.instructions, self._ids_of, self.policy.absent_inputs)
+        reaches = check_inputs(self.policy, infer, observation, variants)
+        if not self._accepts_ignored:
+            check_not_ignored(reaches, self.identity["model"])
+        return reaches
+
+    def _ids_of(self, instruction: str) -> tuple[int, ...] | None:
+        ids = self.policy.token_ids([instruction])
+        return None if ids is None else tuple(map(int, ids[0]))
+
     def run_preflight(self, observations: Sequence[Observation], seeds: Sequence[int]) -> None:
         """One inference of which nothing is kept: what another one will take."""
         with self._acting():
@@ -228,8 +253,7 @@ class PolicyController:
         """The ids that the policy's own packing makes of it, frames around it included."""
         if instruction not in self._instruction_ids:
             with self._acting():
-                ids = self.policy.token_ids([instruction])
-                self._instruction_ids[instruction] = None if ids is None else tuple(map(int, ids[0]))
+                self._instruction_ids[instruction] = self._ids_of(instruction)
         return self._instruction_ids[instruction]
 
     def _executed(self, turn: Turn, chunk: NDArray[np.float32]) -> NDArray[np.float32] | None:
@@ -251,6 +275,7 @@ class PolicyController:
             **({} if self.capture_only or self._source.own_units else {"rotation": self.rotation}),
             "fires_per_inference": self._capturer.fires,
             "capture_check": self._capturer.check,
+            INPUT_CHECK: dict(self._input_check or {}),
             **({"edits": self._edit_log} if self._edits else {}),
         }
 

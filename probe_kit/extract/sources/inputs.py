@@ -4,7 +4,7 @@ An input is `instruction`, `state`, `picture` for the pictures of all cameras, o
 that no further camera has is that of the first one, whose picture is `Observation.image`.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -53,6 +53,27 @@ def hardly_changed(clean: Observation, vary: str, spread: NDArray[np.floating], 
         moved = clean.state + STATE_SHARE * spread[: clean.state.size]
         return replace(clean, state=moved.astype(np.float32))
     return _with_pictures(clean, vary, lambda name: through_jpeg(_picture(clean, name)))
+
+
+def blank_of(observations: Sequence[Observation]) -> Observation:
+    """Return an observation without content: no words, pictures of the mean colour of all, the mean state."""
+    first = observations[0]
+    states = np.stack([observation.state for observation in observations]).astype(np.float64)
+    cameras: Mapping[str, Picture] = {
+        name: _mean_colour([observation.cameras[name] for observation in observations]) for name in first.cameras
+    }
+    return replace(
+        first,
+        image=_mean_colour([observation.image for observation in observations]),
+        state=states.mean(axis=0).astype(np.float32),
+        instruction="",
+        cameras=cameras,
+    )
+
+
+def _mean_colour(pictures: Sequence[Picture]) -> Picture:
+    colour = np.mean([picture.mean(axis=(0, 1)) for picture in pictures], axis=0)
+    return np.broadcast_to(np.rint(colour).astype(np.uint8), pictures[0].shape).copy()
 
 
 def _with_pictures(clean: Observation, vary: str, picture: Callable[[str], Picture]) -> Observation:

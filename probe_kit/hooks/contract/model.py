@@ -111,6 +111,7 @@ class Model(ABC):
     quantities `KV`; captured and edited by naming their sites, such as `kv.02.values`; None where a family
     has none. Its tokens are the backbone's.
     role_names: per stream, every role its tokens can play.
+    absent_inputs: inputs that it never reads by design: `instruction`, `state`, `picture` or `picture.CAMERA`.
     """
 
     card: ModelCard
@@ -118,6 +119,7 @@ class Model(ABC):
     further_streams: Mapping[str, Stream] = MappingProxyType({})
     prompt_kv: Stream | None = None
     role_names: Mapping[str, tuple[str, ...]]
+    absent_inputs: frozenset[str] = frozenset()
 
     def __repr__(self) -> str:
         return model_text(type(self).__name__, self.card, self.streams)

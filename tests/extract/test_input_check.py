@@ -1,0 +1,141 @@
+"""The input check in certificates: a deaf and a blind policy are told by the first inference of `extract`."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from probe_kit.cli import app
+from probe_kit.env import SceneSpec
+from probe_kit.errors import IgnoredInputsError, InstructionError
+from probe_kit.extract import AskSettings, ExtractSettings, LeRobotSource, ask_run, prepare
+from probe_kit.extract.rollout.input_check import varied
+from probe_kit.extract.sources.inputs import PICTURE, same_input
+from probe_kit.hooks import Observation, Policy
+from probe_kit.hooks.families.pi0.adapter import load_pi0_tiny
+from probe_kit.runs import Run
+from probe_kit.runs.certificates import input_notes
+from tests.support.lerobot_recordings import CAMERA, write_recording
+from tests.support.prismatic_checkpoints import write_checkpoint
+
+SETTINGS = ExtractSettings(
+    "pi0-tiny", categories=("color",), items=2, scene=SceneSpec(max_steps=4), capture_only=True, env_workers=0
+)
+BOTH = {"picture": "output", "instruction": "output"}
+
+
+def make_blind(model: Any) -> None:
+    model.multi_modal_projector.linear.weight.zero_()
+    model.multi_modal_projector.linear.bias.zero_()
+
+
+def make_deaf(model: Any) -> None:
+    rows = model.language_model.embed_tokens.weight
+    rows[:] = rows[100].clone()
+
+
+def edited(*edits: Callable[[Any], None]) -> Policy:
+    """The embedded policy with edited weights."""
+    policy: Any = load_pi0_tiny()
+    with torch.no_grad():
+        for edit in edits:
+            edit(policy.network.model.paligemma_with_expert.paligemma.model)
+    return policy  # type: ignore[no-any-return]
+
+
+def extracted(folder: Path, policy: Policy, settings: ExtractSettings = SETTINGS) -> Run:
+    return prepare(settings, policy=policy).run(folder)
+
+
+def test_a_sound_policy_is_certified_without_a_note(tmp_path: Path, pi0_tiny: Policy) -> None:
+    run = extracted(tmp_path / "run", pi0_tiny)
+    assert run.certificate["input_check"] == BOTH
+    assert not input_notes(run.certificate)
+    assert "inputs" not in CliRunner().invoke(app, ["run", "show", str(run.path)]).output
+
+
+@pytest.mark.parametrize(("edit", "lost"), [(make_blind, "picture"), (make_deaf, "instruction")])
+def test_a_blind_and_a_deaf_policy_are_noted(edit: Callable[[Any], None], lost: str, tmp_path: Path) -> None:
+    run = extracted(tmp_path / "run", edited(edit))
+    assert run.certificate["input_check"] == {**BOTH, lost: "nothing"}
+    output = " ".join(CliRunner().invoke(app, ["run", "show", str(run.path)]).output.split())
+    assert f"another {lost} changes no number of the first output" in output
+
+
+def test_a_policy_that_is_blind_and_deaf_stops_before_anything_is_committed(tmp_path: Path) -> None:
+    policy = edited(make_blind, make_deaf)
+    with pytest.raises(IgnoredInputsError, match=r"another picture and another instruction .*probe-kit diagnose"):
+        extracted(tmp_path / "run", policy)
+    run = extracted(tmp_path / "run", policy, SETTINGS.changed(accept_ignored_inputs=True))
+    assert len(input_notes(run.certificate)) == 2
+
+
+def test_an_input_that_a_family_declares_absent_is_not_tested(tmp_path: Path) -> None:
+    policy = edited(make_deaf)
+    policy.absent_inputs = frozenset({"instruction"})
+    assert extracted(tmp_path / "run", policy).certificate["input_check"] == {"picture": "output"}
+
+
+def test_recordings_of_one_instruction_are_checked_too(tmp_path: Path) -> None:
+    pytest.importorskip("lerobot.datasets.lerobot_dataset", reason="the extra `datasets` is not installed")
+    observed = prepare(SETTINGS).source.example("Put the cube on the red shape")
+    picture = np.random.default_rng(0).integers(0, 256, observed.image.shape, np.uint8)
+    frame = Observation(picture, observed.state, observed.instruction)
+    write_recording(tmp_path / "frames", [[frame], [frame]])
+    source = LeRobotSource(str(tmp_path / "frames"), cameras={"base": CAMERA})
+    settings = ExtractSettings("pi0-tiny", source=source, accept_units=True)
+    assert extracted(tmp_path / "sound", load_pi0_tiny(), settings).certificate["input_check"] == BOTH
+    deaf = extracted(tmp_path / "deaf", edited(make_deaf), settings)
+    assert deaf.certificate["input_check"] == {**BOTH, "instruction": "nothing"}
+
+
+def test_questions_are_checked_by_the_logits_of_their_answers(small_suite: Any, tmp_path: Path) -> None:
+    folder = write_checkpoint(tmp_path / "tiny", model_type="prismatic")
+    settings = AskSettings(
+        "prismatic", str(folder), suite=small_suite.folder, categories=("color",), items=2,
+        scene=SceneSpec(picture_size=(224, 224)), options={"tokenizer": "bytes"}, env_workers=0,
+    )  # fmt: skip
+    assert ask_run(settings, tmp_path / "shown").certificate["input_check"] == BOTH
+    unseen = ask_run(settings.changed(picture="none"), tmp_path / "unseen")
+    assert unseen.certificate["input_check"] == {"instruction": "output"}
+
+
+# -- what is changed --------------------------------------------------------------------------------------
+
+
+def observation(instruction: str, image: "np.ndarray[Any, Any] | None" = None) -> Observation:
+    picture = np.random.default_rng(0).integers(0, 256, (4, 4, 3), np.uint8) if image is None else image
+    return Observation(picture, np.zeros(8, np.float32), instruction)
+
+
+def letters(text: str) -> tuple[int, ...]:
+    if "?" in text:
+        raise InstructionError("no question is an instruction")
+    return tuple(text.encode())
+
+
+def test_other_words_of_as_many_tokens_are_tried_first_and_then_all_others() -> None:
+    variants = varied(observation("lift it"), ["drop it now", "lift it", "push it", "what?"], letters)
+    texts = [variant.instruction for variant in variants["instruction"]]
+    assert texts == ["push it", "it lift", "drop it now", "what?"]
+
+
+def test_a_single_word_without_alternatives_and_a_picture_of_one_colour_are_not_varied() -> None:
+    plain = np.full((4, 4, 3), 7, np.uint8)
+    variants = varied(observation("push", plain), ["push"], letters)
+    assert {name: list(observations) for name, observations in variants.items()} == {
+        "picture": [],
+        "instruction": [],
+    }
+
+
+def test_a_blank_picture_changes_nothing_but_the_picture() -> None:
+    clean = observation("lift it")
+    (blank,) = varied(clean, [], letters)["picture"]
+    assert not same_input(clean, blank, PICTURE)
+    assert len(np.unique(blank.image.reshape(-1, 3), axis=0)) == 1
+    assert (blank.instruction, blank.state.tolist()) == (clean.instruction, clean.state.tolist())
