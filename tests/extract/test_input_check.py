@@ -1,4 +1,4 @@
-"""The input check in certificates: a deaf and a blind policy are told by the first inference of `extract`."""
+"""The input check in certificates: `extract` finds a deaf and a blind policy by its first observation."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -127,5 +127,5 @@ def check_not_ignored(reaches: Mapping[str, Reach], model: str) -> None:
         raise IgnoredInputsError(
             f"another {' and another '.join(tested)} changed no number of the first output of {model}, nor of its "
             "last layer; expected at least one of them to. `probe-kit diagnose` takes the same settings and says "
-            "where they are lost. --accept-ignored-inputs goes on"
+            "where they are lost. --accept-ignored-inputs extracts it nevertheless"
         )
