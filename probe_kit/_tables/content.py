@@ -4,7 +4,7 @@ A renderer knows no subject: a cell says what is bold, red, coloured or sorted, 
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Self
 
@@ -12,6 +12,8 @@ from probe_kit._tables.numbers import NONE
 
 _LIMITS = re.compile(r"(?<!^) ?(\[[^\]]*\])")
 """An interval behind its value."""
+_UNITS = re.compile(r"(,? (%|cm|points))?( \[[^\]]*\])?$")
+"""What a heading has behind its term."""
 _NUMBER = re.compile(r"[-+−±]?\d|< \d|n/a|–|$")
 """The beginning of a cell of numbers."""
 
@@ -144,11 +146,11 @@ class Content:
     def only(self, columns: Sequence[int]) -> Self:
         """Return the table with some of its columns, those that name the rows first."""
         rows = tuple(replace(row, cells=tuple(row.cells[at] for at in columns)) for row in self.rows)
+        headings = tuple(self.headings[at] for at in columns)
+        absent = {heading.text for heading in self.headings} - {heading.text for heading in headings}
+        notes = tuple(filter(None, (_without_terms(note, absent) for note in self.notes)))
         return replace(
-            self,
-            headings=tuple(self.headings[at] for at in columns),
-            rows=rows,
-            names=sum(at < self.names for at in columns),
+            self, headings=headings, rows=rows, notes=notes, names=sum(at < self.names for at in columns)
         )
 
     def filled(self, *empty: str) -> Self:
@@ -172,6 +174,21 @@ class Content:
 def grouped(*groups: tuple[str, Sequence[str]]) -> tuple[Heading, ...]:
     """Return headings under names over adjoining columns."""
     return tuple(Heading(text, group=group) for group, texts in groups for text in texts)
+
+
+def _without_terms(legend: str, absent: Collection[str]) -> str:
+    """Return a legend, `term: meaning; term: meaning`, without the terms of headings that are absent.
+
+    A part without a term belongs to the one before it.
+    """
+    terms = {_UNITS.sub("", heading) for heading in absent}
+    parts, is_absent = [], False
+    for part in legend.split("; "):
+        term, colon, _ = part.partition(": ")
+        is_absent = term.lower() in terms if colon else is_absent
+        if not is_absent:
+            parts.append(part)
+    return "; ".join(parts)
 
 
 def _sentence(note: str) -> str:

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 _HEADINGS = (
     Heading("input"),
     Heading("arrives", "whether any number of any action changed under another value"),
-    Heading("verdict", "decides, moves, no effect, open, does not arrive, not varied, not an input"),
+    Heading("effect", "decides, moves, no effect, open, does not arrive, not varied, not an input"),
     Heading("decides %", "share of the action's variance that is due to it: total-effect index, 95 % by groups"),
     Heading("control %", "the same of a change that should not matter"),
     Heading("all inputs %", "the same of all inputs together; the seed decides the rest"),

@@ -85,7 +85,7 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
         **extraction.source.describe(plan.episodes),
         **({"grows": growth.words} if growth and growth.words else {}),
         "streams": ("; ".join(_describe(s) for s in plan.streams) or "none") + source,
-        **_acts_row(identity),
+        **_acts_row(identity, extraction.settings.source.subject),
         "activations": f"{plan.sites} sites, {plan.bytes / 1e6:,.1f} MB before compression",
         "disk": f"up to {needed} with columns, probes and report; "
         + ("no bound" if free is None else f"{in_units(free)} free"),
@@ -140,10 +140,12 @@ def check_size(extraction: "Extraction", location: "Location", agreed: bool) -> 
         )
 
 
-def _acts_row(identity: Mapping[str, Any]) -> dict[str, str]:
+def _acts_row(identity: Mapping[str, Any], subject: str) -> dict[str, str]:
+    """Return why a model does not act. subject: of the source."""
     if not identity.get("capture_only"):
         return {}
-    reason = "only captured, once per episode" if "scene" in identity else "recorded frames are shown"
+    shown = {"recordings": "recorded frames are shown", "pictures": "pictures are shown"}
+    reason = shown.get(subject, "only captured, once per episode")
     return {"acts": f"no: {reason}; no success rate"}
 
 
@@ -217,6 +219,6 @@ def _print_outcomes(run: "Run") -> None:
         say(f"{lost} of them had success before their end only; see the columns {ONCE} and {AT_END}")
     print_input_notes(run)
     can_probe = bool(run.streams) and (run.inputs is not None or _has_groups_for_probes(run))
-    step = "retention" if not can_probe else "labels" if run.inputs is not None else "train"
+    step = "retention" if not can_probe else "targets" if run.inputs is not None else "train"
     say(marked("next: [bold]probe-kit {} {}[/]", step, run.location))
     out.print(str(run.location), soft_wrap=True)

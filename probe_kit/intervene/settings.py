@@ -6,7 +6,6 @@ from typing import Any, ClassVar, Protocol
 from probe_kit.errors import UnknownCategoryError, UsageError
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.contract.interventions import Readout
-from probe_kit.runs.layout import DATASET
 from probe_kit.runs.run import Run
 
 FORMAT = 2  # raise when stored numbers would be others
@@ -115,11 +114,10 @@ def key_of(settings: Mapping[str, Any]) -> str:
 
 def why_not_replayed(run: Run) -> str | None:
     """Return why the observations of a run are not shown again; None for recordings, environments and scenes."""
-    kind = run.settings[DATASET].get("kind", "lerobot") if run.recorded else "lerobot"
-    if kind == "lerobot":
+    if run.subject != "pictures":
         return None
     return (
-        f"it showed {kind}, which are not replayed; expected frames of recordings. Take a run of "
+        f"it showed {run.subject}, which are not replayed; expected frames of recordings. Take a run of "
         "`probe-kit extract --dataset FOLDER`"
     )
 

@@ -191,6 +191,13 @@ class Run:
         return ENVIRONMENT in self.settings
 
     @property
+    def subject(self) -> str:
+        """Return in a word what its model was shown: scenes, recordings, pictures or environments."""
+        if self.recorded:
+            return "pictures" if self.settings[DATASET].get("kind") == "pictures" else "recordings"
+        return "environments" if self.in_own_environment else "scenes"
+
+    @property
     def suite(self) -> str:
         """Identity of the suite that was run, `name@version#hash`.
 

@@ -27,11 +27,22 @@ def targets(run: common.RunFolder, wording: common.Wording = None, partial: comm
     from rich.text import Text
 
     opened = _open(run, partial, wording)
-    table = Table("target", "task", "per", "values")
-    for listed in listed_targets(opened):
-        table.add_row(*map(Text, listed))
+    table, listed = Table("target", "task", "per", "values"), list(listed_targets(opened))
+    for row in listed:
+        table.add_row(*map(Text, row))
     out.print(table)
-    say(marked("next: [bold]probe-kit train {} --target NAME[/]", run))
+    # Those that need no further option come first, and what is not possible is never the next step.
+    possible = sorted((row for row in listed if row[1] != "–"), key=lambda row: row[1] == DOUBTFUL)
+    if not possible:
+        say(marked("next: [bold]probe-kit labels {}[/] writes a table to which you add labels of your own", run))
+        return
+    name, task, *_ = possible[0]
+    options = "" if name == "correct" else f" --target {name}{' --task classes' * (task == DOUBTFUL)}"
+    say(marked("next: [bold]probe-kit train {}{}[/]", run, options))
+
+
+DOUBTFUL = "classes or continuous"
+"""The task of a few integers, which `--task` decides."""
 
 
 def listed_targets(run: "RunReader") -> Iterator[tuple[str, str, str, str]]:
@@ -49,9 +60,15 @@ def listed_targets(run: "RunReader") -> Iterator[tuple[str, str, str, str]]:
         try:
             target = Target.of_run(run, name)
         except ProbeKitError as error:
-            yield name, "–", "–", str(error)
+            try:
+                target = Target.of_run(run, name, "classes")
+            except ProbeKitError:
+                yield name, "–", "–", str(error)
+                continue
+            task = DOUBTFUL
         else:
-            yield name, target.task, "inference" if target.per_step else "episode", target.values_in_words
+            task = target.task
+        yield name, task, "inference" if target.per_step else "episode", target.values_in_words
 
 
 def labels(
@@ -72,7 +89,8 @@ def labels(
     from probe_kit.train.columns.builtin import label_frame, why_no_sim
 
     if out_file.exists():
-        raise UsageError(f"{out_file} exists; choose another --out or remove it")
+        name = f"{out_file.stem}-{Path(run).name}{out_file.suffix}"
+        raise UsageError(f"{out_file} exists and may hold labels of yours; write to another file, as --out {name}")
     opened = _open(run, partial, wording)
     frame = label_frame(opened)
     with draft_of(out_file) as draft:

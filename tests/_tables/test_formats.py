@@ -264,3 +264,13 @@ def test_equal_headings_are_told_apart_by_the_name_over_them_where_a_page_has_on
 
 def test_formats_are_the_files_of_their_folder() -> None:
     assert names() == ("latex", "markdown")
+
+
+def test_a_legend_explains_only_the_columns_that_are_there() -> None:
+    legend = "effect: share, n/a without one; net rate: flips; minus returns; p: exact; *: by construction"
+    table = Table.of(
+        "Edits", ("edit", "effect", "net rate, % [95 %]", "p"), [("a", "1", "2", "3")], notes=[legend]
+    )
+    assert table.only([0, 1, 3]).notes == ("effect: share, n/a without one; p: exact; *: by construction",)
+    assert table.only([0, 2]).notes == ("net rate: flips; minus returns; *: by construction",)
+    assert table.only([0, 1, 2, 3]).notes == (legend,)

@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
+from typer.testing import CliRunner
 
 import probe_kit as pk
+from probe_kit.cli import app
 from probe_kit.diagnose.diagnosis import diagnose_run
 from probe_kit.errors import ProbeKitError, RecordingError, UsageError
 from probe_kit.extract import ExtractSettings, PictureFolder, extract_run, prepare
@@ -164,3 +166,21 @@ def test_a_run_names_the_table_that_was_read_even_if_it_is_changed_later(folder:
     assert opened.identity(1) == before
     changed = PictureSource.open(PictureFolder(folder, table), selects_only=False)
     assert changed.identity(1) != before
+
+
+def test_the_next_step_is_a_target_that_can_be_probed_and_one_of_few_integers_has_its_task(
+    run: pk.Run, folder: Path, tmp_path: Path
+) -> None:
+    lines = (folder / "table.csv").read_text(encoding="utf-8").splitlines()
+    counts = [line.rsplit(",", 2)[0] + f",{number % 3}" for number, line in enumerate(lines[1:])]
+    (tmp_path / "counts.csv").write_text("\n".join(["picture,instruction,objects", *counts]), encoding="utf-8")
+    settings = ExtractSettings("pi0-tiny", source=PictureFolder(folder, tmp_path / "counts.csv"), env_workers=0)
+    counted = extract_run(settings, tmp_path / "run")
+    for where, options in (
+        (run.location, "--target dataset.red"),
+        (counted.location, "--target dataset.objects --task classes"),
+    ):
+        listed = CliRunner().invoke(app, ["targets", str(where)])
+        assert f"next: probe-kit train {where} {options}\n" in listed.stderr.replace("\n ", " "), listed.stderr
+    with pytest.raises(UsageError, match=r"shows pictures .* `probe-kit targets "):
+        pk.train_probes(counted)

@@ -11,7 +11,7 @@ from probe_kit.suite.categories import category_of
 
 _COLUMNS = (
     ("", ("runs", "category")),
-    ("verdict and own probes", ("verdict", "before %", "after %", "after − before, points")),
+    ("change and own probes", ("change", "before %", "after %", "after − before, points")),
     ("transfer of probes", ("layer", "forth %", "recentred %", "p", "back %", "recentred %")),
     ("likeness", ("cosine (ceiling)", "CKA")),
 )

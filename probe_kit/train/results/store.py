@@ -186,6 +186,8 @@ def _why_none(run: RunReader, target: str, stored: int) -> str:
 
 def how_to_probe(run: RunReader) -> str:
     """Return a sentence that says how a run gets probes: the command, or that it has too few groups of items."""
+    if getattr(run, "subject", "scenes") != "scenes":
+        return f"`probe-kit targets {run.location}` lists what can be probed."
     command, episodes = f"probe-kit train {run.location}", run.episodes
     if not {"category", "group_id"} <= set(episodes):
         return f"Run `{command}`."
