@@ -32,7 +32,6 @@ from probe_kit.runs.results import (
     write_bundle,
 )
 from probe_kit.train.data.run_reader import RunReader
-from probe_kit.train.results.store import stamp_of_run
 
 CLEAN, IMAGE_SWAP, INSTRUCTION_SWAP, NOISE = "clean", "image_swap", "instruction_swap", "noise"
 """Conditions: as in the run, the two pictures swapped, the counterpart's instruction, the noise drawn anew."""
@@ -210,8 +209,8 @@ def stored_interventions(run: RunReader, kind: str | None = None) -> list[Stored
     """
     interventions = [StoredIntervention(bundle) for bundle in read_interventions(run.location).values()]
     required = {
-        "stamp": stamp_of_run(run), "run_settings": run.settings_sha256,
-        "wording": getattr(run, "wording", None), **({} if kind is None else {"kind": kind}),
+        "stamp": run.stamp, "run_settings": run.settings_sha256,
+        "wording": run.wording, **({} if kind is None else {"kind": kind}),
     }  # fmt: skip
     fitting = [
         intervention

@@ -6,11 +6,14 @@ from typing import Any, ClassVar, Protocol
 from probe_kit.errors import UnknownCategoryError, UsageError
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.contract.interventions import Readout
+from probe_kit.runs.reader import SIDE
 from probe_kit.runs.run import Run
 
 FORMAT = 2  # raise when stored numbers would be others
 FIRST_CHUNK: Readout = "first-chunk"
 PER_STEP: Readout = "per-step"
+REPLAYED = ("scene", "lerobot", "env")
+"""Kinds of sources whose observations are shown again, see `sessions`."""
 
 
 PairRow = tuple[str, int, str, int]
@@ -103,8 +106,8 @@ def _pairs_of(choice: PairChoice) -> dict[str, Any]:
 
 
 def has_sides(run: Run) -> bool:
-    """Whether a run's questions have a correct picture on a side: it was played in the scene."""
-    return not (run.recorded or run.in_own_environment)
+    """Whether a run's questions have a correct picture on a side."""
+    return SIDE in run.episodes
 
 
 def key_of(settings: Mapping[str, Any]) -> str:
@@ -114,10 +117,10 @@ def key_of(settings: Mapping[str, Any]) -> str:
 
 def why_not_replayed(run: Run) -> str | None:
     """Return why the observations of a run are not shown again; None for recordings, environments and scenes."""
-    if run.subject != "pictures":
+    if run.source.kind in REPLAYED:
         return None
     return (
-        f"it showed {run.subject}, which are not replayed; expected frames of recordings. Take a run of "
+        f"it showed {run.source.subject}, which are not replayed; expected frames of recordings. Take a run of "
         "`probe-kit extract --dataset FOLDER`"
     )
 

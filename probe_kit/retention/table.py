@@ -37,7 +37,7 @@ from probe_kit.retention.rows.build import RowSettings, RowWithEstimates, run_ro
 from probe_kit.retention.rows.category_mean import mean_row
 from probe_kit.retention.rows.outcome_rules import can_be_judged, check_epsilons, under_rule
 from probe_kit.retention.rows.row import RetentionRow
-from probe_kit.runs.scene_only import check_scene_run
+from probe_kit.runs.reader import check_sides
 from probe_kit.statistics.estimates.verdict import ABSENT_BELOW
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.probe_results import ProbeResults
@@ -314,7 +314,7 @@ def retention_table(
     check_epsilons(check_rule(rule), epsilons is not SENSITIVITY_RADII)
     groups = runs if isinstance(runs, Mapping) else {None: runs}
     for run in (of_category for of_group in groups.values() for of_category in of_group):
-        check_scene_run(run, "a retention table")
+        check_sides(run, "a retention table")
     listed = [(name, scored(run, score, with_side_words)) for name, of_group in groups.items() for run in of_group]
     if keys is not None and len(keys) != len(listed):
         raise UsageError(f"{len(keys)} keys for {len(listed)} runs; give one per run, or None for the newest")
@@ -400,7 +400,7 @@ def _check_doubles(runs: Sequence[RunReader]) -> None:
     """A run that counts twice makes every interval too narrow; a copy of its folder is the same run."""
     location_of: dict[str, str] = {}
     for run in runs:
-        stamp = getattr(run, "stamp", None)
+        stamp = run.stamp
         for name in (run.location.address, *([f"{run.settings_sha256} {stamp}"] if stamp else [])):
             if name in location_of:
                 other = "" if location_of[name] == str(run.location) else f", once as its copy {location_of[name]}"

@@ -1,47 +1,19 @@
 """Predicted actions beside the recorded ones, of every shown frame of a run on recordings."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
-from probe_kit.runs.inputs import StoredInputs
 from probe_kit.runs.layout import DATASET, OTHER_ACTIONS
+from probe_kit.runs.reader import RunReader
 
 if TYPE_CHECKING:
     import pandas as pd
 
 Matrix = NDArray[np.float64]
-
-
-class ShownRun(Protocol):
-    """The parts of a run on recordings that are read; see `Run`."""
-
-    @property
-    def recorded(self) -> bool:
-        """Whether it is of recordings."""
-
-    @property
-    def location(self) -> Any:
-        """The place of the run."""
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """The settings of the run and its selection."""
-
-    @property
-    def inputs(self) -> StoredInputs | None:
-        """The inputs that were shown."""
-
-    @property
-    def episodes(self) -> "pd.DataFrame":
-        """A line per row of the plan."""
-
-    @property
-    def control_steps(self) -> NDArray[np.int64]:
-        """(E, C) frames."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +25,7 @@ class ActionErrors:
     shown frames. In these deviations, the mean recorded action has an error of 1.
     """
 
-    run: ShownRun
+    run: RunReader
     names: tuple[str, ...]
     errors: Matrix
     deviations: Matrix
@@ -125,7 +97,7 @@ class ActionErrors:
         return np.asarray(np.isfinite(self.errors[:, :, 0]).any(axis=2))
 
 
-def compare_actions(run: ShownRun) -> ActionErrors:
+def compare_actions(run: RunReader) -> ActionErrors:
     """The predicted actions of a run on recordings beside the recorded ones.
 
     Raises UsageError for another run, or where the two are not the same numbers: another count, changes beside
@@ -147,7 +119,7 @@ def compare_actions(run: ShownRun) -> ActionErrors:
     return ActionErrors(run, inputs.names["action"], predicted - recorded, deviations)
 
 
-def why_not_compared(run: ShownRun) -> str | None:
+def why_not_compared(run: RunReader) -> str | None:
     """Why predicted and recorded actions are not the same numbers; None if they are."""
     inputs = run.inputs
     if inputs is None or "action" not in inputs.kinds:

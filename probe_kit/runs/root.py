@@ -34,7 +34,7 @@ from probe_kit.runs.layout import (
 from probe_kit.runs.location import Location
 from probe_kit.runs.plans import Row, StoredPlan, plan_key, read_plans
 from probe_kit.runs.records import RESTORE, Record, Sum, Sums, expect, read_plain
-from probe_kit.runs.summary import what_to_open
+from probe_kit.runs.run_folders import what_to_open
 
 _SETTINGS = {"model": str, "captured_calls": int, "tokens": str, "codec": str}
 _FURTHER = {"random_weights": bool, "suite": dict, "later_views": str}

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from copy import copy
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -51,6 +52,7 @@ from probe_kit.runs.origin import Origin
 from probe_kit.runs.outcomes_by_rule import Watched, judged, watch, with_outcomes
 from probe_kit.runs.plans import while_growing
 from probe_kit.runs.provenance import Provenance, check_provenances, differences, read_provenances
+from probe_kit.runs.reader import RunSource
 from probe_kit.runs.records import RESTORE, Sum
 from probe_kit.runs.root import read_root
 from probe_kit.runs.rows import Rows, TokenBlock, role_mask, token_blocks
@@ -115,6 +117,8 @@ class Run:
 
     rule: str = DEFAULT_RULE
     last_steps: int = 1
+    score: str = "text"
+    control_features: Mapping[str, NDArray[np.floating]] = MappingProxyType({})
 
     def __init__(
         self, location: Location, wording: str | None = None, item_ids: frozenset[str] | None = None
@@ -180,6 +184,11 @@ class Run:
         """Whether its model was captured and did not act: it has activations and no success rate."""
         return bool(self.settings.get("capture_only"))
 
+    @cached_property
+    def source(self) -> RunSource:
+        """The observations that it is made of: their kind, and the name that identifies them."""
+        return RunSource.of(self.settings)
+
     @property
     def recorded(self) -> bool:
         """Whether it was made of recordings: there are no sides, no outcomes and no scene."""
@@ -191,23 +200,12 @@ class Run:
         return ENVIRONMENT in self.settings
 
     @property
-    def subject(self) -> str:
-        """Return in a word what its model was shown: scenes, recordings, pictures or environments."""
-        if self.recorded:
-            return "pictures" if self.settings[DATASET].get("kind") == "pictures" else "recordings"
-        return "environments" if self.in_own_environment else "scenes"
-
-    @property
     def suite(self) -> str:
         """Identity of the suite that was run, `name@version#hash`.
 
         Of recordings it is the data set's `name#hash`, of an environment of the user's own its `name@revision`.
         """
-        if self.recorded:
-            return f"{self.settings['recording']['name']}#{self.settings[DATASET]['meta_blake2b'][:12]}"
-        if self.in_own_environment:
-            return f"{self.settings['played']['name']}@{self.settings[ENVIRONMENT]['revision']}"
-        return str(self.settings["suite"]["identity"])
+        return self.source.name
 
     @property
     def seed_text(self) -> str:
@@ -383,6 +381,11 @@ class Run:
     def planned(self) -> int:
         """Episodes the plan has, committed or not."""
         return len(self._plan)
+
+    @cached_property
+    def planned_ids(self) -> frozenset[str]:
+        """Ids of all planned episodes, shown or not."""
+        return frozenset(str(row["episode_id"]) for row in self.root.plan)
 
     @cached_property
     def planned_items(self) -> Mapping[str, str]:

@@ -1,8 +1,10 @@
 """The runs below a folder of this machine."""
 
 import os
+from difflib import get_close_matches
 from pathlib import Path
 
+from probe_kit._system.counting import counted
 from probe_kit.errors import UsageError
 from probe_kit.runs.layout import RUN_FILE
 
@@ -38,3 +40,20 @@ def find_runs(folder: Path) -> list[Path]:
             f"there is no run below {folder}: no folder of it has a {RUN_FILE}. Make one with `probe-kit extract`"
         )
     return runs
+
+
+MOST = 12
+"""Runs of a folder that a message names."""
+
+
+def what_to_open(address: str) -> str:
+    """Advise what to do where there is no run: open one inside, one of nearly that name, or make one."""
+    folder = Path(address).expanduser()
+    if "://" not in address:
+        if inside := runs_in(folder):
+            more = f" and {len(inside) - MOST} more" if len(inside) > MOST else ""
+            return f"It holds {counted(len(inside), 'run')}: {', '.join(map(str, inside[:MOST]))}{more}"
+        neighbours = {path.name: path for path in runs_in(folder.parent, deep=False)}
+        if near := get_close_matches(folder.name, neighbours, n=1):
+            return f"Did you mean {neighbours[near[0]]}?"
+    return "Make one with `probe-kit extract`"

@@ -245,10 +245,9 @@ def _probes_in_words(probes: "StoredProbes", inventory: "Inventory") -> str:
 
 def _calls(text: str, run: "RunReader") -> list[int]:
     """The captured inferences that were asked for, each once."""
-    from probe_kit.train.data.captured_call import captured_calls
 
     if text == "all":
-        return list(range(captured_calls(run)))
+        return list(range(run.captured_calls))
     parts = split(text) or ()
     if not parts or not all(part.isdecimal() for part in parts):
         raise UsageError(f"--call {text!r}; expected numbers from 0, comma-separated, or all")

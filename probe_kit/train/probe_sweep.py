@@ -15,7 +15,7 @@ from probe_kit.train.choices import Incomplete
 from probe_kit.train.controls.fit import add_controls, prepare_controls
 from probe_kit.train.controls.untrained import add_untrained, check_same_source, check_untrained
 from probe_kit.train.crossval.site_probe import SiteProbe
-from probe_kit.train.data.run_reader import RunReader, check_several_wordings, seed_text_of
+from probe_kit.train.data.run_reader import RunReader, check_several_wordings
 from probe_kit.train.data.samples import is_token_view, read_samples, sites_of
 from probe_kit.train.execution import ExecutionSettings, Key, probe_columns
 from probe_kit.train.problem import Problem, make_problem
@@ -23,7 +23,7 @@ from probe_kit.train.results.control_scores import Controls
 from probe_kit.train.results.probe_directions import Direction
 from probe_kit.train.results.probe_results import ProbeResults, episodes_sha256
 from probe_kit.train.results.resume import SweepCheckpoint
-from probe_kit.train.results.store import is_stored, load_results, save_results, stamp_of_run
+from probe_kit.train.results.store import is_stored, load_results, save_results
 from probe_kit.train.settings import ProbeSettings
 from probe_kit.train.solver.backend import check_device
 from probe_kit.train.target import Target
@@ -223,7 +223,7 @@ class Sweep:
             random_weights=run.random_weights,
             weights=run.weights_sha256,
             suite=run.suite,
-            seed_text=seed_text_of(run),
+            seed_text=run.seed_text,
             run_settings=run.settings_sha256,
             episodes=episodes_sha256(run),
             categories=tuple(categories),
@@ -306,14 +306,14 @@ class Sweep:
             self.settings,
             curves,
             directions,
-            stamp=stamp_of_run(self.run),
+            stamp=self.run.stamp,
             label=self.run.label,
             left_out=self.samples.left_out,
         )
 
     def _probe_all(self) -> dict[Key, dict[str, SiteProbe]]:
         """Return every view and site, in order, for every category; columns of an interrupted sweep are loaded."""
-        unfinished = SweepCheckpoint.of(self.run.location, self.settings.key, stamp_of_run(self.run))
+        unfinished = SweepCheckpoint.of(self.run.location, self.settings.key, self.run.stamp)
         probes = {key: stored for key in self.keys if (stored := unfinished.read(*key)) is not None}
         progress = self.progress or notebook_progress("sites probed")
         rows, inferences = self.samples.rows, self.samples.inferences

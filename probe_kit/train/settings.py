@@ -13,8 +13,8 @@ FORMAT = 7  # raise when settings have other fields or would give other numbers
 class ProbeSettings:
     """Everything that decides the numbers; its hash is the results' key.
 
-    seed_text: of the run, see `seed_text_of`; scores on equal groups of one are paired. episodes: sha256 of the
-    ids of the run's episodes, so that a run that grew is probed again. label: sha256 of the labels of the target.
+    seed_text: of the run, see `RunReader`; scores on equal groups of one are paired. episodes: sha256 of the ids
+    of the run's episodes, so that a run that grew is probed again. label: sha256 of the labels of the target.
     token_permutations: 0 where no token view is probed. call: captured inference that a label of a whole episode
     is decoded from. window: inferences per episode. group_by: column of the groups. exchange_within: column of the
     strata, empty for exchanges everywhere. grouping: sha256 of groups and strata, empty for a side. align_to:

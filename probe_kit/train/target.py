@@ -17,7 +17,7 @@ from probe_kit._terminal.plain_text import terminal_safe
 from probe_kit.errors import UsageError
 from probe_kit.hashing import derive_seed, sha256_json
 from probe_kit.runs.layout import RECORDED_EPISODES
-from probe_kit.runs.scene_only import check_scene_run
+from probe_kit.runs.reader import check_sides
 from probe_kit.statistics.label_permutations import flip_items
 from probe_kit.train.choices import SIDES, Task
 from probe_kit.train.columns.builtin import builtin_column
@@ -130,7 +130,7 @@ class Target:
         """
         if not self.of_source:
             return self
-        if not getattr(run, "recorded", False):
+        if not run.recorded:
             raise UsageError(
                 f"{self.table.source} has the key {SOURCE!r} of recordings, and {run.location} is of scenes; "
                 f"expected {EPISODE!r}. `probe-kit labels RUN` writes the ids"
@@ -270,7 +270,7 @@ def _side(
 
     Raises UsageError for a run without sides, and for options of other targets.
     """
-    check_scene_run(run, f"a probe of the side ({name})")
+    check_sides(run, f"a probe of the side ({name})")
     options = {"task": task, "group_by": group_by, "exchange_within": exchange_within}
     if refused := [option for option, value in options.items() if value not in (None, "binary")]:
         raise UsageError(
@@ -300,7 +300,7 @@ def side_labels(episodes: "pd.DataFrame", name: str, seed: int) -> NDArray[np.in
 def _shown(run: RunReader, by_frame: bool) -> dict[tuple[str, int], list[tuple[str, int]]]:
     """Episode ids and inferences of a run by source episode and frame; of whole episodes the frame is -1."""
     keys_of: dict[tuple[str, int], list[tuple[str, int]]] = {}
-    steps = run.control_steps  # type: ignore[attr-defined]
+    steps = run.control_steps
     for row, (name, source) in enumerate(zip(run.episodes[EPISODE], run.episodes[SOURCE], strict=True)):
         for call, frame in enumerate(steps[row].tolist() if by_frame else [-1]):
             if frame >= 0 or not by_frame:
@@ -312,7 +312,7 @@ def _check_recorded(
     run: RunReader, table: LabelTable, episodes: Sequence[str], frames: Sequence[int] | None
 ) -> None:
     """Raise UsageError for an episode that the data set lacks, or a frame that its episode lacks."""
-    count: int = run.settings["recording"][RECORDED_EPISODES]  # type: ignore[attr-defined]
+    count: int = run.settings["recording"][RECORDED_EPISODES]
     rows = zip(run.episodes[SOURCE].tolist(), run.episodes["recorded_frames"].tolist(), strict=True)
     lengths = {str(source): int(length) for source, length in rows}
     for row, episode in enumerate(episodes):

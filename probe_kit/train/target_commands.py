@@ -54,7 +54,7 @@ def listed_targets(run: "RunReader") -> Iterator[tuple[str, str, str, str]]:
     from probe_kit.train.target import Target
 
     names = [*SIDES, *builtin_names()]
-    if getattr(run, "inputs", None) is not None:
+    if run.inputs is not None:
         names = [*(prefix_of(run) + name for name in recorded_columns(run)), *outcome_column(run)]
     for name in names:
         try:

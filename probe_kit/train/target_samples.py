@@ -217,8 +217,7 @@ def _label_grid(run: RunReader, target: Target) -> NDArray[np.float64]:
 
 def _planned(run: Any) -> set[str]:
     """Ids of episodes that a run plans, finished or not, shown or not."""
-    root = getattr(run, "root", None)
-    return {str(planned["episode_id"]) for planned in root.plan} if root is not None else set()
+    return {*run.planned_ids}
 
 
 def _column(

@@ -14,7 +14,7 @@ from probe_kit.hooks.contract.sites import Site
 from probe_kit.retention import RetentionRow, RetentionTable, retention_table
 from probe_kit.retention.behaviour.vlm_answers import ask_of
 from probe_kit.runs import Run
-from probe_kit.runs.scene_only import check_scene_run
+from probe_kit.runs.reader import check_sides
 from probe_kit.train.results.by_call import load_results_by_call
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeResults
@@ -151,7 +151,7 @@ def view_runs(runs: Sequence[Run], probes_of: Run | None = None) -> list[ViewedR
     if not runs:
         raise UsageError("the viewer needs at least one run")
     for run in runs:
-        check_scene_run(run, "the viewer")
+        check_sides(run, "the viewer")
     places = [run.location.address for run in runs]
     if doubles := [address for at, address in enumerate(places) if address in places[:at]]:
         raise UsageError(f"{doubles[0]} is given twice. Leave one out")

@@ -34,7 +34,7 @@ from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.statistics.student import unbounded_student_interval
 from probe_kit.statistics.sufficiency import SMALLEST_EFFECT_OF_INTEREST
 from probe_kit.suite.categories import category_of
-from probe_kit.train.data.run_reader import RunReader, seed_text_of
+from probe_kit.train.data.run_reader import RunReader
 
 if TYPE_CHECKING:
     from probe_kit._tables.table import Table
@@ -90,7 +90,7 @@ class Reach:
 
 def tiles_apart(run: RunReader) -> float:
     """Return metres between the middles of the tiles of a run's scene, or of the default one."""
-    scene: Any = getattr(run, "settings", {}).get("scene", {})
+    scene: Any = run.settings.get("scene", {})
     if "tile_left" not in scene or "tile_right" not in scene:
         return TILES_APART
     (left_x, left_y), (right_x, right_y) = scene["tile_left"], scene["tile_right"]
@@ -260,7 +260,7 @@ def stored_image_swaps(run: RunReader, readout: str | None = None) -> dict[str, 
     apart, rows = tiles_apart(run), dict[str, dict[str, ImageSwapEffect]]()
     for stored in {result.stored.key: result.stored for result in preferred.values()}.values():
         read_as = str(stored.settings.get("readout", FIRST_CHUNK))
-        effects = image_swap_effects(stored.outcomes(), seed_text_of(run), stored.key, read_as, apart)
+        effects = image_swap_effects(stored.outcomes(), run.seed_text, stored.key, read_as, apart)
         rows[stored.key] = {row.category: row for row in effects}
     return {category: rows[result.stored.key][category] for category, result in preferred.items()}
 

@@ -45,7 +45,7 @@ from probe_kit.intervene.selection import StoredResult, stored_results
 from probe_kit.intervene.settings import PER_STEP
 from probe_kit.statistics.paired_tests import max_t, paired_greater_p, smallest_flip_p
 from probe_kit.statistics.significance import SIGNIFICANCE
-from probe_kit.train.data.run_reader import RunReader, seed_text_of
+from probe_kit.train.data.run_reader import RunReader
 
 if TYPE_CHECKING:
     from probe_kit._tables.table import Table
@@ -301,7 +301,7 @@ def stored_joint_places(run: RunReader) -> dict[str, list[JointEffect]]:
     """
     return {
         category: _Category(
-            result.outcomes, category, seed_text_of(run), result.stored.settings, result.stored.key
+            result.outcomes, category, run.seed_text, result.stored.settings, result.stored.key
         ).rows(result.stored.certificate().get(NAME, {}).get(category, {}))
         for category, result in _preferred(run).items()
     }

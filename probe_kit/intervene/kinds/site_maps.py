@@ -32,7 +32,7 @@ from probe_kit.intervene.patching.sweep import SwapShare, share_fields, share_of
 from probe_kit.intervene.places import ALL, RESIDUAL, PlaceName
 from probe_kit.intervene.selection import PooledConditions, Rank, pool_conditions, stored_results
 from probe_kit.statistics.significance import SIGNIFICANCE
-from probe_kit.train.data.run_reader import RunReader, seed_text_of
+from probe_kit.train.data.run_reader import RunReader
 
 # -- effects of edits at places ------------------------------------------------------------------------------
 
@@ -202,7 +202,7 @@ def stored_steering(run: RunReader) -> dict[str, dict[str, list[PatchEffect]]]:
     (`backbone.02 image, probe, toward left`).
     """
     steering: dict[str, dict[str, list[PatchEffect]]] = {}
-    for selection, rows in _rows_of(_steering(run), seed_text_of(run)):
+    for selection, rows in _rows_of(_steering(run), run.seed_text):
         steering.setdefault(selection.group.like.category, {})[_in_words(selection)] = rows
     return steering
 
@@ -350,7 +350,7 @@ def _test_together(group: PooledConditions, stream: str, seed_text: str) -> dict
 
 def _by_category(run: RunReader, selections: Sequence[_Selection]) -> dict[str, list[PatchEffect]]:
     effects: dict[str, list[PatchEffect]] = {}
-    for selection, rows in _rows_of(selections, seed_text_of(run)):
+    for selection, rows in _rows_of(selections, run.seed_text):
         effects.setdefault(selection.group.like.category, []).extend(rows)
     return effects
 

@@ -61,7 +61,7 @@ class ListedIntervention:
 
 def listed_interventions(run: Any) -> list[ListedIntervention]:
     """All of a run, oldest first. Raises RunDamagedError if one was changed."""
-    wordings = getattr(run, "wordings", ())
+    wordings = run.wordings
     readers: list[RunReader] = [run.in_wording(name) for name in wordings] or [run]
     current = {intervention.key for reader in readers for intervention in stored_interventions(reader)}
     used = {key for reader in readers for key in _used(reader)}

@@ -21,7 +21,7 @@ from probe_kit.intervene.results.verdict import Places, UseVerdict, classify_all
 from probe_kit.intervene.settings import PER_STEP
 from probe_kit.statistics.paired_tests import smallest_flip_p
 from probe_kit.statistics.significance import SIGNIFICANCE
-from probe_kit.train.data.run_reader import RunReader, seed_text_of
+from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.store import load_results
 
 if TYPE_CHECKING:
@@ -205,7 +205,7 @@ def load_effects(run: RunReader, key: str | None = None, kind: str | None = None
 def effects_of(run: RunReader, stored: StoredIntervention) -> InterventionResult:
     """Read one stored intervention."""
     measurement = Measurement(
-        stored.outcomes(), seed_text_of(run), stored.settings, stored.certificate(), stored.bundle.read,
+        stored.outcomes(), run.seed_text, stored.settings, stored.certificate(), stored.bundle.read,
         stored.key, tiles_apart(run),
     )  # fmt: skip
     result = InterventionResult(run.label, run.random_weights, run.suite, measurement)

@@ -25,7 +25,7 @@ def mixed_episodes(runs: Sequence[RunReader]) -> list[str]:
         f"{run.location} is mixed: its episodes were made with other {', '.join(mixed)}, which changes numbers "
         "(--allow-mixed)."
         for run in runs
-        if (mixed := getattr(run, "mixed", ()))
+        if (mixed := run.mixed)
     ]
 
 
@@ -35,7 +35,7 @@ def chosen_wordings(runs: Sequence[RunReader]) -> list[str]:
         f"Rows of {run.location} are of the wording {run.episodes['wording'].iloc[0]!r}; it was asked in "
         f"{', '.join(names)} (--wording)."
         for run in runs
-        if (names := getattr(run, "wordings", ()))
+        if (names := run.wordings)
     ]
 
 

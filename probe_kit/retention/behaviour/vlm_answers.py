@@ -24,7 +24,7 @@ SCORES: Mapping[str, tuple[str, str]] = {
 
 def ask_of(run: RunReader) -> Mapping[str, Any] | None:
     """Return how a run was asked, None for one that acts."""
-    ask: Mapping[str, Any] | None = getattr(run, "settings", {}).get("ask")
+    ask: Mapping[str, Any] | None = run.settings.get("ask")
     return ask
 
 

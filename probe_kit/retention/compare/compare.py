@@ -36,7 +36,7 @@ from probe_kit.retention.rows.row import MEAN
 from probe_kit.statistics.estimates.retention import Ratio, retention_difference
 from probe_kit.statistics.estimates.scores import Scores
 from probe_kit.statistics.paired_tests import corrected
-from probe_kit.train.data.run_reader import RunReader, seed_text_of
+from probe_kit.train.data.run_reader import RunReader
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -175,8 +175,8 @@ def _on_common_items(
     side: Side, items: Mapping[str, CommonItems], runs: Sequence[RunReader], others_too: bool
 ) -> Side:
     """Return the side on the items in common, with the draws of the first of `runs`."""
-    seed_texts = {str(run.location): seed_text_of(run) for run in runs}
-    seed_text = seed_text_of(runs[0])
+    seed_texts = {str(run.location): run.seed_text for run in runs}
+    seed_text = runs[0].seed_text
 
     def common(row: RowWithEstimates) -> RowWithEstimates:
         in_common = items.get(row.row.category)

@@ -18,7 +18,7 @@ from probe_kit.hashing import derive_seed
 from probe_kit.retention.behaviour.success_rate import units_of
 from probe_kit.retention.behaviour.vlm_answers import ask_of
 from probe_kit.retention.estimators.retention import best_site
-from probe_kit.runs.scene_only import check_scene_run
+from probe_kit.runs.reader import check_sides
 from probe_kit.statistics.paired_tests import (
     clopper_pearson,
     corrected,
@@ -146,7 +146,7 @@ def match_runs(
     Raises UsageError for runs of the wrong kinds or without a question in common, OtherFramesError if their first
     frames differ or carry no hash.
     """
-    check_scene_run(policy, "a comparison with answers")
+    check_sides(policy, "a comparison with answers")
     _check_kinds(vlm, policy)
     pairs = _same_questions(vlm, policy)
     probed_view = None if results is None else view or results.settings.views[0]

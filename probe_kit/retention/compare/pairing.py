@@ -199,9 +199,9 @@ def compare_wordings(runs: Sequence[RunReader]) -> list[Difference]:
     settings = RowSettings(None, "all", (), DEFAULT_RULE, with_behaviour=False)
     differences: list[Difference] = []
     for run in runs:
-        every_wording = getattr(run, "whole", run)
+        every_wording = run.whole
         sides = {}
-        for wording in getattr(run, "wordings", ()):
+        for wording in run.wordings:
             in_wording: RunReader = _InWording(every_wording, wording)
             if len(in_wording.episodes):
                 sides[wording] = Side(
@@ -282,7 +282,7 @@ def _why_not(minuend: RunReader, subtrahend: RunReader, items: Mapping[str, Comm
 
 
 def _seed(run: RunReader) -> Any:
-    return getattr(run, "settings", {}).get("seed")
+    return run.settings.get("seed")
 
 
 _SAME = {"seeds": _seed, "wordings": wording_of}

@@ -29,6 +29,6 @@ def grew_from(policy: RunReader, vlm: RunReader) -> Relation:
 
 def card_of(run: RunReader) -> Mapping[str, Any]:
     """Return what was really loaded; empty where a run has no certificate."""
-    certificate: Mapping[str, Any] = getattr(run, "certificate", {})
+    certificate: Mapping[str, Any] = run.certificate
     card: Mapping[str, Any] = certificate.get("policy") or {}
     return card

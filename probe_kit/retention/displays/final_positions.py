@@ -61,7 +61,7 @@ class FinalPositionsDisplay(Display):
             episodes = episodes[episodes["category"] == category]
         if episodes.empty:
             raise UsageError(f"{run.location} has no episodes of category {category!r}")
-        scene = scene or getattr(run, "settings", {}).get("scene")
+        scene = scene or run.settings.get("scene")
         if scene is None or not {"cube_x", "cube_y"} <= set(episodes):
             raise UsageError(
                 f"{run.location} stores no scene or no final positions (cube_x, cube_y); runs of `extract` do"
@@ -74,7 +74,7 @@ class FinalPositionsDisplay(Display):
             never_moved=int(unmoved),
             scene=scene,
             certificate=ProvenanceLine.of_run(run),
-            rule=getattr(run, "rule", DEFAULT_RULE),
+            rule=run.rule,
         )
 
     @property
@@ -202,7 +202,7 @@ def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
         run = drawn.judged(source.table)
         if run is None or capture_only(run.episodes):
             continue
-        if {"cube_x", "cube_y"} <= set(run.episodes) and getattr(run, "settings", {}).get("scene"):
+        if {"cube_x", "cube_y"} <= set(run.episodes) and run.settings.get("scene"):
             yield ReportFigure(
                 f"{drawn.stem}-final-positions", "Where the cube ended", "behaviour",
                 "The table from above, the robot below the picture. An episode counts as an answer if the middle "

@@ -125,7 +125,7 @@ PLACE = 4
 
 def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
     """The figures that a report of these runs shows."""
-    with_trajectories = [drawn.run for drawn in source.runs if getattr(drawn.run, "has_trajectories", False)]
+    with_trajectories = [drawn.run for drawn in source.runs if drawn.run.has_trajectories]
     runs = [run for run in with_trajectories if not run.episodes.empty]
     if runs:
         yield ReportFigure(

@@ -180,7 +180,7 @@ def event_calls(run: Any) -> EventCalls:
     Nothing for a run without trajectories. Inference c decides actions c · k + 1 to (c + 1) · k, with k actions
     executed per inference.
     """
-    if not getattr(run, "has_trajectories", False):
+    if not run.has_trajectories:
         return {}
     executed = int(run.settings["execute"])
     by_event: dict[str, dict[str, int]] = {event: {} for event in EVENTS}

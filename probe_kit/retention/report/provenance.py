@@ -1,7 +1,7 @@
 """The origin of the numbers, and how to cite them."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -31,8 +31,8 @@ def provenance(
 
     labels: its probes of labels.
     """
-    settings: dict[str, Any] = getattr(run, "settings", {})
-    certificate: dict[str, Any] = getattr(run, "certificate", {})
+    settings = run.settings
+    certificate = run.certificate
     probes = _probe_settings(results)
     facts = {
         "run": run.label,
@@ -47,7 +47,7 @@ def provenance(
         "hooks on equals hooks off": {True: "yes, bit for bit", None: ""}.get(
             certificate.get("hooks_on_equals_hooks_off"), "no"
         ),
-        "mixed": ", ".join(getattr(run, "mixed", ())),
+        "mixed": ", ".join(run.mixed),
         "probes": str(probes.get("key", "none" * (not labels))),
         **{f"probes of {probes_of.settings.target}": probes_of.key for probes_of in labels},
     }
@@ -63,7 +63,7 @@ def provenance(
     )
 
 
-def _protocol(settings: dict[str, Any]) -> dict[str, str]:
+def _protocol(settings: Mapping[str, Any]) -> dict[str, str]:
     """The protocol that a run follows, how it differs from the default, and how the run differs from it."""
     protocol = settings.get("protocol")
     if not protocol:

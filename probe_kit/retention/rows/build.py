@@ -39,7 +39,7 @@ from probe_kit.retention.rows.parts import (
 )
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.statistics.estimates.verdict import ABSENT_BELOW, Verdict, verdict
-from probe_kit.train.data.run_reader import RunReader, seed_text_of
+from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.control_scores import Controls, Exceeds, UntrainedScore, has_signal
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeResults
@@ -131,7 +131,7 @@ def _row(
         radii = settings.epsilons if settings.rule == DEFAULT_RULE else ()
         by_radius = {f"{radius:g}": rate for radius, rate in sensitivity(episodes, radii).items()}
         rules = replace(judged.part(episodes), sr_by_epsilon=by_radius)
-        estimates = RowEstimates({"sr": success_share(episodes, seed_text_of(run)), **judged.shares(episodes)})
+        estimates = RowEstimates({"sr": success_share(episodes, run.seed_text), **judged.shares(episodes)})
     row = RetentionRow(
         category=category,
         view=view,
@@ -155,7 +155,7 @@ def _with_probes(
     if row.view is None or curve is None:
         note = f"n/a (probes {results.key} are of {', '.join(results.settings.categories)})"
         return replace(row, retention=RetentionPart(note=note)), None
-    streams = curve_scores(curve, settings.iterations, seed_text_of(run))
+    streams = curve_scores(curve, settings.iterations, run.seed_text)
     peaks = stream_peaks(curve, settings.iterations)
     exceeds = {
         name: results.controls.exceeds(row.category, row.view, str(peak.site), peak.p_fwe)
@@ -204,7 +204,7 @@ def _answers(run: RunReader, episodes: "pd.DataFrame") -> AnswerStats:
         picture=str(ask["picture"]),
         picture_size=str(ask["picture_size"]),
         asked_for=str(ask["object"]),
-        score=getattr(run, "score", "text"),
+        score=run.score,
         accuracy_text=float((text == "correct").mean()),
         accuracy_logits=float((episodes["outcome_logits"] == "correct").mean()),
         accuracy_order_balanced=float((episodes["outcome_debiased"] == "correct").mean()),

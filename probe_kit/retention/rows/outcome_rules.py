@@ -12,7 +12,7 @@ from probe_kit.retention.behaviour.success_rate import capture_only, group_names
 from probe_kit.retention.behaviour.vlm_answers import ask_of
 from probe_kit.retention.estimators.stream_scores import Limits, limits
 from probe_kit.statistics.estimates.shares import Share
-from probe_kit.train.data.run_reader import RunReader, seed_text_of
+from probe_kit.train.data.run_reader import RunReader
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -86,12 +86,12 @@ class RunUnderRule:
         """
         if ask_of(run) is not None:
             return cls(run, DEFAULT_RULE, "", 1)
-        scene = getattr(run, "settings", {}).get("scene")
+        scene = run.settings.get("scene")
         words = "" if scene is None else rule_of(rule, scene).words
         is_stored = (rule, last_steps) == (DEFAULT_RULE, 1)
         if scene is None or run.episodes.empty or (is_stored and not with_behaviour):
             return cls(run, rule, words, last_steps)
-        if not getattr(run, "has_trajectories", False):
+        if not run.has_trajectories:
             return cls(run, rule, words, last_steps)
         judgeable = cast("Judgeable", run)
         verdicts = {name: judgeable.judged(name) for name in RULES}
@@ -158,7 +158,7 @@ class RunUnderRule:
             return None
         counted = weights > 0
         right = np.divide(shares_of(episodes, "correct"), weights, out=np.zeros(weights.size), where=counted)
-        return Share.of(right.clip(0, 1), group_names(episodes, seed_text_of(self.run)), weights)
+        return Share.of(right.clip(0, 1), group_names(episodes, self.run.seed_text), weights)
 
 
 def _idle_side(idle: "pd.Series[str]", sides: "pd.Series[str]") -> str:
@@ -203,12 +203,12 @@ def can_be_judged(run: RunReader, rule: str, last_steps: int) -> bool:
     """Whether there are outcomes of a run by this rule; those by `disc` at the last step are always stored."""
     if (rule, last_steps) == (DEFAULT_RULE, 1) or ask_of(run) is not None or capture_only(run.episodes):
         return True
-    return bool(getattr(run, "has_trajectories", False))
+    return bool(run.has_trajectories)
 
 
 def under_rule(run: RunReader, rule: str, last_steps: int = 1) -> RunReader:
     """The run with its outcomes by a rule, for figures; as it is where it cannot be judged."""
-    if (rule, last_steps) == (DEFAULT_RULE, 1) or not getattr(run, "has_trajectories", False):
+    if (rule, last_steps) == (DEFAULT_RULE, 1) or not run.has_trajectories:
         return run
     return cast("Judgeable", run).under(rule, last_steps)
 

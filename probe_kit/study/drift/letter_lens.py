@@ -13,7 +13,7 @@ def lens_accuracy(run: RunReader, episodes: NDArray[np.str_]) -> NDArray[np.floa
 
     None for a run without margins, which is every run but questions that are answered by letter.
     """
-    stored: NDArray[np.float64] | None = getattr(run, "lens_margins", None)
+    stored: NDArray[np.float64] | None = run.lens_margins
     if stored is None:
         return None
     chosen = run.episodes["episode_id"].isin(episodes).to_numpy()

@@ -149,26 +149,26 @@ def _of_source(run: RunReader, name: str) -> BuiltinColumn:
 def _cells(run: RunReader, name: str, values: NDArray[np.float64]) -> tuple[Cell, ...]:
     """The values (n,) of a column of a run's own source: numbers, or truth values where the source says so."""
     cells = [_finite(float(value)) for value in values]
-    if name not in run.inputs.truths:  # type: ignore[attr-defined]  # only runs have inputs
+    if run.inputs is None or name not in run.inputs.truths:
         return tuple(cells)
     return tuple(bool(cell) if cell in (0, 1) else cell for cell in cells)
 
 
 def prefix_of(run: RunReader) -> str:
     """Return the prefix of the columns of a run's own source."""
-    return PLAYED if getattr(run, "in_own_environment", False) else RECORDED
+    return PLAYED if run.in_own_environment else RECORDED
 
 
 def outcome_column(run: RunReader) -> dict[str, list[str]]:
     """The column `env.outcome`, a text per episode; empty for a run in which all episodes end alike."""
-    if not getattr(run, "in_own_environment", False) or run.episodes["outcome"].nunique() < 2:
+    if not run.in_own_environment or run.episodes["outcome"].nunique() < 2:
         return {}
     return {OUTCOME: run.episodes["outcome"].astype(str).tolist()}
 
 
 def recorded_columns(run: RunReader) -> dict[str, NDArray[np.float64]]:
     """(E, C) values of data set or environment by name, of every shown frame; none for a run of scenes."""
-    inputs = getattr(run, "inputs", None)
+    inputs = run.inputs
     if inputs is None:
         return {}
     columns = {name: inputs.column(name) for name in inputs.columns}
@@ -177,8 +177,8 @@ def recorded_columns(run: RunReader) -> dict[str, NDArray[np.float64]]:
             values = inputs.read(kind)
             now = values if kind == "state" else values[:, :, 0]
             columns |= {f"{kind}.{name}": now[..., number].astype(np.float64) for number, name in enumerate(names)}
-    if getattr(run, "recorded", False) and why_not_compared(run) is None:  # type: ignore[arg-type]  # only runs have inputs
-        columns[ACTION_ERROR] = compare_actions(run).of_frames[0]  # type: ignore[arg-type]
+    if run.recorded and why_not_compared(run) is None:
+        columns[ACTION_ERROR] = compare_actions(run).of_frames[0]
     return columns
 
 
@@ -210,13 +210,13 @@ def label_frame(run: RunReader) -> "pd.DataFrame":
         values = _of_frames(run, [value for _, value in SIM_COLUMNS.values()])
         sim = dict(zip((SIM + name for name in SIM_COLUMNS), zip(*values, strict=True), strict=True))
         table["control_step"] = [frame for _, _, frames in frames_of_inferences(run) for frame in frames]
-    if getattr(run, "recorded", False):
-        steps = run.control_steps  # type: ignore[attr-defined]
+    if run.recorded:
+        steps = run.control_steps
         table["source_episode"] = run.episodes["source_episode"].iloc[rows].tolist()
         table["frame"] = steps[rows, list(inferences)].tolist()
-    if getattr(run, "in_own_environment", False):
-        table["control_step"] = run.control_steps[rows, list(inferences)].tolist()  # type: ignore[attr-defined]
-    if getattr(run, "inputs", None) is not None:
+    if run.in_own_environment:
+        table["control_step"] = run.control_steps[rows, list(inferences)].tolist()
+    if run.inputs is not None:
         table["instruction"] = run.episodes["instruction"].iloc[rows].tolist()
         sim = {
             prefix_of(run) + name: list(_cells(run, name, column[rows, list(inferences)]))
@@ -226,7 +226,7 @@ def label_frame(run: RunReader) -> "pd.DataFrame":
     for name in ("group_id", "category"):
         table[name] = run.episodes[name].iloc[rows].tolist()
     table |= sim
-    for name in ITEM_COLUMNS if getattr(run, "inputs", None) is None else ():
+    for name in ITEM_COLUMNS if run.inputs is None else ():
         if set(_needed(name)) <= set(run.episodes):
             cells = list(_of_item(run, name))
             table[ITEM + name] = [cells[row] for row in rows]

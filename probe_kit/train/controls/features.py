@@ -92,7 +92,7 @@ class ControlInputs:
     @cached_property
     def recorded(self) -> "StoredInputs | None":
         """The stored inputs of recordings and of a user's own environment."""
-        inputs: StoredInputs | None = getattr(self.run, "inputs", None)
+        inputs: StoredInputs | None = self.run.inputs
         return inputs
 
     def _recorded(self, kind: str) -> NDArray[Any]:
@@ -105,7 +105,7 @@ class ControlInputs:
         """(n,) place of every recorded frame in the order of frames; None for scenes, and from an event on."""
         if self.recorded is None or self.samples.aligned is not None:
             return None
-        steps = self.run.control_steps[self.samples.rows, self.samples.inferences]  # type: ignore[attr-defined]
+        steps = self.run.control_steps[self.samples.rows, self.samples.inferences]
         return np.asarray(np.unique(steps, return_inverse=True)[1], np.intp)
 
     def _pixels(self, side: int) -> Features:
@@ -119,7 +119,7 @@ class ControlInputs:
 def why_impossible(run: RunReader, samples: TargetSamples) -> dict[str, str]:
     """Return why the run or the target does not allow a control, by name."""
     reasons = {}
-    inputs = getattr(run, "inputs", None)
+    inputs = run.inputs
     if "layout" not in run.episodes:
         reasons["position"] = "the episodes have no layouts"
     if samples.window == 1:
@@ -137,13 +137,13 @@ def why_impossible(run: RunReader, samples: TargetSamples) -> dict[str, str]:
 
 def control_features(run: RunReader) -> "Mapping[str, NDArray[np.floating]]":
     """Return (E, D) features of controls that a run of arrays brings, by name, in place of built-in ones."""
-    features: Mapping[str, NDArray[np.floating]] = getattr(run, "control_features", {})
+    features: Mapping[str, NDArray[np.floating]] = run.control_features
     return features
 
 
 def why_no_state(run: RunReader) -> str | None:
     """Return why a run has no control `state`; None if it has one."""
-    inputs = getattr(run, "inputs", None)
+    inputs = run.inputs
     if inputs is None:
         return why_no_sim(run)
     return None if "state" in inputs.kinds else "the data set has no state"

@@ -79,7 +79,7 @@ def prepare_controls(
     left_out = {name: reasons[name] for name in ordered if name in reasons}
     missing = [name for name in ordered if name not in reasons and not stored.has(name, categories)]
     suite = None
-    if PICTURED.intersection(missing).difference(array_features) and getattr(run, "inputs", None) is None:
+    if PICTURED.intersection(missing).difference(array_features) and run.inputs is None:
         try:
             suite = suite_of(run, folder)
         except SuiteNotFoundError as error:

@@ -107,9 +107,9 @@ def _identity(settings: Any, name: str) -> Any:
 def _check_frames(
     run: RunReader, untrained: RunReader, samples: TargetSamples, untrained_samples: TargetSamples
 ) -> None:
-    if getattr(run, "recorded", False):
+    if run.recorded:
         frames, other_frames = (
-            reader.control_steps[reader_samples.rows, reader_samples.inferences]  # type: ignore[attr-defined]
+            reader.control_steps[reader_samples.rows, reader_samples.inferences]
             for reader, reader_samples in ((run, samples), (untrained, untrained_samples))
         )
         if (frames != other_frames).any():

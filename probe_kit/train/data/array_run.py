@@ -1,28 +1,57 @@
 """A run made of arrays."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit.env.scoring.rules import DEFAULT_RULE
 from probe_kit.errors import UnknownSiteError, UsageError
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.contract.sites import Site, Stream
+from probe_kit.runs.origin import Origin
+from probe_kit.runs.reader import RunSource
 from probe_kit.runs.store import Location, locate
 
 if TYPE_CHECKING:
     import pandas as pd
 
+    from probe_kit.runs.inputs import StoredInputs
     from probe_kit.runs.rows import TokenBlock
 
 
+class NotPlayed:
+    """The parts of a `RunReader` that arrays in memory do not have; a class of your own may have some."""
+
+    recorded: bool = False
+    in_own_environment: bool = False
+    inputs: "StoredInputs | None" = None
+    captured_calls: int = 1
+    has_trajectories: bool = False
+    lens_margins: NDArray[np.float64] | None = None
+    settings: Mapping[str, Any] = MappingProxyType({})
+    certificate: Mapping[str, Any] = MappingProxyType({})
+    mixed: Sequence[str] = ()
+    origins: Sequence[Origin] = ()
+    stamp: str = ""
+    suite_parent: str | None = None
+    items: "pd.DataFrame | None" = None
+    planned_ids: Collection[str] = ()
+    failed: Mapping[str, str] = MappingProxyType({})
+    wording: str | None = None
+    wordings: Sequence[str] = ()
+    rule: str = DEFAULT_RULE
+    score: str = "text"
+
+
 @dataclass(frozen=True)
-class ArrayRun:
+class ArrayRun(NotPlayed):
     """A `RunReader` over features in memory, for activations that were not recorded by probe_kit.
 
     path: folder for the probe results. episodes: the table described in `RunReader.episodes`.
@@ -62,6 +91,36 @@ class ArrayRun:
     def location(self) -> Location:
         """The folder `path`."""
         return locate(self.path)
+
+    @property
+    def source(self) -> RunSource:
+        """The suite that it names."""
+        return RunSource("arrays", self.suite, f"it is made of arrays on {self.suite}")
+
+    @property
+    def seed_text(self) -> str:
+        """The suite, which sets its draws apart."""
+        return self.suite
+
+    @property
+    def whole(self) -> Self:
+        """The run itself: it has no wordings."""
+        return self
+
+    @property
+    def planned(self) -> int:
+        """The number of its episodes."""
+        return len(self.episodes)
+
+    @property
+    def planned_items(self) -> Mapping[str, str]:
+        """The items of its episodes."""
+        return dict(zip(self.episodes["item_id"], self.episodes["category"], strict=True))
+
+    @property
+    def control_steps(self) -> NDArray[np.int64]:
+        """(E, 0): inferences in memory have no steps."""
+        return np.zeros((len(self.episodes), 0), np.int64)
 
     @cached_property
     def settings_sha256(self) -> str:

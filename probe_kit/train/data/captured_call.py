@@ -10,7 +10,7 @@ from probe_kit.train.data.run_reader import RunReader
 
 def check_call(run: RunReader, call: int) -> None:
     """Raise UsageError if no such inference was captured, and for a run that does not keep them apart."""
-    captured = captured_calls(run)
+    captured = run.captured_calls
     if call and not 0 < call < captured:
         raise UsageError(
             f"{run.location} has {counted(captured, 'captured inference')} per episode, counted from 0; "
@@ -18,13 +18,8 @@ def check_call(run: RunReader, call: int) -> None:
         )
 
 
-def captured_calls(run: RunReader) -> int:
-    """Return the inferences captured per episode, at most; 1 for a run that was not made by probe_kit."""
-    return int(getattr(run, "captured_calls", 1))
-
-
 def reached_calls(run: RunReader) -> NDArray[np.bool_]:
     """(E, C) whether an episode has a captured inference; all have the only one of a run not made by probe_kit."""
     if not hasattr(run, "reached"):
         return np.ones((len(run.episodes), 1), bool)
-    return np.stack([run.reached(call) for call in range(captured_calls(run))], axis=1)
+    return np.stack([run.reached(call) for call in range(run.captured_calls)], axis=1)

@@ -27,7 +27,7 @@ def suite_of(run: RunReader, folder: Path | None = None) -> "Suite":
     if folder is not None:
         return _in_folder(run, folder)
     moved = []
-    for source_folder in dict.fromkeys(origin.suite for origin in getattr(run, "origins", ()) if origin.suite):
+    for source_folder in dict.fromkeys(origin.suite for origin in run.origins if origin.suite):
         try:
             return _in_folder(run, Path(source_folder))
         except UsageError:
@@ -107,7 +107,4 @@ def _hash_of_part(suite: "Suite", run: RunReader) -> str:
 
 def _items(run: RunReader) -> Mapping[str, str]:
     """Category of every item by id: those the run was to have, also where it was shortened or is unfinished."""
-    planned: Mapping[str, str] | None = getattr(run, "planned_items", None)
-    if planned is not None:
-        return planned
-    return dict(zip(run.episodes["item_id"], run.episodes["category"], strict=True))
+    return run.planned_items

@@ -79,19 +79,19 @@ def inventory(run: Any) -> Inventory:
         settings_sha256=run.settings_sha256,
         categories=tuple(dict.fromkeys(episodes["category"].astype(str))),
         episodes=len(episodes),
-        planned=getattr(run, "planned", len(episodes)),
-        failed=len(getattr(run, "failed", ())),
+        planned=run.planned,
+        failed=len(run.failed),
         outcomes={str(name): int(count) for name, count in episodes["outcome"].value_counts().items()},
         streams={name: _words(run, name) for name in run.streams},
         probes=tuple(stored_probes(run)),
         unfinished=unfinished_sweeps(run.location),
-        wordings={name: len(run.in_wording(name).episodes) for name in getattr(run, "wordings", ())},
+        wordings={name: len(run.in_wording(name).episodes) for name in run.wordings},
     )
 
 
 def _in_wordings(run: Any) -> list[Any]:
     """The run in each of its wordings, which is what probes are fitted on; itself if it has none."""
-    return [run.in_wording(name) for name in getattr(run, "wordings", ())] or [run]
+    return [run.in_wording(name) for name in run.wordings] or [run]
 
 
 def stored_probes(run: Any) -> list[StoredProbes]:

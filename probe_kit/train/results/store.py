@@ -186,7 +186,7 @@ def _why_none(run: RunReader, target: str, stored: int) -> str:
 
 def how_to_probe(run: RunReader) -> str:
     """Return a sentence that says how a run gets probes: the command, or that it has too few groups of items."""
-    if getattr(run, "subject", "scenes") != "scenes":
+    if run.recorded or run.in_own_environment:
         return f"`probe-kit targets {run.location}` lists what can be probed."
     command, episodes = f"probe-kit train {run.location}", run.episodes
     if not {"category", "group_id"} <= set(episodes):
@@ -303,7 +303,7 @@ def _read(run: RunReader, bundle: Bundle) -> ProbeResults:
 
 def _check_foreign(run: RunReader, bundle: Bundle, settings: ProbeSettings) -> None:
     """Raise RunDamagedError for results of another run, or of these episodes as they are no more."""
-    stamp, now = _stamp(bundle), stamp_of_run(run)
+    stamp, now = _stamp(bundle), run.stamp
     if stamp == now or not (stamp and now):
         return
     if settings.run_settings != run.settings_sha256 or is_current(settings, run):
@@ -316,8 +316,3 @@ def _check_foreign(run: RunReader, bundle: Bundle, settings: ProbeSettings) -> N
 def _stamp(bundle: Bundle) -> str:
     """Return the hash of the commits that probes were fitted to; empty for arrays in memory."""
     return str(bundle.head.get("stamp", ""))
-
-
-def stamp_of_run(run: RunReader) -> str:
-    """Return the hash of the commits of a run; empty for one whose settings are the hash of all its numbers."""
-    return str(getattr(run, "stamp", ""))

@@ -132,13 +132,13 @@ def shared_groups(
 def _sources(run: RunReader) -> set[str]:
     """Names under which what a run shows is known."""
     digest = run.suite.partition("#")[2]
-    parent = getattr(run, "suite_parent", None)
+    parent = run.suite_parent
     return {name for name in (run.suite, digest[:_DIGITS], (parent or "")[:_DIGITS]) if name}
 
 
 def _contents(run: RunReader, samples: TargetSamples) -> dict[int, tuple[str, str]]:
     """Item id and content hash by row of the episodes; empty where the run has no items."""
-    items = getattr(run, "items", None)
+    items = run.items
     if items is None or "item_id" not in run.episodes or "content_sha256" not in items:
         return {}
     content = dict(zip(items["item_id"].astype(str), items["content_sha256"], strict=True))

@@ -35,7 +35,7 @@ class ProvenanceLine:
     @classmethod
     def of_run(cls, run: RunReader) -> Self:
         """Return the line of a run's behaviour."""
-        rule = getattr(run, "rule", "disc")
+        rule = run.rule
         n = f"n = {counted(len(run.episodes), 'episode')}" + ("" if rule == "disc" else f" by the rule {rule}")
         return cls(run.label, run.random_weights, run.weights_sha256, run.suite, n, run.settings_sha256)
 
