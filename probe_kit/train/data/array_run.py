@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.env.scoring.rules import DEFAULT_RULE
 from probe_kit.errors import UnknownSiteError, UsageError
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.contract.sites import Site, Stream
@@ -46,7 +45,7 @@ class NotPlayed:
     failed: Mapping[str, str] = MappingProxyType({})
     wording: str | None = None
     wordings: Sequence[str] = ()
-    rule: str = DEFAULT_RULE
+    rule: str = "disc"  # the rule by which outcomes are stored; its module needs a scene
     score: str = "text"
 
 
