@@ -15,9 +15,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from probe_kit.study import load_study, plan_study
-from probe_kit.study.planning.plan import StudyPlan
-from probe_kit.study.running.model_task import Failure, Made, ModelTask, RunTask
-from probe_kit.study.running.playing import play_models
+from probe_kit.study.plan import StudyPlan
+from probe_kit.study.playing import Failure, Made, ModelTask, RunTask, play_models
 
 STUDY = """
 schema = 1

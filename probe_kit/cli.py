@@ -161,7 +161,7 @@ def _stored_runs_of_study(name: str) -> "list[Run] | None":
     """The stored runs of a study file or of a study of the package; None for a run."""
     if Path(name).is_dir() or "://" in name:
         return None
-    from probe_kit.study.tables.stored_runs import stored_runs_by_name
+    from probe_kit.study.stored import stored_runs_by_name
 
     return stored_runs_by_name(name)
 

@@ -5,27 +5,22 @@ from typing import TYPE_CHECKING
 from probe_kit._system.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from probe_kit.study.drift.measures import CategoryDrift, measure_drift
+    from probe_kit.study.data_set import publish_data_set, write_data_set
+    from probe_kit.study.drift import CategoryDrift, measure_drift
+    from probe_kit.study.failures import Failure
     from probe_kit.study.figures import make_figures
-    from probe_kit.study.ledger import Failure, Ledger
     from probe_kit.study.mistakes import Mistake, StudyFileError
-    from probe_kit.study.packing.data_set import write_data_set
-    from probe_kit.study.packing.pack import pack_study
-    from probe_kit.study.packing.publishing import publish_data_set
-    from probe_kit.study.packing.report import write_study_report
-    from probe_kit.study.planning.plan import StudyPlan, plan_study
+    from probe_kit.study.named_table import NamedTable
+    from probe_kit.study.pack import pack_study
+    from probe_kit.study.plan import StudyPlan, plan_study
+    from probe_kit.study.playing import Made, Moved, conduct_study, fit_probes
     from probe_kit.study.reading import LoadedStudy, load_study
-    from probe_kit.study.running.calibrating import calibrate_study
-    from probe_kit.study.running.conduct import conduct_study
-    from probe_kit.study.running.model_task import Made, Moved
-    from probe_kit.study.running.probing import fit_probes
-    from probe_kit.study.tables.make import make_table
-    from probe_kit.study.tables.named_table import NamedTable
+    from probe_kit.study.report import write_study_report
+    from probe_kit.study.tables import make_table
 
 __all__ = [
     "CategoryDrift",
     "Failure",
-    "Ledger",
     "LoadedStudy",
     "Made",
     "Mistake",
@@ -33,7 +28,6 @@ __all__ = [
     "NamedTable",
     "StudyFileError",
     "StudyPlan",
-    "calibrate_study",
     "conduct_study",
     "fit_probes",
     "load_study",
@@ -54,23 +48,21 @@ __getattr__, __dir__ = lazy_names(
         "load_study": "reading",
         "Mistake": "mistakes",
         "StudyFileError": "mistakes",
-        "CategoryDrift": "drift.measures",
-        "measure_drift": "drift.measures",
+        "CategoryDrift": "drift",
+        "measure_drift": "drift",
         "make_figures": "figures",
-        "pack_study": "packing.pack",
-        "publish_data_set": "packing.publishing",
-        "write_data_set": "packing.data_set",
-        "write_study_report": "packing.report",
-        "StudyPlan": "planning.plan",
-        "plan_study": "planning.plan",
-        "Failure": "ledger",
-        "Ledger": "ledger",
-        "Made": "running.model_task",
-        "Moved": "running.model_task",
-        "calibrate_study": "running.calibrating",
-        "conduct_study": "running.conduct",
-        "fit_probes": "running.probing",
-        "NamedTable": "tables.named_table",
-        "make_table": "tables.make",
+        "pack_study": "pack",
+        "publish_data_set": "data_set",
+        "write_data_set": "data_set",
+        "write_study_report": "report",
+        "StudyPlan": "plan",
+        "plan_study": "plan",
+        "Failure": "failures",
+        "Made": "playing",
+        "Moved": "playing",
+        "conduct_study": "playing",
+        "fit_probes": "playing",
+        "NamedTable": "named_table",
+        "make_table": "tables",
     },
 )

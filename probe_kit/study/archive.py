@@ -111,13 +111,13 @@ def open_archive(name: str | Path) -> Path | None:
     Raises RunDamagedError where a file is missing, was added, or has other bytes than were packed, and for a link
     or a zip file beyond the bounds.
     """
-    place = Path(name)
-    if place.is_dir():
-        if not (place / PACK_FILE).is_file():
+    path = Path(name)
+    if path.is_dir():
+        if not (path / PACK_FILE).is_file():
             return None
-        check_sums(place)
-        return place
-    return _unpacked(place.resolve()) if place.is_file() and place.suffix == ".zip" else None
+        check_sums(path)
+        return path
+    return _unpacked(path.resolve()) if path.is_file() and path.suffix == ".zip" else None
 
 
 @cache
@@ -246,13 +246,13 @@ def check_sums(folder: Path) -> None:
     files = list(files_of(folder))  # first: no link is followed
     _check_sizes(len(files), sum(file.stat().st_size for file in files), str(folder))
     expected = _read_sums(sums)
-    there = {file.relative_to(folder).as_posix(): file for file in files if file != sums}
+    present = {file.relative_to(folder).as_posix(): file for file in files if file != sums}
     for name, digest in expected.items():
-        if name not in there:
+        if name not in present:
             raise RunDamagedError(f"{folder / name} is missing. {_RESTORE}")
-        if _digest(there[name]) != digest:
+        if _digest(present[name]) != digest:
             raise RunDamagedError(f"{folder / name} has other bytes than were packed. {_RESTORE}")
-    for name in there:
+    for name in present:
         if name not in expected:
             raise RunDamagedError(f"{folder / name} was not packed: {SUMS_FILE} does not have it. {_RESTORE}")
 

@@ -1,7 +1,7 @@
 """Cells: one model in one condition, or asked in one way, with one seed. Known without loading a model."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from math import ceil
@@ -27,11 +27,13 @@ class Selection:
         every = {name: suite.items.get(name, 0) for name in self.categories}
         return {name: count if self.items is None else min(count, self.items) for name, count in every.items()}
 
-    def joined(self, other: "Selection") -> "Selection":
-        """The smallest selection that holds both."""
-        categories = tuple(dict.fromkeys((*self.categories, *other.categories)))
-        items = None if None in (self.items, other.items) else max(self.items or 0, other.items or 0)
-        return Selection(categories, items)
+
+def joined(selections: Iterable[Selection]) -> Selection:
+    """Return the smallest selection that holds all of these."""
+    every = list(selections)
+    categories = tuple(dict.fromkeys(name for selection in every for name in selection.categories))
+    counts = [selection.items for selection in every]
+    return Selection(categories, None if None in counts else max(count or 0 for count in counts))
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,7 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """As tables of the plan name it, such as `base/plain`."""
+        """The name in tables of the plan, such as `base/plain`."""
         return f"{self.model}/{self.way}" + (f"/seed {self.seed}" if self.seed else "")
 
     @property
@@ -69,11 +71,8 @@ class Cell:
 
     @cached_property
     def selection(self) -> Selection:
-        """What all blocks together need."""
-        first, *others = self.selections.values()
-        for other in others:
-            first = first.joined(other)
-        return first
+        """The selection that all blocks together need."""
+        return joined(self.selections.values())
 
     @property
     def n_items(self) -> int:
@@ -95,10 +94,12 @@ class Cell:
         return self.episodes * ceil(self.settings.scene.max_steps / (self.settings.task.execute or 1))
 
     @cached_property
-    def known(self) -> dict[str, Any]:
-        """All that the settings decide but the selection, as plain values."""
+    def key(self) -> str:
+        """The hash of all that the settings decide but the selection, by which the run's folder is named."""
+        if self.packed_key:
+            return self.packed_key
         settings = self.settings
-        known = {
+        decided = {
             **settings.identity(),
             "checkpoint": checkpoint_stamp(settings.model.checkpoint),
             "options": {name: str(value) for name, value in settings.model.options.items()},
@@ -108,21 +109,15 @@ class Cell:
             "scene": settings.scene.to_json(),
             "suite": self.suite.identity,
         }
-        plain: dict[str, Any] = json.loads(canonical_json(known))
-        return plain
-
-    @cached_property
-    def key(self) -> str:
-        """Hash of `known`: what the run's folder is named by."""
-        return self.packed_key or key_of(self.known)
+        return sha256_json(json.loads(canonical_json(decided)))[:KEY_DIGITS]
 
     @property
     def folder(self) -> str:
-        """The run's folder below `out`."""
-        return folder_of(self.name, self.key)
+        """The run's folder below `out`, such as `base/plain-seed1-0123abcd`."""
+        return f"{self.name.replace('/seed ', '-seed')}-{self.key}"
 
     def location(self, out: str) -> str:
-        """Where the run lies below `out`."""
+        """Return the location of the run below `out`."""
         return f"{out.rstrip('/')}/{self.folder}"
 
     @property
@@ -134,18 +129,11 @@ class Cell:
         )
 
 
-def key_of(known: Mapping[str, Any]) -> str:
-    """The key of a cell with these settings, see `Cell.known`."""
-    return sha256_json(known)[:KEY_DIGITS]
-
-
-def folder_of(name: str, key: str) -> str:
-    """The folder below `out` of the run of the cell `name`, such as `base/plain/seed 1`."""
-    return f"{name.replace('/seed ', '-seed')}-{key}"
-
-
 def checkpoint_stamp(checkpoint: str | None) -> Any:
-    """What names a checkpoint without reading it: its hub id, or name, size and time of every file of a folder."""
+    """Return what tells checkpoints apart without reading them.
+
+    Of a folder or file, name, size and time of every file; else the hub id.
+    """
     if checkpoint is None or not (folder := Path(checkpoint).expanduser()).exists():
         return checkpoint
     files = sorted(folder.rglob("*")) if folder.is_dir() else [folder]

@@ -20,13 +20,12 @@ from probe_kit._terminal.options import (
     speed_option,
 )
 from probe_kit.errors import ProbeKitError, UsageError
-from probe_kit.study.planning.plan_lines import print_plan
 from probe_kit.train.command_options import Jobs
 
 if TYPE_CHECKING:
     from probe_kit.study import Failure, LoadedStudy, StudyPlan
-    from probe_kit.study.running.model_task import Event
-    from probe_kit.study.tables.named_table import NamedTable
+    from probe_kit.study.named_table import NamedTable
+    from probe_kit.study.playing import Event
 
 HELP = """Run a whole study from one file: models × conditions × categories.
 
@@ -89,14 +88,10 @@ def run(
     ray: RayAddress = None,
     env_workers: EnvWorkers = None,
     jobs: Jobs = None,
-    calibrate: Annotated[
-        bool,
-        speed_option("--calibrate", help="Measure models on a few episodes, for the hours of the plan."),
-    ] = False,
 ) -> None:
     """Play and ask what a study needs and is not stored yet, then fit its probes.
 
-    Each model is loaded once. A model that fails stops itself alone, and the ledger keeps the reason.
+    Each model is loaded once. A model that fails stops itself alone, and its reason is stored.
     The same command resumes. What failed while it played is tried again with --retry-failed. --dry-run prints
     what is stored, and why other runs are to be made.
 
@@ -112,14 +107,12 @@ def run(
         raise UsageError("give either --slots, for processes of this machine, or --ray, for a cluster")
     looks = {"--exit-code": exit_code, "--verify": verify, "--orphans": orphans}
     if not dry_run and any(looks.values()):
-        named = next(name for name, is_on in looks.items() if is_on)
-        raise UsageError(f"{named} looks at what is stored and plays nothing; give it with --dry-run")
+        flag = next(name for name, is_on in looks.items() if is_on)
+        raise UsageError(f"{flag} looks at what is stored and plays nothing; give it with --dry-run")
     study = load_study(file)
     if study.archive is not None and not dry_run:
         raise UsageError(f"{file} is an archive without activations; nothing can be added to its runs")
     plan = plan_study(study, only)
-    if calibrate:
-        plan = _calibrated(plan, env_workers)
     if dry_run:
         changed = _look(plan, verify, orphans, as_json)
         if changed or (exit_code and not plan.whole):
@@ -141,34 +134,47 @@ def run(
 
 
 def _print(plan: "StudyPlan", as_json: bool) -> None:
-    print_json(plan.to_json()) if as_json else print_plan(plan)
+    """Print a line per run with its state, then what all of them take."""
+    from rich.table import Table
+
+    if as_json:
+        print_json(plan.to_json())
+        return
+    columns = ("model", "run", "blocks", "episodes", "inferences", "state")
+    rows = Table(*columns, title=f"study {plan.study.study.name}", box=None)
+    for column in rows.columns[3:5]:
+        column.justify = "right"
+    for planned in plan.cells:
+        cell = planned.cell
+        inferences = "–" if cell.asks else f"{cell.inferences:,}"
+        texts = (cell.model, planned.run_text, ", ".join(cell.selections), f"{cell.episodes:,}", inferences)
+        rows.add_row(*(marked("{}", text) for text in (*texts, planned.words)))
+    out.print(rows)
+    for line in plan.lines():
+        _print_plain(line)
+
+
+def _print_plain(line: str) -> None:
+    out.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
 def _look(plan: "StudyPlan", verify: bool, orphans: bool, as_json: bool) -> bool:
     """Print the plan, changed bytes and unused runs; return whether a byte was changed."""
-    from probe_kit.study.planning.stored_checks import changed_runs, orphaned_runs
+    from probe_kit.study.plan import changed_runs, orphaned_runs
 
     problems = changed_runs(plan) if verify else {}
     unused = orphaned_runs(plan) if orphans else []
     if as_json:
-        further = {"problems": problems} if verify else {}
-        print_json({**plan.to_json(), **further, **({"orphans": unused} if orphans else {})})
-    else:
-        print_plan(plan)
-        lines = [f"damaged: {name}: {problem}" for name, texts in problems.items() for problem in texts]
-        for line in (*lines, *(f"used by no run of the file: {location}" for location in unused)):
-            out.print(line, highlight=False, markup=False, soft_wrap=True)
+        audits = {**({"problems": problems} if verify else {}), **({"orphans": unused} if orphans else {})}
+        print_json({**plan.to_json(), **audits})
+        return bool(problems)
+    _print(plan, as_json)
+    for name, texts in problems.items():
+        for problem in texts:
+            _print_plain(f"damaged: {name}: {problem}")
+    for location in unused:
+        _print_plain(f"used by no run of the file: {location}")
     return bool(problems)
-
-
-def _calibrated(plan: "StudyPlan", env_workers: int | None) -> "StudyPlan":
-    """The plan again, with rates that were measured now."""
-    from probe_kit.study import calibrate_study, plan_study
-
-    failures = calibrate_study(plan, lambda name: say(f"measuring {name}"), env_workers)
-    for failure in failures:
-        say(marked("[yellow]not measured:[/] {}", failure))
-    return plan_study(plan.study, plan.only)
 
 
 def _played(plan: "StudyPlan", **options: Any) -> "list[Failure]":
@@ -176,19 +182,17 @@ def _played(plan: "StudyPlan", **options: Any) -> "list[Failure]":
     from probe_kit.study import Failure, Moved, conduct_study
 
     with progress() as bar:
-        totals = plan.totals()
-        whole = counter(bar, f"study {plan.study.study.name}")
-        done, counters = [totals["episodes"] - totals["missing"]], dict[str, Callable[..., None]]()
+        totals, counters = plan.totals(), _Counters(bar, "")
+        stored, of_study = totals["episodes"] - totals["missing"], counter(bar, f"study {plan.study.study.name}")
 
         def report(event: "Event") -> None:
+            nonlocal stored
             if isinstance(event, Failure):
                 say(marked("[red]{}[/]", event))
             elif isinstance(event, Moved):
-                if event.run not in counters:
-                    counters[event.run] = counter(bar, event.run)
-                counters[event.run](event.done, event.planned)
-                done[0] += 1
-                whole(done[0], totals["episodes"])
+                counters.show(event.run, event.stored, event.planned)
+                stored += 1
+                of_study(stored, totals["episodes"])
 
         return conduct_study(plan, report, **options)
 
@@ -198,14 +202,22 @@ def _probed(plan: "StudyPlan", jobs: int | None) -> "list[Failure]":
     from probe_kit.study import fit_probes
 
     with progress() as bar:
-        counters: dict[str, Callable[..., None]] = {}
+        failures = fit_probes(plan, _Counters(bar, "probes of ").show, jobs)
+        return [failure for failure in failures if failure.stage != "waiting"]
 
-        def count(name: str, done: int, sites: int, last: str) -> None:
-            if name not in counters:
-                counters[name] = counter(bar, f"probes of {name}")
-            counters[name](done, sites, last)
 
-        return [one for one in fit_probes(plan, count, jobs) if one.stage != "waiting"]
+class _Counters:
+    """A bar per run, which appears with the first thing that is counted."""
+
+    def __init__(self, bar: Any, prefix: str) -> None:
+        self._bar, self._prefix = bar, prefix
+        self._of_run: dict[str, Callable[..., None]] = {}
+
+    def show(self, run: str, count: int, total: int, last: str = "") -> None:
+        """Show how far a run is."""
+        if run not in self._of_run:
+            self._of_run[run] = counter(self._bar, f"{self._prefix}{run}")
+        self._of_run[run](count, total, *([last] if last else []))
 
 
 @app.command("table")
@@ -229,7 +241,6 @@ def table(
     With --partial the command exits with 1 if anything is missing that the study would play.
     """
     from probe_kit.study import load_study, make_table
-    from probe_kit.study.tables.formats import table_json
 
     study = load_study(file)
     if html is not None:
@@ -241,34 +252,40 @@ def table(
         raise UsageError(
             f"--format csv prints one table, and {file} has {', '.join(study.study.tables)}; give the name of one"
         )
-    made: dict[str, NamedTable] = {}
-    for one in [name] if name else study.study.tables:
+    tables: dict[str, NamedTable] = {}
+    for table_name in [name] if name else study.study.tables:
         try:
-            made[one] = make_table(study, one, partial)
+            tables[table_name] = make_table(study, table_name, partial)
         except ProbeKitError as error:
             if name or not partial:
                 raise
-            say(marked("[red]no table {}: {}[/]", one, error))
-    if style == "json":
-        found = {one: table_json(own) for one, own in made.items()}
-        print_json(found[name] if name else found)
-    elif style == "csv":
-        for own in made.values():
-            print_text(own.to_csv().rstrip("\n"))
-    elif style == "table":
-        for own in made.values():
-            out.print(own)
-    else:
-        texts = (own.to_text(style) for own in made.values())
-        print_text("\n\n".join(text.rstrip("\n") for text in texts))
+            say(marked("[red]no table {}: {}[/]", table_name, error))
+    _print_tables(tables, style, single=name is not None)
     if not name and style not in ("json", "csv"):
-        tests = sum(own.n_tests for own in made.values())
+        tests = sum(printed.n_tests for printed in tables.values())
         say(
-            f"{counted(len(made), 'table')} with {counted(tests, 'test')}; "
+            f"{counted(len(tables), 'table')} with {counted(tests, 'test')}; "
             "each is corrected within its own comparison."
         )
-    if len(made) < (1 if name else len(study.study.tables)) or any(own.is_partial for own in made.values()):
+    expected = 1 if name else len(study.study.tables)
+    if len(tables) < expected or any(printed.is_partial for printed in tables.values()):
         raise typer.Exit(UNFINISHED)
+
+
+def _print_tables(tables: "dict[str, NamedTable]", style: str, single: bool) -> None:
+    from probe_kit.study.named_table import table_json
+
+    if style == "json":
+        records = {name: table_json(printed) for name, printed in tables.items()}
+        print_json(next(iter(records.values())) if single else records)
+    elif style == "csv":
+        for printed in tables.values():
+            print_text(printed.to_csv().rstrip("\n"))
+    elif style == "table":
+        for printed in tables.values():
+            out.print(printed)
+    else:
+        print_text("\n\n".join(printed.to_text(style).rstrip("\n") for printed in tables.values()))
 
 
 def _write_report(study: "LoadedStudy", html: Path, partial: bool) -> None:
@@ -278,11 +295,11 @@ def _write_report(study: "LoadedStudy", html: Path, partial: bool) -> None:
     if html.is_dir():
         raise UsageError(f"--html {html} is a folder; give a file, such as {html / 'report.html'}")
     with err.status("drawing the report"):
-        made = write_study_report(study, html, partial)
+        report = write_study_report(study, html, partial)
     say_report(html)
-    for name, reason in made.missing.items():
+    for name, reason in report.missing.items():
         say(marked("[red]no {}: {}[/]", name, reason))
-    if made.is_partial:
+    if report.is_partial:
         raise typer.Exit(UNFINISHED)
 
 
@@ -304,9 +321,9 @@ def figure(
 
     check_file(out_folder)
     study = load_study(file)
-    for one in [name] if name else study.study.figures:
-        for path in save_figures(make_figures(study, one, partial), out_folder):
-            out.print(str(path), highlight=False, markup=False, soft_wrap=True)
+    for figure_name in [name] if name else study.study.figures:
+        for path in save_figures(make_figures(study, figure_name, partial), out_folder):
+            _print_plain(str(path))
 
 
 @app.command("pack")
@@ -363,7 +380,7 @@ def pack(
     With --publish the pack is a data set of the Hugging Face hub.
     """
     from probe_kit.study import load_study, pack_study
-    from probe_kit.study.packing.pack import EXTRAS
+    from probe_kit.study.pack import EXTRAS
 
     if publish is None and (pull_request or private):
         raise UsageError(
@@ -375,27 +392,29 @@ def pack(
         )
         _write_data_set(load_study(file), out_file, partial, licence, again=publish is not None)
         if publish is None:
-            out.print(str(out_file), highlight=False, markup=False, soft_wrap=True)
+            _print_plain(str(out_file))
             return
         _upload(out_file, publish, pull_request, private)
         return
     if licence is not None:
         raise UsageError("--license is of a data set; give --data-set or --publish OWNER/NAME too")
-    asked = dict(zip(EXTRAS, (pictures, trajectories, directions), strict=True))
+    extras = dict(zip(EXTRAS, (pictures, trajectories, directions), strict=True))
     with err.status("packing"):
-        made = pack_study(load_study(file), out_file, partial, [name for name in EXTRAS if asked[name]])
-    out.print(f"{out_file}: {counted(len(made.runs), 'run')}, without {', '.join(made.left_out)}", soft_wrap=True)
-    for name, reason in made.missing.items():
-        out.print(f"not packed: {name}: {reason}", highlight=False, markup=False, soft_wrap=True)
+        record = pack_study(load_study(file), out_file, partial, [name for name in EXTRAS if extras[name]])
+    out.print(
+        f"{out_file}: {counted(len(record.runs), 'run')}, without {', '.join(record.left_out)}", soft_wrap=True
+    )
+    for name, reason in record.missing.items():
+        _print_plain(f"not packed: {name}: {reason}")
 
 
 def _write_data_set(study: "LoadedStudy", folder: Path, partial: bool, licence: str | None, again: bool) -> None:
     from probe_kit.study import write_data_set
 
     with err.status("packing"):
-        made = write_data_set(study, folder, partial, licence, again)
-    for name, reason in made.missing.items():
-        out.print(f"not in it: {name}: {reason}", highlight=False, markup=False, soft_wrap=True)
+        record = write_data_set(study, folder, partial, licence, again)
+    for name, reason in record.missing.items():
+        _print_plain(f"not in it: {name}: {reason}")
 
 
 def _upload(folder: Path, repository: str, pull_request: bool, private: bool) -> None:
@@ -403,4 +422,4 @@ def _upload(folder: Path, repository: str, pull_request: bool, private: bool) ->
 
     with err.status("uploading"):
         address = publish_data_set(folder, repository, pull_request, private)
-    out.print(address, highlight=False, markup=False, soft_wrap=True)
+    _print_plain(address)

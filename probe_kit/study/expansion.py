@@ -36,27 +36,32 @@ def acts(model: ModelTable) -> bool:
 
 @dataclass(frozen=True)
 class Member:
-    """A run that a block asks for. place: of the block in the file."""
+    """A run that a block asks for. position: of the block in the file."""
 
     block: BlockTable
-    place: int
+    position: int
     model: str
     way: str
     seed: int
 
     @property
+    def run(self) -> tuple[str, str, int]:
+        """Model, condition or ask, and seed, which tell runs apart."""
+        return self.model, self.way, self.seed
+
+    @property
     def path(self) -> Place:
-        """Of the list that names its condition or ask."""
-        return ("runs", self.place, "conditions" if self.block.conditions else "asks")
+        """The path of the list that names its condition or ask."""
+        return ("runs", self.position, "conditions" if self.block.conditions else "asks")
 
 
 def members(study: Study) -> Iterator[Member]:
     """The runs that blocks ask for, excludes left out, in the order of the file."""
-    for place, block in enumerate(study.runs):
+    for position, block in enumerate(study.runs):
         for model in block.models:
             for way in block.conditions or block.asks or ():
                 if not any(excludes(rule.model_dump(exclude_none=True), model, way) for rule in block.exclude):
-                    yield from (Member(block, place, model, way, seed) for seed in block.seeds)
+                    yield from (Member(block, position, model, way, seed) for seed in block.seeds)
 
 
 def excludes(rule: dict[str, str], model: str, way: str) -> bool:
@@ -65,18 +70,14 @@ def excludes(rule: dict[str, str], model: str, way: str) -> bool:
     return all(names[part] == value for part, value in rule.items())
 
 
-def expand(
-    study: Study, suite: PlannedSuite, known_mistakes: Sequence[Mistake] = ()
-) -> tuple[list[Cell], list[Mistake]]:
-    """The cells of a study, and mistakes that only their settings show.
+def expand(study: Study, suite: PlannedSuite) -> tuple[list[Cell], list[Mistake]]:
+    """Return the cells of a study without wrong names, and mistakes that only their settings show.
 
     Blocks that ask for the same run share its cell.
-    known_mistakes: of the file; runs of their tables are left out.
     """
-    found: dict[tuple[str, str, int], Cell] = {}
+    cells: dict[tuple[str, str, int], Cell] = {}
     mistakes: list[Mistake] = []
-    wrong = {one.path[:length] for one in known_mistakes if not one.absent for length in (2, 3)}
-    for member in (one for one in members(study) if _can_be_made(study, one, wrong)):
+    for member in members(study):
         try:
             settings = _settings(study, member)
         except ProbeKitError as error:
@@ -87,30 +88,19 @@ def expand(
         except ProbeKitError as error:  # of the one file that a scene is drawn with
             mistakes.append(Mistake(("conditions", member.way, "background"), str(error)))
             continue
-        selection = _selection(study, member.block, suite)
-        place = (member.model, member.way, member.seed)
-        known = found.get(place)
-        if known is None:
+        selections = {member.block.name: _selection(study, member.block, suite)}
+        cell = cells.get(member.run)
+        if cell is None:
             unavailable = study.models[member.model].unavailable or ""
-            selections = {member.block.name: selection}
-            cell = Cell(member.model, member.way, member.seed, settings, selections, suite, unavailable)
-            found[place] = cell
-        elif known.settings != settings:
-            said = f"{known.name} is already planned by block {next(iter(known.selections))!r} with other settings"
-            mistakes.append(Mistake(member.path, f"{said}; give both blocks the same tokens"))
+            cells[member.run] = Cell(*member.run, settings, selections, suite, unavailable)
+        elif cell.settings != settings:
+            text = f"{cell.name} is already planned by block {next(iter(cell.selections))!r} with other settings"
+            mistakes.append(Mistake(member.path, f"{text}; give both blocks the same tokens"))
         else:
-            found[place] = replace(known, selections={**known.selections, member.block.name: selection})
-    mistakes += [*_same_settings(list(found.values())), *_without_control(study, list(found.values()))]
-    return list(found.values()), list(dict.fromkeys(mistakes))
-
-
-def _can_be_made(study: Study, member: Member, wrong: set[Place]) -> bool:
-    """Whether the names of a run are known and nothing is wrong with its model and its condition or ask."""
-    model, (home, ways) = study.models.get(member.model), _ways(study, member)
-    concerned: set[Place] = {("models", member.model), (home, member.way), ("runs", member.place, "tokens")}
-    if model is None or member.way not in ways or wrong & concerned:
-        return False
-    return answers(model) if member.block.asks else acts(model)
+            cells[member.run] = replace(cell, selections={**cell.selections, **selections})
+    every = list(cells.values())
+    mistakes += [*_same_settings(every), *_without_control(study, every)]
+    return every, list(dict.fromkeys(mistakes))
 
 
 def _ways(study: Study, member: Member) -> tuple[str, Mapping[str, ConditionTable | AskTable]]:
@@ -123,16 +113,16 @@ def _selection(study: Study, block: BlockTable, suite: PlannedSuite) -> Selectio
     return Selection(slugs(categories), block.items or study.suite.items)
 
 
-def _blamed(study: Study, member: Member, said: str) -> Place:
+def _blamed(study: Study, member: Member, message: str) -> Place:
     """The table whose values a settings error is of, and the key in it that the message names."""
     home, name = _ways(study, member)[0], member.way
     try:
         _settings_of(study, member.model, ConditionTable(), None)
     except ProbeKitError:
         home, name = "models", member.model
-    given = getattr(study, home)[name].model_fields_set
-    named = [word for word in re.findall(r"\w+", said) if word in given]
-    return (home, name, *named[:1])
+    fields = getattr(study, home)[name].model_fields_set
+    in_message = [word for word in re.findall(r"\w+", message) if word in fields]
+    return (home, name, *in_message[:1])
 
 
 def _settings(study: Study, member: Member) -> Settings:
@@ -140,8 +130,8 @@ def _settings(study: Study, member: Member) -> Settings:
         ask = study.asks[member.way]
         tokens = member.block.tokens or "none"
         return _asked(study, member.model, ask).changed(tokens=tokens, seed=member.seed)
-    found = _settings_of(study, member.model, study.conditions[member.way], member.block.tokens)
-    return found.changed(seed=member.seed)
+    settings = _settings_of(study, member.model, study.conditions[member.way], member.block.tokens)
+    return settings.changed(seed=member.seed)
 
 
 def _common(study: Study, name: str) -> dict[str, Any]:
@@ -166,11 +156,11 @@ def _scene(study: Study, model: ModelTable) -> str | None:
 
 
 def _settings_of(study: Study, name: str, condition: ConditionTable, tokens: str | None) -> ExtractSettings:
-    """Of a policy, with what its protocol decides."""
-    chosen = condition.model_dump(exclude={"no_act"})
+    """Return the settings of a policy, with what its protocol decides."""
+    values = condition.model_dump(exclude={"no_act"})
     return ExtractSettings(
         **_common(study, name),
-        **chosen,
+        **values,
         execute=study.models[name].execute,
         capture_only=condition.no_act,
         tokens=tokens or "pooled",
@@ -183,16 +173,16 @@ def _asked(study: Study, name: str, ask: AskTable) -> AskSettings:
 
 def _same_settings(cells: list[Cell]) -> list[Mistake]:
     """Conditions or asks that are the same for a model under two names."""
-    found = []
+    mistakes = []
     for at, cell in enumerate(cells):
         for other in cells[:at]:
             alike = (cell.model, cell.seed, cell.settings) == (other.model, other.seed, other.settings)
             if alike and cell.way != other.way:
                 home = "asks" if cell.asks else "conditions"
-                said = f"is the same as {other.way!r} for {cell.model!r}: all values are equal"
-                said = f"{said}. Leave one out, or exclude it for this model"
-                found.append(Mistake((home, cell.way), said, absent=True))
-    return found
+                text = f"is the same as {other.way!r} for {cell.model!r}: all values are equal"
+                text = f"{text}. Leave one out, or exclude it for this model"
+                mistakes.append(Mistake((home, cell.way), text))
+    return mistakes
 
 
 def control_of(study: Study, cells: Sequence[Cell], cell: Cell) -> Cell | None:
@@ -201,9 +191,13 @@ def control_of(study: Study, cells: Sequence[Cell], cell: Cell) -> Cell | None:
     It is in the same condition, or else of the same scene and seed: whether a network then acts changes nothing in
     what was captured before.
     """
-    own = [one for one in cells if one.model == study.models[cell.model].untrained and one.seed == cell.seed]
-    same = (one for one in own if one.way == cell.way)
-    alike = (one for one in own if one.asks == cell.asks and one.settings.scene == cell.settings.scene)
+    of_network = [
+        other for other in cells if other.model == study.models[cell.model].untrained and other.seed == cell.seed
+    ]
+    same = (other for other in of_network if other.way == cell.way)
+    alike = (
+        other for other in of_network if other.asks == cell.asks and other.settings.scene == cell.settings.scene
+    )
     return next(same, None) or next(alike, None)
 
 
@@ -214,6 +208,6 @@ def _without_control(study: Study, cells: list[Cell]) -> Iterator[Mistake]:
             model = study.models[cell.model]
             probed = any(block in table.runs for block in cell.selections) and not cell.unavailable
             if probed and model.untrained is not None and control_of(study, cells, cell) is None:
-                said = f"{model.untrained!r}, the control of {cell.name}, has no run in the same scene"
-                said = f"{said}; play it so, or capture it so with no_act"
-                yield Mistake(("probes", name, "controls"), said, absent=True)
+                text = f"{model.untrained!r}, the control of {cell.name}, has no run in the same scene"
+                text = f"{text}; play it so, or capture it so with no_act"
+                yield Mistake(("probes", name, "controls"), text)

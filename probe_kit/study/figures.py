@@ -14,10 +14,10 @@ from probe_kit.retention.displays.heat_table import SideTableDisplay
 from probe_kit.retention.table import RetentionTable, retention_table
 from probe_kit.study.mistakes import unknown
 from probe_kit.study.planned_suite import slugs
+from probe_kit.study.rates import domain_scores
 from probe_kit.study.reading import LoadedStudy
 from probe_kit.study.schema import FigureKind, FigureTable
-from probe_kit.study.tables.rates import domain_scores
-from probe_kit.study.tables.stored_runs import StoredRuns, of_blocks, stored_runs, study_probes
+from probe_kit.study.stored import StoredRuns, of_blocks, stored_runs, study_probes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -33,13 +33,13 @@ def make_figures(study: LoadedStudy, name: str, partial_runs: bool = False) -> l
     if name not in study.study.figures:
         raise UsageError(unknown("figure", name, list(study.study.figures)))
     figure = study.study.figures[name]
-    chosen = None if figure.categories is None else slugs(figure.categories)
-    runs = stored_runs(study, of_blocks(figure.runs), partial_runs, chosen)
-    if not runs.found:
+    categories = None if figure.categories is None else slugs(figure.categories)
+    runs = stored_runs(study, of_blocks(figure.runs), partial_runs, categories)
+    if not runs.runs:
         raise UsageError(
             f"no run of the figure {name!r} is stored. Play them with `probe-kit study run {study.file}`"
         )
-    return _MAKERS[figure.kind](_Source(study, name, figure, runs, chosen, runs.labels(study), partial_runs))
+    return _MAKERS[figure.kind](_Source(study, name, figure, runs, categories, runs.labels(study), partial_runs))
 
 
 @dataclass(frozen=True)
@@ -59,23 +59,27 @@ class _Source:
 
     @property
     def table(self) -> RetentionTable:
-        """Of all runs, nothing compared."""
-        runs = [one.run for one in self.runs.found]
+        """The table of all runs, nothing compared."""
+        runs = [stored.run for stored in self.runs.runs]
         return retention_table(runs, labels=self.labels, pairs=(), keys=[""] * len(runs))
 
 
 def _curves(source: _Source) -> list[ReportFigure]:
     """A panel per category and part of the model, a line per system; of one system a line per iteration."""
     probes = {
-        source.labels[one.place]: study_probes(source.study, one, one.probed.in_wording(), source.partial)
-        for one in source.runs.found
+        source.labels[stored.location]: study_probes(
+            source.study, stored, stored.probed.in_wording(), source.partial
+        )
+        for stored in source.runs.runs
     }
-    found = [(label, own) for label, own in probes.items() if own is not None]
-    if not found:
+    with_probes = [
+        (label, results_of_run) for label, results_of_run in probes.items() if results_of_run is not None
+    ]
+    if not with_probes:
         raise UsageError(
             f"no run of the figure {source.name!r} has probes; name its block in a table [probes.NAME]"
         )
-    names, results = [label for label, _ in found], [own for _, own in found]
+    names, results = [label for label, _ in with_probes], [results_of_run for _, results_of_run in with_probes]
     view = source.figure.view or results[0].settings.views[0]
     if len(results) == 1 and source.categories is None:
         draw = partial(layer_curve, results[0], view)
@@ -92,21 +96,26 @@ def _sides(source: _Source) -> list[ReportFigure]:
 
 def _dose(source: _Source) -> list[ReportFigure]:
     """A figure per run that was steered."""
-    steered = [one for one in source.runs.found if stored_steering(one.run)]
+    steered = [stored for stored in source.runs.runs if stored_steering(stored.run)]
     if not steered:
         raise UsageError(
             f"no run of the figure {source.name!r} was steered. Steer one with `probe-kit intervene "
-            f"{source.runs.found[0].place} --kind steer --sites backbone.NN --roles image`"
+            f"{source.runs.runs[0].location} --kind steer --sites backbone.NN --roles image`"
         )
     reading = "Episodes that turn to the side they are pushed to, minus those that turn from it, by coefficient."
-    found = []
-    for at, one in enumerate(steered):
+    figures = []
+    for at, stored in enumerate(steered):
         stem = "-".join(
-            [source.name, one.cell.model, one.cell.way, *([str(one.cell.seed)] if one.cell.seed else [])]
+            [
+                source.name,
+                stored.cell.model,
+                stored.cell.way,
+                *([str(stored.cell.seed)] if stored.cell.seed else []),
+            ]
         )
-        title = f"Dose and response: {source.labels[one.place]}"
-        found.append(ReportFigure(stem, title, "interventions", reading, at, partial(dose_response, one.run)))
-    return found
+        title = f"Dose and response: {source.labels[stored.location]}"
+        figures.append(ReportFigure(stem, title, "interventions", reading, at, partial(dose_response, stored.run)))
+    return figures
 
 
 def _overview(source: _Source) -> list[ReportFigure]:
@@ -131,13 +140,13 @@ def draw_overview(table: RetentionTable) -> "Figure":
     scores = domain_scores(table)
     if not scores:
         raise UsageError("no model of these runs acted or answered, so there is no score")
-    systems = list(dict.fromkeys(system for own in scores.values() for system in own))
+    systems = list(dict.fromkeys(system for of_domain in scores.values() for system in of_domain))
     figure, grid = panels(len(scores), width=3.1, height=0.24 * len(systems) + 0.8, columns=min(3, len(scores)))
-    for axes, (domain, own) in zip(grid, scores.items(), strict=True):
-        found = [own.get(system, 0.0) for system in systems]
-        for at in (at for at, system in enumerate(systems) if system not in own):
+    for axes, (domain, of_domain) in zip(grid, scores.items(), strict=True):
+        values = [of_domain.get(system, 0.0) for system in systems]
+        for at in (at for at, system in enumerate(systems) if system not in of_domain):
             axes.text(2, at, "no episodes", fontsize=7, color="0.45", va="center")
-        axes.barh(range(len(systems)), found, color=[BLUE if score >= 0 else VERMILION for score in found])
+        axes.barh(range(len(systems)), values, color=[BLUE if score >= 0 else VERMILION for score in values])
         axes.axvline(0, color="0.45", lw=1)
         plain(axes)
         axes.set_title(domain, fontsize=9, loc="left")

@@ -1,6 +1,6 @@
 """Comparison of a stored run with the cell in whose folder it lies: settings, weights, wordings and suite.
 
-A folder's name says what should lie there. No number is taken before the content says the same.
+A folder's name says which run should lie in it. No number is taken before the content says the same.
 """
 
 import json
@@ -12,14 +12,16 @@ from probe_kit.errors import SettingsMismatchError
 from probe_kit.hashing import canonical_json
 from probe_kit.hooks.checkpoints.checkpoint import COMMIT_DIGITS, is_on_hub, without_revision
 from probe_kit.runs.growth import flat_settings
-from probe_kit.study.cells import Cell
+from probe_kit.study.cells import Cell, checkpoint_stamp
 
 if TYPE_CHECKING:
     from probe_kit.runs import Run
 
 _OF_LOADED_MODEL = {"dtype", "weights_sha256", "execute", "captured_calls", "policy", "begun", "zeros_for"}
 """Settings of a run that the loaded model decides where the file leaves them open."""
-_MOST_SHOWN = 3
+_MOST_PRINTED = 3
+Change = tuple[str, Any, Any]
+"""Path of a setting, its stored value, and the value that the cell has."""
 
 
 def check_run_of_cell(
@@ -27,54 +29,72 @@ def check_run_of_cell(
 ) -> None:
     """Raise SettingsMismatchError unless `run` is the run of `cell`.
 
-    cells: of the study, to name the one that the run belongs to. settings_sha256: hash of the settings that the
-    ledger or the archive noted for the cell, which holds the weights' hash; None without such a record. file: of
-    the study, for the message.
+    cells: of the study, to name the one that the run belongs to. settings_sha256: hash of the run's settings by
+    the record of an archive, which holds the weights' hash; None without one. file: of the study, for the message.
     """
     problems = list(differences(run, cell))
     if not problems and settings_sha256 not in (None, run.settings_sha256):
         problems = [f"settings and weights hash {run.settings_sha256[:12]}, noted {str(settings_sha256)[:12]}"]
     if not problems:
         return
-    other = next((one for one in cells if one.name != cell.name and not any(differences(run, one))), None)
-    whose = "" if other is None else f" It is a run of {other.name}."
-    more = f" and {len(problems) - _MOST_SHOWN} more" if len(problems) > _MOST_SHOWN else ""
+    other = next((each for each in cells if each.name != cell.name and not any(differences(run, each))), None)
+    owner = "" if other is None else f" It is a run of {other.name}."
+    more = f" and {len(problems) - _MOST_PRINTED} more" if len(problems) > _MOST_PRINTED else ""
     raise SettingsMismatchError(
         f"{run.location} should hold the run of {cell.name}, and holds another one: "
-        f"{'; '.join(problems[:_MOST_SHOWN])}{more}.{whose} Move each folder back to its own name, or remove this "
-        f"one and run `probe-kit study run {file}`"
+        f"{'; '.join(problems[:_MOST_PRINTED])}{more}.{owner} Move each folder back to its own name, or remove "
+        f"this one and run `probe-kit study run {file}`"
     )
 
 
 def check_same_items(runs: Sequence["Run"]) -> None:
     """Raise SettingsMismatchError for two runs that hold different items under one id, naming both runs."""
     contents = [dict(zip(run.items["item_id"], run.items["content_sha256"], strict=True)) for run in runs]
-    for (one, first), (other, second) in combinations(zip(runs, contents, strict=True), 2):
-        changed = [name for name in first if name in second and first[name] != second[name]]
-        if changed and one.suite.partition("#")[0] == other.suite.partition("#")[0]:
+    for (run, items), (other, other_items) in combinations(zip(runs, contents, strict=True), 2):
+        changed = [name for name in items if name in other_items and items[name] != other_items[name]]
+        if changed and run.suite.partition("#")[0] == other.suite.partition("#")[0]:
             raise SettingsMismatchError(
-                f"{one.location} and {other.location} hold different items as {changed[0]!r} "
+                f"{run.location} and {other.location} hold different items as {changed[0]!r} "
                 f"({len(changed)} in all): their suites have one name and version and other content. Play both "
                 "with one suite, or give the changed suite another version"
             )
 
 
+def check_same_weights(runs: Sequence[tuple[Cell, "Run"]]) -> None:
+    """Raise SettingsMismatchError for two runs of one model that were played with different weights."""
+    first: dict[str, Run] = {}
+    for cell, run in runs:
+        other = first.setdefault(cell.model, run)
+        if other.weights_sha256 != run.weights_sha256:
+            raise SettingsMismatchError(
+                f"{other.location} and {run.location} are runs of {cell.model!r} with different weights "
+                f"({str(other.weights_sha256)[:12]} and {str(run.weights_sha256)[:12]}). The checkpoint was "
+                "changed in between, or a folder was moved: remove one of them, and run the study again"
+            )
+
+
 def differences(run: "Run", cell: Cell) -> Iterator[str]:
-    """The settings in which a run is not one of `cell`, in words, stored value first."""
-    stored, expected = flat_settings(run.root.own_settings), flat_settings(_expected(cell))
-    for name in sorted(stored | expected):
-        is_open = name.partition(".")[0] in _OF_LOADED_MODEL
-        if name in expected or not is_open:
-            yield from _different(name, stored.get(name), expected.get(name))
+    """Yield the settings in which a run is not one of `cell`, in words, stored value first."""
+    for change in changed_settings(run.root.own_settings, cell):
+        yield _in_words(*change)
     yield from _different("wordings", list(run.wordings), list(cell.settings.wordings or ()))
     yield from _other_weights(run, cell)
     yield from _other_items(run, cell.suite.contents)
 
 
-def _expected(cell: Cell) -> dict[str, Any]:
-    """The settings that a run of the cell has whatever model is loaded, as plain values.
+def changed_settings(own_settings: Mapping[str, Any], cell: Cell) -> Iterator[Change]:
+    """Yield the settings of a stored run that `cell` has otherwise."""
+    stored, expected = flat_settings(own_settings), flat_settings(_expected(cell))
+    for name in sorted(stored | expected):
+        is_open = name.partition(".")[0] in _OF_LOADED_MODEL
+        if (name in expected or not is_open) and stored.get(name) != expected.get(name):
+            yield name, stored.get(name), expected.get(name)
 
-    What the file leaves to the model is absent. So is the suite where it is not here.
+
+def _expected(cell: Cell) -> dict[str, Any]:
+    """Return the settings that a run of the cell has whatever model is loaded, as plain values.
+
+    What the file leaves to the model is absent.
     """
     settings = cell.settings
     decided = {
@@ -83,18 +103,18 @@ def _expected(cell: Cell) -> dict[str, Any]:
         if name != "dtype" and not (name in _OF_LOADED_MODEL and value in (None, "all"))
     }
     name, _, version = cell.suite.identity.rpartition("@")
-    expected = {
-        **decided,
-        "scene": settings.scene.to_json(),
-        "suite": {"name": name, "version": version},
-    }
+    expected = {**decided, "scene": settings.scene.to_json(), "suite": {"name": name, "version": version}}
     plain: dict[str, Any] = json.loads(canonical_json(expected))
     return plain
 
 
 def _different(name: str, stored: Any, expected: Any) -> Iterator[str]:
     if stored != expected:
-        yield f"{name}: stored {_short(stored)}, expected {_short(expected)}"
+        yield _in_words(name, stored, expected)
+
+
+def _in_words(name: str, stored: Any, expected: Any) -> str:
+    return f"{name}: stored {_short(stored)}, expected {_short(expected)}"
 
 
 def _short(value: Any) -> str:
@@ -103,9 +123,11 @@ def _short(value: Any) -> str:
 
 
 def _other_weights(run: "Run", cell: Cell) -> Iterator[str]:
-    """The seed of random weights, or the hub id, as the process that loaded them recorded it.
+    """Yield the seed of random weights, or the checkpoint, as the process that loaded them recorded it.
 
-    A card has the commit of a hub id. A file may name a branch or nothing: then repository and folder count.
+    A card has the commit of a hub id. A file may name a branch or nothing: then repository and folder count. The
+    folder of a local checkpoint may have been moved since. If it is still at its old path, and is another one than
+    the file's by name, size and time of its files, the run is another checkpoint's.
     """
     if not run.commits():
         return
@@ -113,14 +135,17 @@ def _other_weights(run: "Run", cell: Cell) -> Iterator[str]:
     if cell.settings.model.random_weights and "weights_seed" in card:
         yield from _different("weights_seed", card["weights_seed"], cell.settings.model.weights_seed)
     stored, expected = str(card.get("checkpoint")), str(cell.settings.model.checkpoint)
-    if is_on_hub(stored) and is_on_hub(expected):  # a folder may have been moved, and is bound by its hash
+    if is_on_hub(stored) and is_on_hub(expected):
         has_commit = len(expected.partition("@")[2]) == COMMIT_DIGITS
         names = (name if has_commit else without_revision(name) for name in (stored, expected))
         yield from _different("checkpoint", *names)
+    stamps = [checkpoint_stamp(stored), checkpoint_stamp(expected)]
+    if all(isinstance(stamp, list) for stamp in stamps) and stamps[0] != stamps[1]:
+        yield _in_words("checkpoint", stored, expected)
 
 
 def _other_items(run: "Run", contents: Mapping[str, str]) -> Iterator[str]:
-    """Items that the suite has with other content, or has not. contents: hash by id; empty where unknown."""
+    """Yield the items that the suite has with other content, or lacks. contents: hash by id; empty if unknown."""
     if not contents:
         return
     hashes = dict(zip(run.items["item_id"], run.items["content_sha256"], strict=True))

@@ -17,15 +17,10 @@ _LONGEST = 60
 
 @dataclass(frozen=True)
 class Mistake:
-    """path: of the value in the file, such as `("runs", 0, "models")`. text: what is wrong and what is right.
-
-    absent: whether something is not there, which may follow from another mistake. name: the unknown one.
-    """
+    """A mistake in a file. path: of the value, such as `("runs", 0, "models")`. text: the fault and the remedy."""
 
     path: Place
     text: str
-    absent: bool = False
-    name: str = ""
 
     @property
     def place(self) -> str:
@@ -71,13 +66,13 @@ def _order(content: Any, path: Place) -> list[int]:
     return positions
 
 
-def unknown(what: str, name: str, known: Collection[str], none: str = "there are none") -> str:
-    """What to say of a name that is not known, with the nearest match."""
-    near = get_close_matches(name, known, n=1)
+def unknown(what: str, name: str, names: Collection[str], none: str = "there are none") -> str:
+    """Return a sentence on a name that is unknown, with the nearest match."""
+    near = get_close_matches(name, names, n=1)
     hint = f" Did you mean {near[0]!r}?" if near else ""
-    return f"unknown {what} {shortened(name)!r}; known: {', '.join(known) or none}.{hint}"
+    return f"unknown {what} {shortened(name)!r}; known: {', '.join(names) or none}.{hint}"
 
 
-def each_unknown(path: Place, what: str, names: Iterable[str], known: Collection[str]) -> list[Mistake]:
+def each_unknown(path: Place, what: str, uses: Iterable[str], names: Collection[str]) -> list[Mistake]:
     """A mistake per name that is not known."""
-    return [Mistake(path, unknown(what, name, known), name=name) for name in names if name not in known]
+    return [Mistake(path, unknown(what, name, names)) for name in uses if name not in names]

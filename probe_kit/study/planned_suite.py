@@ -14,15 +14,14 @@ from probe_kit.suite.categories import in_order
 class PlannedSuite:
     """identity: `name@version`; when a run grows, items are compared by content. items: by category.
 
-    folder: None for the embedded suite. source: where the numbers of items are from. here: whether the suite can
-    be played from. contents: hash of every item's content by its id, of a suite in a folder; empty for others.
+    folder: None for the embedded suite. source: where the numbers of items are from. contents:
+     hash of every item's content by its id, of a suite in a folder; empty for others.
     """
 
     identity: str
     items: Mapping[str, int]
     folder: Path | None
     source: str
-    here: bool = True
     contents: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -36,13 +35,13 @@ def planned_suite(table: SuiteTable) -> tuple[PlannedSuite, list[Mistake]]:
         return _from_folder(folder, table.counts)
     if counts:
         ordered = {name: counts[name] for name in in_order(counts)}
-        return PlannedSuite(f"not here: {table.path}", ordered, folder, "suite.counts", here=False), []
-    said = f"there is no folder {folder}. Make the suite, or give items per category in [suite.counts] for a plan"
-    return _unknown(table.path, folder, said)
+        return PlannedSuite(f"not here: {table.path}", ordered, folder, "suite.counts"), []
+    text = f"there is no folder {folder}. Make the suite, or give items per category in [suite.counts] for a plan"
+    return _unknown(table.path, folder, text)
 
 
 def _unknown(name: str, folder: Path, why: str) -> tuple[PlannedSuite, list[Mistake]]:
-    return PlannedSuite(f"not here: {name}", {}, folder, "nothing", here=False), [Mistake(("suite", "path"), why)]
+    return PlannedSuite(f"not here: {name}", {}, folder, "nothing"), [Mistake(("suite", "path"), why)]
 
 
 def slug(name: str) -> str:

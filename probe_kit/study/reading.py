@@ -15,11 +15,10 @@ from probe_kit.errors import UsageError
 from probe_kit.study import schema
 from probe_kit.study.archive import RUNS, STUDY_FILE, Pack, open_archive
 from probe_kit.study.cells import Cell
+from probe_kit.study.checks import reference_mistakes
 from probe_kit.study.expansion import expand
-from probe_kit.study.left_over import LeftOver
 from probe_kit.study.mistakes import Mistake, Place, StudyFileError, part_in_file, shortened
 from probe_kit.study.planned_suite import PlannedSuite, planned_suite
-from probe_kit.study.references import reference_mistakes
 
 _MOST_BYTES = 1 << 20
 _DEEP_KEY = re.compile(r"""(?:[\w"'-]+\s*\.\s*){64}""")
@@ -83,24 +82,25 @@ def load_study(name: str | Path) -> LoadedStudy:
     try:
         study = schema.Study.model_validate(content)
     except ValidationError as error:
-        raise StudyFileError(str(file), content, [*_mistakes(error, content), *_further(error, content)]) from None
-    if archive is not None:  # its runs are all it has
-        study = study.model_copy(update={"reuse": schema.ReuseTable()})
+        raise StudyFileError(str(file), content, _mistakes(error, content)) from None
     pack = None if archive is None else Pack.read(archive)
     suite, mistakes = planned_suite(study.suite) if pack is None else (_packed_suite(pack), [])
-    cells, found = _checked(study, suite)
-    if mistakes := [*mistakes, *found]:
+    mistakes += reference_mistakes(study, suite)
+    cells: list[Cell] = []
+    if not mistakes:  # settings are made of names that exist
+        cells, mistakes = expand(study, suite)
+    if mistakes:
         raise StudyFileError(str(file), content, mistakes)
     if pack is None:
         return LoadedStudy(file, study, suite, tuple(cells))
-    keys, home = {name: run.key for name, run in pack.runs.items()}, str(file.parent / RUNS)
+    keys, runs = {name: run.key for name, run in pack.runs.items()}, str(file.parent / RUNS)
     packed = tuple(replace(cell, packed_key=keys.get(cell.name, "")) for cell in cells)
-    return LoadedStudy(file, study.model_copy(update={"out": home}), suite, packed, pack)
+    return LoadedStudy(file, study.model_copy(update={"out": runs}), suite, packed, pack)
 
 
 def _packed_suite(pack: Pack) -> PlannedSuite:
     """The suite as it was when the study was packed; its items are not in the archive."""
-    return PlannedSuite(pack.suite.identity, dict(pack.suite.items), None, "the archive", here=False)
+    return PlannedSuite(pack.suite.identity, dict(pack.suite.items), None, "the archive")
 
 
 def _parsed(file: Path) -> dict[str, Any]:
@@ -120,47 +120,38 @@ def _parsed(file: Path) -> dict[str, Any]:
         raise UsageError(f"{file}: {error}. The file must be TOML 1.0") from error
 
 
-def _checked(study: schema.Study, suite: PlannedSuite) -> tuple[list[Cell], list[Mistake]]:
-    """The cells of a study, and all mistakes that its schema does not show."""
-    mistakes = reference_mistakes(study, suite)
-    cells, further = expand(study, suite, mistakes)
-    found = [*mistakes, *(one for one in further if not (mistakes and one.absent))]
-    return cells, list(dict.fromkeys(found))
-
-
 # -- mistakes of the schema --------------------------------------------------------------------------------------
 
 
 def _mistakes(error: ValidationError, content: dict[str, Any]) -> list[Mistake]:
-    """What pydantic found, in our words where its own name no key or value of the file."""
-    found: dict[Place, list[str]] = {}
-    for one in error.errors(include_url=False, include_context=True):
-        missing = one["type"] == "missing"
-        path = part_in_file(one["loc"], content)
-        if missing:
-            path, text = (*path, one["loc"][-1]), "is missing"
-        elif one["type"] == "extra_forbidden":
+    """Return the complaints of pydantic, in our words where its own name no key or value of the file."""
+    texts: dict[Place, list[str]] = {}
+    for complaint in error.errors(include_url=False, include_context=True):
+        path = part_in_file(complaint["loc"], content)
+        if complaint["type"] == "missing":
+            path, text = (*path, complaint["loc"][-1]), "is missing"
+        elif complaint["type"] == "extra_forbidden":
             text = f"unknown key{_near(path)}"
         else:
-            text = f"{_plain(one['msg'])}, not {shortened(repr(one['input']))}"
-        found.setdefault(path, []).append(text)
-    return [Mistake(path, _joined(texts)) for path, texts in found.items()]
+            text = f"{_plain(complaint['msg'])}, not {shortened(repr(complaint['input']))}"
+        texts.setdefault(path, []).append(text)
+    return [Mistake(path, _joined(of_value)) for path, of_value in texts.items()]
 
 
 def _joined(texts: list[str]) -> str:
-    """What several choices would take of one value, in one sentence."""
-    *others, last = texts
-    return " or ".join([*(text.rpartition(", not ")[0] for text in others), last])
+    """Join what several choices would take of one value to a sentence."""
+    *before, last = texts
+    return " or ".join([*(text.rpartition(", not ")[0] for text in before), last])
 
 
 def _plain(message: str) -> str:
     plain = f"{message[:1].lower()}{message[1:]}".removeprefix("value error, ").replace("input should", "should")
-    said = f"{_NAME_PATTERN} (small letters, digits, dots, hyphens and underscores)"
-    return plain.replace(_NAME_PATTERN, said)
+    words = f"{_NAME_PATTERN} (small letters, digits, dots, hyphens and underscores)"
+    return plain.replace(_NAME_PATTERN, words)
 
 
 def _near(path: Place) -> str:
-    """What the key may have been meant as, or else what its table knows."""
+    """Return the key that may have been meant, or else the keys of its table."""
     home = _table_of(path)
     names = [field.alias or name for name, field in home.model_fields.items()]
     near = get_close_matches(str(path[-1]), names, n=1)
@@ -169,23 +160,12 @@ def _near(path: Place) -> str:
 
 def _table_of(path: Place) -> type[BaseModel]:
     """The table that the last name of a path stands in."""
-    inner = next((one for name, one in _INNER.items() if name in path[2:-1]), None)
+    inner = next((table for name, table in _INNER.items() if name in path[2:-1]), None)
     return inner or (schema.Study if len(path) == 1 else _TABLES.get(str(path[0]), schema.Study))
-
-
-def _further(error: ValidationError, content: dict[str, Any]) -> list[Mistake]:
-    """Mistakes of the rest of a file whose wrong values are left out, so that one reading shows all."""
-    left = LeftOver(content)
-    study = left.validated(error)
-    if study is None:
-        return []
-    suite, mistakes = planned_suite(study.suite)
-    return left.own([*mistakes, *_checked(study, suite)[1]])
 
 
 _TABLES: dict[str, type[BaseModel]] = {
     "suite": schema.SuiteTable,
-    "reuse": schema.ReuseTable,
     "models": schema.ModelTable,
     "conditions": schema.ConditionTable,
     "asks": schema.AskTable,
@@ -196,10 +176,10 @@ _TABLES: dict[str, type[BaseModel]] = {
     "tables": schema.TableTable,
     "figures": schema.FigureTable,
 }
-"""By the first name of a path, what the tables there may say."""
+"""The tables by the first name of a path."""
 _INNER: dict[str, type[BaseModel]] = {
     "exclude": schema.ExcludeTable,
     "pairs": schema.PairsTable,
     "elsewhere": schema.ElsewhereTable,
 }
-"""By its key, what a table inside a table may say."""
+"""The tables inside tables by their key."""

@@ -1,4 +1,4 @@
-"""What a study file may say: its tables and their fields. Values are checked here, references elsewhere."""
+"""The tables of a study file and their fields. Values are checked here, references to names in `checks`."""
 
 from typing import Annotated, Any, Literal, get_args
 from unicodedata import category
@@ -25,7 +25,7 @@ def _each_once[Value](values: list[Value]) -> list[Value]:
 
 def _printable(text: str) -> str:
     """The text. Raises ValueError where a terminal or file name could not show it."""
-    if any(category(one) in ("Zl", "Zp") or category(one).startswith("C") for one in text):
+    if any(category(character) in ("Zl", "Zp") or category(character).startswith("C") for character in text):
         raise ValueError("a line break or control character is not allowed")
     return text
 
@@ -38,9 +38,9 @@ def _whole_number(value: Any) -> Any:
 
 
 Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9._-]{0,59}$")]
-"""Of a model, condition, ask, block or table: small letters, digits, dots, hyphens and underscores."""
+"""A name of a model, condition, ask, block or table: small letters, digits, dots, hyphens and underscores."""
 Text = Annotated[str, Field(min_length=1, max_length=500), AfterValidator(_printable)]
-"""What is shown as it is, or names a place: one line."""
+"""A text that is printed as it is, or names a place: one line."""
 Names = Annotated[list[str], Field(min_length=1), AfterValidator(_each_once)]
 SeveralNames = Annotated[list[str], Field(min_length=2), AfterValidator(_each_once)]
 TwoNames = Annotated[list[str], Field(min_length=2, max_length=2), AfterValidator(_each_once)]
@@ -114,7 +114,7 @@ class ModelTable(_Table):
 
 
 class ConditionTable(_Table):
-    """How a policy is played: fields of the scene, and what else `probe-kit extract` takes."""
+    """The playing of a policy: fields of the scene, and what else `probe-kit extract` takes."""
 
     max_steps: Count | None = None
     tile_side: float | None = None
@@ -135,7 +135,7 @@ class ConditionTable(_Table):
 
 
 class AskTable(_Table):
-    """How a VLM is asked, as in `probe-kit ask`."""
+    """The asking of a VLM, as in `probe-kit ask`."""
 
     prompt: Text
     picture_size: Size = "224x224"
@@ -233,12 +233,6 @@ class FigureTable(_Table):
     view: str | None = None
 
 
-class ReuseTable(_Table):
-    """Folders of other runs, such as those made by hand; equal ones serve the study where they lie."""
-
-    folders: Annotated[list[Text], AfterValidator(_each_once)] = []
-
-
 class Study(_Table):
     """A whole study file.
 
@@ -250,7 +244,6 @@ class Study(_Table):
     out: Text | None = None
     scene: SceneName | None = None
     suite: SuiteTable = SuiteTable()
-    reuse: ReuseTable = ReuseTable()
     models: Annotated[dict[Name, ModelTable], Field(min_length=1)]
     conditions: dict[Name, ConditionTable] = {}
     asks: dict[Name, AskTable] = {}
@@ -263,7 +256,7 @@ class Study(_Table):
 
     @property
     def folder(self) -> str:
-        """Where runs are written."""
+        """The folder or URL of the runs."""
         return self.out or f"runs/{self.name}"
 
     def block(self, name: str) -> BlockTable:

@@ -183,7 +183,11 @@ MISTAKES: list[tuple[str, str, str]] = [
     # what does not fit together
     ('out = "runs/small"', 'out = "ftp://host/x"  # here', "out: runs lie in folders or at s3://"),
     ("[suite]\n", "[suite]\ncounts = { color = 10 }  # here\n", "belongs to a suite of your own"),
-    ("[models.random]", '[models.ledger]  # here\nfamily = "idle"\n\n[models.random]', "the ledger's folder"),
+    (
+        "[models.random]",
+        '[models.failures]  # here\nfamily = "idle"\n\n[models.random]',
+        "the folder of failures",
+    ),
     (
         'finetuned_from = "base"',
         'finetuned_from = "base"\nlabel = "reader"',

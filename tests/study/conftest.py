@@ -4,7 +4,7 @@ import pytest
 
 from probe_kit.study import LoadedStudy, conduct_study, load_study, plan_study
 from probe_kit.suite import Suite
-from tests.study.running.small_study import small_study
+from tests.study.small_study import small_study
 
 PLAYED = """
 schema = 1

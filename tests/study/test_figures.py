@@ -12,7 +12,7 @@ from probe_kit.errors import UsageError
 from probe_kit.retention import retention_table
 from probe_kit.study import LoadedStudy, make_figures
 from probe_kit.study.figures import draw_overview
-from probe_kit.study.tables.rates import domain_scores
+from probe_kit.study.rates import domain_scores
 from tests.retention.asked_runs import acted
 
 

@@ -19,9 +19,9 @@ from probe_kit.study import (
     pack_study,
     plan_study,
 )
-from probe_kit.study.tables.formats import table_record
+from probe_kit.study.named_table import table_record
 from probe_kit.suite import Suite
-from tests.study.running.small_study import small_study
+from tests.study.small_study import small_study
 
 FEW, MANY = 25, 300
 Undo = Callable[[], object]

@@ -20,9 +20,9 @@ from probe_kit.retention.compare.known_used import match_runs
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.statistics.paired_tests import holm
 from probe_kit.study import LoadedStudy, load_study, make_table, write_study_report
-from probe_kit.study.tables.compared import difference_table, stages_table
-from probe_kit.study.tables.named_table import caption
-from probe_kit.study.tables.rates import score_table, success_table, vlm_table
+from probe_kit.study.compared import difference_table, stages_table
+from probe_kit.study.named_table import caption
+from probe_kit.study.rates import score_table, success_table, vlm_table
 from tests.retention.asked_runs import SaidRun, acted, asked, probes
 from tests.view.payload_reader import read_payload
 

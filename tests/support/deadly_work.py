@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from probe_kit.study.running.model_task import ModelTask
-from probe_kit.study.running.playing import play_here
+from probe_kit.study.playing import ModelTask, play_here
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,315 @@
+"""The plan of a study: what is stored of each cell, why others are to be made, and what they take.
+
+Everything is read from the runs themselves, and from the failures that are stored beside them.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from probe_kit._system.counting import counted
+from probe_kit.errors import ProbeKitError, RunIncompleteError, RunNotFoundError, UsageError
+from probe_kit.runs import verify_run
+from probe_kit.runs.disk import in_units
+from probe_kit.runs.layout import RUN_FILE
+from probe_kit.runs.root import read_root
+from probe_kit.runs.store import locate
+from probe_kit.study.cells import KEY_DIGITS, Cell
+from probe_kit.study.cost import Cost, Work, cost_of
+from probe_kit.study.failures import NOT_TRIED_AGAIN, Failure, Failures
+from probe_kit.study.matching import changed_settings
+from probe_kit.study.mistakes import unknown
+from probe_kit.study.probes import PlannedProbes, planned_probes
+from probe_kit.study.reading import LoadedStudy
+from probe_kit.study.stored import open_matching
+
+if TYPE_CHECKING:
+    from probe_kit.runs import Run
+
+State = Literal["new", "partial", "whole", "damaged", "failed", "waiting", "skipped"]
+_MOST_CHANGES = 3
+
+
+@dataclass(frozen=True)
+class PlannedCell:
+    """A cell with what lies at its location. stored: episodes of its selection. why: the state in words.
+
+    failure: of the last time it was played. waits_for: failure of another run of its model. probes: those that the
+    file names of it. sealed: whether nothing is left to do after its last episode.
+    """
+
+    cell: Cell
+    location: str
+    state: State
+    stored: int
+    why: str
+    failure: Failure | None = None
+    waits_for: Failure | None = None
+    probes: tuple[PlannedProbes, ...] = ()
+    sealed: bool = True
+
+    @property
+    def missing(self) -> int:
+        """Episodes that are to be played or asked."""
+        return 0 if self.state == "skipped" else self.cell.episodes - self.stored
+
+    @property
+    def unprobed(self) -> tuple[PlannedProbes, ...]:
+        """Probes that are to be fitted."""
+        return tuple(probes for probes in self.probes if probes.state != "stored")
+
+    @property
+    def given_up(self) -> bool:
+        """Whether the run is tried again only on request."""
+        return any(failure and failure.stage in NOT_TRIED_AGAIN for failure in (self.failure, self.waits_for))
+
+    @property
+    def words(self) -> str:
+        """The state of the run, and of its probes."""
+        if not self.probes or self.state != "whole":
+            return self.why
+        of_probes = [f"probes {probes.name}: {probes.why}" for probes in self.unprobed] or ["probed"]
+        return "; ".join([self.why, *of_probes])
+
+    @property
+    def run_text(self) -> str:
+        """The condition or ask, with the seed where there are several."""
+        return self.cell.way + (f", seed {self.cell.seed}" if self.cell.seed else "")
+
+
+@dataclass(frozen=True)
+class StudyPlan:
+    """The cells of a study in the order in which models are loaded. cost: of what is missing. only: as planned."""
+
+    study: LoadedStudy
+    cells: tuple[PlannedCell, ...]
+    cost: Cost
+    only: str | None = None
+
+    @property
+    def played(self) -> list[PlannedCell]:
+        """All cells but the skipped ones."""
+        return [planned for planned in self.cells if planned.state != "skipped"]
+
+    @property
+    def whole(self) -> bool:
+        """Whether no episode and no probes are missing."""
+        return not any(planned.missing or planned.unprobed for planned in self.played)
+
+    def skipped(self) -> dict[str, str]:
+        """Return by model why it is not played."""
+        return {name: model.unavailable for name, model in self.study.study.models.items() if model.unavailable}
+
+    def totals(self) -> dict[str, int]:
+        """Count runs, episodes by what is done in them, inferences of policies, and what is missing."""
+        cells = [planned.cell for planned in self.played]
+        n_asked = sum(cell.episodes for cell in cells if cell.asks)
+        captured = sum(cell.episodes for cell in cells if cell.captured)
+        return {
+            "runs": len(cells),
+            "episodes": sum(cell.episodes for cell in cells),
+            "acted": sum(cell.episodes for cell in cells) - n_asked - captured,
+            "captured": captured,
+            "asked": n_asked,
+            "inferences": sum(cell.inferences for cell in cells),
+            "missing": sum(planned.missing for planned in self.played),
+            "unprobed": sum(len(planned.unprobed) for planned in self.played),
+        }
+
+    def lines(self) -> list[str]:
+        """Return totals, hours and bytes with their source, and what is skipped, in words."""
+        totals, suite, cost = self.totals(), self.study.suite, self.cost
+        unprobed = f"; probes of {counted(totals['unprobed'], 'run')}" if totals["unprobed"] else ""
+        lines = [
+            f"suite: {suite.identity}; items from {suite.source}",
+            f"{counted(totals['runs'], 'run')}, {counted(totals['episodes'], 'episode')} ({totals['acted']:,} "
+            f"acted, {totals['captured']:,} captured without acting, {totals['asked']:,} asked), at most "
+            f"{counted(totals['inferences'], 'inference')} of policies (given by shape: no model was loaded)",
+            f"missing: {counted(totals['missing'], 'episode')}{unprobed}",
+        ]
+        if cost.hours:
+            each = ", ".join(f"{model} {hours:.2g}" for model, hours in cost.hours.items())
+            lines.append(f"hours, measured in stored episodes: {sum(cost.hours.values()):.2g} ({each})")
+        if cost.unmeasured:
+            lines.append(f"hours unknown before a first episode is stored: {', '.join(cost.unmeasured)}")
+        if cost.bytes:
+            lines.append(f"bytes: up to {in_units(sum(cost.bytes.values()))} before compression")
+        if cost.unsized:
+            lines.append(f"bytes unknown before the model is loaded: {', '.join(cost.unsized)}")
+        return [*lines, *(f"skipped: {model}: {reason}" for model, reason in self.skipped().items())]
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values."""
+        return {
+            "study": self.study.study.name,
+            "suite": self.study.suite.identity,
+            "totals": self.totals(),
+            "skipped": self.skipped(),
+            **self.cost.to_json(),
+            "runs": [
+                {
+                    "model": planned.cell.model,
+                    "way": planned.cell.way,
+                    "seed": planned.cell.seed,
+                    "blocks": list(planned.cell.selections),
+                    "key": planned.cell.key,
+                    "location": planned.location,
+                    "state": planned.state,
+                    "why": planned.why,
+                    "episodes": planned.cell.episodes,
+                    "done": planned.stored,
+                    "inferences": planned.cell.inferences,
+                    "failure": None if planned.failure is None else planned.failure.content,
+                    "probes": {probes.name: probes.why or probes.state for probes in planned.probes},
+                }
+                for planned in self.cells
+            ],
+        }
+
+
+def plan_study(study: LoadedStudy, only: str | None = None) -> StudyPlan:
+    """Compare a study with what is stored. Loads no model and writes nothing.
+
+    only: a block or a model, whose runs alone are planned; all by default. Raises UsageError for another name, and
+    RunDamagedError for the record of a failure that was changed.
+    """
+    names = [*study.study.models, *(block.name for block in study.study.runs)]
+    if only is not None and only not in names:
+        raise UsageError(f"--only: {unknown('block or model', only, names)}")
+    cells = [cell for cell in study.cells if only is None or only == cell.model or only in cell.selections]
+    order = {name: position for position, name in enumerate(study.study.models)}
+    pairs = [_planned(study, cell) for cell in sorted(cells, key=lambda cell: order[cell.model])]
+    works = [work for _, work in pairs if work is not None]
+    return StudyPlan(study, tuple(_waiting([planned for planned, _ in pairs])), cost_of(works), only)
+
+
+def _planned(study: LoadedStudy, cell: Cell) -> tuple[PlannedCell, Work | None]:
+    """Return a cell with what is stored of it, and its work, None for a skipped one."""
+    location = str(locate(cell.location(study.study.folder)))
+    if cell.unavailable:
+        return PlannedCell(cell, location, "skipped", 0, f"skipped: {cell.unavailable}"), None
+    try:
+        run = open_matching(study, cell, partial=True)
+    except (RunNotFoundError, RunIncompleteError):  # the second one was killed before it had a plan
+        new = PlannedCell(cell, location, "new", 0, _why_new(study, cell))
+        return _failed(study, new), Work(cell, 0, cell.episodes)
+    except ProbeKitError as error:
+        return PlannedCell(cell, location, "damaged", 0, f"damaged: {error}"), Work(cell, 0, cell.episodes)
+    stored = _stored_episodes(cell, run)
+    work = Work(cell, stored, cell.episodes - stored, _mean_seconds(run), list(run.root.streams.values()))
+    if stored < cell.episodes:
+        partial = PlannedCell(cell, location, "partial", stored, f"{stored} of {cell.episodes} episodes")
+        return _failed(study, partial), work
+    # An archive has the probes of its runs, and nothing is fitted to it.
+    probes = () if study.archive is not None else tuple(planned_probes(study, cell, run))
+    sealed = run.sealed or not run.streams or study.archive is not None
+    return PlannedCell(cell, location, "whole", cell.episodes, "whole", probes=probes, sealed=sealed), work
+
+
+def _why_new(study: LoadedStudy, cell: Cell) -> str:
+    """Return what changed since the newest run of the same model, condition and seed, if there is one."""
+    former = sorted(_former_runs(study.study.folder, cell), key=lambda file: file.stat().st_mtime_ns)
+    if not former:
+        return "new"
+    try:
+        settings = read_root(locate(former[-1].parent)).own_settings
+    except ProbeKitError:
+        return "new"
+    changes = [
+        f"{name.rpartition('.')[2]} {_short(before)} → {_short(after)}"
+        for name, before, after in changed_settings(settings, cell)
+    ]
+    if not changes:  # a run does not store these by value
+        return f"new: another checkpoint, or other options, than {former[-1].parent.name}"
+    more = f" and {len(changes) - _MOST_CHANGES} more" if len(changes) > _MOST_CHANGES else ""
+    return f"new: {', '.join(changes[:_MOST_CHANGES])}{more}"
+
+
+def _short(value: Any) -> str:
+    text = "none" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
+    return text if len(text) <= 40 else f"{text[:37]}…"
+
+
+def _former_runs(out: str, cell: Cell) -> Iterator[Path]:
+    """Yield the `run.json` of runs of other settings, in a folder of this machine."""
+    if "://" not in out:
+        digits = "[0-9a-f]" * KEY_DIGITS
+        for file in Path(out).glob(f"{cell.folder[:-KEY_DIGITS]}{digits}/{RUN_FILE}"):
+            if file.parent != Path(cell.location(out)):
+                yield file
+
+
+def _failed(study: LoadedStudy, planned: PlannedCell) -> PlannedCell:
+    failure = None if study.archive is not None else Failures(study.study.folder).of(planned.cell)
+    if failure is None:
+        return planned
+    why = f"failed ({failure.when}): {failure.reason}"
+    why = f"{planned.why}; {why}" if planned.stored else why
+    return replace(planned, state="failed", failure=failure, why=why)
+
+
+def _waiting(cells: list[PlannedCell]) -> Iterator[PlannedCell]:
+    """Yield the cells, of which those wait whose model failed at another run."""
+    failed = {
+        planned.cell.model: planned.failure
+        for planned in cells
+        if planned.failure and planned.failure.stage != "episodes"
+    }
+    for planned in cells:
+        failure = failed.get(planned.cell.model)
+        if failure is None or planned.failure is not None or planned.state in ("whole", "skipped", "damaged"):
+            yield planned
+        else:
+            why = f"{planned.why}; waits, because {failure.run} failed"
+            yield replace(planned, state="waiting", waits_for=failure, why=why)
+
+
+def _stored_episodes(cell: Cell, run: "Run") -> int:
+    """Count the episodes of the cell's selection that a run holds."""
+    selected: set[str] = set()
+    for category, count in cell.selection.counts(cell.suite).items():
+        items = run.items.loc[run.items["category"] == category, "item_id"]
+        selected |= set(items.iloc[:count])
+    return int(run.episodes["item_id"].isin(selected).sum())
+
+
+def _mean_seconds(run: "Run") -> float | None:
+    """Return the mean seconds of an episode, inference and simulation."""
+    episodes = run.episodes
+    if episodes.empty or not {"seconds_inference", "seconds_simulation"} <= set(episodes):
+        return None
+    total = (episodes["seconds_inference"] + episodes["seconds_simulation"]).dropna()
+    return None if total.empty else float(total.mean())
+
+
+def cells_by_model(cells: Sequence[PlannedCell]) -> Mapping[str, list[PlannedCell]]:
+    """Return the cells of each model, in order."""
+    by_model: dict[str, list[PlannedCell]] = {}
+    for planned in cells:
+        by_model.setdefault(planned.cell.model, []).append(planned)
+    return by_model
+
+
+# -- checks of what is stored ------------------------------------------------------------------------------------
+
+
+def changed_runs(plan: StudyPlan) -> dict[str, tuple[str, ...]]:
+    """Compare every byte of stored runs with its hash; return by run what is wrong with it."""
+    audits = {
+        planned.cell.name: verify_run(planned.location, deep=True)
+        for planned in plan.played
+        if locate(planned.location).exists(RUN_FILE)
+    }
+    return {name: audit.problems for name, audit in audits.items() if not audit.ok}
+
+
+def orphaned_runs(plan: StudyPlan) -> list[str]:
+    """Return folders of runs below the study's folder that are no run of the file, such as of former settings.
+
+    Another study with the same folder may use them. Of a folder on this machine; none are found at a URL.
+    """
+    out = plan.study.study.folder
+    used = {Path(cell.location(out)) for cell in plan.study.cells}
+    files = () if "://" in out else Path(out).glob(f"*/*/{RUN_FILE}")
+    return sorted(str(file.parent) for file in files if file.parent not in used)

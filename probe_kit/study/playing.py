@@ -1,0 +1,372 @@
+"""Playing of all runs that a plan finds missing, here, in processes or on a Ray cluster, then fitting of probes.
+
+A worker gets all runs of one model, loads the model once, and reports events. What is committed stays, so that a
+model whose worker is lost, or whose study is started again, resumes after its last episode.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from probe_kit._execution.executor import GivenUp, Pool, TaskQueue, work_off
+from probe_kit._execution.process_pool import ProcessPool, share_of_machine
+from probe_kit._execution.ray_pool import RayPool
+from probe_kit._system.optional_dependencies import require
+from probe_kit.env import SceneSpec
+from probe_kit.errors import (
+    DiskSpaceError,
+    EpisodesFailedError,
+    ProbeKitError,
+    RunIncompleteError,
+    RunNotFoundError,
+    StoreError,
+    WorkerDiedError,
+)
+from probe_kit.extract import prepare
+from probe_kit.extract.extraction import Extraction
+from probe_kit.extract.preparation import load_acting_policy, load_answer_model, open_checked
+from probe_kit.extract.rollout.controllers import SCRIPTED
+from probe_kit.extract.settings import AskSettings, ExtractSettings, Settings
+from probe_kit.runs import seal
+from probe_kit.runs.store import locate
+from probe_kit.study.cells import Cell
+from probe_kit.study.cost import units
+from probe_kit.study.expansion import control_of
+from probe_kit.study.failures import NOT_TRIED_AGAIN, Failure, Failures
+from probe_kit.study.plan import PlannedCell, StudyPlan, cells_by_model
+from probe_kit.study.probes import controls_of, probes_of
+from probe_kit.study.reading import LoadedStudy
+from probe_kit.study.schema import ProbesTable
+from probe_kit.study.stored import StoredRun, of_blocks, open_cell
+from probe_kit.train import train_probes
+
+if TYPE_CHECKING:
+    from probe_kit.hooks import AnswerModel, Policy
+
+STOPS_ALL = (DiskSpaceError, StoreError)
+"""Errors of the place of all runs, which stop the study."""
+MOST_LOSSES = 3
+"""Workers of a model that may be lost one after another without an episode in between."""
+_SECONDS_PER_INFERENCE = 0.1
+"""A guess where no rate is known, by which the longest model is found."""
+
+
+@dataclass(frozen=True)
+class RunTask:
+    """A run to be played or asked. run: as the plan names it. location: an address for any working directory.
+
+    stored: episodes that were stored when the task was made.
+    """
+
+    run: str
+    settings: Settings
+    location: str
+    stored: int
+
+
+@dataclass(frozen=True)
+class ModelTask:
+    """Runs of one model. gpus: that it needs. size: an estimate by which the longest task is found."""
+
+    model: str
+    runs: tuple[RunTask, ...]
+    gpus: int = 0
+    size: float = 0.0
+
+
+@dataclass(frozen=True)
+class Moved:
+    """The event that an episode of a run is stored. stored, planned: episodes."""
+
+    model: str
+    run: str
+    stored: int
+    planned: int
+    outcome: str
+
+
+@dataclass(frozen=True)
+class Made:
+    """The event that a run is whole."""
+
+    model: str
+    run: str
+
+
+Event = Moved | Made | Failure
+Report = Callable[[Event], None]
+ProbeProgress = Callable[[str, int, int, str], None]
+
+
+def conduct_study(
+    plan: StudyPlan,
+    report: Report | None = None,
+    *,
+    slots: int = 0,
+    ray: str | None = None,
+    env_workers: int | None = None,
+    retry_failed: bool = False,
+) -> list[Failure]:
+    """Play and ask all that a plan finds missing; returns what failed, now or before.
+
+    Every run is checked, and every scene built, before the first one is played. A model that fails stops itself
+    alone: episodes that are committed stay, and the next call resumes after them. What failed while it was played
+    is not tried again until its settings change, or with `retry_failed`.
+    report: called with every event as it happens. slots: processes, each with one model at a time; 0 for this
+    process. ray: address of a Ray cluster that plays instead, or `auto`. env_workers: processes that simulate, as
+    in `ExtractSettings`.
+    Raises DiskSpaceError and StoreError, MissingExtraError without Ray, and UsageError if no cluster answers.
+    """
+    if ray is not None:
+        require("ray", "ray")
+    cells = {planned.cell.name: planned.cell for planned in plan.cells}
+    missing = [planned for planned in plan.played if planned.state != "whole"]
+    stored, failures = Failures(plan.study.study.folder), list[Failure]()
+    if not retry_failed:
+        before = (planned.failure for planned in missing)
+        failures += [failure for failure in before if failure and failure.stage in NOT_TRIED_AGAIN]
+        missing = [planned for planned in missing if not planned.given_up]
+    stored.check_place()  # a place that cannot be written is no model's failure
+
+    def note(event: Event) -> None:
+        if isinstance(event, Made):
+            stored.clear(cells[event.run])
+        elif isinstance(event, Failure):
+            failures.append(event)
+            stored.note(cells[event.run], event)
+        if report is not None:
+            report(event)
+
+    tasks = list(_checked_tasks(plan, missing, note, ray, env_workers))
+    if tasks:
+        play_models(tasks, note, slots, ray)
+    for planned in plan.played:
+        if not planned.sealed:  # its process was killed after the last episode
+            seal(locate(planned.location))
+    return failures
+
+
+def _checked_tasks(
+    plan: StudyPlan, missing: list[PlannedCell], note: Report, ray: str | None, env_workers: int | None
+) -> Iterator[ModelTask]:
+    """Yield the tasks of all models whose runs pass the checks; the others fail at once."""
+    rehearsed: list[SceneSpec] = []
+    for model, cells in cells_by_model(missing).items():
+        failure = next(filter(None, (_problem(planned, rehearsed, ray) for planned in cells)), None)
+        if failure is not None:
+            note(failure)
+            continue
+        size = sum(
+            plan.cost.seconds.get(
+                planned.cell.name, _SECONDS_PER_INFERENCE * planned.missing * units(planned.cell)
+            )
+            for planned in cells
+        )
+        runs = tuple(_task(planned, env_workers) for planned in cells)
+        yield ModelTask(model, runs, plan.study.study.models[model].gpus, size)
+
+
+def _problem(planned: PlannedCell, rehearsed: list[SceneSpec], ray: str | None) -> Failure | None:
+    """Return the fault of a run that shows without the model. rehearsed: scenes that can be built."""
+    cell = planned.cell
+    try:
+        if planned.state == "damaged":
+            raise ProbeKitError(planned.why.removeprefix("damaged: "))
+        settings = cell.settings_to_play.changed(ray=ray)  # the devices of a cluster are elsewhere
+        settings, source = open_checked(settings, locate(planned.location))
+        if settings.scene not in rehearsed:
+            source.rehearse(source.rows(settings.seed))
+            rehearsed.append(settings.scene)
+    except STOPS_ALL:
+        raise
+    except ProbeKitError as error:
+        return Failure.of("checking", cell.model, cell.name, error)
+    return None
+
+
+def _task(planned: PlannedCell, env_workers: int | None) -> RunTask:
+    # A worker may have another working directory: paths travel as absolute ones.
+    folder = planned.cell.suite.folder
+    suite = None if folder is None else folder.resolve()
+    settings = planned.cell.settings_to_play.changed(suite=suite, env_workers=env_workers)
+    return RunTask(planned.cell.name, settings, locate(planned.location).address, planned.stored)
+
+
+# -- one model ---------------------------------------------------------------------------------------------------
+
+
+def play_model(task: ModelTask, report: Report) -> None:
+    """Load the model and make its runs one after another; what fails is reported, and committed episodes stay.
+
+    Episodes that are given up end their run alone; anything else ends the model. Raises DiskSpaceError and
+    StoreError, which concern all runs.
+    """
+    loaded = _Loaded()
+    for run in task.runs:
+        moved = list[int]()
+
+        def count(stored: int, planned: int, outcome: str, run: RunTask = run, moved: list[int] = moved) -> None:
+            moved.append(stored)
+            report(Moved(task.model, run.run, stored, planned, outcome))
+
+        try:
+            loaded.prepare(run.settings, run.location).run(run.location, progress=count)
+            report(Made(task.model, run.run))
+        except STOPS_ALL:
+            raise
+        except EpisodesFailedError as error:
+            some = bool(run.stored or moved)
+            report(Failure.of("episodes" if some else "playing", task.model, run.run, error))
+            if not some:
+                return
+        except Exception as error:  # noqa: BLE001 - whatever a model raises must not end the others
+            report(Failure.of("playing", task.model, run.run, error))
+            return
+
+
+@dataclass
+class _Loaded:
+    """The model as policy and as VLM, loaded on first use."""
+
+    policy: "Policy | None" = field(default=None)
+    answer_model: "AnswerModel | None" = field(default=None)
+
+    def prepare(self, settings: Settings, location: str) -> Extraction:
+        """Prepare an extraction with the loaded model."""
+        if isinstance(settings, AskSettings):
+            self.answer_model = self.answer_model or load_answer_model(settings)
+            return prepare(settings, location, answer_model=self.answer_model)
+        assert isinstance(settings, ExtractSettings)
+        if settings.model.family not in SCRIPTED and self.policy is None:
+            self.policy = load_acting_policy(settings)
+        return prepare(settings, location, policy=self.policy)
+
+
+# -- all models --------------------------------------------------------------------------------------------------
+
+
+def play_models(tasks: Sequence[ModelTask], report: Report, slots: int = 0, ray: str | None = None) -> None:
+    """Play models one after the other here, in `slots` processes, or on the cluster `ray`.
+
+    The longest goes first. A model whose worker is lost resumes after what is stored; it fails once it was lost
+    `MOST_LOSSES` times without an episode in between. With GPUs each process has one of its own; further processes
+    play models that need none. Ray finds room for each model; its nodes see the runs.
+    Raises DiskSpaceError and StoreError of any worker, WorkerDiedError if workers die before they begin,
+    MissingExtraError without Ray, and UsageError if no cluster answers.
+    """
+    tasks = sorted(tasks, key=lambda task: -task.size)
+    if ray is None and not slots:
+        for task in tasks:
+            play_model(task, report)
+        return
+    pool, fits = _on_ray(tasks, ray) if ray is not None else _in_processes(tasks, min(slots, len(tasks)))
+    queue = TaskQueue(((task.model, task) for task in tasks), "model", MOST_LOSSES, fits)
+    for slot, event in work_off(pool, queue):
+        _note(queue, slot, event, report)
+
+
+def play_here(_setup: None, take: Callable[[], ModelTask], report: Callable[[Event | ModelTask], None]) -> None:
+    """Play one model after the other in a worker elsewhere; each is reported when it is played."""
+    while True:
+        task = take()
+        play_model(task, report)
+        report(task)
+
+
+def _note(queue: TaskQueue[ModelTask], slot: int, event: Any, report: Report) -> None:
+    """Note and report an event: what is made or given up is not played again."""
+    if isinstance(event, ModelTask):
+        queue.end(slot, event.model)
+        return
+    if isinstance(event, GivenUp):
+        model, run = event.task.model, event.task.runs[0].run
+        reason = f"{event.reason}, {MOST_LOSSES} times without an episode in between. Its last words are above"
+        report(Failure.of("playing", model, run, WorkerDiedError(reason)))
+        return
+    if isinstance(event, Moved):
+        queue.advanced(event.model)
+    elif isinstance(event, Made) or event.stage == "episodes":
+        task = queue.holds(slot)[event.model]
+        runs = tuple(run for run in task.runs if run.run != event.run)
+        queue.replace(slot, event.model, replace(task, runs=runs))
+    report(event)
+
+
+def _in_processes(tasks: Sequence[ModelTask], size: int) -> tuple[Pool, Callable[[int, ModelTask], bool]]:
+    device, gpus = "cpu", 0
+    if any(task.gpus for task in tasks):
+        import torch
+
+        device, gpus = "cuda", torch.cuda.device_count()
+    pool = ProcessPool(play_here, None, size, partial(share_of_machine, size=size, device=device))
+    return pool, lambda slot, task: slot < gpus or not task.gpus
+
+
+def _on_ray(tasks: Sequence[ModelTask], address: str) -> tuple[Pool, Callable[[int, ModelTask], bool]]:
+    """Return a worker for every model, with the GPUs that it needs."""
+    gpus = [task.gpus for task in tasks]
+    return RayPool(play_here, None, address, lambda _cluster: gpus), lambda slot, task: gpus[slot] == task.gpus
+
+
+# -- probes ------------------------------------------------------------------------------------------------------
+
+
+def fit_probes(plan: StudyPlan, progress: ProbeProgress | None = None, jobs: int | None = None) -> list[Failure]:
+    """Fit the probes of a study file that a plan does not find stored. Returns what could not be fitted.
+
+    A failure of stage `waiting` says that a run is not whole yet; others are stored with the study.
+    progress: called with the run's name, sites done, sites in all and the last one. jobs: processes, as in
+    `train_probes`.
+    """
+    stored, failures = Failures(plan.study.study.folder), list[Failure]()
+    fitted = {(planned.cell.name, probes.name) for planned in plan.cells for probes in planned.probes}
+    fitted -= {(planned.cell.name, probes.name) for planned in plan.cells for probes in planned.unprobed}
+    for cell in (planned.cell for planned in plan.cells):
+        for name, table in probes_of(plan.study, cell):
+            if (cell.name, name) in fitted:
+                continue
+            try:
+                _fit(plan.study, table, cell, progress, jobs)
+            except (RunNotFoundError, RunIncompleteError) as error:
+                failures.append(Failure.of("waiting", cell.model, cell.name, error))
+            except ProbeKitError as error:
+                failures.append(Failure.of("probes", cell.model, cell.name, error))
+                stored.note(cell, failures[-1], name)
+            else:
+                stored.clear(cell, name)
+    return failures
+
+
+def _fit(
+    study: LoadedStudy, table: ProbesTable, cell: Cell, progress: ProbeProgress | None, jobs: int | None
+) -> None:
+    probed = _opened(study, table, cell)
+    with_untrained = "untrained" in controls_of(study, table, cell)
+    control = control_of(study.study, study.cells, cell) if with_untrained else None
+    untrained = None if control is None else _opened(study, table, control, of=cell)
+    baselines = tuple(name for name in table.controls if name != "untrained")
+
+    def report(sites_done: int, sites: int, last: str) -> None:
+        if progress is not None:
+            progress(cell.name, sites_done, sites, last)
+
+    train_probes(
+        probed.run.in_wording(),
+        views=table.views,
+        permutations=table.permutations,
+        target=table.target,
+        controls=baselines or None,
+        suite=study.suite.folder,
+        untrained=None if untrained is None else untrained.run.in_wording(),
+        seed=table.seed,
+        jobs=jobs,
+        progress=report,
+    )
+
+
+def _opened(study: LoadedStudy, table: ProbesTable, cell: Cell, of: Cell | None = None) -> StoredRun:
+    """Open the run of a cell, restricted to what is probed of it, or of another cell."""
+    selection = of_blocks(table.runs)(of or cell)
+    assert selection is not None, "the table is one of `probes_of`"
+    return open_cell(study, cell, selection)

@@ -1,0 +1,318 @@
+"""Tables with a row per system and a column per category: success rates, sides, scores and probes."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from itertools import groupby
+from statistics import fmean
+
+from probe_kit._tables.numbers import number, percent, with_limits
+from probe_kit._tables.table import Heading
+from probe_kit.retention.behaviour.success_rate import Regime, normalised_score
+from probe_kit.retention.columns.text import published_value, retention_value
+from probe_kit.retention.rows.row import MEAN, RetentionRow
+from probe_kit.retention.table import RetentionTable
+from probe_kit.study.named_table import NamedTable, Number, caption, ordered, titles
+from probe_kit.suite.categories import OWN_DOMAIN, category_of
+
+MARKS = {Regime.KNOWLEDGE: " ↑", Regime.FAILURE: " ↓"}
+DISAGREES = "*"
+"""Of a rate whose 95 % interval and whose regime say different things about guessing."""
+_MARKED = "↑ above what guessing reaches, ↓ below it, at 95 % with items as the unit"
+_MEAN = "the mean is over the categories that a system has"
+OfSystem = Mapping[str, RetentionRow]
+"""Rows of one system by category, its mean among them."""
+
+
+@dataclass(frozen=True)
+class _Column:
+    """heading: of the column. domain: the head over it, empty for none. cell: what it says of a system."""
+
+    heading: str
+    domain: str
+    cell: Callable[[OfSystem], str]
+
+
+def success_table(table: RetentionTable) -> NamedTable:
+    """Success rates of policies, and shares right of VLMs, by system and category; means and score last.
+
+    A domain of several categories has a mean of its own, of the category means.
+    """
+    columns = [*_by_category(table, success_cell, domain_means=True), _SCORE]
+    printed = _pivot(table, "Success rate %", [_MARKED, *_disagreement(table), _MEAN], columns)
+    return replace(printed, numbers=(*printed.numbers, *_domain_numbers(table)))
+
+
+def vlm_table(table: RetentionTable) -> NamedTable:
+    """Shares right of VLMs by prompt, size of the picture and category."""
+    of_prompt = [
+        _Column("prompt", "", lambda rows: rows[MEAN].answers.prompt or "–"),
+        _Column("picture", "", lambda rows: rows[MEAN].answers.picture_size or "–"),
+    ]
+    columns = [*of_prompt, *_by_category(table, success_cell)]
+    return _pivot(table, "Share right %", [_MARKED, *_disagreement(table), _MEAN], columns)
+
+
+def success_cell(row: RetentionRow) -> str:
+    """The rate in percent with the mark of its regime; a mean has none."""
+    success = row.success
+    if success.sr is None:
+        return "–"
+    if success.regime is None:
+        return percent(success.sr)
+    return percent(success.sr) + MARKS.get(success.regime, "") + (f" {DISAGREES}" if _disagrees(row) else "")
+
+
+def _disagrees(row: RetentionRow) -> bool:
+    """Whether the interval excludes one half and the regime does not, or the other way round."""
+    low, high = row.success.ci or (None, None)
+    if row.success.regime is None or low is None or high is None:
+        return False
+    return (low > 0.5 or high < 0.5) != (row.success.regime != Regime.NO_RELIABLE_KNOWLEDGE)
+
+
+def _disagreement(table: RetentionTable) -> list[str]:
+    notes = []
+    if any(_disagrees(row) for row in table.rows):
+        notes.append("* the 95 % interval and the range of guessing disagree about 50 %")
+    if any(_is_unmarked(row) for row in table.rows):
+        notes.append("rates beyond it whose 95 % interval includes 50 % have no mark: too few items")
+    return notes
+
+
+def _is_unmarked(row: RetentionRow) -> bool:
+    """Whether the rate is beyond what guessing reaches, and its interval includes one half."""
+    success = row.success
+    if success.sr is None or success.chance_margin is None or success.regime != Regime.NO_RELIABLE_KNOWLEDGE:
+        return False
+    return abs(success.sr - 0.5) > success.chance_margin
+
+
+def sides_table(table: RetentionTable) -> NamedTable:
+    """Success rates where the correct picture lay on the left and on the right, then by layout of the pictures."""
+    by_side = _Column("half", "", lambda _: "left / right")
+    by_layout = _Column("half", "", lambda _: "original / swapped")
+    note = ["left, right: side of the correct picture", _MEAN]
+    title = "Success rate % by side and layout"
+    sides = _pivot(table, title, note, [by_side, *_by_category(table, _sides)])
+    layouts = _pivot(table, title, note, [by_layout, *_by_category(table, _layouts)])
+    rows = tuple(row for both in zip(sides.rows, layouts.rows, strict=True) for row in both)
+    return replace(sides, rows=rows, names=2)
+
+
+def _sides(row: RetentionRow) -> str:
+    return _two(row.success.sr_left, row.success.sr_right)
+
+
+def _layouts(row: RetentionRow) -> str:
+    return _two(row.success.sr_original, row.success.sr_swapped)
+
+
+def _two(first: float | None, second: float | None) -> str:
+    return "–" if first is None and second is None else f"{percent(first)} / {percent(second)}"
+
+
+_SCORE = _Column("score", "", lambda rows: number(rows[MEAN].success.normalised_score))
+
+
+def score_table(
+    table: RetentionTable, title: str = "", source: str = "", elsewhere: Mapping[str, float] | None = None
+) -> NamedTable:
+    """The normalised score of every system with its interval: 0 for guessing, 100 for perfection.
+
+    title, source, elsewhere: a further column of numbers that were not measured here, by location of the run.
+    """
+    means = [row for row in once_per_run(table.means) if row.success.sr is not None]
+    other_scores = {} if elsewhere is None else elsewhere
+    cells = tuple(
+        (
+            row.run.label,
+            with_limits(row.success.normalised_score, _score_limits(row), number),
+            percent(row.success.sr),
+            str(len(row.categories)),
+            *(
+                []
+                if elsewhere is None
+                else [f"{other_scores[location]:g}" if (location := row.run.location) in other_scores else "–"]
+            ),
+        )
+        for row in means
+    )
+    numbers = [
+        {
+            "system": row.run.label,
+            "score": row.success.normalised_score,
+            "score_ci": _score_limits(row),
+            "sr": row.success.sr,
+            "ci": row.success.ci,
+            "elsewhere": other_scores.get(row.run.location),
+            "elsewhere_source": source or None,
+        }
+        for row in means
+    ]
+    note = ["score = (mean % − 50) / 50 × 100 over the categories of a system, 95 % interval"]
+    note += [f"{title}: not measured here, from {source}"] if elsewhere is not None else []
+    columns = ("system", "score [95 %]", "mean %", "categories", *([] if elsewhere is None else [title]))
+    notes = [caption(table, note)]
+    return NamedTable.of("Normalised score", columns, cells, notes=notes, numbers=tuple(numbers))
+
+
+def _score_limits(row: RetentionRow) -> tuple[float | None, float | None] | None:
+    """The interval of the mean on the scale of the score, which is linear in it."""
+    if row.success.ci is None:
+        return None
+    low, high = (None if end is None else (end - 0.5) * 200 for end in row.success.ci)
+    return low, high
+
+
+def probing_table(table: RetentionTable) -> NamedTable:
+    """Best accuracy in the backbone and where the action is made, and retention, by category and as a mean."""
+    rows = [row for row in table.all_rows if row.view is not None]
+    cells = tuple(
+        (
+            row.run.label,
+            row.view or "–",
+            row.category if row.category == MEAN else category_of(row.category).title,
+            percent(row.backbone.score),
+            percent(row.action.score),
+            "–" if row.action.score is None else retention_value(row),
+            published_value(row),
+        )
+        for row in rows
+    )
+    numbers = [
+        {
+            "system": row.run.label,
+            "category": row.category,
+            "view": row.view,
+            "backbone": row.backbone.score,
+            "backbone_ci": row.backbone.ci,
+            "action": row.action.score,
+            "action_ci": row.action.ci,
+            "retention": row.retention.value,
+            "retention_ci": row.retention.ci,
+            "retention_defined": row.retention.defined,
+            "published": row.retention.published,
+        }
+        for row in table.all_rows
+    ]
+    note = [
+        "cross-fitted scores of the best sites",
+        "n/a: the backbone's signal is not shown; such categories are not in the mean of retention",
+        "–: no site where the action is made has the view",
+        "published: the paper's ratio of best accuracies, in the mean its mean over categories",
+    ]
+    columns = ("system", "view", "category", "backbone %", "action %", "retention [95 %]", "published")
+    notes = [caption(table, note)]
+    return NamedTable.of("Probes", columns, cells, names=3, mean=MEAN, notes=notes, numbers=tuple(numbers))
+
+
+def as_paper_table(table: RetentionTable) -> NamedTable:
+    """Return the paper's own numbers by its own formulas, see `probe_kit.retention.formats.as_paper`."""
+    paper = table.as_paper
+    return NamedTable(**{field.name: getattr(paper, field.name) for field in fields(paper)})
+
+
+def once_per_run(rows: Sequence[RetentionRow]) -> list[RetentionRow]:
+    """Rows of the first view of each run and category; rates do not depend on views."""
+    return list({(row.run.location, row.category): row for row in reversed(rows)}.values())[::-1]
+
+
+def domain_scores(table: RetentionTable) -> dict[str, dict[str, float]]:
+    """Return by domain and system the normalised score of the mean over the domain's categories."""
+    scores: dict[str, dict[str, float]] = {}
+    for domain, members in _domains(table):
+        for name, rows in _systems(table).items():
+            mean = _mean_of(rows, members)
+            if mean is not None:
+                scores.setdefault(domain or OWN_DOMAIN, {})[name] = normalised_score([mean])
+    return scores
+
+
+# -- columns by category -----------------------------------------------------------------------------------------
+
+
+def _by_category(
+    table: RetentionTable, cell: Callable[[RetentionRow], str], domain_means: bool = False
+) -> Iterator[_Column]:
+    """A column per category under its domain, then the mean."""
+
+    def of(category: str) -> Callable[[OfSystem], str]:
+        return lambda rows: cell(rows[category]) if category in rows else "–"
+
+    for domain, members in _domains(table):
+        for name, title in zip(members, titles(members), strict=True):
+            yield _Column(title, domain, of(name))
+        if domain_means and domain and len(members) > 1:
+            yield _Column(domain, domain, lambda rows, inside=tuple(members): percent(_mean_of(rows, inside)))  # type: ignore[misc]
+    yield _Column(MEAN, "", of(MEAN))
+
+
+def _domains(table: RetentionTable) -> list[tuple[str, list[str]]]:
+    """Categories of a table in the order of the paper, by domain; those of a suite's own have none."""
+    categories = ordered([row.category for row in table.rows])
+    by_domain = groupby(categories, key=lambda name: category_of(name).domain)
+    return [("" if domain == OWN_DOMAIN else domain, list(members)) for domain, members in by_domain]
+
+
+def _mean_of(rows: OfSystem, categories: Sequence[str]) -> float | None:
+    """Return the mean of the rates of categories, which count alike whatever their episodes."""
+    rates = [rows[name].success.sr for name in categories if name in rows]
+    defined = [rate for rate in rates if rate is not None]
+    return fmean(defined) if defined else None
+
+
+def _systems(table: RetentionTable) -> dict[str, OfSystem]:
+    """Return rows by label, in order. Labels tell runs apart."""
+    systems: dict[str, dict[str, RetentionRow]] = {}
+    for row in once_per_run([*table.rows, *table.means]):
+        systems.setdefault(row.run.label, {})[row.category] = row
+    return dict(systems)
+
+
+def _pivot(table: RetentionTable, title: str, note: Sequence[str], columns: Sequence[_Column]) -> NamedTable:
+    cells = tuple(
+        (name, *(column.cell(of_system) for column in columns)) for name, of_system in _systems(table).items()
+    )
+    headings = [Heading("system"), *(Heading(column.heading, group=column.domain) for column in columns)]
+    rows = once_per_run([*table.rows, *table.means])
+    return NamedTable.of(
+        title, headings, cells, notes=[caption(table, note)], numbers=tuple(_number(row) for row in rows)
+    )
+
+
+def _number(row: RetentionRow) -> Number:
+    success = row.success
+    return {
+        "system": row.run.label,
+        "run": row.run.location,
+        "category": row.category,
+        "domain": None if row.category == MEAN else category_of(row.category).domain,
+        "sr": success.sr,
+        "ci": success.ci,
+        "left": success.sr_left,
+        "right": success.sr_right,
+        "original": success.sr_original,
+        "swapped": success.sr_swapped,
+        "episodes": success.n_episodes,
+        "items": success.n_items,
+        "margin": success.chance_margin,
+        "regime": None if success.regime is None else str(success.regime),
+        "normalised_score": success.normalised_score,
+        "prompt": row.answers.prompt,
+        "picture_size": row.answers.picture_size,
+    }
+
+
+def _domain_numbers(table: RetentionTable) -> Iterator[Number]:
+    """The means of domains of several categories."""
+    for name, rows in _systems(table).items():
+        for domain, members in _domains(table):
+            if domain and len(members) > 1:
+                yield {
+                    "system": name,
+                    "run": rows[MEAN].run.location,
+                    "category": MEAN,
+                    "domain": domain,
+                    "sr": _mean_of(rows, members),
+                    "categories": [member for member in members if member in rows],
+                }

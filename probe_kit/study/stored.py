@@ -1,0 +1,260 @@
+"""The stored runs of a study, restricted to what its blocks select, and why others are missing."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from probe_kit._terminal.console import say
+from probe_kit.errors import (
+    ProbeKitError,
+    RunIncompleteError,
+    RunNotFoundError,
+    SettingsMismatchError,
+    UsageError,
+)
+from probe_kit.runs import open_run
+from probe_kit.runs.store import locate
+from probe_kit.study.cells import Cell, Selection, joined
+from probe_kit.study.failures import Failures
+from probe_kit.study.matching import check_run_of_cell, check_same_items, check_same_weights
+from probe_kit.study.reading import LoadedStudy, load_study, shipped_studies
+from probe_kit.study.schema import ProbesTable
+from probe_kit.train.probe_sweep import probe_settings
+from probe_kit.train.results.probe_results import ProbeResults
+from probe_kit.train.results.store import is_stored, load_results, read_probes, settings_of
+
+if TYPE_CHECKING:
+    from probe_kit.runs import Run
+
+
+@dataclass(frozen=True)
+class StoredRun:
+    """A run of the study, and its cell.
+
+    run: the items that a table prints. probed: those that the file's probes are fitted to.
+    """
+
+    cell: Cell
+    run: "Run"
+    probed: "Run"
+
+    @property
+    def location(self) -> str:
+        """The run's location, as tables name runs."""
+        return str(self.run.location)
+
+
+@dataclass(frozen=True)
+class StoredRuns:
+    """The runs that a table is made of, in the order of the file.
+
+    missing: of the others, why they are not in the table. unfinished: episodes that `study run` would still play
+    of both, in words; only of partial tables. models: of every run, stored or not.
+    """
+
+    runs: tuple[StoredRun, ...]
+    missing: tuple[str, ...]
+    unfinished: tuple[str, ...]
+    models: tuple[str, ...]
+
+    def labels(self, study: LoadedStudy) -> dict[str, str]:
+        """Return by location the model's label, with condition or ask and seed where a model has several runs."""
+        return {
+            stored.location: _label(study, stored.cell, self.models.count(stored.cell.model) > 1)
+            for stored in self.runs
+        }
+
+
+def stored_runs(
+    study: LoadedStudy,
+    select: Callable[[Cell], Selection | None],
+    partial: bool = False,
+    categories: Sequence[str] | None = None,
+) -> StoredRuns:
+    """Open the stored runs of a study. select: returns what of a cell a table prints; None leaves it out.
+
+    partial: accept runs that are missing or unfinished; they are named. categories: slugs, all by default.
+    Raises RunIncompleteError for a run that is missing, unfinished or damaged, unless `partial`, and
+    SettingsMismatchError for a run that is not its cell's.
+    """
+    runs, missing, unfinished, models = list[StoredRun](), list[str](), list[str](), list[str]()
+    for cell in study.cells:
+        selection = select(cell)
+        if selection is None:
+            continue
+        models.append(cell.model)
+        label = _label(study, cell, True)
+        if cell.unavailable:
+            missing.append(f"{label} is missing: {cell.unavailable}")
+            continue
+        try:
+            stored = open_cell(study, cell, selection, partial, categories)
+        except SettingsMismatchError:
+            raise
+        except ProbeKitError as error:
+            if not partial:
+                raise RunIncompleteError(
+                    f"{cell.name} is not whole: {_first_sentence(error)}. Finish it with `probe-kit study run "
+                    f"{study.file}`, or accept what is there (--partial)"
+                ) from error
+            unfinished.append(f"{label} is missing: {_why_missing(study, cell, error)}")
+        else:
+            runs.append(stored)
+            if len(stored.run.episodes) < stored.run.planned:
+                unfinished.append(f"{label} has {len(stored.run.episodes)} of {stored.run.planned} episodes")
+    check_same_items([stored.run for stored in runs])
+    check_same_weights([(stored.cell, stored.run) for stored in runs])
+    return StoredRuns(tuple(runs), tuple(missing), tuple(unfinished), tuple(models))
+
+
+def _why_missing(study: LoadedStudy, cell: Cell, error: ProbeKitError) -> str:
+    """Return the reason of the stored failure, or else what is wrong with the run."""
+    failure = None if study.archive is not None else Failures(study.study.folder).of(cell)
+    if failure is not None:
+        return failure.reason
+    return "not played yet" if isinstance(error, RunNotFoundError) else _first_sentence(error)
+
+
+def _first_sentence(error: ProbeKitError) -> str:
+    """Return what an error found, without its advice on a single run."""
+    return str(error).partition(". ")[0].removesuffix(".")
+
+
+def open_matching(study: LoadedStudy, cell: Cell, partial: bool) -> "Run":
+    """Open the run of a cell, checked to be of its settings, weights and suite.
+
+    Raises what `open_run` raises, and SettingsMismatchError for the run of another cell.
+    """
+    packed = None if study.pack is None else study.pack.runs.get(cell.name)
+    run = open_run(locate(cell.location(study.study.folder)), allow_partial=partial)
+    check_run_of_cell(run, cell, study.cells, None if packed is None else packed.settings_sha256, study.file)
+    return run
+
+
+def open_stored(study: LoadedStudy, cell: Cell, partial: bool = False) -> "Run":
+    """Open the run of a cell as `open_matching` does, checked to hold all items of its blocks.
+
+    partial: accept missing episodes. Raises what `open_matching` raises, and RunIncompleteError for a run of fewer
+    items.
+    """
+    run = open_matching(study, cell, partial)
+    planned = run.items["category"].value_counts().to_dict()
+    expected = cell.selection.counts(cell.suite)
+    fewer = [name for name, count in expected.items() if planned.get(name, 0) < count]
+    if fewer and not partial:
+        name = fewer[0]
+        raise RunIncompleteError(f"{run.location} has {planned.get(name, 0)} of {expected[name]} items of {name}")
+    return run
+
+
+def open_cell(
+    study: LoadedStudy,
+    cell: Cell,
+    selection: Selection,
+    partial: bool = False,
+    categories: Sequence[str] | None = None,
+) -> StoredRun:
+    """Open the stored run of a cell, restricted to a selection. Raises what `open_stored` raises."""
+    run = open_stored(study, cell, partial)
+    of_probes = (of_blocks(table.runs)(cell) for table in study.study.probes.values())
+    fitted = next((of_table for of_table in of_probes if of_table is not None), None)
+    part = part_of(run, cell, selection, categories)
+    return StoredRun(cell, part, part if fitted is None else part_of(run, cell, fitted))
+
+
+def part_of(run: "Run", cell: Cell, selection: Selection, categories: Sequence[str] | None = None) -> "Run":
+    """Return the selected part of a run, which may hold more: of other blocks or a former state of the file."""
+    counts = selection.counts(cell.suite)
+    counts = {name: count for name, count in counts.items() if categories is None or name in categories}
+    if counts == run.items["category"].value_counts().to_dict():
+        return run
+    return run.only(list(counts), selection.items)
+
+
+# -- probes ------------------------------------------------------------------------------------------------------
+
+
+def probe_keys(study: LoadedStudy, runs: Sequence[tuple[StoredRun, "Run"]], partial: bool) -> list[str]:
+    """Return of each run the key of the probes that the file's tables fit to it; empty for none.
+
+    runs: what is stored of a cell, and the part of it that is printed. Probes that were fitted otherwise, by hand
+    or for a former state of the file, give no number.
+    Raises RunIncompleteError for a run without the probes of the file, unless `partial`.
+    """
+    return [_probe_key(study, stored, run, partial) for stored, run in runs]
+
+
+def study_probes(study: LoadedStudy, stored: StoredRun, run: "Run", partial: bool) -> ProbeResults | None:
+    """Return the probes of the file that are stored of a run, None without any. Raises as `probe_keys`."""
+    key = _probe_key(study, stored, run, partial)
+    return load_results(run, key) if key else None
+
+
+def _probe_key(study: LoadedStudy, stored: StoredRun, run: "Run", partial: bool) -> str:
+    tables = {
+        name: table
+        for name, table in study.study.probes.items()
+        if table.target == "correct" and of_blocks(table.runs)(stored.cell) is not None
+    }
+    if not tables or not run.streams:
+        return ""
+    if keys := _stored_keys(tables.values(), run):
+        return keys[-1]
+    if partial or _stored_keys(tables.values(), stored.probed.in_wording()):  # they are fitted to other items
+        return ""
+    other_keys = [key for key, bundle in read_probes(run.location).items() if settings_of(bundle).is_side]
+    also = f" It has those of other settings: {', '.join(other_keys)}." if other_keys else ""
+    names = ", ".join(f"[probes.{name}]" for name in tables)
+    raise RunIncompleteError(
+        f"{stored.cell.name} has no probes of {names}.{also} Fit them with `probe-kit study run {study.file}`, or "
+        "accept what is there (--partial)"
+    )
+
+
+def _stored_keys(tables: Iterable[ProbesTable], run: "Run") -> list[str]:
+    """Return the keys of those probes of the tables that are stored of a run."""
+    return [key for table in tables if is_stored(run.location, key := probe_key_of(table, run))]
+
+
+def probe_key_of(table: ProbesTable, run: "Run") -> str:
+    """Return the key of the probes that a table of the file fits to a run."""
+    return probe_settings(
+        run, views=table.views, permutations=table.permutations, target=table.target, seed=table.seed
+    ).key
+
+
+# -- names -------------------------------------------------------------------------------------------------------
+
+
+def _label(study: LoadedStudy, cell: Cell, several: bool) -> str:
+    label = study.study.models[cell.model].label or cell.model
+    seed = f", seed {cell.seed}" if cell.seed else ""
+    return f"{label} · {cell.way}{seed}" if several or seed else label
+
+
+def of_blocks(names: Sequence[str]) -> Callable[[Cell], Selection | None]:
+    """Return a function that gives what cells hold for some blocks."""
+
+    def select(cell: Cell) -> Selection | None:
+        selections = [selection for name, selection in cell.selections.items() if name in names]
+        return joined(selections) if selections else None
+
+    return select
+
+
+def stored_runs_by_name(name: str) -> "list[Run] | None":
+    """Return the stored runs of a study file, or of a study of the package; None for a name of neither.
+
+    Runs that are missing are named on the terminal. Raises UsageError if none is stored, and as `load_study` does.
+    """
+    if not (name.endswith(".toml") or (name in shipped_studies() and not Path(name).exists())):
+        return None
+    study = load_study(name)
+    blocks = [block for cell in study.cells for block in cell.selections]
+    stored = stored_runs(study, of_blocks(blocks), partial=True)
+    for remark in (*stored.missing, *stored.unfinished):
+        say(remark)
+    if not stored.runs:
+        raise UsageError(f"no run of {study.file} is stored. Play it with `probe-kit study run {name}`")
+    return [run.probed for run in stored.runs]

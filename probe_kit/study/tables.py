@@ -1,0 +1,292 @@
+"""Making of a study's named tables."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from itertools import product
+from math import isfinite
+from pathlib import Path
+from typing import Any
+
+from probe_kit._system.bounded_json import load_json
+from probe_kit.errors import RunDamagedError, UsageError
+from probe_kit.retention import retention_table
+from probe_kit.retention.behaviour.vlm_answers import scored
+from probe_kit.retention.compare.known_used import KnownUsedTable, correct_joins, match_runs
+from probe_kit.retention.table import RetentionTable
+from probe_kit.runs.provenance import differences
+from probe_kit.study.archive import TABLES, Pack
+from probe_kit.study.cells import Cell, Selection
+from probe_kit.study.compared import difference_table, group_table, stages_table, vlm_vla_table
+from probe_kit.study.drift import CategoryDrift, measure_drift
+from probe_kit.study.drift_table import drift_table
+from probe_kit.study.mistakes import unknown
+from probe_kit.study.named_table import NamedTable, Number, table_of_record
+from probe_kit.study.planned_suite import slugs
+from probe_kit.study.rates import (
+    as_paper_table,
+    probing_table,
+    score_table,
+    sides_table,
+    success_table,
+    vlm_table,
+)
+from probe_kit.study.reading import LoadedStudy
+from probe_kit.study.schema import ComparisonTable, DriftTable, TableTable
+from probe_kit.study.stored import (
+    StoredRun,
+    StoredRuns,
+    of_blocks,
+    probe_keys,
+    stored_runs,
+    study_probes,
+)
+
+_OF_RUNS: Mapping[str, Callable[[RetentionTable], NamedTable]] = {
+    "success": success_table,
+    "vlms": vlm_table,
+    "sides": sides_table,
+}
+_OF_PROBED_RUNS: Mapping[str, Callable[[RetentionTable], NamedTable]] = {
+    "probing": probing_table,
+    "as-paper": as_paper_table,
+}
+
+
+def make_table(study: LoadedStudy, name: str, partial: bool = False) -> NamedTable:
+    """Make a table of a study file from stored runs alone: no model and no simulator.
+
+    partial: accept runs that are missing or unfinished; the note names them. Raises UsageError for an unknown
+    name, RunIncompleteError for runs that are missing, and what `open_run` raises.
+    """
+    if name not in study.study.tables:
+        raise UsageError(unknown("table", name, list(study.study.tables)))
+    table = study.study.tables[name]
+    if study.pack is not None and table.kind == "drift":
+        return _packed(study.file.parent, study.pack, name)
+    stored = stored_runs(study, _selection(study, table), partial, _categories(table))
+    if not stored.runs:
+        raise UsageError(
+            f"no run of the table {name!r} is stored. Play them with `probe-kit study run {study.file}`"
+        )
+    printed = _of_kind(study, table, stored, name, partial)
+    printed = printed.with_note([*stored.missing, *stored.unfinished, *_versions(stored)])
+    return replace(printed, is_partial=bool(stored.unfinished), numbers=_numbers(printed.numbers, stored))
+
+
+def _numbers(numbers: Sequence[Number], stored: StoredRuns) -> tuple[Number, ...]:
+    """Return numbers with runs as the plan names them, because an archive is unpacked at another location.
+
+    A value that is not defined is None, because JSON has no NaN.
+    """
+    names = {run.location: run.cell.name for run in stored.runs}
+    defined = ({name: _defined(value) for name, value in number.items()} for number in numbers)
+    return tuple(
+        {**number, "run": names[number["run"]]} if number.get("run") in names else number for number in defined
+    )
+
+
+def _defined(value: Any) -> Any:
+    if isinstance(value, list | tuple):
+        return type(value)(map(_defined, value))
+    return None if isinstance(value, float) and not isfinite(value) else value
+
+
+def _categories(table: TableTable) -> tuple[str, ...] | None:
+    return None if table.categories is None else slugs(table.categories)
+
+
+def _packed(archive: Path, pack: Pack, name: str) -> NamedTable:
+    """Return a table as it was packed, because it is made of activations."""
+    file = archive / TABLES / f"{name}.json"
+    try:
+        return table_of_record(load_json(file))
+    except FileNotFoundError:
+        why = pack.missing.get(f"table {name}", "it was not made")
+        raise UsageError(f"the archive holds no table {name!r}: {why}") from None
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise RunDamagedError(f"{file} is no record of a table ({error!r}). Fetch the archive again") from error
+
+
+def _versions(stored: StoredRuns) -> list[str]:
+    """Return a remark on what changes numbers and is not the same for all runs, such as the version of torch."""
+    provenances = [provenance for run in stored.runs for provenance in run.run.provenances.values()]
+    different = ", ".join(differences(provenances))
+    return [f"runs were made with different {different}"] if different else []
+
+
+def _of_kind(study: LoadedStudy, table: TableTable, stored: StoredRuns, name: str, partial: bool) -> NamedTable:
+    labels, opened = stored.labels(study), [run.run for run in stored.runs]
+    no_keys = [""] * len(opened)
+    if table.kind in _OF_RUNS:
+        return _OF_RUNS[table.kind](retention_table(opened, labels=labels, pairs=(), keys=no_keys))
+    if table.kind == "score":
+        scores, elsewhere = retention_table(opened, labels=labels, pairs=(), keys=no_keys), table.elsewhere
+        if elsewhere is None:
+            return score_table(scores)
+        models = {run.location: run.cell.model for run in stored.runs}
+        values = {
+            location: elsewhere.values[model] for location, model in models.items() if model in elsewhere.values
+        }
+        return score_table(scores, elsewhere.title, elsewhere.source, values)
+    if table.kind == "vlm-vla":
+        vlms = retention_table(opened, labels=labels, pairs=(), keys=no_keys, vlm_vla=_sources(study, stored.runs))
+        return vlm_vla_table(vlms.vlm_vla)
+    if table.kind in _OF_PROBED_RUNS:
+        probed = [(run, run.probed.in_wording()) for run in stored.runs]
+        keys, categories = probe_keys(study, probed, partial), _categories(table)
+        return _OF_PROBED_RUNS[table.kind](
+            retention_table([run for _, run in probed], labels=labels, pairs=(), categories=categories, keys=keys)
+        )
+    if table.kind == "drift":
+        return _drift(study, study.study.drift[table.drift or ""], stored, labels, name, partial)
+    if table.kind == "stages":
+        return stages_table(_joins(study, stored, labels, partial))
+    comparison = study.study.comparisons[table.comparison or ""]
+    if comparison.groups is not None:
+        groups = _groups(study, comparison.groups, stored)
+        members = [run for of_group in groups.values() for run in of_group]
+        return group_table(
+            retention_table(
+                {group: [run.run for run in of_group] for group, of_group in groups.items()},
+                labels=labels,
+                keys=probe_keys(study, [(run, run.run) for run in members], partial),
+                origins={str(run.run.location): _origin(study, run.cell.model) for run in members},
+            ),
+            f"Groups of models: {name}",
+        )
+    title = "Ablation" if comparison.chain is None else "Chain"
+    keys = probe_keys(study, [(run, run.run) for run in stored.runs], partial)
+    pairs = _pairs(comparison, stored.runs)
+    return difference_table(retention_table(opened, labels=labels, pairs=pairs, keys=keys), f"{title}: {name}")
+
+
+def _selection(study: LoadedStudy, table: TableTable) -> Callable[[Cell], Selection | None]:
+    """Return a function that gives what a table prints of each cell."""
+    if table.kind == "drift":
+        pairs = study.study.drift[table.drift or ""].pairs
+        names = {cell.name for pair in pairs for side in pair for cell in _side(study.cells, side)}
+        return lambda cell: cell.selection if cell.name in names else None
+    comparison = study.study.comparisons.get(table.comparison or "")
+    if comparison is None:
+        return of_blocks(table.runs or ())
+    models, ways = _compared(study, comparison)
+    asks = comparison.pairs is not None  # a chain and groups are of policies
+
+    def select(cell: Cell) -> Selection | None:
+        blocks = table.runs is None or of_blocks(table.runs)(cell) is not None
+        is_compared = cell.model in models and cell.way in ways and (asks or not cell.asks) and blocks
+        return cell.selection if is_compared else None
+
+    return select
+
+
+def _compared(study: LoadedStudy, comparison: ComparisonTable) -> tuple[list[str], list[str]]:
+    """Return the models of a comparison, and their conditions: of its pairs, else the first that all have."""
+    if comparison.pairs is not None:
+        return comparison.pairs.models, comparison.pairs.conditions
+    groups = set(comparison.groups or ())
+    models = comparison.chain or [name for name, model in study.study.models.items() if groups & set(model.groups)]
+    planned = [{cell.way for cell in study.cells if cell.model == name and not cell.asks} for name in models]
+    common = set.intersection(*planned) if planned else set()
+    return models, [way for way in study.study.conditions if way in common][:1]
+
+
+def _pairs(comparison: ComparisonTable, runs: Sequence[StoredRun]) -> list[tuple[str, str]]:
+    """Return the locations of the runs that are compared, each the first minus the second."""
+    if comparison.pairs is not None:
+        reference, other = comparison.pairs.conditions
+        by_cell = {(run.cell.model, run.cell.way, run.cell.seed): run.location for run in runs}
+        return [
+            (location, by_cell[model, reference, seed])
+            for (model, way, seed), location in by_cell.items()
+            if way == other and (model, reference, seed) in by_cell
+        ]
+    chain = comparison.chain or []
+    steps = [*zip(chain[1:], chain, strict=False), *([(chain[-1], chain[0])] if len(chain) > 2 else [])]
+    by_model = {(run.cell.model, run.cell.seed): run.location for run in runs}
+    return [
+        (by_model[late, seed], by_model[early, seed])
+        for late, early in steps
+        for seed in dict.fromkeys(run.cell.seed for run in runs)
+        if (late, seed) in by_model and (early, seed) in by_model
+    ]
+
+
+def _sources(study: LoadedStudy, runs: Sequence[StoredRun]) -> list[tuple[str, str]]:
+    """Return the locations of the VLM runs and policy runs whose backbones are the same, as the file says."""
+    return [
+        (vlm.location, policy.location)
+        for policy in runs
+        for vlm in runs
+        if vlm.cell.asks
+        and not policy.cell.asks
+        and study.study.models[policy.cell.model].vlm == vlm.cell.model
+        and vlm.cell.seed == policy.cell.seed
+    ]
+
+
+def _drift(
+    study: LoadedStudy,
+    table: DriftTable,
+    stored: StoredRuns,
+    labels: Mapping[str, str],
+    name: str,
+    partial: bool,
+) -> NamedTable:
+    """Make the table of every pair of the file whose runs are both stored."""
+    by_name = {run.cell.name: run for run in stored.runs}
+    drifts: dict[tuple[str, str], list[CategoryDrift]] = {}
+    for cells in ([_side(study.cells, side) for side in pair] for pair in table.pairs):
+        for pair in product(*cells):
+            before, after = (by_name.get(cell.name) for cell in pair)
+            if before is None or after is None or before.cell.seed != after.cell.seed:
+                continue
+            runs = (before, after)
+            of_pair = measure_drift(
+                before.probed.in_wording(),
+                after.probed.in_wording(),
+                table.view,
+                {run.location: labels[run.location] for run in runs},
+                [study_probes(study, run, run.probed.in_wording(), partial) for run in runs],
+            )
+            printed = set(before.run.items["category"])
+            drifts[labels[before.location], labels[after.location]] = [
+                drift for drift in of_pair if drift.category in printed
+            ]
+    return drift_table(drifts, name, table.view)
+
+
+def _side(cells: Sequence[Cell], side: str) -> list[Cell]:
+    """Return the runs that a side of a pair names: of a model's first condition, or of that behind the slash."""
+    model, _, way = side.partition("/")
+    of_model = [cell for cell in cells if cell.model == model and (cell.way == way if way else not cell.asks)]
+    return [cell for cell in of_model if cell.way == of_model[0].way]
+
+
+def _joins(
+    study: LoadedStudy, stored: StoredRuns, labels: Mapping[str, str], partial: bool
+) -> list[KnownUsedTable]:
+    """Join every policy run with the run of its VLM, with the probes of the policy where there are any."""
+    runs = {run.location: run for run in stored.runs}
+    probes = {location: study_probes(study, run, run.probed, partial) for location, run in runs.items()}
+    joins = [
+        replace(
+            match_runs(scored(runs[vlm].run, "text"), runs[policy].run, probes[policy]),
+            asked=labels[vlm],
+            acted=labels[policy],
+        )
+        for vlm, policy in _sources(study, stored.runs)
+    ]
+    return correct_joins(joins)
+
+
+def _origin(study: LoadedStudy, model: str) -> str:
+    """Return the model that a model was trained from, or itself: the first of the chain of `finetuned_from`."""
+    while (earlier := study.study.models[model].finetuned_from) is not None:
+        model = earlier
+    return model
+
+
+def _groups(study: LoadedStudy, names: list[str], stored: StoredRuns) -> dict[str, list[StoredRun]]:
+    models = study.study.models
+    return {name: [run for run in stored.runs if name in models[run.cell.model].groups] for name in names}

@@ -1,1 +1,0 @@
-"""Named tables of a study, from stored runs alone."""

@@ -1,0 +1,34 @@
+"""`study run` killed at drawn moments and given again: nothing stored is lost, and the bytes are the same."""
+
+from pathlib import Path
+
+import pytest
+
+from probe_kit.suite import Suite
+from tests.study.small_study import SCRIPTED, TEXT, bytes_of, run_folders, small_study
+from tests.support.killed_commands import KilledCommand, committed, kill_often, run_problems
+
+KILLS = 20
+
+
+def command(suite: Suite, text: str, *options: str) -> KilledCommand:
+    def runs(place: Path) -> list[Path]:
+        return run_folders(place / "study.toml")
+
+    return KilledCommand(
+        "study run",
+        lambda place: small_study(place, suite, text),
+        lambda place: ["study", "run", str(place / "study.toml"), *options],
+        lambda place: bytes_of(place / "study.toml"),
+        lambda place: committed(*runs(place)),
+        lambda place: run_problems(*runs(place)),
+    )
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("text", [SCRIPTED, TEXT], ids=["scripted", "probed"])
+@pytest.mark.parametrize("options", [(), ("--slots", "2")], ids=["here", "processes"])
+def test_twenty_kills_lose_nothing_and_change_no_byte(
+    text: str, options: tuple[str, ...], small_suite: Suite, tmp_path: Path
+) -> None:
+    print(kill_often(command(small_suite, text, *options), tmp_path, KILLS, seed=len(options)))
