@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from probe_kit.errors import ProbeKitError
+from probe_kit.extract.parts import ModelSettings
 from probe_kit.extract.settings import AskSettings, ExtractSettings, Settings
 from probe_kit.hooks.registry import family_names, get_family
 from probe_kit.study.cells import Cell, Selection
@@ -136,33 +137,21 @@ def _settings(study: Study, member: Member) -> Settings:
 
 def _common(study: Study, name: str) -> dict[str, Any]:
     model = study.models[name]
-    return {
-        "model": model.family,
-        "checkpoint": model.checkpoint,
-        "random_weights": model.random_weights,
-        "weights_seed": model.weights_seed,
-        "options": model.options,
-        "protocol": model.protocol,
-        "scene": _scene(study, model),
-        "dtype": model.dtype,
-        "batch": model.batch,
-        "device": "cuda" if model.gpus else "cpu",
-    }
-
-
-def _scene(study: Study, model: ModelTable) -> str | None:
-    """A protocol has its own scene; the study's is for models that name neither."""
-    return model.scene or (None if model.protocol else study.scene)
+    weights = {field: getattr(model, field) for field in ModelSettings.model_fields if field != "family"}
+    # A protocol has its own scene; the study's is for models that name neither.
+    scene = model.scene or (None if model.protocol else study.scene)
+    device = "cuda" if model.gpus else "cpu"
+    of_model = {"model": model.family, **weights, "protocol": model.protocol, "batch": model.batch}
+    return {**of_model, "scene": scene, "device": device}
 
 
 def _settings_of(study: Study, name: str, condition: ConditionTable, tokens: str | None) -> ExtractSettings:
     """Return the settings of a policy, with what its protocol decides."""
-    values = condition.model_dump(exclude={"no_act"})
+    of_model, of_condition = _common(study, name), dict(condition)
+    scene, capture_only = of_condition.pop("scene") or of_model["scene"], of_condition.pop("no_act")
     return ExtractSettings(
-        **_common(study, name),
-        **values,
+        **{**of_model, **of_condition, "scene": scene, "capture_only": capture_only},
         execute=study.models[name].execute,
-        capture_only=condition.no_act,
         tokens=tokens or "pooled",
     ).followed()
 

@@ -2,11 +2,12 @@
 
 import re
 import tomllib
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
 
@@ -159,27 +160,17 @@ def _near(path: Place) -> str:
 
 
 def _table_of(path: Place) -> type[BaseModel]:
-    """The table that the last name of a path stands in."""
-    inner = next((table for name, table in _INNER.items() if name in path[2:-1]), None)
-    return inner or (schema.Study if len(path) == 1 else _TABLES.get(str(path[0]), schema.Study))
+    """Return the table that the last name of a path stands in, by the types of the fields on the way."""
+    table: type[BaseModel] = schema.Study
+    for name in path[:-1]:
+        field = table.model_fields.get(str(name))
+        table = next(_models_in(field.annotation), table) if field is not None else table
+    return table
 
 
-_TABLES: dict[str, type[BaseModel]] = {
-    "suite": schema.SuiteTable,
-    "models": schema.ModelTable,
-    "conditions": schema.ConditionTable,
-    "asks": schema.AskTable,
-    "runs": schema.BlockTable,
-    "probes": schema.ProbesTable,
-    "comparisons": schema.ComparisonTable,
-    "drift": schema.DriftTable,
-    "tables": schema.TableTable,
-    "figures": schema.FigureTable,
-}
-"""The tables by the first name of a path."""
-_INNER: dict[str, type[BaseModel]] = {
-    "exclude": schema.ExcludeTable,
-    "pairs": schema.PairsTable,
-    "elsewhere": schema.ElsewhereTable,
-}
-"""The tables inside tables by their key."""
+def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+    """Yield the models in a type, such as that of `dict[Name, ModelTable]`."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for argument in get_args(annotation):
+        yield from _models_in(argument)

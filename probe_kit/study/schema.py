@@ -1,15 +1,17 @@
 """The tables of a study file and their fields. Values are checked here, references to names in `checks`."""
 
+from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
 from unicodedata import category
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
+from probe_kit.extract.parts import ModelSettings
+from probe_kit.extract.sources.scene import SceneOptions
 from probe_kit.extract.vqa.phrases import Picture, Query
 from probe_kit.hooks.contract.protocol import ProtocolName
-from probe_kit.hooks.family import Dtype
 from probe_kit.runs.layout import AskTokens, LaterViews
-from probe_kit.scene_names import ArmName, Rendering, SceneName
+from probe_kit.scene_names import SceneName
 from probe_kit.train.choices import Control as FeatureControl
 from probe_kit.train.choices import Side
 
@@ -72,6 +74,10 @@ class _Table(BaseModel):
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
+    def __init__(self, **values: Any) -> None:
+        # Settings of a run raise UsageError for the first wrong value; a file's mistakes are all collected.
+        BaseModel.__init__(self, **values)
+
 
 class SuiteTable(_Table):
     """The suite of all runs.
@@ -86,46 +92,35 @@ class SuiteTable(_Table):
     counts: dict[str, Even] = {}
 
 
-class ModelTable(_Table):
-    """One model. family: a name of `probe-kit models`.
+class ModelTable(_Table, ModelSettings):
+    """One model: the part `model` of the settings of a run, and its place in the study.
 
     label: what tables call it. groups: it belongs to. vlm: the VLM of its backbone. finetuned_from: what it was
     trained from. untrained: its network with random weights. unavailable: why it is not played; it is named in
-    plans and tables. The rest is as in `probe-kit extract`.
+    plans and tables. protocol, scene, execute, batch: as in `probe-kit extract`.
     """
 
-    family: str
     label: Text | None = None
     groups: Annotated[list[Name], AfterValidator(_each_once)] = []
     vlm: str | None = None
     finetuned_from: str | None = None
     untrained: str | None = None
-    checkpoint: Text | None = None
-    random_weights: bool = False
-    weights_seed: Seed = 0
-    options: dict[str, Any] = {}
     protocol: ProtocolName | None = None
     scene: SceneName | None = None
     execute: Count | None = None
-    dtype: Dtype | None = None
     batch: Count = 1
     gpus: Annotated[int, Field(ge=0, le=1)] = 0
     unavailable: Text | None = None
 
 
-class ConditionTable(_Table):
-    """The playing of a policy: fields of the scene, and what else `probe-kit extract` takes."""
+class ConditionTable(_Table, SceneOptions):
+    """The playing of a policy: the options of a scene, and what else `probe-kit extract` takes.
 
-    max_steps: Count | None = None
-    tile_side: float | None = None
-    light_level: float | None = None
-    rendering: Rendering | None = None
-    background: Text | None = None
-    picture_size: Size | None = None
-    epsilon: float | None = None
-    arm: ArmName | None = None
-    start_grasped: bool = False
-    early_stop: bool = False
+    scene: in place of the model's.
+    """
+
+    background: Annotated[Path | None, Field(strict=False)] = None
+    arm_urdf: Annotated[Path | None, Field(strict=False)] = None
     wordings: Names | None = None
     no_act: bool = False
     accept_units: bool = False

@@ -102,7 +102,7 @@ MISTAKES: list[tuple[str, str, str]] = [
     ('vlm = "reader"', 'vlm = "reader"\nunavailable = ""  # here', "at least 1 character"),
     ("light_level = 0.7", "light_level = 0.7\nlite = 1  # here", "unknown key"),
     ("light_level = 0.7", 'rendering = "photo"  # here', "conditions.dark.rendering: should be 'raw'"),
-    ("light_level = 0.7", 'picture_size = "big"  # here', "string should match pattern"),
+    ("light_level = 0.7", 'picture_size = "big"  # here', "should be a text such as 224x224, not 'big'"),
     ("light_level = 0.7", 'captured_calls = "each"  # here', "conditions.dark.captured_calls"),
     ("light_level = 0.7", "captured_calls = 0  # here", "conditions.dark.captured_calls"),
     ("[conditions.dark]", '[conditions.dark]  # here\nlater_views = "mean"', "the first alone is captured"),

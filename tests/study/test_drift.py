@@ -59,7 +59,7 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[ArrayRun, ArrayRun]:
     folder = tmp_path_factory.mktemp("drift")
     runs = [run_of(folder / str(after), after, list(TRUTH)) for after in (False, True)]
     for run in runs:
-        train_probes(run, permutations=39, jobs=1)
+        train_probes(run, permutations=39, jobs=1, controls=("random-features",))
     return runs[0], runs[1]
 
 

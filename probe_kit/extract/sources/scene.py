@@ -11,6 +11,7 @@ from probe_kit._terminal import options as common
 from probe_kit._terminal.field_options import Part, plain
 from probe_kit._terminal.options import choices as listed_choices
 from probe_kit._terminal.options import further_option, read_size, some_of
+from probe_kit.errors import UsageError
 from probe_kit.extract.parts import LARGEST, Scene, option_of
 from probe_kit.extract.sources.source import SourceSettings
 from probe_kit.scene_names import ArmName, Rendering
@@ -20,7 +21,10 @@ _option = partial(typer.Option, rich_help_panel="Scene")
 
 
 def _size(value: Any) -> Any:
-    return read_size(value) if isinstance(value, str) else value
+    try:
+        return read_size(value) if isinstance(value, str) else value
+    except UsageError:  # pydantic names the field of a ValueError, and the value
+        raise ValueError("should be a text such as 224x224") from None
 
 
 class SceneOptions(Part):
