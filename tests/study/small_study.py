@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from probe_kit.runs import open_run
 from probe_kit.study import load_study
 from probe_kit.suite import Suite
 from tests.support.killed_commands import run_files
@@ -124,3 +125,14 @@ def run_folders(file: Path) -> list[Path]:
     """Where the runs of a study lie."""
     study = load_study(file)
     return [Path(cell.location(study.study.folder)) for cell in study.cells]
+
+
+def check_same_bytes(file: Path, other: Path) -> None:
+    """Fail unless the runs of two studies have the same bytes, and one code of probe_kit has made both.
+
+    A commit names the code that made it: a process that starts after an edit names another, with equal numbers.
+    """
+    runs = [open_run(folder) for study in (file, other) for folder in run_folders(study)]
+    codes = {str(made_by["code_sha256"])[:12] for run in runs for made_by in run.provenances.values()}
+    assert len(codes) == 1, f"probe_kit was edited while the studies played: {codes}; run the test again"
+    assert bytes_of(file) == bytes_of(other)

@@ -11,7 +11,7 @@ from probe_kit._execution.executor import WorkerLostWarning
 from probe_kit.errors import WorkerDiedError
 from probe_kit.study import Moved, conduct_study, load_study, plan_study, playing
 from probe_kit.suite import Suite
-from tests.study.small_study import EPISODES, bytes_of, small_study
+from tests.study.small_study import EPISODES, check_same_bytes, small_study
 
 pytestmark = pytest.mark.slow
 
@@ -32,7 +32,7 @@ def test_processes_give_the_bytes_of_this_process(played_here: Path, small_suite
     )
     assert failures == []
     assert len(moved) == EPISODES
-    assert bytes_of(file) == bytes_of(played_here)
+    check_same_bytes(file, played_here)
 
 
 def test_a_killed_process_is_replaced_and_nothing_changes(
@@ -52,7 +52,7 @@ def test_a_killed_process_is_replaced_and_nothing_changes(
     ):
         assert conduct_study(plan_study(load_study(file)), kill_one, slots=2) == []
     assert killed
-    assert bytes_of(file) == bytes_of(played_here)
+    check_same_bytes(file, played_here)
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from probe_kit.runs.layout import COMMITS
 from probe_kit.study import conduct_study, load_study, plan_study
 from probe_kit.suite import Suite
 from tests.extract.two_nodes import TwoNodes, two_nodes, wait_for
-from tests.study.small_study import bytes_of, run_folders, small_study
+from tests.study.small_study import check_same_bytes, run_folders, small_study
 
 
 def test_without_ray_the_error_names_the_extra(
@@ -46,7 +46,7 @@ def test_two_nodes_of_which_one_is_lost_give_the_numbers_of_this_process(
         ):
             assert conduct_study(plan_study(load_study(there)), ray=nodes.address) == []
     assert 0 < kept.result() < 4 * 24
-    assert bytes_of(there) == bytes_of(here)
+    check_same_bytes(there, here)
 
 
 def _committed(file: Path) -> int:
