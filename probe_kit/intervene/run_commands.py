@@ -13,6 +13,8 @@ from probe_kit._terminal.plain_text import terminal_safe
 from probe_kit.errors import UsageError
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from probe_kit.runs import Run
 
 
@@ -114,7 +116,6 @@ def show(
     recorded action has an error of 1. `--json` prints every episode too; `probe-kit labels RUN` writes the
     error of every frame. An unfinished run needs --partial for it.
     """
-    from probe_kit.extract.source_commands.action_error_table import show_action_errors
     from probe_kit.intervene.results.inventory import listed_interventions, unfinished_interventions
     from probe_kit.runs import label_run, open_run
     from probe_kit.runs.certificates import input_notes
@@ -127,7 +128,7 @@ def show(
     if label is not None:
         label_run(run, label)
     if action_errors:
-        show_action_errors(run, partial, as_json)
+        _show_action_errors(run, partial, as_json)
         return
     opened = open_run(run, allow_partial=True)
     facts, interventions = inventory(opened), listed_interventions(opened)
@@ -155,3 +156,21 @@ def show(
     if not facts.probes:
         why = f". {how_to_probe(opened)}" if facts.streams else ": a policy without streams has none"
         out.print(f"no probes{why}", soft_wrap=True)
+
+
+def _show_action_errors(run: str, partial: bool, as_json: bool) -> None:
+    """Print how predicted actions differ from the recorded ones. Raises what `compare_actions` raises."""
+    from probe_kit.runs import compare_actions, open_run
+    from probe_kit.runs.action_errors import action_error_table
+
+    errors = compare_actions(open_run(run, allow_partial=partial))
+    if as_json:
+        print_json({"run": run, "numbers": _plain(errors.by_number), "episodes": _plain(errors.by_episode)})
+    else:
+        out.print(action_error_table(errors))
+
+
+def _plain(frame: "pd.DataFrame") -> list[dict[str, Any]]:
+    """Return the lines of a frame as JSON has them: NaN is null."""
+    rows = frame.to_dict("records")
+    return [{str(name): None if value != value else value for name, value in row.items()} for row in rows]

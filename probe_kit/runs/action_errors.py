@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._tables.table import Table
 from probe_kit.errors import UsageError
 from probe_kit.runs.layout import DATASET, OTHER_ACTIONS
 from probe_kit.runs.reader import RunReader
@@ -117,6 +118,32 @@ def compare_actions(run: RunReader) -> ActionErrors:
     constant = np.nanmax(first, axis=(0, 1)) == np.nanmin(first, axis=(0, 1))  # its deviation may not round to 0
     deviations = np.where(constant, 0.0, np.nanstd(first, axis=(0, 1)))
     return ActionErrors(run, inputs.names["action"], predicted - recorded, deviations)
+
+
+def action_error_table(errors: ActionErrors) -> Table:
+    """Return a line per number of an action; its note says how the episodes differ."""
+    episodes, numbers = errors.by_episode, errors.by_number.to_dict("records")
+    ordered = episodes.sort_values("first").dropna().to_dict("records")
+    span = [f"{row['first']:.2f} in episode {row['source_episode']}" for row in (*ordered[:1], *ordered[-1:])]
+    return Table.of(
+        f"Predicted against recorded actions, {int(episodes['frames'].sum())} frames",
+        ("number", "recorded deviation", "bias", "error, first action", "error, whole chunk"),
+        [
+            (
+                str(row["number"]),
+                f"{row['deviation']:.3g}",
+                *(
+                    "constant" if np.isnan(row[name]) else f"{row[name]:.2f}"
+                    for name in ("bias", "first", "chunk")
+                ),
+            )
+            for row in numbers
+        ],
+        notes=[
+            "bias and errors are in recorded deviations; the mean recorded action has 1. First action: "
+            f"{' to '.join(span) or 'nothing recorded'}"
+        ],
+    )
 
 
 def why_not_compared(run: RunReader) -> str | None:

@@ -74,6 +74,12 @@ class StoredInputs:
         rows = Rows(open_array(self._store, f"{INPUTS}/{kind}"), self._numbers)
         return np.stack(list(rows))
 
+    def row(self, kind: str, position: int) -> NDArray[Any]:
+        """Return (C, …) of one kind of the row at a position. Raises KeyError as `read` does, RunDamagedError."""
+        if kind not in self.kinds:
+            raise KeyError(kind)
+        return Rows(open_array(self._store, f"{INPUTS}/{kind}"), self._numbers)[position]
+
     def column(self, name: str) -> NDArray[np.float64]:
         """(E, C) one column of the data set. Raises KeyError."""
         if name not in self.columns:

@@ -9,15 +9,15 @@ from probe_kit.hashing import sha256_json
 from probe_kit.retention.columns.glossary import VIEWER_WORDS
 from probe_kit.runs import Run
 from probe_kit.runs.layout import COMMITS, FAILED
-from probe_kit.runs.thumbnails import read_sheet
 from probe_kit.view.payloads.coding import failure_script, payload_script
 from probe_kit.view.payloads.episode_payload import episode_payload
 from probe_kit.view.payloads.episodes_payload import episodes_payload
+from probe_kit.view.payloads.results_payload import results_payload, stored_keys
 from probe_kit.view.payloads.run_payload import run_payload
-from probe_kit.view.payloads.site_map_payload import site_map_payload
+from probe_kit.view.payloads.site_map_payload import site_map_payload, target_map_payload
 from probe_kit.view.viewed_run import view_runs
 
-SCHEMA = 1
+SCHEMA = 2
 """Of the payloads; the page refuses another one."""
 INDEX_PAYLOAD = "index"
 """The payload that a page reads first."""
@@ -31,6 +31,8 @@ class Catalogue:
     RUN/run                 settings, streams, sites, certificate, rows of the table
     RUN/episodes            one column per property of the episodes
     RUN/map/CATEGORY        scores by site, and held-out log-odds of the category's episodes
+    RUN/target/N            scores by site of the N-th target that was probed
+    RUN/results             tables of stored probes, interventions and diagnoses
     RUN/e/NNNNN             one episode
     """
 
@@ -45,7 +47,9 @@ class Catalogue:
         """All names in the order of export. categories: whose episodes and maps are named, all by default."""
         yield INDEX_PAYLOAD
         for key, viewed in self.runs.items():
-            yield from (f"{key}/run", f"{key}/episodes")
+            yield from (f"{key}/run", f"{key}/episodes", f"{key}/results")
+            if len(viewed.run.episodes):
+                yield from (f"{key}/target/{number}" for number in range(len(viewed.target_curves)))
             probed = [name for name in viewed.probed_categories if categories is None or name in categories]
             yield from (f"{key}/map/{category}" for category in probed)
             yield from (f"{key}/e/{number:05d}" for number in self.numbers(key, categories))
@@ -79,13 +83,13 @@ class Catalogue:
         viewed = self.runs[parts[0]]
         refitted = sorted(other.key for other in viewed.refitted.values())
         probes = None if viewed.results is None else viewed.results.key
-        return sha256_json([SCHEMA, name, viewed.run.stamp, probes, refitted])
+        stored = stored_keys(viewed) if parts[-1] in ("results", "run") or "target" in parts else []
+        return sha256_json([SCHEMA, name, viewed.run.stamp, probes, refitted, stored])
 
     def picture(self, key: str, number: int) -> bytes | None:
         """The committed frames of an episode, None without any. Raises KeyError; RunDamagedError if changed."""
         viewed = self.runs[key]
-        _ = viewed.position_of[number]
-        sheet = read_sheet(viewed.run.location, number)
+        sheet = viewed.sheet(number)
         return None if sheet is None else sheet.content
 
     def _payload(self, name: str) -> Any:
@@ -96,6 +100,10 @@ class Catalogue:
                 return run_payload(self.runs[key], list(self.runs.values()))
             case [key, "episodes"]:
                 return episodes_payload(self.runs[key])
+            case [key, "results"]:
+                return results_payload(self.runs[key])
+            case [key, "target", number] if number.isdecimal():
+                return target_map_payload(self.runs[key], int(number))
             case [key, "map", category]:
                 return site_map_payload(self.runs[key], category)
             case [key, "e", number] if _NUMBER.fullmatch(number):

@@ -11,14 +11,15 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import Site
+from probe_kit.intervene.settings import has_sides
 from probe_kit.retention import RetentionRow, RetentionTable, retention_table
 from probe_kit.retention.behaviour.vlm_answers import ask_of
 from probe_kit.runs import Run
-from probe_kit.runs.reader import check_sides
+from probe_kit.runs.thumbnails import FrameSheet, as_thumbnail, read_sheet
 from probe_kit.train.results.by_call import load_results_by_call
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeResults
-from probe_kit.train.results.store import how_to_probe
+from probe_kit.train.results.store import how_to_probe, load_results, stored_targets
 from probe_kit.view.frozen_probes import FrozenProbes, Values, count_inferences
 
 UNREAD = "unread"
@@ -38,6 +39,11 @@ class ViewedRun:
     lender: "ViewedRun | None" = None
     readings: dict[str, dict[int, Values]] = field(default_factory=dict)
 
+    @property
+    def has_sides(self) -> bool:
+        """Whether answers lie on a side, as in the scene; other runs have no retention table."""
+        return has_sides(self.run)
+
     @cached_property
     def table(self) -> RetentionTable:
         """The retention table of this run alone, without the columns that no page shows and that take longest."""
@@ -51,7 +57,7 @@ class ViewedRun:
     @property
     def own_results(self) -> ProbeResults | None:
         """The probes of the table; None without any."""
-        return self.table.results.get(str(self.run.location))
+        return self.table.results.get(str(self.run.location)) if self.has_sides else None
 
     @property
     def is_lent(self) -> bool:
@@ -113,6 +119,17 @@ class ViewedRun:
             return None
         return self.results.curves.get((category, self.view))
 
+    @cached_property
+    def target_curves(self) -> list[tuple[ProbeResults, str]]:
+        """Results and category of every target but the sides that was probed, in the first view of its probes."""
+        results = [load_results(self.run, target=target) for target in stored_targets(self.run)]
+        return [
+            (probes, category)
+            for probes in results
+            for category, view in probes.curves
+            if view == probes.settings.views[0]
+        ]
+
     @property
     def sites(self) -> tuple[Site, ...]:
         """All probed sites, the same in every category; none without probes."""
@@ -136,6 +153,25 @@ class ViewedRun:
             for name in self.probed_categories
         }
 
+    def inference_steps(self, position: int) -> list[int]:
+        """Return the control step, or the recorded frame, of every inference of the episode in a row."""
+        steps = self.run.control_steps[position]
+        return [int(step) for step in steps[steps >= 0]]
+
+    def sheet(self, number: int) -> FrameSheet | None:
+        """Return the stored picture of an episode, else one of what its inferences saw; None without either.
+
+        Raises KeyError, and RunDamagedError for a picture that was changed.
+        """
+        position, inputs = self.position_of[number], self.run.inputs
+        stored = read_sheet(self.run.location, number)
+        if stored is not None or inputs is None or "pixels" not in inputs.kinds:
+            return stored
+        shown = inputs.row("pixels", position)[: len(self.inference_steps(position))]
+        # The pictures of all cameras stand side by side.
+        frames = tuple(np.hstack(list(cameras)) for cameras in shown)
+        return FrameSheet(as_thumbnail(frames, "all"), len(frames)) if frames else None
+
     @cached_property
     def position_of(self) -> dict[int, int]:
         """Row in `run.episodes` by the episode's number."""
@@ -150,8 +186,6 @@ def view_runs(runs: Sequence[Run], probes_of: Run | None = None) -> list[ViewedR
     """
     if not runs:
         raise UsageError("the viewer needs at least one run")
-    for run in runs:
-        check_sides(run, "the viewer")
     places = [run.location.address for run in runs]
     if doubles := [address for at, address in enumerate(places) if address in places[:at]]:
         raise UsageError(f"{doubles[0]} is given twice. Leave one out")

@@ -62,8 +62,20 @@ def test_an_episode_says_how_its_sheet_is_divided_and_what_its_prompt_lost(
     writer.write(replace(cut, outcome={**cut.outcome, "lost_words": 2}))
     catalogue = Catalogue([open_run(tmp_path / "run", allow_partial=True)])
     size = {"width": 80, "height": 60}
-    assert payload(catalogue, "run/e/00000")["frames"] == {"count": 10, "columns": 8, **size, "all": True}
-    assert payload(catalogue, "run/e/00001")["frames"] == {"count": 2, "columns": 2, **size, "all": False}
+    assert payload(catalogue, "run/e/00000")["frames"] == {
+        "count": 10,
+        "columns": 8,
+        **size,
+        "all": True,
+        "steps": None,
+    }
+    assert payload(catalogue, "run/e/00001")["frames"] == {
+        "count": 2,
+        "columns": 2,
+        **size,
+        "all": False,
+        "steps": None,
+    }
     assert catalogue.picture("run", 0) == pictures[thumbnail_key(0)]
     assert [payload(catalogue, f"run/e/0000{number}")["lost_words"] for number in (0, 1)] == [0, 2]
 
@@ -201,8 +213,8 @@ def test_another_name_is_no_payload(catalogue: Catalogue, name: str) -> None:
 
 def test_every_payload_that_is_named_can_be_made(catalogue: Catalogue) -> None:
     names = list(catalogue.names())
-    assert names[:4] == ["index", "run/run", "run/episodes", "run/map/color"]
-    assert len(names) == 4 + 24
+    assert names[:5] == ["index", "run/run", "run/episodes", "run/results", "run/map/color"]
+    assert len(names) == 5 + 24
     for name in names:
         assert read_payload(catalogue.script(name))[0] == name
 

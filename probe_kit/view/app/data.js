@@ -1,6 +1,6 @@
 // Payloads are scripts that call put(name, value): the same files open from file:// and from a server.
 "use strict";
-const SCHEMA = 1, KEPT = 64;
+const SCHEMA = 2, KEPT = 64;
 const store = new Map(), pending = new Map(), decoded = new Map(), refused = new Map();
 
 function put(name, value) { store.set(name, value); refused.delete(name); }

@@ -53,7 +53,7 @@ function Filters({ run, list, shown, place }) {
   return html`<form class="filters" aria-label="Filters" onSubmit=${(e) => e.preventDefault()}>
     <${Choice} name="category" label="category" value=${place.category} options=${values("category", (v) => titleOf(run, v))} />
     <${Choice} name="outcome" label="outcome" value=${place.outcome} options=${values("outcome", (v) => OUTCOMES[v] ?? v)} />
-    <${Choice} name="layout" label="layout" value=${place.layout} options=${values("layout")} />
+    ${run.sides && html`<${Choice} name="layout" label="layout" value=${place.layout} options=${values("layout")} />`}
     ${cases.length > 0 && html`<${Choice} name="case" label="probe and arm" value=${place.case} options=${cases.flatMap(([part, words]) => Object.entries(PAIRS).map(([pair, w]) => [`${part}.${pair}`, `${words} ${w}`]))} />`}
     <label class="choice grow"><span>words</span><input name="words" type="search" placeholder="instruction, id, number" value=${place.words ?? ""} onInput=${(e) => go({ words: e.target.value, ep: undefined }, true)} /></label>
     <output class="count" aria-live="polite">${shown.length.toLocaleString("en")} of ${list.length.toLocaleString("en")}</output>
@@ -81,7 +81,7 @@ function EpisodeList({ run, shown, one: chosen, value }) {
     ${shown.slice(from, to).map((one, k) => {
       const { log_odds, signal } = value(one), read = says(log_odds, signal);
       return html`<a key=${one.number} title=${one.instruction} role="option" aria-selected=${one === chosen} aria-setsize=${shown.length} aria-posinset=${from + k + 1} class="item" style=${{ transform: `translateY(${(from + k) * ROW}px)` }} href=${link({ ep: one.number, t: 0 })}>
-        <span class=${`sign ${one.outcome}`} aria-label=${OUTCOMES[one.outcome] ?? one.outcome}>${SIGNS[one.outcome] ?? "○"}</span><span class="what"><b><${Text}>${one.instruction ?? one.id}<//></b><small>${one.number} · ${titleOf(run, one.category)} · ${one.layout}</small></span>
+        <span class=${`sign ${one.outcome}`} aria-label=${OUTCOMES[one.outcome] ?? one.outcome}>${SIGNS[one.outcome] ?? "○"}</span><span class="what"><b><${Text}>${one.instruction ?? one.id}<//></b><small>${one.number} · ${titleOf(run, one.category)}${one.layout ? ` · ${one.layout}` : ` · ${one.item}`}</small></span>
         ${run.sites.length > 0 && html`<span class=${`odds ${read === "right" ? "up" : read === "wrong" ? "down" : ""}`} title=${read ? "" : "no signal shown at this site"}>${signal ? signed(log_odds) : "–"}</span>`}</a>`;
     })}</div></div>`;
 }
@@ -104,13 +104,14 @@ function Episodes({ run, list, place }) {
     if (e.key === "/") { e.preventDefault(); document.querySelector("input[name=words]").focus(); }
   });
   return html`<div class="episodes"><${Filters} run=${run} list=${list} shown=${shown} place=${place} />
-    <div class="split"><aside><p class="listhead">${run.sites.length ? `log-odds at ${named >= 0 ? short(place.site) : "the best site with signal"}` : "this run has no probes"}</p><${EpisodeList} run=${run} shown=${shown} one=${one} value=${value} /></aside>
+    <div class="split"><aside><p class="listhead">${run.sites.length ? `log-odds at ${named >= 0 ? short(place.site) : "the best site with signal"}` : run.sides ? "this run has no probes" : `${shown.length.toLocaleString("en")} episodes`}</p><${EpisodeList} run=${run} shown=${shown} one=${one} value=${value} /></aside>
     ${one ? html`<${Episode} key=${`${run.key} ${one.number}`} run=${run} one=${one} place=${place} near=${[1, -1].map((by) => shown[shown.indexOf(one) + by]).filter(Boolean)} />`
       : html`<p class="empty">No episode is left. <a href=${link(Object.fromEntries(FILTERS.map((name) => [name, undefined])))}>Clear the filters</a></p>`}</div></div>`;
 }
 
 /* ---- one episode ---- */
 function frameAt(frames, now, steps) {
+  if (frames.steps) return Math.max(0, frames.steps.findLastIndex((step) => step <= now));
   if (frames.all) return Math.min(now, frames.count - 1);
   return frames.count > 1 && now >= steps && steps > 0 ? 1 : 0;
 }
@@ -133,7 +134,7 @@ function Episode({ run, one, place, near }) {
   const [[episode, map], trouble] = useLoaded(`${run.key}/e/${numbered(one.number)}`, hasMap && `${run.key}/map/${one.category}`);
   useEffect(() => { for (const next of near) load(`${run.key}/e/${numbered(next.number)}`).catch(() => {}); }, [one]);
   const [playing, setPlaying] = useState(false);
-  const last = episode?.trajectory ? episode.trajectory.frames - 1 : one.steps ?? 0, now = Math.max(0, Math.min(last, Math.floor(Number(place.t)) || 0));
+  const last = episode?.trajectory ? episode.trajectory.frames - 1 : Math.max(one.steps ?? 0, ...(episode?.inferences ?? [])), now = Math.max(0, Math.min(last, Math.floor(Number(place.t)) || 0));
   const step = (t) => go({ t: Math.max(0, Math.min(last, t)) }, true);
   const play = () => { if (now >= last && !playing) step(0); setPlaying(!playing); };
   useEffect(() => {
@@ -157,7 +158,7 @@ function Episode({ run, one, place, near }) {
       ${episode.trajectory && html`<div><${Plan} trajectory=${episode.trajectory} inferences=${episode.inferences} now=${now} scene=${run.scene} correct=${one.side_correct} names=${names} /><p class="note"><span class="mark toolmark"></span>tool <span class="mark cubemark"></span>cube <span class="mark callmark"></span>inference · circle: zone of the rule disc</p></div>`}
       ${map && episode.log_odds && html`<${NetworkNow} run=${run} one=${one} episode=${episode} map=${map} now=${now} place=${place} />`}</div>
     ${episode.trajectory ? html`<${Charts} run=${run} one=${one} episode=${episode} map=${map} now=${now} last=${last} step=${step} place=${place} />`
-      : html`<p class="empty">${run.answers ? "The model was asked and did not act: nothing moves." : "This run keeps no trajectories: it was made before they were stored, or its model did not act."}</p>`}
+      : episode.inputs.length ? html`<${Inputs} episode=${episode} now=${now} last=${last} step=${step} />` : html`<p class="empty">${run.answers ? "The model was asked and did not act: nothing moves." : "This run keeps no trajectories: it was made before they were stored, or its model did not act."}</p>`}
     ${Object.keys(episode.answers).length > 0 && html`<dl class="readout answers">${Object.entries(episode.answers).map(([name, value]) => html`<dt>${name}</dt><dd><${Text}>${value}<//></dd>`)}</dl>`}
   </article>`;
 }
@@ -168,7 +169,7 @@ function Delivered({ text, lost }) {
 }
 function Facts({ run, one, episode }) {
   const rules = Object.entries(episode.outcomes);
-  return html`<p class="facts"><${Outcome} outcome=${one.outcome} /> <span>correct side: <b>${one.side_correct}</b></span> <span>${run.answers ? "answered" : "placed"}: <b>${one.side_placed ?? "none"}</b></span> <span>${titleOf(run, one.category)}</span> <span>${one.layout}</span>
+  return html`<p class="facts"><${Outcome} outcome=${one.outcome} /> ${run.sides && html`<span>correct side: <b>${one.side_correct}</b></span> <span>${run.answers ? "answered" : "placed"}: <b>${one.side_placed ?? "none"}</b></span>`} <span>${titleOf(run, one.category)}</span> ${one.layout && html`<span>${one.layout}</span>`}
     ${one.distance != null && html`<span>${(100 * one.distance).toFixed(1)} cm from the correct picture</span>`}
     ${one.ending && html`<span>ended by ${ENDINGS[one.ending] ?? one.ending}</span>`}
     ${rules.map(([rule, outcome]) => html`<span class="soft" title=${run.rules[rule]}>${rule}: ${OUTCOMES[outcome] ?? outcome}</span>`)}

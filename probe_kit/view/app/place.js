@@ -1,7 +1,7 @@
 // What is shown stands in the address, and nowhere else. Unknown values fall back and never throw.
 "use strict";
 const { h, html, render, useState, useEffect, useMemo, useRef, useLayoutEffect } = htmPreact;
-const VIEWS = { overview: "Overview", map: "Layer × iteration", episodes: "Episodes", compare: "Compare", questions: "Questions" };
+const VIEWS = { overview: "Overview", map: "Layer × iteration", episodes: "Episodes", compare: "Compare", questions: "Questions", results: "Results" };
 
 function address() {
   const [path, query] = location.hash.replace(/^#\/?/, "").split("?");

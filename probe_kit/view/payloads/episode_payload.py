@@ -1,5 +1,6 @@
 """The payload of one episode: paths, actions, events, outcomes, and log-odds of every site at every inference."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from probe_kit.env.scoring.trajectory import Trajectory
 from probe_kit.errors import RunDamagedError
 from probe_kit.retention.behaviour.vlm_answers import SCORES
 from probe_kit.runs.layout import CAPTURE_ONLY, FRAME_COLUMNS
-from probe_kit.runs.thumbnails import read_sheet
+from probe_kit.runs.thumbnails import thumbnail_key
 from probe_kit.suite.pictures import picture_size
 from probe_kit.view.frozen_probes import toward
 from probe_kit.view.payloads.coding import pack_floats, pack_log_odds
@@ -45,7 +46,7 @@ def episode_payload(viewed: ViewedRun, number: int) -> dict[str, Any]:
     return {
         "number": number,
         "frames": _frames(viewed, number, row),
-        "inferences": _inference_steps(viewed, position),
+        "inferences": viewed.inference_steps(position),
         "log_odds": None if probed is None else pack_log_odds(probed.values),
         "refitted": None if probed is None else _refitted(viewed, row, calls),
         "held_out": probed is None or probed.held_out,
@@ -55,6 +56,7 @@ def episode_payload(viewed: ViewedRun, number: int) -> dict[str, Any]:
         "lost_words": _lost_words(row),
         "instruction_tokens": len(run.instruction_ids(position) or ()),
         "answers": _answers(viewed, row),
+        "inputs": _inputs(viewed, position),
     }
 
 
@@ -68,12 +70,6 @@ def _lost_words(row: dict[str, Any]) -> int:
     """Return the number of words at the end of the instruction that did not reach the network."""
     lost = row.get("lost_words")
     return 0 if lost is None or lost != lost else int(lost)
-
-
-def _inference_steps(viewed: ViewedRun, position: int) -> list[int]:
-    """The control step of every inference of an episode."""
-    steps = viewed.run.control_steps[position]
-    return [int(step) for step in steps[steps >= 0]]
 
 
 def _refitted(viewed: ViewedRun, row: dict[str, Any], calls: int) -> Any:
@@ -92,10 +88,13 @@ def _refitted(viewed: ViewedRun, row: dict[str, Any], calls: int) -> Any:
 
 
 def _frames(viewed: ViewedRun, number: int, row: dict[str, Any]) -> dict[str, Any] | None:
-    """Return the division of the episode's picture: `count` frames of one size in `columns`; None without one."""
-    sheet = read_sheet(viewed.run.location, number)
+    """Return the division of the episode's picture: `count` frames of one size in `columns`; None without one.
+
+    steps: of the frames, where there is one for each inference."""
+    sheet = viewed.sheet(number)
     if sheet is None:
         return None
+    stored = viewed.run.location.exists(thumbnail_key(number))
     count = sheet.count or (1 if viewed.answers or row["outcome"] == CAPTURE_ONLY else 2)
     columns = min(count, FRAME_COLUMNS)
     size = picture_size(sheet.content)
@@ -103,7 +102,42 @@ def _frames(viewed: ViewedRun, number: int, row: dict[str, Any]) -> dict[str, An
         raise RunDamagedError(f"the picture of episode {number} in {viewed.run.location} cannot be decoded")
     width, height = size
     cell = {"width": width // columns, "height": height // -(-count // columns)}
-    return {"count": count, "columns": columns, **cell, "all": sheet.count is not None}
+    steps = None if stored else viewed.inference_steps(viewed.position_of[number])
+    return {"count": count, "columns": columns, **cell, "all": sheet.count is not None, "steps": steps}
+
+
+def _inputs(viewed: ViewedRun, position: int) -> list[dict[str, Any]]:
+    """Return what the inferences of an episode got and gave, by group and number: lines packed (K,)."""
+    inputs = viewed.run.inputs
+    if inputs is None:
+        return []
+    count = len(viewed.inference_steps(position))
+    rows = {kind: inputs.row(kind, position)[:count] for kind in inputs.kinds if kind != "pixels"}
+    # Of a chunk of actions the first one is shown.
+    first = {name: rows[name][:, 0] for name in ("action", "prediction") if name in rows}
+    words = {"action": "recorded" if viewed.run.recorded else "action", "prediction": "predicted"}
+    groups = [("actions", {words[name]: values for name, values in first.items()}, inputs.names.get("action", ()))]
+    if "state" in rows:
+        groups.append(("state", {"state": rows["state"]}, inputs.names.get("state", ())))
+    if "columns" in rows:
+        groups.append(("columns", {"value": rows["columns"]}, inputs.columns))
+    return [{"title": title, "series": _series(lines, names)} for title, lines, names in groups if lines and count]
+
+
+def _series(lines: dict[str, NDArray[Any]], names: Sequence[str]) -> list[dict[str, Any]]:
+    """Return a chart per number. lines: (K, D) by name. names: of the numbers, if they have any."""
+    width = max(values.shape[1] for values in lines.values())
+    return [
+        {
+            "name": names[number] if number < len(names) else str(number),
+            "lines": [
+                {"name": name, "values": pack_floats(values[:, number])}
+                for name, values in lines.items()
+                if number < values.shape[1]
+            ],
+        }
+        for number in range(width)
+    ]
 
 
 def _trajectory(trajectory: Trajectory) -> dict[str, Any]:

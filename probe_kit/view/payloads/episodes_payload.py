@@ -34,7 +34,7 @@ def episodes_payload(viewed: ViewedRun) -> dict[str, Any]:
     else 0; None without any. `seeds`: equal where scene and policy seed are equal, by which runs are paired.
     """
     episodes = viewed.run.episodes
-    none = [None] * len(episodes)
+    none, zeros = [None] * len(episodes), [0] * len(episodes)
     return {
         "number": [int(number) for number in episodes["episode"]],
         "id": [str(name) for name in episodes["episode_id"]],
@@ -47,7 +47,7 @@ def episodes_payload(viewed: ViewedRun) -> dict[str, Any]:
         "distance": [rounded(value, 3) for value in episodes.get("distance_correct", none)],
         "seeds": [
             sha256_json([int(scene), int(policy)])[:_SHORT]
-            for scene, policy in zip(episodes["scene_seed"], episodes["policy_seed"], strict=True)
+            for scene, policy in zip(episodes.get("scene_seed", zeros), episodes["policy_seed"], strict=True)
         ],
         "first_frame": [None if value is None else str(value)[:_SHORT] for value in _first_frames(viewed)],
         "swap": _swap_responses(viewed),
@@ -56,7 +56,7 @@ def episodes_payload(viewed: ViewedRun) -> dict[str, Any]:
 
 
 def _swap_responses(viewed: ViewedRun) -> list[int | None]:
-    responses = swap_responses_by_episode(viewed.run)
+    responses = swap_responses_by_episode(viewed.run) if viewed.has_sides else {}
     return [responses.get(str(name)) for name in viewed.run.episodes["episode_id"]]
 
 

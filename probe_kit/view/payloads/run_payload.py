@@ -24,6 +24,9 @@ from probe_kit.suite.categories import category_of
 from probe_kit.view.payloads.coding import rounded
 from probe_kit.view.viewed_run import ViewedRun
 
+SCENE_VIEWS = ("overview", "map", "episodes", "compare", "questions", "results")
+OTHER_VIEWS = ("overview", "map", "episodes")
+"""Views of a run of the scene, and of one without sides: its overview holds the results."""
 _PROBED = (BACKBONE, BACKBONE_VERDICT, ACTION, ACTION_VERDICT, RETENTION)
 
 
@@ -43,6 +46,12 @@ def run_payload(viewed: ViewedRun, page_runs: Sequence[ViewedRun] = ()) -> dict[
         "committed": len(run.episodes),
         "failed": len(run.failed),
         "answers": viewed.answers,
+        "sides": viewed.has_sides,
+        "views": list(SCENE_VIEWS if viewed.has_sides else OTHER_VIEWS),
+        "targets": [
+            {"target": results.settings.target, "category": category}
+            for results, category in (viewed.target_curves if len(run.episodes) else ())
+        ],
         "captured_calls": run.captured_calls,
         "probes": None if results is None else results.key,
         "probes_of": viewed.lender.run.label if viewed.lender is not None and viewed.is_lent else None,
@@ -68,7 +77,7 @@ def run_payload(viewed: ViewedRun, page_runs: Sequence[ViewedRun] = ()) -> dict[
             "device": certificate.get("device"),
         },
         "table": _table(viewed, [other for other in page_runs if other.answers and other.run.suite == run.suite]),
-        "notes": [note for note in viewed.table.notes if len(run.episodes)],
+        "notes": list(viewed.table.notes) if len(run.episodes) and viewed.has_sides else [],
         "settings": {name: str(value) for name, value in flat_settings(run.settings).items()},
         "stamp": run.stamp,
     }
@@ -76,7 +85,7 @@ def run_payload(viewed: ViewedRun, page_runs: Sequence[ViewedRun] = ()) -> dict[
 
 def best_places(viewed: ViewedRun, category: str) -> dict[str, Any]:
     """Return by part the index of the best site among all, and whether it has signal; None without probes."""
-    row = viewed.probed_rows.get(category)
+    row = viewed.probed_rows.get(category) if viewed.has_sides else None
     if row is None or viewed.curve(category) is None:
         return {"backbone": None, "action": None}
     names = [str(site) for site in viewed.sites]
@@ -95,7 +104,7 @@ def _scene(scene: Mapping[str, Any] | None) -> dict[str, Any] | None:
 
 def _table(viewed: ViewedRun, vlm_runs: Sequence[ViewedRun]) -> dict[str, Any]:
     """Headings, a row per category and their mean, as the retention table spells them."""
-    rows = [*viewed.rows.values(), viewed.mean] if len(viewed.run.episodes) else []
+    rows = [*viewed.rows.values(), viewed.mean] if len(viewed.run.episodes) and viewed.has_sides else []
     columns: tuple[Column, ...] = (ACCURACY if viewed.answers else SR,)
     if any(row.backbone.site or row.action.site for row in rows):
         columns += _PROBED

@@ -60,6 +60,44 @@ def site_map_payload(viewed: ViewedRun, category: str) -> dict[str, Any]:
     }
 
 
+def target_map_payload(viewed: ViewedRun, number: int) -> dict[str, Any]:
+    """Return the scores by site of a target that was probed. Raises KeyError for a number without one."""
+    if number >= len(viewed.target_curves):
+        raise KeyError(number)
+    results, category = viewed.target_curves[number]
+    view = results.settings.views[0]
+    scores = _scores(results, category, view)
+    metric = str(scores["metric"].iloc[0])
+    return {
+        "target": results.settings.target,
+        "category": category,
+        "view": view,
+        "metric": metric,
+        "n": int(scores["n"].iloc[0]),
+        "groups": int(scores["groups"].iloc[0]),
+        "sites": [
+            {"name": str(site), "stream": site.stream, "layer": site.layer, "iteration": site.iteration}
+            for site in results.curves[category, view].sites
+        ],
+        "headings": (f"{metric} [95 %]", "chance", "p of this site", "p, family-wise", "verdict"),
+        "cells": [_target_cells(row) for row in scores.to_dict("records")],
+        "score": [rounded(value) for value in scores["score"]],
+        "chance": [rounded(value) for value in scores["chance"]],
+        "signal": [bool(value) for value in scores["signal"]],
+    }
+
+
+def _target_cells(row: Mapping[Hashable, Any]) -> list[str]:
+    limits = _or_none(row["ci_low"]), _or_none(row["ci_high"])
+    return [
+        with_limits(_or_none(row["score"]), limits, "{:.2f}".format),
+        "–" if row["chance"] != row["chance"] else f"{row['chance']:.2f}",
+        p_text(_or_none(row["p"])),
+        p_text(_or_none(row["p_fwe"])),
+        "signal" if row["signal"] else "no signal shown",
+    ]
+
+
 def _first_log_odds(viewed: ViewedRun, category: str) -> tuple[list[int], Values]:
     """Rows of the E episodes that the probes of a category read, and (S, E) log-odds."""
     probes = viewed.probes[category]
