@@ -281,6 +281,7 @@ NOT_TYPED = {
     r"kitchen|runs/own": "needs a LeRobotDataset or an environment; tests/extract/recordings and "
         "tests/extract/own_environments have some",
     r"lerobot:libero": "needs a simulator",
+    r"--pictures photos": "of a reader's own pictures; tests/extract/test_pictures.py has some",
     r"suite convert act2answer --root": "of files that this repository may not pass on",
 }  # fmt: skip
 """Patterns of lines that are not typed, after the stand-ins, and why."""
