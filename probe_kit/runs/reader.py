@@ -1,4 +1,4 @@
-"""The protocol of a run: what probes, tables and interventions read of it, whoever stored it."""
+"""The protocol of a run: what probes, tables and interventions read of it, in memory or stored."""
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
