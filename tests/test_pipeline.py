@@ -54,5 +54,5 @@ def test_a_planted_answer_is_found_exactly_where_it_lies(planted_run: Run) -> No
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*is not sealed")
 def test_with_shuffled_labels_nothing_is_significant(planted_run: Run) -> None:
-    results = train_probes(planted_run, ["color"], permutations=20, target="shuffled", controls=(), jobs=1)
+    results = train_probes(planted_run, ["color"], permutations=20, target="side.shuffled", controls=(), jobs=1)
     assert (results.scores["p_fwe"] >= 0.05).all()

@@ -18,6 +18,7 @@ from probe_kit.study.mistakes import Mistake, Place, each_unknown
 from probe_kit.study.planned_suite import PlannedSuite, slug, slugs
 from probe_kit.study.schema import BlockTable, ModelTable, ProbesTable, Study, TableKind, TableTable
 from probe_kit.suite.categories import check_slug
+from probe_kit.train.choices import CORRECT
 
 FEWEST_ITEMS = 10
 """Items of a category that five folds need, where every group is a pair of counterparts."""
@@ -402,7 +403,7 @@ def _other_view(study: Study, runs: list[Member], view: str, side: str, path: Pl
         text = f"{side!r} is asked by block {block.name!r} with tokens none, which leaves nothing to compare"
         yield Mistake((*path, "pairs"), text)
     blocks = {member.block.name for member in runs}
-    fitted = [table for table in study.probes.values() if table.target == "correct" and blocks & set(table.runs)]
+    fitted = [table for table in study.probes.values() if table.target == CORRECT and blocks & set(table.runs)]
     if fitted and not any(view in table.views for table in fitted):
         views = dict.fromkeys(member for table in fitted for member in table.views)
         text = f"the view {view!r} of {side!r} is not probed; its probes have {', '.join(views)}"

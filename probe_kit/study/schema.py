@@ -12,8 +12,8 @@ from probe_kit.extract.vqa.phrases import Picture, Query
 from probe_kit.hooks.contract.protocol import ProtocolName
 from probe_kit.runs.layout import AskTokens, LaterViews
 from probe_kit.scene_names import SceneName
+from probe_kit.train.choices import CORRECT, Side
 from probe_kit.train.choices import Control as FeatureControl
-from probe_kit.train.choices import Side
 
 SCHEMA_VERSION = 1
 
@@ -167,7 +167,7 @@ class ProbesTable(_Table):
     views: Names = ["mean"]
     permutations: Annotated[int, Field(ge=0, le=100_000)] = 200
     controls: Annotated[list[Control], AfterValidator(_each_once)] = []
-    target: Side = "correct"
+    target: Side = CORRECT
     seed: Seed = 0
 
 

@@ -20,6 +20,7 @@ from probe_kit.study.failures import Failures
 from probe_kit.study.matching import check_run_of_cell, check_same_items, check_same_weights
 from probe_kit.study.reading import LoadedStudy, load_study, shipped_studies
 from probe_kit.study.schema import ProbesTable
+from probe_kit.train.choices import CORRECT
 from probe_kit.train.probe_sweep import probe_settings
 from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.train.results.store import is_stored, load_results, read_probes, settings_of
@@ -195,7 +196,7 @@ def _probe_key(study: LoadedStudy, stored: StoredRun, run: "Run", partial: bool)
     tables = {
         name: table
         for name, table in study.study.probes.items()
-        if table.target == "correct" and of_blocks(table.runs)(stored.cell) is not None
+        if table.target == CORRECT and of_blocks(table.runs)(stored.cell) is not None
     }
     if not tables or not run.streams:
         return ""

@@ -2,15 +2,17 @@
 
 from typing import Literal
 
-Side = Literal["correct", "chosen", "shuffled"]
+Side = Literal["side.correct", "side.chosen", "side.shuffled"]
 Incomplete = Literal["keep", "drop"]
 Control = Literal["position", "step", "state", "action", "instruction", "random-features", "pixels"]
 Task = Literal["binary", "classes", "continuous"]
 
+CORRECT: Side = "side.correct"
+"""The target of probes unless another is named."""
 SIDES: dict[str, str] = {
-    "correct": "side of the correct picture",
-    "chosen": "side on which the cube was placed; episodes outside both zones are left out",
-    "shuffled": "control: side of the correct picture, flipped for a random half of the items",
+    CORRECT: "side of the correct picture",
+    "side.chosen": "side on which the cube was placed; episodes outside both zones are left out",
+    "side.shuffled": "control: side of the correct picture, flipped for a random half of the items",
 }
 """Targets that are sides of a picture."""
 INCOMPLETE: dict[str, str] = {

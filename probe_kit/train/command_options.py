@@ -39,9 +39,9 @@ ProbeTarget = Annotated[
     typer.Option(
         "--target",
         metavar="NAME",
-        help="Label to decode. correct: side of the correct picture. chosen: side where the cube was placed. "
-        "shuffled: correct side, flipped for half of the items. Or a column of --labels, or a built-in column "
-        "such as sim.tool_y or item.named; `probe-kit targets RUN` lists them.",
+        help="Label to decode. side.correct: side of the correct picture. side.chosen: side where the cube was "
+        "placed. side.shuffled: correct side, flipped for half of the items. Or a column of --labels, or a "
+        "built-in column such as sim.tool_y or item.named; `probe-kit targets RUN` lists them.",
     ),
 ]
 Calls = Annotated[

@@ -11,6 +11,7 @@ from probe_kit._terminal import options as common
 from probe_kit._terminal.console import counter, marked, out, progress, say, split
 from probe_kit.errors import TooFewGroupsError, UnbalancedEpisodesError, UsageError
 from probe_kit.train import command_options as own
+from probe_kit.train.choices import CORRECT
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -25,7 +26,7 @@ def train(
     run: common.RunFolder,
     categories: own.Categories = None,
     views: own.Views = own.MEAN,
-    target: own.ProbeTarget = "correct",
+    target: own.ProbeTarget = CORRECT,
     labels: own.LabelFile = None,
     task: own.LabelTask = None,
     group_by: own.GroupBy = None,

@@ -11,7 +11,7 @@ from probe_kit.errors import NoProbesError, RunIncompleteError, UnknownCategoryE
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.statistics.folds import FoldUnit
-from probe_kit.train.choices import Incomplete
+from probe_kit.train.choices import CORRECT, Incomplete
 from probe_kit.train.controls.fit import add_controls, prepare_controls
 from probe_kit.train.controls.untrained import add_untrained, check_same_source, check_untrained
 from probe_kit.train.crossval.site_probe import SiteProbe
@@ -40,7 +40,7 @@ def train_probes(
     categories: Sequence[str] | None = None,
     views: Sequence[str] = ("mean",),
     *,
-    target: Target | str = "correct",
+    target: Target | str = CORRECT,
     window: int | None = None,
     align_to: Target | None = None,
     call: int = 0,
@@ -59,12 +59,12 @@ def train_probes(
 ) -> ProbeResults:
     """Probe every site of every stream for `target`, per category and view, and store the results in the run.
 
-    target: a side, such as `correct`, a built-in column, such as `sim.tool_y`, or a `Target` of a table of one's
-    own. categories: each one by itself, by default of a side; `all` pools every episode, by default of every other
-    target. views: pooled ones, and `tokens` or `tokens:ROLE`, where every token is a sample and the decision about
-    a sample the mean of its tokens'. permutations: label permutations behind the p-values, of which token views,
-    many times as dear, take the first `token_permutations`. call: which captured inference, counted from 0, a
-    label of whole episodes is decoded from; episodes that ended before it are left out. window: with a label for
+    target: a side, such as `side.correct`, a built-in column, such as `sim.tool_y`, or a `Target` of a table of
+    one's own. categories: each one by itself, by default of a side; `all` pools every episode, by default of every
+    other target. views: pooled ones, and `tokens` or `tokens:ROLE`, where every token is a sample and the decision
+    about a sample the mean of its tokens'. permutations: label permutations behind the p-values, of which token
+    views, many times as dear, take the first `token_permutations`. call: which captured inference, counted from 0,
+    a label of whole episodes is decoded from; episodes that ended before it are left out. window: with a label for
     every inference, how many of each episode take part; by default as many as 90 % of the episodes reach.
     align_to: where windows begin: at the first inference at which this target is true. folds: `concepts` also
     keeps items about the same two concepts together. incomplete: `drop` leaves out items of which an episode is

@@ -163,7 +163,7 @@ def _side_folds_and_permutations(
     run: RunReader, target: Target, samples: TargetSamples, labels: NDArray[Any], category: str,
     settings: ProbeSettings,
 ) -> Drawn:  # fmt: skip
-    """Groups flip their sides, or exchange the chosen ones; folds are balanced by side, for `chosen` by layout."""
+    """Groups flip sides, or exchange chosen ones; folds are balanced by side, for `side.chosen` by layout."""
     table, groups = run.episodes.iloc[samples.rows], samples.groups
     if settings.call > 0 and groups.size == 0:
         raise TooFewGroupsError(f"category {category!r}: {_reached(0, settings.call)}")
@@ -194,7 +194,7 @@ def _side_folds_and_permutations(
 def _side_folds(
     target: Target, table: "pd.DataFrame", labels: NDArray[np.bool_], groups: NDArray[np.str_], seed: int
 ) -> list[NestedFold]:
-    """Return folds that are balanced by side, for `chosen` by layout.
+    """Return folds that are balanced by side, for `side.chosen` by layout.
 
     Groups exchange their chosen sides, so folds that knew the real ones would make them easier than any exchange.
     Raises TooFewGroupsError as `nested_folds` does, and for a training side with a single class.

@@ -167,7 +167,7 @@ class Target:
     ) -> "Target":
         """Return a side or built-in column of a run, such as `sim.tool_y`; `probe-kit targets RUN` lists them.
 
-        task: the column's own by default. seed: of the target `shuffled`. Raises UsageError for another name, and
+        task: the column's own by default. seed: of the target `side.shuffled`. Raises UsageError for another name,
         for a run that lacks what the column needs; NoTrajectoryError for `sim.*` of a run without trajectories.
         """
         if name in SIDES:
@@ -283,15 +283,15 @@ def _side(
     lines = list(range(1, len(episodes) + 1))
     table = LabelTable(f"the side {name}", "episode", (EPISODE,), {EPISODE: list(episodes)}, lines)
     coded = LabelValues("binary", ("right", "left"), values)
-    null: Null = "exchange_groups" if name == "chosen" else "flip_groups"
+    null: Null = "exchange_groups" if name == "side.chosen" else "flip_groups"
     return Target(name, coded, episodes, None, table, builtin=True, null=null)
 
 
 def side_labels(episodes: "pd.DataFrame", name: str, seed: int) -> NDArray[np.int8]:
     """Return the side of every episode, (E,): 1 left, 0 right, −1 where it is not defined."""
-    sides = episodes["side_placed" if name == "chosen" else "side_correct"]
+    sides = episodes["side_placed" if name == "side.chosen" else "side_correct"]
     labels = np.select([sides == "left", sides == "right"], [np.int8(1), np.int8(0)], np.int8(-1))
-    if name != "shuffled":
+    if name != "side.shuffled":
         return labels
     flipped = flip_items(labels == 1, episodes["item_id"], 1, derive_seed("shuffled target", seed))
     return flipped[:, 0].astype(np.int8)

@@ -120,12 +120,12 @@ def test_a_later_inference_has_probes_of_its_own(trained: Path) -> None:
     assert "7" in refused.text
 
 
-@pytest.mark.parametrize("target", ["chosen", "shuffled"])
+@pytest.mark.parametrize("target", ["side.chosen", "side.shuffled"])
 def test_the_chosen_and_the_shuffled_side_are_targets_too(trained: Path, target: str) -> None:
     run = pk.open_run(trained)
     scores = pk.train_probes(run, target=target, permutations=3, controls=(), views=("mean:language",)).scores
     assert (scores["target"] == target).all()
-    if target == "chosen":
+    if target == "side.chosen":
         assert scores["accuracy"].max() > 0.85
 
 

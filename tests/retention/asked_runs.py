@@ -108,7 +108,7 @@ def probes(
     settings = ProbeSettings(
         model=run.model, random_weights=False, weights=None, suite=run.suite, seed_text=run.suite,
         run_settings=run.settings_sha256,
-        episodes=episodes_sha256(run), categories=tuple(accuracies), views=("mean",), target="correct",
+        episodes=episodes_sha256(run), categories=tuple(accuracies), views=("mean",), target="side.correct",
         permutations=99, seed=0,
     )  # fmt: skip
     return ProbeResults(settings, curves)

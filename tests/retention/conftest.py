@@ -118,7 +118,7 @@ def runs_in(folder: Path) -> Callable[..., ArrayRun]:
             episodes=episodes_sha256(run),
             categories=tuple(accuracies),
             views=("mean",),
-            target="correct",
+            target="side.correct",
             permutations=99,
             seed=0,
         )

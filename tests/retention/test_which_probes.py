@@ -88,7 +88,7 @@ def test_a_run_of_too_few_groups_is_not_sent_to_train_which_refuses_it(probed_ru
 MIXTURES = {
     "permutations": (50, "label permutations 99 (one) against 50 (other)"),
     "seed": (3, "seeds 0 (one) against 3 (other)"),
-    "target": ("chosen", "targets correct (one) against chosen (other)"),
+    "target": ("side.chosen", "targets side.correct (one) against side.chosen (other)"),
 }
 
 

@@ -77,7 +77,7 @@ def planted_run(tmp_path: Path) -> PlantedRun:
 
 
 def problem_of(
-    run: ArrayRun | pd.DataFrame, category: str = "color", target: Target | str = "correct", **options: Any
+    run: ArrayRun | pd.DataFrame, category: str = "color", target: Target | str = "side.correct", **options: Any
 ) -> Problem:
     """Return the problem of a category that `train_probes` would probe; of a table the features are zeros."""
     if isinstance(run, pd.DataFrame):

@@ -34,9 +34,9 @@ def test_the_curve_peaks_exactly_where_the_answer_was_planted(planted_run: Plant
 
 @pytest.mark.slow
 def test_nothing_is_significant_with_shuffled_labels(planted_run: PlantedRun) -> None:
-    scores = train_probes(planted_run({PLANTED: 2.0}), permutations=60, target="shuffled").scores
+    scores = train_probes(planted_run({PLANTED: 2.0}), permutations=60, target="side.shuffled").scores
     assert (scores["p_fwe"] > 0.05).all()
-    assert (scores["target"] == "shuffled").all()
+    assert (scores["target"] == "side.shuffled").all()
 
 
 def test_every_site_has_a_complete_row(planted_run: PlantedRun) -> None:
@@ -54,7 +54,7 @@ def test_every_site_has_a_complete_row(planted_run: PlantedRun) -> None:
 
 def test_chosen_leaves_out_episodes_placed_nowhere(planted_run: PlantedRun) -> None:
     run = planted_run()
-    results = train_probes(run, permutations=10, target="chosen")
+    results = train_probes(run, permutations=10, target="side.chosen")
     curve = results.curves["color", "mean"]
     in_zone = run.episodes[run.episodes["side_placed"] != "none"]
     assert curve.episodes.tolist() == in_zone["episode_id"].tolist()
@@ -65,7 +65,7 @@ def test_chosen_leaves_out_episodes_placed_nowhere(planted_run: PlantedRun) -> N
 
 def test_scores_are_balanced_between_the_sides(planted_run: PlantedRun) -> None:
     """Where one side has more episodes, naming it is worth nothing."""
-    results = train_probes(planted_run({PLANTED: 2.0}), permutations=0, target="chosen")
+    results = train_probes(planted_run({PLANTED: 2.0}), permutations=0, target="side.chosen")
     curve = results.curves["color", "mean"]
     left = curve.labels
     for row in range(len(curve.sites)):

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from probe_kit.train.choices import SIDES
+from probe_kit.train.choices import CORRECT, SIDES
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.train.settings import ProbeSettings
@@ -54,7 +54,7 @@ def mixed_settings(results: Mapping[str, ProbeResults], views: Sequence[str] | N
         if len(runs) > 1:
             parts = (f"{setting} ({', '.join(names)})" for setting, names in runs.items())
             differences.append(f"{name} {' against '.join(parts)}")
-    labels = {probes.settings.target for probes in results.values()} - {"correct"}
+    labels = {probes.settings.target for probes in results.values()} - {CORRECT}
     notes = [f"Probes were asked for the target {label!r}: {SIDES[label]}." for label in sorted(labels)]
     calls = {probes.settings.call for probes in results.values()} - {0}
     notes += [f"Probes are of captured inference {call}, counted from 0." for call in sorted(calls)]

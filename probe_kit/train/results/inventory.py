@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from probe_kit.runs.results import Bundle
+from probe_kit.train.choices import CORRECT
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.control_scores import UNTRAINED
 from probe_kit.train.results.resume import unfinished_sweeps
@@ -97,7 +98,7 @@ def _in_wordings(run: Any) -> list[Any]:
 def stored_probes(run: Any) -> list[StoredProbes]:
     """Return every set of probe results of a run, oldest first."""
     readers, bundles = _in_wordings(run), read_probes(run.location)
-    newest = (newest_bundle(reader, bundles, "correct") for reader in readers)
+    newest = (newest_bundle(reader, bundles, CORRECT) for reader in readers)
     used = {bundle.key for bundle in newest if bundle is not None}
     probes = [_probes(readers, bundle, used) for bundle in bundles.values()]
     return sorted(probes, key=lambda stored: (stored.created, stored.key))

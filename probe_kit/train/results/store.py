@@ -32,7 +32,7 @@ from probe_kit.runs.results import (
 )
 from probe_kit.runs.store import Location, locate
 from probe_kit.statistics.sufficiency import GROUPS_FOR_PROBES
-from probe_kit.train.choices import SIDES
+from probe_kit.train.choices import CORRECT, SIDES
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.control_scores import Controls
 from probe_kit.train.results.probe_curve import ProbeCurve
@@ -121,7 +121,7 @@ def load_results(run: RunReader, key: str | None = None, target: str | None = No
                 f"--target {probed}, or leave it out"
             )
         return _read(run, bundle)
-    target, stored = target or "correct", read_probes(location)
+    target, stored = target or CORRECT, read_probes(location)
     newest = newest_bundle(run, stored, target)
     if newest is None:
         raise NoProbesError(_why_none(run, target, len(stored)))

@@ -19,9 +19,9 @@ _LEGEND = "+: as many other sites tie with it. The score of a chosen site is too
 _OF_SIDE = "; `retention` corrects it"
 _OF_LABEL = ". Chance: mean score of this site with exchanged labels"
 _SIDES = {
-    "correct": "the side of the correct picture",
-    "chosen": "the chosen side",
-    "shuffled": "the shuffled side",
+    "side.correct": "the side of the correct picture",
+    "side.chosen": "the chosen side",
+    "side.shuffled": "the shuffled side",
 }
 
 

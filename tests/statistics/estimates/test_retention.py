@@ -21,12 +21,12 @@ def scores(expert: float, backbone: float, error: float = 0.03, df: float = 30) 
     return Scores(np.array([expert, backbone]), np.diag([error**2, error**2]), df)
 
 
-def test_the_limits_solve_fiellers_equation() -> None:
+def test_the_limits_solve_fiellers_equation_with_errors_a_tenth_larger() -> None:
     found = Scores(np.array([0.12, 0.3]), np.array([[0.0010, 0.0003], [0.0003, 0.0012]]), 30)
     interval = retention(found).interval
     for ratio in (interval.low, interval.high):
         by = np.array([1, -ratio])
-        assert (by @ found.above) ** 2 == pytest.approx(t.ppf(0.975, 30) ** 2 * by @ found.covariance @ by)
+        assert (by @ found.above) ** 2 == pytest.approx((1.1 * t.ppf(0.975, 30)) ** 2 * by @ found.covariance @ by)
     assert interval.low < 0.4 < interval.high
 
 
@@ -40,7 +40,7 @@ def test_twelve_perfect_groups_leave_as_much_open_as_unseen_groups_may_hold() ->
     perfect = stream_of(GroupSums(np.full((5, 12), 4.0), np.full(12, 4.0)), np.arange(5))
     found = retention(Scores.of(fitted(perfect, perfect)))
     assert found.value == 1
-    assert 0.6 < found.interval.high - found.interval.low < 0.75
+    assert 0.6 < found.interval.high - found.interval.low < 0.8
 
 
 def test_a_backbone_that_is_hardly_known_gives_no_limits() -> None:

@@ -68,7 +68,7 @@ def test_so_few_groups_that_nothing_can_be_significant_are_said(planted_run: Pla
 
 
 def test_permutation_the_chosen_side_keeps_its_share(planted_run: PlantedRun) -> None:
-    problem = problem_of(planted_run().episodes, target="chosen")
+    problem = problem_of(planted_run().episodes, target="side.chosen")
     assert problem.labels.size < 80
     np.testing.assert_array_equal(problem.permuted_labels.mean(axis=0), problem.labels.mean())
 
@@ -99,8 +99,8 @@ def test_missing_episodes_move_chance_and_say_so(planted_run: PlantedRun) -> Non
 
 
 def test_too_few_groups_name_category_and_target(planted_run: PlantedRun) -> None:
-    with pytest.raises(TooFewGroupsError, match=r"category 'color', target 'chosen': \d independent groups"):
-        problem_of(planted_run(n_items=6), target="chosen")
+    with pytest.raises(TooFewGroupsError, match=r"category 'color', target 'side.chosen': \d independent groups"):
+        problem_of(planted_run(n_items=6), target="side.chosen")
 
 
 def test_folds_of_the_chosen_side_do_not_know_which_side_was_chosen(planted_run: PlantedRun) -> None:
@@ -109,7 +109,7 @@ def test_folds_of_the_chosen_side_do_not_know_which_side_was_chosen(planted_run:
     placed = {"left": "right", "right": "left", "none": "none"}
     some = exchanged["group_id"].isin(sorted(set(exchanged["group_id"]))[:7])
     exchanged.loc[some, "side_placed"] = exchanged.loc[some, "side_placed"].map(placed)
-    folds = [problem_of(table, target="chosen").folds for table in (episodes, exchanged)]
+    folds = [problem_of(table, target="side.chosen").folds for table in (episodes, exchanged)]
     for here, there in zip(*folds, strict=True):
         for one, other in zip((here.outer, *here.inner), (there.outer, *there.inner), strict=True):
             np.testing.assert_array_equal(one.test, other.test)
@@ -121,4 +121,4 @@ def test_folds_of_the_chosen_side_are_refused_where_a_training_side_holds_one_si
     episodes = planted_run().episodes.assign(side_placed="left")
     episodes.loc[episodes["group_id"] == episodes["group_id"].iloc[0], "side_placed"] = "right"
     with pytest.raises(TooFewGroupsError, match="chose the left side, and a training fold holds one side"):
-        problem_of(episodes, target="chosen")
+        problem_of(episodes, target="side.chosen")

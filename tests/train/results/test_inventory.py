@@ -11,12 +11,12 @@ def test_a_run_lists_its_probes_oldest_first_and_which_are_used(planted_run: Pla
     run = planted_run({Site("backbone", 1): 1.0})
     assert inventory(run).probes == ()
     first = train_probes(run, permutations=1, controls=("position",))
-    second = train_probes(run, permutations=2, target="shuffled", seed=7)
+    second = train_probes(run, permutations=2, target="side.shuffled", seed=7)
     found = inventory(run)
     assert [(probes.key, probes.state) for probes in found.probes] == [(first.key, "used"), (second.key, "other")]
     assert [(probes.target, probes.seed, probes.controls) for probes in found.probes] == [
-        ("correct", 0, ("position",)),
-        ("shuffled", 7, ()),
+        ("side.correct", 0, ("position",)),
+        ("side.shuffled", 7, ()),
     ]
     assert (found.episodes, found.planned, sum(found.outcomes.values())) == (80, 80, 80)
     assert found.streams["expert"] == "2 layers × 2 iterations, width 8; views mean"

@@ -9,7 +9,7 @@ from probe_kit.train import ArrayRun, ProbeResults, ProbeSettings, train_probes
 
 PlantedRun = Callable[..., ArrayRun]
 SETTINGS = ProbeSettings(
-    "m", False, None, "s@1#0", "s@1#0", "0", "0", ("color",), ("mean",), "correct", permutations=9, seed=0
+    "m", False, None, "s@1#0", "s@1#0", "0", "0", ("color",), ("mean",), "side.correct", permutations=9, seed=0
 )
 
 

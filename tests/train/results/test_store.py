@@ -85,9 +85,9 @@ def test_the_newest_results_for_the_target_are_loaded(planted_run: PlantedRun) -
     run = planted_run()
     train_probes(run, permutations=1)
     newest = train_probes(run, permutations=2)
-    control = train_probes(run, permutations=1, target="shuffled")
+    control = train_probes(run, permutations=1, target="side.shuffled")
     assert load_results(run).key == newest.key
-    assert load_results(run, target="shuffled").key == control.key
+    assert load_results(run, target="side.shuffled").key == control.key
 
 
 def test_results_of_fewer_episodes_are_not_taken_for_current(planted_run: PlantedRun) -> None:

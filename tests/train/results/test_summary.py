@@ -33,7 +33,7 @@ def curve(lower: float = 0.0) -> ProbeCurve:
 @pytest.fixture
 def results() -> ProbeResults:
     settings = ProbeSettings(
-        "m", False, None, "s@1#0", "s@1#0", "0", "0", ("color",), ("mean",), "correct", permutations=9, seed=0
+        "m", False, None, "s@1#0", "s@1#0", "0", "0", ("color",), ("mean",), "side.correct", permutations=9, seed=0
     )
     return ProbeResults(settings, {("color", "mean"): curve()})
 

@@ -89,16 +89,16 @@ def test_ridge_on_tokens_is_ridge_of_scikit_learn_on_every_token(run: ArrayRun) 
         np.testing.assert_allclose(curve.decisions[1, fold.test], expected, atol=1e-4)
 
 
-@pytest.mark.parametrize("target", ["correct", "label"])
+@pytest.mark.parametrize("target", ["side.correct", "label"])
 def test_categories_are_probed_one_by_one_or_pooled(run: ArrayRun, target: str) -> None:
-    of = "correct" if target == "correct" else target_of(run, "continuous")
+    of = "side.correct" if target == "side.correct" else target_of(run, "continuous")
     each = train_probes(run, ("shape", "color"), target=of, **QUICK)
     assert list(dict.fromkeys(each.scores["category"])) == ["shape", "color"]
     assert (each.scores["n"] == 2 * ITEMS).all()
     pooled = train_probes(run, ("all",), target=of, **QUICK)
     assert (pooled.scores["n"] == 4 * ITEMS).all()
     default = train_probes(run, target=of, **QUICK)
-    assert set(default.settings.categories) == ({"color", "shape"} if target == "correct" else {"all"})
+    assert set(default.settings.categories) == ({"color", "shape"} if target == "side.correct" else {"all"})
 
 
 def test_a_class_that_only_another_category_has_does_not_count(run: ArrayRun) -> None:
@@ -110,9 +110,9 @@ def test_a_class_that_only_another_category_has_does_not_count(run: ArrayRun) ->
     assert each.curves["shape", "mean"].classes == ("shape0", "shape1")
 
 
-@pytest.mark.parametrize("target", ["correct", "label"])
+@pytest.mark.parametrize("target", ["side.correct", "label"])
 def test_an_interrupted_sweep_continues_after_the_last_finished_site(run: ArrayRun, target: str) -> None:
-    of = "correct" if target == "correct" else target_of(run, "continuous")
+    of = "side.correct" if target == "side.correct" else target_of(run, "continuous")
 
     def stop(*_: object) -> None:
         raise KeyboardInterrupt
@@ -127,13 +127,13 @@ def test_an_interrupted_sweep_continues_after_the_last_finished_site(run: ArrayR
     assert (results.key, done) == (key, [2])
 
 
-@pytest.mark.parametrize("target", ["correct", "label"])
+@pytest.mark.parametrize("target", ["side.correct", "label"])
 def test_incomplete_items_can_be_dropped_for_every_target(run: ArrayRun, target: str) -> None:
     keep = np.ones(len(run.episodes), bool)
     keep[:6:2] = False
     features = {place: array[keep] for place, array in run.features.items()}
     some = ArrayRun(run.path, "m", "s@1#0", run.episodes[keep].reset_index(drop=True), features)
-    of = "correct" if target == "correct" else target_of(some, "continuous")
+    of = "side.correct" if target == "side.correct" else target_of(some, "continuous")
     results = train_probes(some, ("all",), target=of, incomplete="drop", **QUICK)
     assert results.left_out == {"episodes of items without their other layout": 3}
     assert (results.scores["n"] == len(run.episodes) - 6).all()
@@ -153,7 +153,7 @@ def test_a_side_and_a_label_transfer_by_the_same_call(tmp_path: Path, run: Array
         across_weights=True,
     )
     assert label.scores.set_index("layer").loc[1, "score"] > 0.5
-    side = transfer_probes(run, other, "correct", permutations=19, across_weights=True)
+    side = transfer_probes(run, other, "side.correct", permutations=19, across_weights=True)
     assert (side.task, side.classes, side.left_out) == ("binary", ("right", "left"), {})
 
 
@@ -161,10 +161,10 @@ def test_options_that_a_target_does_not_have_are_refused_with_the_reason(run: Ar
     label = target_of(run, "continuous")
     with pytest.raises(UsageError, match="a device solves logistic probes"):
         train_probes(run, target=label, device="cpu")
-    with pytest.raises(UsageError, match="window=2 with the side 'correct'; it needs labels of single inferences"):
+    with pytest.raises(UsageError, match=r"window=2 with the side 'side\.correct'; it needs labels of single"):
         train_probes(run, window=2)
     with pytest.raises(UsageError, match="a side is binary and its groups are the run's"):
-        Target.of_run(run, "correct", group_by="layout")
+        Target.of_run(run, "side.correct", group_by="layout")
     with pytest.raises(UnknownSiteError, match="store no directions"):
         train_probes(run, target=label, **QUICK).direction("all", "mean", SITES[0])
 
@@ -193,8 +193,8 @@ def test_the_command_lists_every_target_with_its_values_or_the_reason_why_not(st
     done = CliRunner().invoke(app, ["targets", str(stored.path)], env={"COLUMNS": "250"})
     assert done.exit_code == 0, done.output
     lines = {line.split("│")[1].strip(): line for line in done.stdout.splitlines() if line.startswith("│")}
-    assert {"correct", "chosen", "sim.tool_y", "item.category"} <= set(lines)
+    assert {"side.correct", "side.chosen", "sim.tool_y", "item.category"} <= set(lines)
     counts = stored.episodes["side_correct"].value_counts()
-    assert f"2 classes: right {counts['right']}, left {counts['left']}" in lines["correct"]
+    assert f"2 classes: right {counts['right']}, left {counts['left']}" in lines["side.correct"]
     assert "continuous" in lines["sim.tool_y"]
     assert "numbers from" in lines["sim.tool_y"]

@@ -95,8 +95,8 @@ def test_probes_of_sides_keep_key_and_bytes_and_neither_kind_reads_the_other(run
     assert load_results(run).key == sides.key
     assert load_results(run, target="sim.tool_y").key == label.key
     assert load_results(run, label.key).settings.task == "continuous"
-    with pytest.raises(UsageError, match=r"are of 'sim\.tool_y', not of 'correct'"):
-        load_results(run, label.key, "correct")
+    with pytest.raises(UsageError, match=r"are of 'sim\.tool_y', not of 'side.correct'"):
+        load_results(run, label.key, "side.correct")
     with pytest.raises(NoProbesError, match=r"no probes for target 'other'.*--target other"):
         load_results(run, target="other")
 
@@ -185,7 +185,7 @@ def test_too_few_groups_rare_classes_and_unknown_options_are_refused_before_any_
         train_probes(run, target=labels, controls=("step",))
     with pytest.raises(UnknownCategoryError):
         train_probes(run, ("texture",), target=labels)
-    with pytest.raises(UsageError, match="window=2 with the side 'correct'"):
+    with pytest.raises(UsageError, match=r"window=2 with the side 'side\.correct'"):
         train_probes(run, window=2)
     with pytest.raises(UsageError, match=r"device 'cpu' with .* ridge is solved by numpy"):
         train_probes(run, target=labels, device="cpu")
@@ -211,7 +211,9 @@ def test_the_command_prints_one_table_and_a_sentence(run: Run, tmp_path: Path) -
         app, ["train", str(run.location), "--labels", str(file), "--target", "y", *options], env={"COLUMNS": "100"}
     )
     assert done.exit_code == 0, done.stderr
-    assert "y not shown in the backbone and the action expert beyond chance" in " ".join(done.stdout.split())
+    assert "y not testable in the backbone and the action expert: train with --permutations" in " ".join(
+        done.stdout.split()
+    )
     assert f"y (continuous), {len(run.episodes)} numbers" in done.stdout
     assert "control instruction" in done.stdout
     assert done.stdout.splitlines()[0] == Target.read(file, "y").contents
@@ -236,7 +238,7 @@ def test_the_command_prints_the_classes_once_with_their_counts(run: Run, tmp_pat
     ("options", "expected"),
     [
         (["--target", "y"], "nor a built-in column (sim.tool_x"),
-        (["--target", "chosen", "--labels", "own.csv"], "--target chosen is a side"),
+        (["--target", "side.chosen", "--labels", "own.csv"], "--target side.chosen is a side"),
         (["--task", "binary"], "--task is for labels of your own"),
         (["--window", "3"], "--window is for labels of your own"),
         (["--target", "sim.held", "--call", "1"], "call=1 with the built-in column 'sim.held'"),

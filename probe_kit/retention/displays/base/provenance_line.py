@@ -5,6 +5,7 @@ from typing import Self
 
 from probe_kit._system.counting import counted
 from probe_kit.retention.rows.row import RetentionRow
+from probe_kit.train.choices import CORRECT
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.probe_results import ProbeResults
 
@@ -29,7 +30,7 @@ class ProvenanceLine:
     n: str
     settings: str
     probes: str | None = None
-    target: str = "correct"
+    target: str = CORRECT
     call: int | None = None
 
     @classmethod
@@ -88,7 +89,7 @@ class ProvenanceLine:
             self.suite,
             self.n,
             "" if self.call is None else f"call {self.call}",
-            f"target {self.target}" if self.target != "correct" else "",
+            f"target {self.target}" if self.target != CORRECT else "",
             f"probes {self.probes}" if self.probes else "",
             f"weights {self.weights[:SHOWN]}" if self.weights else "",
         )
