@@ -364,7 +364,7 @@ def play_more_kinds(fence: Fence) -> None:
     call("extract", "--model", "pi0-tiny", *TWO, "--max-steps", 10, "--label", "acting", *SMALL, "--out", "longer")
     run = pk.open_run("longer")
     add_episodes(fence, "longer", run)
-    for target in ("chosen", "shuffled"):
+    for target in ("side.chosen", "side.shuffled"):
         few = ("--permutations", 3, "--categories", "state", "--controls", "none", "--views", "mean,last")
         call("train", "longer", "--target", target, *few)
         add_probes(fence, "longer", f"sides, target {target}", pk.load_results(run, target=target))
