@@ -124,10 +124,10 @@ def molmoact2() -> dict[str, float]:
     from physicalai.policies.molmoact2.model import MolmoAct2Model
 
     from probe_kit.hooks import Observation
-    from probe_kit.hooks.families.molmoact2.adapter import load_molmoact2
+    from probe_kit.hooks.families.molmoact2.adapter import MolmoAct2
 
     folder = GOLDEN / "molmoact2"
-    ours, found = load_molmoact2(str(folder / "checkpoint")), _reference(folder)
+    ours, found = MolmoAct2.load(str(folder / "checkpoint")), _reference(folder)
     lerobots, config = ours.network._backbone(), ours.network.model.config
     fields = {
         **_fields(config.text_config, "", ("hidden_size", "num_attention_heads", "num_key_value_heads", "head_dim",

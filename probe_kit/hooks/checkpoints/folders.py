@@ -17,7 +17,14 @@ from probe_kit.hooks.checkpoints.adapter_files import (
     base_folder_of,
     remember_joined,
 )
-from probe_kit.hooks.checkpoints.checkpoint import ADAPTER_FILE, CONFIG_FILE, PATTERNS, is_weights, plain_folder
+from probe_kit.hooks.checkpoints.checkpoint import (
+    ADAPTER_FILE,
+    CONFIG_FILE,
+    PATTERNS,
+    SMALL_FILES,
+    is_weights,
+    plain_folder,
+)
 
 CONFIGURATIONS = (CONFIG_FILE, "config.yaml")
 """Either holds the configuration of a network."""
@@ -58,6 +65,15 @@ def checkpoint_folder(checkpoint: str, patterns: Sequence[str] = PATTERNS) -> Pa
     if key not in _DONE:
         _DONE[key] = _join(folder, base)
     return _DONE[key]
+
+
+def inside_or_hub(folder: Path, name: str, patterns: Sequence[str] = SMALL_FILES) -> Path:
+    """The folder that a checkpoint names: inside its own, anywhere, or on the hub. patterns: the files to fetch.
+
+    Raises CheckpointError for one that is not there.
+    """
+    inside = folder / name
+    return inside if inside.is_dir() else checkpoint_folder(name, patterns)
 
 
 def has_configuration(folder: Path) -> bool:

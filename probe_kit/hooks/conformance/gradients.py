@@ -18,8 +18,10 @@ from probe_kit.hooks.contract.sites import KV, Site
 
 CLOSE = 0.01
 """Relative difference of a gradient from a central difference."""
+_AGREED = 0.001
+"""Relative difference of two central differences between which a shorter step has nothing to decide."""
 STEPS = (1e-2, 3e-3, 1e-3)
-"""Lengths of steps, relative to the activation's own norm; the two that agree best are taken."""
+"""Lengths of steps, relative to the activation's own norm, until two agree; of all, the two that agree best."""
 _ADVICE = (
     "Let `differentiable` compute what `act` computes: pass by `no_grad` and `inference_mode`, detach nothing, "
     "and keep in-place writes away from tensors that sites tap."
@@ -62,7 +64,11 @@ def _require_slope(subject: PolicySubject, site: Site, slope: Tensor, norm: floa
     steepness = float(slope.norm())
     require(steepness > 0, f"no gradient at {site}", "one: the acting part reads it")
     direction = slope / steepness
-    differences = [_difference(subject, site, direction, step * norm) for step in STEPS]
+    differences: list[float] = []
+    for step in STEPS:
+        differences.append(_difference(subject, site, direction, step * norm))
+        if len(differences) > 1 and abs(differences[-1] - differences[-2]) <= _AGREED * abs(differences[-1]):
+            break
     jumps = [abs(after - before) for before, after in pairwise(differences)]
     best = differences[int(np.argmin(jumps)) + 1]
     require(

@@ -63,7 +63,7 @@ def every_option_reaches_the_card(subject: Subject) -> None:
     checkpoint, other_values = subject.checkpoint, subject.other_options
     if not other_values:
         raise SkipTest("the family declares no option of which another value is known")
-    plain = subject.load(checkpoint).card.settings
+    plain = subject.stored_card.settings
     for name, values in sorted(other_values.items()):
         reached = any(_settings(subject, checkpoint, name, value) != plain for value in values)
         require(reached, f"the same settings with {name}={' or '.join(map(repr, values))}", "other settings")
@@ -109,7 +109,7 @@ def random_twins_differ_by_their_seed_and_repeat_by_it(subject: Subject) -> None
     "Set `weights_seed=weights_seed if random_weights else None`: a file has no seed, whatever it says of itself.",
 )
 def weights_of_a_file_have_no_seed(subject: Subject) -> None:
-    seed = subject.load(subject.checkpoint).card.weights_seed
+    seed = subject.stored_card.weights_seed
     require(seed is None, f"weights_seed {seed!r} for the weights of a file", "None")
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.conformance.check import SkipTest, require
+from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.hooks.contract.model import AnswerModel, Model, Policy, Prompt, Reading
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.options import Option, check_options
@@ -134,6 +135,11 @@ class Subject:
     def load(self, checkpoint: Path, **options: Any) -> Model:
         """The model of another checkpoint."""
         return self.family.load(str(checkpoint), options={**self.loading_options, **options})
+
+    @cached_property
+    def stored_card(self) -> ModelCard:
+        """The card of the checkpoint as it lies there, loaded by its folder."""
+        return self.load(self.checkpoint).card
 
     @property
     def loading_options(self) -> dict[str, Any]:

@@ -4,7 +4,7 @@ Source: arXiv 2508.21112 (EO-1), through lerobot's `EO1Policy`.
 """
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,11 +12,10 @@ from typing import Any, cast
 
 import torch
 from lerobot.configs.types import FeatureType, PolicyFeature
-from lerobot.lerobot_types import TransitionKey
 from lerobot.policies.eo1 import processor_eo1
 from lerobot.policies.eo1.configuration_eo1 import EO1Config
 from lerobot.policies.eo1.modeling_eo1 import EO1Policy
-from lerobot.policies.eo1.processor_eo1 import EO1ConversationTemplateStep, EO1QwenProcessorStep
+from lerobot.policies.eo1.processor_eo1 import EO1QwenProcessorStep
 from torch import Tensor, nn
 from transformers import Qwen2_5_VLProcessor
 
@@ -58,34 +57,18 @@ def full_size_eo1() -> EO1Policy:
     return build_eo1(config, "meta")
 
 
-class Packing:
-    """lerobot's chat of pictures, state, instruction and actions. folder: of the processor's files.
+def chat_step(folder: Path, fields: Mapping[str, Any]) -> EO1QwenProcessorStep:
+    """lerobot's step that reads a chat. folder: of the processor's files.
 
     Raises CheckpointError for files without a chat template.
     """
-
-    def __init__(self, folder: Path, chunk: int, fields: Mapping[str, Any]) -> None:
-        self.chunk = chunk
-        logging.getLogger("transformers.processing_utils").addFilter(_is_news)
-        safely = SimpleNamespace(from_pretrained=partial(load_pretrained, Qwen2_5_VLProcessor))
-        with replaced(processor_eo1, {"Qwen2_5_VLProcessor": safely}):
-            self.step = EO1QwenProcessorStep(**{**fields, "processor_name": str(folder)})
-        processor: Any = self.step._processor
-        if processor.chat_template is None:
-            raise CheckpointError(
-                f"{folder} has no chat_template, and EO-1 reads a chat. Take Qwen2.5-VL's own files"
-            )
-        self.tokenizer: Any = processor.tokenizer
-
-    def batch(self, pictures: Mapping[str, Tensor], tasks: Sequence[str]) -> dict[str, Any]:
-        """The inputs of the network besides the state. pictures: (B, 3, H, W) in [0, 1] by lerobot's key."""
-        features = {
-            key: PolicyFeature(FeatureType.VISUAL, tuple(picture.shape[1:])) for key, picture in pictures.items()
-        }
-        data = TransitionKey.COMPLEMENTARY_DATA
-        transition: Any = {TransitionKey.OBSERVATION: dict(pictures), data: {"task": list(tasks)}}
-        packed = self.step(EO1ConversationTemplateStep(features, self.chunk)(transition))[data]
-        return {name: value for name, value in packed.items() if name != "task"}
+    logging.getLogger("transformers.processing_utils").addFilter(_is_news)
+    safely = SimpleNamespace(from_pretrained=partial(load_pretrained, Qwen2_5_VLProcessor))
+    with replaced(processor_eo1, {"Qwen2_5_VLProcessor": safely}):
+        step = EO1QwenProcessorStep(**{**fields, "processor_name": str(folder)})
+    if step._processor.chat_template is None:
+        raise CheckpointError(f"{folder} has no chat_template, and EO-1 reads a chat. Take Qwen2.5-VL's own files")
+    return step
 
 
 def _is_news(record: logging.LogRecord) -> bool:

@@ -13,26 +13,19 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from probe_kit.errors import UsageError
-from probe_kit.hooks.checkpoints.checkpoint import side_files
 from probe_kit.hooks.contract.model import Tap
-from probe_kit.hooks.contract.observation import Observation, checked_picture
-from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import HEADS, Site, Stream
-from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.groot import BRIDGE, INTERVENTIONS
 from probe_kit.hooks.families.groot.checkpoint import GrootChoice, Places, is_nvidias, nvidias_config
-from probe_kit.hooks.families.groot.packing import PackedRow, Packing, Steps, padded_labels, read_steps
+from probe_kit.hooks.families.groot.packing import Packing, Steps, read_steps
 from probe_kit.hooks.families.groot.pictures import NvidiasPictures, lerobots_rule
 from probe_kit.hooks.families.groot.units import BoundedUnits, StateUnits, action_units, state_units
 from probe_kit.hooks.families.shared.lerobot.evaluation import AS_STORED, Evaluation
-from probe_kit.hooks.families.shared.lerobot.flow import DenoisingPolicy
-from probe_kit.hooks.families.shared.lerobot.policy import IMAGES
+from probe_kit.hooks.families.shared.lerobot.packed import PackedPolicy
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack
 from probe_kit.hooks.families.shared.qwen.tower import tower_tap
 from probe_kit.hooks.verification.outputs import Produce, RecordedRun, numpy_of
@@ -96,7 +89,7 @@ class TowerStack(Stack):
         return Stream(name, len(self.layers) + 1, self.width, part="vision", quantities=("residual",))
 
 
-class Groot(DenoisingPolicy):
+class Groot(PackedPolicy):
     """A loaded GR00T N1.7. One observation per call: its bridge reads padding, which changes the actions."""
 
     family = "groot"
@@ -104,15 +97,11 @@ class Groot(DenoisingPolicy):
     known_steps = None
     interventions = INTERVENTIONS
     unread = (_HEAD,)
+    tied: ClassVar[Mapping[str, str]] = {_EMBEDDING: _HEAD}
 
     other_roles: ClassVar[tuple[str, ...]] = ("language", "special")
     suffix_roles = ("state", "action")
-    masked_cameras = 0
-
-    def __init__(self, network: Any, folder: Path) -> None:
-        super().__init__(network, folder)
-        names = ("backbone", "bridge", "expert") if "bridge" in self.stacks else ("backbone", "expert")
-        self.streams = {name: self.stacks[name].stream(name) for name in names}
+    word_roles = ("language",)
 
     # -- loading -----------------------------------------------------------------------------------------
 
@@ -145,7 +134,8 @@ class Groot(DenoisingPolicy):
             )
         else:
             config = super().parse_config(folder, evaluation)
-        config.vlm, config.resize, config.letterbox = choice.vlm, choice.resize, choice.letterbox
+        config.resize, config.letterbox = choice.resize, choice.letterbox
+        config.places = Places.of(folder, config.base_model_path, choice.vlm)
         return config
 
     @classmethod
@@ -155,7 +145,6 @@ class Groot(DenoisingPolicy):
             config.use_bf16 = dtype == "bfloat16"
             config.model_params_fp32 = config.model_params_fp32 or dtype == "float32"
         config.dtype = "bfloat16" if config.use_bf16 else "float32"
-        config.places = Places.of(folder, config.base_model_path, config.vlm)
         if (folder / config.base_model_path).is_dir():
             config.base_model_path = str(config.places.base)
         network: nn.Module = build_groot(
@@ -165,18 +154,15 @@ class Groot(DenoisingPolicy):
 
     @classmethod
     def current_keys(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return tensors by lerobot's names, also of NVIDIA's files; a file may hold either tied embedding."""
+        """Return tensors by lerobot's names, also of NVIDIA's files."""
         renamed = {
             name if name.startswith(_MODEL) else f"{_MODEL}{name}": tensor for name, tensor in tensors.items()
         }
-        if _HEAD in renamed and _EMBEDDING not in renamed:
-            renamed[_EMBEDDING] = renamed[_HEAD]
-        return renamed
+        return super().current_keys(renamed)
 
-    def side_files(self) -> dict[str, Path]:
-        """Also those of the base model and of the vision-language model."""
-        places = self.config.places
-        return {**super().side_files(), **side_files(places.base, "base/"), **side_files(places.vlm, "vlm/")}
+    def parts(self) -> dict[str, Path]:
+        """The base model and the vision-language model."""
+        return {"base": self.config.places.base, "vlm": self.config.places.vlm}
 
     def further_settings(self) -> dict[str, str]:
         """The embodiment whose statistics and weights are read, and how pictures are resized."""
@@ -230,13 +216,6 @@ class Groot(DenoisingPolicy):
     def _action_numbers(self) -> int:
         return int(self.config.output_features["action"].shape[0])
 
-    def batch(
-        self, observations: Sequence[Observation], state: NDArray[np.float32] | None = None
-    ) -> dict[str, Tensor]:
-        """Return lerobot's packing of one observation. state: (1, numbers) as the network reads them."""
-        (row,) = self._rows(observations, self.state(observations) if state is None else state)
-        return {name: tensor.to(self.config.device) for name, tensor in row.inputs.items()}
-
     def denoise(self, batch: Mapping[str, Tensor], noise: Tensor) -> Tensor:
         """The steps and numbers that this embodiment has."""
         return flow_actions(self.network, batch, noise)[:, : self.chunk, : self._action_numbers]
@@ -253,83 +232,27 @@ class Groot(DenoisingPolicy):
         """lerobot's packing."""
         return Packing(self._steps, self.config.places.vlm)
 
-    @cached_property
-    def tokenizer(self) -> Any:
-        """The vision-language model's."""
-        return self.packing.tokenizer
-
-    def _rows(self, observations: Sequence[Observation], state: NDArray[np.float32]) -> list[PackedRow]:
-        pictures = [
-            {camera: checked_picture(o.image if camera == self.cameras[0] else o.cameras[camera])
-             for camera in self.shown_cameras}
-            for o in observations
-        ]  # fmt: skip
-        rows = zip(pictures, observations, state, strict=True)
-        return [
-            self.packing.row(images, observation.instruction, numbers) for images, observation, numbers in rows
-        ]
-
-    def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
-        """Roles from the packing itself; the bridge has the backbone's tokens."""
-        rows = self._rows(observations, np.zeros((len(observations), self._state_numbers), np.float32))
-        prompt = [Roles.from_labels(labels) for labels in padded_labels(rows)]
-        suffix = [Roles.from_labels(self.suffix_labels())] * len(rows)
-        roles = {"backbone": prompt, "bridge": prompt, "expert": suffix}
-        return {name: roles[name] for name in self.streams}
-
-    def prefix_labels(self, language: Sequence[str]) -> list[str]:
-        """The packing says every position."""
-        return list(language)
-
     def suffix_labels(self) -> list[str]:
         """The state, then the network's whole horizon."""
         return ["state", *["action"] * int(self._head.action_horizon)]
 
-    @classmethod
-    def check_words(cls, checkpoint: str, instructions: Sequence[str], evaluation: Evaluation = AS_STORED) -> None:
-        """Raise InstructionError for a text without words, from configuration and tokenizer alone."""
-        text = cls._text_reader(checkpoint, evaluation)
-        text.config.places = Places.of(text.folder, text.config.base_model_path, text.config.vlm)
-        text.token_ids(instructions)
-
-    def token_ids(self, instructions: Sequence[str]) -> list[tuple[int, ...]]:
-        """The ids of each instruction, as the chat holds it."""
-        size = tuple(self.config.image_features[f"{IMAGES}{self.cameras[0]}"].shape[-2:])
-        blank = {camera: np.zeros((*size, 3), np.uint8) for camera in self.shown_cameras}
-        rows = [self.packing.row(blank, text, np.zeros(self._state_numbers, np.float32)) for text in instructions]
-        return [
-            tuple(
-                token
-                for token, label in zip(row.inputs["input_ids"][0].tolist(), row.labels, strict=True)
-                if label == "language"
-            )
-            for row in rows
-        ]
-
     # -- capture -----------------------------------------------------------------------------------------
-
-    def _show(self, cameras: tuple[str, ...]) -> None:
-        self.shown_cameras = cameras
-        self.further_streams = {"vision": self.stacks["vision"].stream("vision")}
-        prompt = (*(f"image.{camera}" for camera in cameras), *self.other_roles, PADDING)
-        self.role_names = {"backbone": prompt, "bridge": prompt, "expert": self.suffix_roles}
-        if "bridge" not in self.stacks:
-            del self.role_names["bridge"]
 
     def _stacks(self) -> dict[str, Stack]:
         backbone, head = self.network._groot_model.backbone, self._head
         text, tower, dit = backbone.language_model, backbone.visual, head.model
         steps = int(head.num_inference_timesteps)
-        stacks = {
+        bridge: dict[str, Stack] = {}
+        if (blocks := getattr(head.vl_self_attention, "transformer_blocks", None)) is not None:
+            width = int(head.vl_self_attention.inner_dim)
+            bridge["bridge"] = BridgeStack(blocks, head.vl_self_attention, width, None, "norm1")
+        return {
             # What the bridge's norm reads is the end of the backbone: Qwen's own last norm is not read.
             "backbone": BackboneStack(text.layers, head.vlln, int(text.config.hidden_size), None),
+            **bridge,
             "expert": DiffusersStack(dit.transformer_blocks, dit.norm_out, int(dit.inner_dim), steps, "norm1"),
             "vision": TowerStack(tower.blocks, tower, int(backbone.model.config.vision_config.hidden_size), None),
         }
-        if (blocks := getattr(head.vl_self_attention, "transformer_blocks", None)) is not None:
-            width = int(head.vl_self_attention.inner_dim)
-            stacks["bridge"] = BridgeStack(blocks, head.vl_self_attention, width, None, "norm1")
-        return stacks
 
     # -- verification ------------------------------------------------------------------------------------
 

@@ -11,8 +11,8 @@ from lerobot.policies.groot.utils import stat_dim_from_entry
 
 from probe_kit._system.bounded_json import read_json_object
 from probe_kit.errors import CheckpointError, UsageError
-from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, SMALL_FILES
-from probe_kit.hooks.checkpoints.folders import checkpoint_folder
+from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE
+from probe_kit.hooks.checkpoints.folders import inside_or_hub
 from probe_kit.hooks.families.groot.processor_fields import check_widths, processor_settings, read_state_fields
 from probe_kit.hooks.families.shared.lerobot.evaluation import Evaluation
 from probe_kit.hooks.families.shared.lerobot.policy import IMAGES, STATE
@@ -57,12 +57,6 @@ class Places:
         model_name = str(content.get("model_name", VLM))
         files = inside_or_hub(base_folder, vlm or model_name)
         return cls(content, base_folder, files, VLM if model_name.rstrip("/") == VLM else str(files))
-
-
-def inside_or_hub(folder: Path, name: str) -> Path:
-    """A folder in `folder`, one anywhere, or the small files of a hub id."""
-    inside = folder / name
-    return inside if inside.is_dir() else checkpoint_folder(name, SMALL_FILES)
 
 
 def is_nvidias(folder: Path) -> bool:

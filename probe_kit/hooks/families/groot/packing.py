@@ -28,9 +28,9 @@ from transformers import AutoTokenizer, Qwen2VLImageProcessor, Qwen3VLProcessor,
 from probe_kit._system.bounded_json import read_json_object
 from probe_kit.errors import CheckpointError, InstructionError
 from probe_kit.hooks.checkpoints.checkpoint import shard_name
-from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.groot.pictures import nvidias_pictures
 from probe_kit.hooks.families.groot.processor_fields import StateFields, processor_settings, read_state_fields
+from probe_kit.hooks.families.shared.lerobot.packed import PackedRow, chat_labels
 from probe_kit.hooks.families.shared.lerobot.policy import IMAGES, STATE
 from probe_kit.models.pretrained import load_pretrained
 
@@ -141,14 +141,6 @@ def _chosen(steps: Sequence[Any], source: str) -> Steps:
     return Steps(pack, encode, decode, source)
 
 
-@dataclass(frozen=True)
-class PackedRow:
-    """One observation. inputs: what lerobot packs. labels: the role of each of its positions."""
-
-    inputs: dict[str, Tensor]
-    labels: list[str]
-
-
 class Packing:
     """lerobot's packing of pictures, words and state into the inputs of the network."""
 
@@ -211,29 +203,14 @@ class Packing:
         inputs = {name: content[name] for name in _READ if name in content}
         inputs["state"] = packed[TransitionKey.OBSERVATION]["state"]
         frames = len(inputs["image_grid_thw"]) // len(cameras)
+        picture, *words = self.tokenizer.convert_tokens_to_ids(
+            [processor.image_token, "<|vision_end|>", "<|im_end|>"]
+        )
+        roles = [f"image.{camera}" for camera in cameras] * frames
         return PackedRow(
-            inputs, self._labels(inputs, [f"image.{camera}" for camera in cameras] * frames, processor)
+            inputs, chat_labels(inputs["input_ids"][0].tolist(), roles, picture, (words[0], words[1]))
         )
 
-    def _labels(self, inputs: Mapping[str, Tensor], pictures: Sequence[str], processor: Any) -> list[str]:
-        """Each patch is its camera's; `language` stands between the last picture and the end of the turn."""
-        ids, merge = inputs["input_ids"][0].tolist(), processor.image_processor.merge_size
-        end_of_picture, end_of_turn = self.tokenizer.convert_tokens_to_ids(["<|vision_end|>", "<|im_end|>"])
-        patches = iter(
-            name
-            for name, grid in zip(pictures, inputs["image_grid_thw"].tolist(), strict=True)
-            for _ in range(int(np.prod(grid)) // merge**2)
-        )
-        begin = len(ids) - ids[::-1].index(end_of_picture)
-        end = ids.index(end_of_turn, begin)
-        image = self.tokenizer.convert_tokens_to_ids(processor.image_token)
-        return [
-            next(patches) if token == image else "language" if begin <= index < end else "special"
-            for index, token in enumerate(ids)
-        ]
-
-
-def padded_labels(rows: Sequence[PackedRow]) -> list[list[str]]:
-    """The roles of every position of these rows, the shorter ones with padding behind them."""
-    longest = max(len(row.labels) for row in rows)
-    return [row.labels + [PADDING] * (longest - len(row.labels)) for row in rows]
+    def batch(self, rows: Sequence[PackedRow]) -> dict[str, Tensor]:
+        """The one row: its bridge reads padding, so several make no batch."""
+        return rows[0].inputs if len(rows) == 1 else {}

@@ -21,7 +21,7 @@ FAMILIES = (
         "molmoact2",
         "MolmoAct2 (Molmo2-ER, flow-matching expert on the keys and values of each layer) through lerobot",
         "allenai/MolmoAct2-LIBERO-LeRobot",
-        "probe_kit.hooks.families.molmoact2.adapter:load_molmoact2",
+        "probe_kit.hooks.families.molmoact2.adapter:MolmoAct2.load",
         streams="backbone 37 layers, expert 37 layers x 10 flow steps",
         embodiment="LIBERO end-effector delta; other fine-tunes in lerobot's layout as --checkpoint",
         hub=(("allenai/MolmoAct2-LIBERO", "tokenizer.json"),),
@@ -32,7 +32,7 @@ FAMILIES = (
         ),
         outputs="probe_kit.hooks.families.shared.lerobot.outputs:lerobot_outputs",
         config_types=("molmoact2",),
-        words="probe_kit.hooks.families.molmoact2.adapter:check_molmoact2_words",
+        words="probe_kit.hooks.families.molmoact2.adapter:MolmoAct2.check_words",
         full_size="probe_kit.models.lerobot.molmoact2:full_size_molmoact2",
         parameters={"": 5_442_196_208},
         declared={

@@ -7,7 +7,7 @@ Suffix: the action chunk. Block n of the expert attends to the keys and values o
 Source: arXiv 2605.02881, through lerobot's `MolmoAct2Policy`.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from functools import cached_property
 from pathlib import Path
@@ -19,23 +19,19 @@ from safetensors.numpy import load_file
 from torch import Tensor, nn
 
 from probe_kit.errors import CaptureError, CheckpointError
-from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES, side_files
-from probe_kit.hooks.checkpoints.folders import checkpoint_folder
+from probe_kit.hooks.checkpoints.folders import inside_or_hub
 from probe_kit.hooks.contract.model import Tap
-from probe_kit.hooks.contract.observation import Observation, checked_picture
-from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import Site, Stream, kv_stream
-from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.molmoact2 import EXPERT, LAYERWISE
-from probe_kit.hooks.families.molmoact2.packing import PackedRow, Packing, padded_labels
+from probe_kit.hooks.families.molmoact2.packing import Packing
 from probe_kit.hooks.families.molmoact2.steps import STEPS, in_packed_order, read_steps
 from probe_kit.hooks.families.molmoact2.units import SteppedUnits
 from probe_kit.hooks.families.shared.attention_weights import Note, recording_weights, shares
 from probe_kit.hooks.families.shared.lerobot.config_fields import Inert
-from probe_kit.hooks.families.shared.lerobot.evaluation import AS_STORED, Evaluation
-from probe_kit.hooks.families.shared.lerobot.flow import DenoisingPolicy
+from probe_kit.hooks.families.shared.lerobot.evaluation import Evaluation
 from probe_kit.hooks.families.shared.lerobot.normaliser import Normaliser
-from probe_kit.hooks.families.shared.lerobot.policy import IMAGES, checked_steps
+from probe_kit.hooks.families.shared.lerobot.packed import PackedPolicy
+from probe_kit.hooks.families.shared.lerobot.policy import checked_steps
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack
 from probe_kit.hooks.verification.outputs import Produce, RecordedRun, stacked
 from probe_kit.models.lerobot.molmoact2 import build_molmoact2, flow_actions, network_config, uses_cuda_graphs
@@ -66,7 +62,7 @@ class TowerStack(Stack):
         return Stream(name, len(self.layers), self.width, part="vision", quantities=("residual",))
 
 
-class MolmoAct2(DenoisingPolicy):
+class MolmoAct2(PackedPolicy):
     """A loaded MolmoAct2."""
 
     family = "molmoact2"
@@ -81,7 +77,6 @@ class MolmoAct2(DenoisingPolicy):
 
     other_roles: ClassVar[tuple[str, ...]] = ("language", "state", "special")
     suffix_roles = ("action",)
-    masked_cameras = 0
 
     def __init__(self, network: Any, folder: Path) -> None:
         super().__init__(network, folder)
@@ -106,12 +101,16 @@ class MolmoAct2(DenoisingPolicy):
 
     @classmethod
     def parse_config(cls, folder: Path, evaluation: Evaluation) -> Any:
-        """lerobot's configuration, with what the processor files say: lerobot packs as they do."""
+        """lerobot's configuration, with what the processor files say: lerobot packs as they do.
+
+        checkpoint_path: then the folder of the VLM's configuration and tokenizer.
+        """
         config = super().parse_config(folder, evaluation)
         config.steps = read_steps(folder, config)
         for name, value in config.steps.packing.items():
             setattr(config, name, value)
         config.input_features = in_packed_order(config, folder)
+        config.checkpoint_path = str(inside_or_hub(folder, config.checkpoint_path))
         return config
 
     @classmethod
@@ -123,7 +122,7 @@ class MolmoAct2(DenoisingPolicy):
             raise CheckpointError(f"{folder} was trained for discrete actions only; the flow expert acts here")
         config.model_dtype = config.dtype = getattr(config, "dtype", None) or config.model_dtype
         config.inference_action_mode = "continuous"
-        vlm_folder = network_folder(folder, config.checkpoint_path)
+        vlm_folder = Path(config.checkpoint_path)
         try:
             network: nn.Module = build_molmoact2(config, network_config(vlm_folder), vlm_folder)
         except (FileNotFoundError, ValueError) as error:
@@ -135,14 +134,9 @@ class MolmoAct2(DenoisingPolicy):
             ) from error
         return network
 
-    @classmethod
-    def current_keys(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return the tensors under lerobot's names."""
-        return dict(tensors)
-
-    def side_files(self) -> dict[str, Path]:
-        """Also the VLM's configuration and tokenizer."""
-        return {**super().side_files(), **side_files(Path(self.config.checkpoint_path), "vlm/")}
+    def parts(self) -> dict[str, Path]:
+        """The VLM's configuration and tokenizer."""
+        return {"vlm": Path(self.config.checkpoint_path)}
 
     def own_units(self, feature: str, kind: str) -> SteppedUnits | None:
         """The units of lerobot's steps: numbers that a mask leaves unscaled, clamps, and frames of joints."""
@@ -159,13 +153,6 @@ class MolmoAct2(DenoisingPolicy):
         return SteppedUnits(units, unscaled, steps.clamps_state, unclamped, steps.state_frame)
 
     # -- acting ------------------------------------------------------------------------------------------
-
-    def batch(
-        self, observations: Sequence[Observation], state: NDArray[np.float32] | None = None
-    ) -> dict[str, Tensor]:
-        """Return a batch in lerobot's keys; see `Packing`. state: (B, numbers) as the network reads them."""
-        packed = self.packing.batch(self._rows(observations, self.state(observations) if state is None else state))
-        return {name: tensor.to(self.config.device) for name, tensor in packed.items()}
 
     def denoise(self, batch: Mapping[str, Tensor], noise: Tensor) -> Tensor:
         """See the base. Raises CaptureError for CUDA graphs."""
@@ -201,72 +188,7 @@ class MolmoAct2(DenoisingPolicy):
         """lerobot's packing."""
         return Packing(self.config, self._action_numbers)
 
-    @cached_property
-    def tokenizer(self) -> Any:
-        """The VLM's."""
-        return self.packing.tokenizer
-
-    def _rows(self, observations: Sequence[Observation], state: NDArray[np.float32]) -> list[PackedRow]:
-        pictures = [
-            {camera: checked_picture(o.image if camera == self.cameras[0] else o.cameras[camera])
-             for camera in self.shown_cameras}
-            for o in observations
-        ]  # fmt: skip
-        rows = zip(pictures, observations, state, strict=True)
-        return [
-            self.packing.row(images, observation.instruction, numbers) for images, observation, numbers in rows
-        ]
-
-    def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
-        """Roles from the packing itself."""
-        state = self.read_state(observations)
-        rows = self._rows(
-            observations,
-            np.zeros((len(observations), self._state_numbers), np.float32) if state is None else state,
-        )
-        suffix = Roles.from_labels(self.suffix_labels())
-        return {
-            "backbone": [Roles.from_labels(labels) for labels in padded_labels(rows)],
-            "expert": [suffix] * len(rows),
-        }
-
-    def prefix_labels(self, language: Sequence[str]) -> list[str]:
-        """The packing says every position."""
-        return list(language)
-
-    def suffix_labels(self) -> list[str]:
-        """The chunk."""
-        return ["action"] * int(self.config.chunk_size)
-
-    @classmethod
-    def check_words(cls, checkpoint: str, instructions: Sequence[str], evaluation: Evaluation = AS_STORED) -> None:
-        """Raise InstructionError for a prompt that does not fit, from configuration and tokenizer alone."""
-        text = cls._text_reader(checkpoint, evaluation, SMALL_FILES)
-        text.config.checkpoint_path = str(network_folder(text.folder, text.config.checkpoint_path))
-        text.token_ids(instructions)
-
-    def token_ids(self, instructions: Sequence[str]) -> list[tuple[int, ...]]:
-        """The ids of each prompt, without pictures and without the state, which change at every inference."""
-        size = tuple(self.config.image_features[f"{IMAGES}{self.cameras[0]}"].shape[-2:])
-        blank = {camera: np.zeros((*size, 3), np.uint8) for camera in self.shown_cameras}
-        state = np.zeros(self._state_numbers, np.float32)
-        rows = [self.packing.row(blank, text, state) for text in instructions]
-        return [
-            tuple(
-                token
-                for token, label in zip(row.inputs["input_ids"][0].tolist(), row.labels, strict=True)
-                if label in ("language", "special")
-            )
-            for row in rows
-        ]
-
     # -- capture -----------------------------------------------------------------------------------------
-
-    def _show(self, cameras: tuple[str, ...]) -> None:
-        self.shown_cameras = cameras
-        self.further_streams = {"vision": self.stacks["vision"].stream("vision")}
-        images = tuple(f"image.{camera}" for camera in cameras)
-        self.role_names = {"backbone": (*images, *self.other_roles, PADDING), "expert": self.suffix_roles}
 
     def _stacks(self) -> dict[str, Stack]:
         backbone = self.network._backbone()
@@ -310,25 +232,3 @@ def _on_the_prompt(attention: Any, inputs: tuple[Any, ...], keywords: dict[str, 
 def _of_width(marked: NDArray[np.bool_], numbers: int) -> NDArray[np.bool_]:
     """(numbers,), or nothing marked where it is of another width, as in lerobot."""
     return marked if marked.shape == (numbers,) else np.zeros(numbers, bool)
-
-
-def network_folder(folder: Path, name: str) -> Path:
-    """The folder of the VLM's configuration and tokenizer: in the checkpoint, or on the hub without weights."""
-    inside = folder / name
-    return inside if inside.is_dir() else checkpoint_folder(name, SMALL_FILES)
-
-
-def load_molmoact2(
-    checkpoint: str,
-    device: str = "cpu",
-    dtype: str | None = None,
-    random_weights: bool = False,
-    weights_seed: int = 0,
-) -> MolmoAct2:
-    """Load a lerobot MolmoAct2 checkpoint; see `LerobotPolicy.load`."""
-    return MolmoAct2.load(checkpoint, device, dtype, random_weights, weights_seed)
-
-
-def check_molmoact2_words(checkpoint: str, instructions: Sequence[str], **_: Any) -> None:
-    """See `Family.words`."""
-    MolmoAct2.check_words(checkpoint, instructions)

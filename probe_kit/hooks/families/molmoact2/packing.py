@@ -6,7 +6,6 @@ there depends on the longest prompt of its batch. Here each row is what it is al
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from probe_kit.errors import InstructionError
-from probe_kit.hooks.contract.views import PADDING
+from probe_kit.hooks.families.shared.lerobot.packed import PackedRow
 from probe_kit.hooks.families.shared.lerobot.policy import STATE
 from probe_kit.hooks.families.shared.lerobot.state_prompt import label_groups
 
@@ -27,14 +26,6 @@ _PROMPT = re.compile(
 )
 _TEXT = ("input_ids", "attention_mask", "token_type_ids")
 _PICTURES = ("pixel_values", "image_token_pooling", "image_grids", "image_num_crops")
-
-
-@dataclass(frozen=True)
-class PackedRow:
-    """One observation. inputs: what lerobot packs. labels: the role of each of its positions."""
-
-    inputs: dict[str, Tensor]
-    labels: list[str]
 
 
 class Packing:
@@ -112,9 +103,3 @@ class Packing:
             name: torch.cat([row.inputs[name] for row in rows]) for name in (*_PICTURES, "action_dim_is_pad")
         }
         return text | unpadded
-
-
-def padded_labels(rows: Sequence[PackedRow]) -> list[list[str]]:
-    """The roles of every position of a batch of these rows."""
-    longest = max(len(row.labels) for row in rows)
-    return [row.labels + [PADDING] * (longest - len(row.labels)) for row in rows]

@@ -17,6 +17,7 @@ from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.hooks.families.shared.lerobot.config_fields import Inert
 from probe_kit.hooks.families.shared.lerobot.evaluation import Evaluation, Picture
 from probe_kit.hooks.families.shared.lerobot.pipelines import CROP
+from probe_kit.hooks.families.shared.lerobot.policy import LerobotPolicy
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack
 from probe_kit.hooks.families.shared.lerobot.state_prompt import StatePrompt
 from probe_kit.models.lerobot.pi0 import Pi0Size
@@ -69,9 +70,7 @@ class Pi05(StatePrompt, Pi0):
         stacks = super()._stacks()
         return {**stacks, "expert": GatedStack(**vars(stacks["expert"]))}
 
-    def suffix_labels(self) -> list[str]:
-        """The chunk."""
-        return ["action"] * self.config.chunk_size
+    suffix_labels = LerobotPolicy.suffix_labels
 
 
 def load_pi05(

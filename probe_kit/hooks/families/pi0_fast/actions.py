@@ -18,7 +18,6 @@ from tokenizers import Tokenizer
 
 from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import CheckpointError
-from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 
 FILES = ("tokenizer.json", "processor_config.json")
 _BROKEN = "\ufffd"
@@ -143,12 +142,3 @@ class ActionText:
                 remaining.append(ids[at])
                 at += 1
         return remaining
-
-
-def fast_folder(checkpoint: Path, name: str) -> Path:
-    """The folder of the FAST tokenizer that a configuration names: in the checkpoint, or on the hub.
-
-    Only its two data files are fetched, never its code. Raises CheckpointError.
-    """
-    inside = checkpoint / name
-    return inside if inside.is_dir() else checkpoint_folder(name, FILES)

@@ -22,11 +22,11 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from probe_kit.errors import UsageError
-from probe_kit.hooks.checkpoints.checkpoint import side_files
+from probe_kit.hooks.checkpoints.folders import inside_or_hub
 from probe_kit.hooks.contract.sites import Stream
 from probe_kit.hooks.contract.unembedding import Unembedding
 from probe_kit.hooks.families.pi0_fast import CAPTURED, FAST
-from probe_kit.hooks.families.pi0_fast.actions import ActionText, DecodedChunk, FastTokenizer, fast_folder
+from probe_kit.hooks.families.pi0_fast.actions import FILES, ActionText, DecodedChunk, FastTokenizer
 from probe_kit.hooks.families.shared.attention_weights import Note, of_decoder
 from probe_kit.hooks.families.shared.lerobot.evaluation import Evaluation
 from probe_kit.hooks.families.shared.lerobot.paligemma import PaliGemmaPolicy, sizes_file
@@ -97,8 +97,8 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
                 raise UsageError(f"captured_tokens is {evaluation.captured}; expected 1 to {most}")
             chooser(evaluation.temperature or 0, ())
             self.stacks |= self._stacks()
+            self._read_streams()
             self._show(self.shown_cameras)
-            self.streams = {name: self.stacks[name].stream(name) for name in ("backbone", "action")}
 
     @property
     def decoding(self) -> Decoding:
@@ -139,18 +139,14 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
             else "the instruction keeps its case, as in lerobot; openpi writes lower case (-M lowercase=true)",
         )
 
-    def side_files(self) -> dict[str, Path]:
-        """Also the FAST tokenizer."""
-        return {**super().side_files(), **side_files(self._fast_folder, "fast/")}
-
-    @cached_property
-    def _fast_folder(self) -> Path:
-        return fast_folder(self.folder, self.config.action_tokenizer_name)
+    def parts(self) -> dict[str, Path]:
+        """The FAST tokenizer."""
+        return {"fast": inside_or_hub(self.folder, self.config.action_tokenizer_name, FILES)}
 
     @cached_property
     def action_text(self) -> ActionText:
         """The meaning of the network's tokens."""
-        fast, checked = FastTokenizer.from_folder(self._fast_folder), self.config.validate_action_token_prefix
+        fast, checked = FastTokenizer.from_folder(self.parts()["fast"]), self.config.validate_action_token_prefix
         return ActionText.of(self.tokenizer, fast, self.config.fast_skip_tokens, checked)
 
     # -- acting ------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ FAMILIES = (
         "smolvla",
         "SmolVLA (SmolVLM2 500M, 16 layers, + flow-matching expert) through lerobot",
         "lerobot/smolvla_base",
-        "probe_kit.hooks.families.smolvla.adapter:load_smolvla",
+        "probe_kit.hooks.families.smolvla.adapter:SmolVLA.load",
         streams="backbone 17 layers, expert 17 layers x 10 iterations",
         embodiment="as fine-tuned; the base model acts in SO-100 joint positions",
         hub=(("HuggingFaceTB/SmolVLM2-500M-Video-Instruct", "tokenizer.json"),),
@@ -19,7 +19,7 @@ FAMILIES = (
         ),
         outputs="probe_kit.hooks.families.shared.lerobot.outputs:lerobot_outputs",
         config_types=("smolvla",),
-        words="probe_kit.hooks.families.smolvla.adapter:check_smolvla_words",
+        words="probe_kit.hooks.families.smolvla.adapter:SmolVLA.check_words",
         declared={
             "": (backbone(17, 960, 113, "state", camera="top"), expert(17, 720, 10, 50, ("action",))),
         },

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from probe_kit.errors import CheckpointError
-from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES, is_on_hub, side_files
+from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES, is_on_hub
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.shared.attention_weights import Note, shares
@@ -89,10 +89,10 @@ class SmolVLA(LerobotFlow):
             return self._joint.processor.tokenizer
         return load_pretrained(AutoTokenizer, _folder_of(vlm))
 
-    def side_files(self) -> dict[str, Path]:
-        """Also the VLM's configuration and tokenizer, where they lie in a folder here."""
+    def parts(self) -> dict[str, Path]:
+        """The VLM's configuration and tokenizer, where they lie in a folder here."""
         vlm = Path(self.config.vlm_model_name)
-        return {**super().side_files(), **(side_files(vlm, "vlm/") if vlm.is_dir() else {})}
+        return {"vlm": vlm} if vlm.is_dir() else {}
 
     @property
     def masked_cameras(self) -> int:
@@ -104,10 +104,6 @@ class SmolVLA(LerobotFlow):
         images = [label for camera in self.shown_cameras for label in self._camera_labels(f"image.{camera}")]
         labels = [*images, *self._camera_labels(PADDING) * self.masked_cameras, *language, "state"]
         return labels + [PADDING] * (self.config.prefix_length - len(labels))
-
-    def suffix_labels(self) -> list[str]:
-        """The chunk."""
-        return ["action"] * int(self.config.chunk_size)
 
     def _camera_labels(self, role: str) -> list[str]:
         """One camera's positions; the special tokens around a masked picture are not masked."""
@@ -160,22 +156,6 @@ class SmolVLA(LerobotFlow):
         return int(patches // vlm.scale_factor**2)
 
 
-def check_smolvla_words(checkpoint: str, instructions: Sequence[str]) -> None:
-    """See `Family.words`."""
-    SmolVLA.check_words(checkpoint, instructions)
-
-
 def _folder_of(vlm: str) -> Path:
     """The folder with the small files of a vision-language model, a folder or a hub id."""
     return checkpoint_folder(vlm, SMALL_FILES) if is_on_hub(vlm) else Path(vlm)
-
-
-def load_smolvla(
-    checkpoint: str,
-    device: str = "cpu",
-    dtype: str | None = None,
-    random_weights: bool = False,
-    weights_seed: int = 0,
-) -> SmolVLA:
-    """Load a lerobot SmolVLA checkpoint; see `LerobotFlow.load`."""
-    return SmolVLA.load(checkpoint, device, dtype, random_weights, weights_seed)

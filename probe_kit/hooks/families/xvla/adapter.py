@@ -21,7 +21,7 @@ from PIL import Image
 from torch import Tensor, nn
 
 from probe_kit.errors import CheckpointError, ObservationError, UsageError
-from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES, side_files
+from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.contract.model import Tap
 from probe_kit.hooks.contract.observation import Observation
@@ -164,10 +164,10 @@ class Xvla(DenoisingPolicy):
             ]
         return super().look(camera, images)
 
-    def side_files(self) -> dict[str, Path]:
-        """Also the tokenizer, where it is another folder's."""
+    def parts(self) -> dict[str, Path]:
+        """The tokenizer, where it is another folder's."""
         folder = self._tokenizer_folder
-        return {**super().side_files(), **({} if folder == self.folder else side_files(folder, "tokenizer/"))}
+        return {} if folder == self.folder else {"tokenizer": folder}
 
     @property
     def _tokenizer_folder(self) -> Path:
@@ -254,10 +254,6 @@ class Xvla(DenoisingPolicy):
         """The first camera's picture, then the text."""
         return [*[f"image.{self.shown_cameras[0]}"] * self.tokens_per_camera, *language]
 
-    def suffix_labels(self) -> list[str]:
-        """The chunk; what follows depends on the text."""
-        return ["action"] * int(self.config.chunk_size)
-
     def packed_roles(self, tokens: Tensor, mask: Tensor) -> dict[str, list[Roles]]:
         """The backbone's tokens once more in the expert, between actions, further cameras and soft prompts."""
         prompts = [
@@ -273,7 +269,7 @@ class Xvla(DenoisingPolicy):
         }
 
     def _show(self, cameras: tuple[str, ...]) -> None:
-        self.shown_cameras, self.further_streams = cameras, {}
+        super()._show(cameras)
         views = tuple(f"image.{camera}" for camera in cameras)
         self.role_names = {
             "backbone": (views[0], *self.other_roles),

@@ -16,7 +16,7 @@ from safetensors.torch import load_file, save_file
 from probe_kit.errors import CaptureError, CheckpointError, InstructionError, ObservationError, WeightsError
 from probe_kit.hooks import Observation, capture
 from probe_kit.hooks.conformance.subject import examples_for
-from probe_kit.hooks.families.molmoact2.adapter import MolmoAct2, check_molmoact2_words, load_molmoact2
+from probe_kit.hooks.families.molmoact2.adapter import MolmoAct2
 from probe_kit.models.lerobot import molmoact2 as network
 from tests.support.lerobot_pipelines import changed, raw, save_pipelines
 from tests.support.molmoact2_checkpoints import write_molmoact2
@@ -30,7 +30,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def molmoact2(folder: Path) -> MolmoAct2:
-    return load_molmoact2(str(folder))
+    return MolmoAct2.load(str(folder))
 
 
 @pytest.fixture
@@ -43,7 +43,7 @@ def test_actions_are_those_of_lerobots_own_policy_bit_for_bit(
     folder: Path, seen: list[Observation], dtype: str
 ) -> None:
     """Its own sampling, with its own blocks, draws the noise of the same seed."""
-    policy, place = load_molmoact2(str(folder), dtype=dtype), folder / "vlm"
+    policy, place = MolmoAct2.load(str(folder), dtype=dtype), folder / "vlm"
     batch = policy.batch(seen[:1])
     plain = network.lerobots_policy(policy.config, network.network_config(place), place)
     assert not hasattr(plain._backbone().action_expert.blocks[0], "mlp_gate")
@@ -86,7 +86,7 @@ def test_actions_are_those_of_lerobots_saved_pipelines_and_policy(
     write_molmoact2(tmp_path, cameras=("image", "wrist"))
     place = str(tmp_path / "vlm")  # the other action mode reads a FAST tokenizer on the hub
     before, behind = save_pipelines(tmp_path, change, action_mode="continuous", checkpoint_path=place, **fields)
-    ours = load_molmoact2(str(tmp_path))
+    ours = MolmoAct2.load(str(tmp_path))
     ours = ours.showing(ours.cameras)
     theirs = network.lerobots_policy(copy(ours.config), network.network_config(Path(place)), Path(place))
     theirs.load_state_dict(load_file(tmp_path / "model.safetensors"))
@@ -110,7 +110,7 @@ def test_a_gripper_that_stays_as_it_is_must_lie_between_its_bounds(
     write_molmoact2(tmp_path)
     save_pipelines(tmp_path, action_mode="continuous", checkpoint_path=str(tmp_path / "vlm"),
                    dataset_feature_names=NAMES)  # fmt: skip
-    policy = load_molmoact2(str(tmp_path))
+    policy = MolmoAct2.load(str(tmp_path))
     state = np.array([0.3, 0, 0.1, 0, 0, 0, 0, 1.5], np.float32)
     with pytest.raises(ObservationError, match=r"number 7 of the state is 1\.5"):
         policy.act([replace(seen[0], state=state)], [0])
@@ -138,11 +138,11 @@ def test_pipelines_that_say_something_else_are_refused(
             json.dumps(json.loads(path.read_text(encoding="utf-8")) | {"norm_tag": tag}), encoding="utf-8"
         )
     with pytest.raises(CheckpointError, match=message):
-        load_molmoact2(str(tmp_path))
+        MolmoAct2.load(str(tmp_path))
 
 
 def test_cuda_graphs_are_off_and_an_error_while_they_are_on(folder: Path, seen: list[Observation]) -> None:
-    policy = load_molmoact2(str(folder))
+    policy = MolmoAct2.load(str(folder))
     assert not network.uses_cuda_graphs(policy.network)
     policy.network._set_inference_cuda_graph_enabled(True)
     with pytest.raises(CaptureError, match="CUDA graphs"), capture(policy, policy.sites()):
@@ -225,7 +225,7 @@ def test_roles_name_pictures_instruction_and_state(molmoact2: MolmoAct2, seen: l
 
 
 def test_two_cameras_are_told_apart(tmp_path: Path) -> None:
-    policy = load_molmoact2(str(write_molmoact2(tmp_path, cameras=("image", "wrist")))).showing(["image", "wrist"])
+    policy = MolmoAct2.load(str(write_molmoact2(tmp_path, cameras=("image", "wrist")))).showing(["image", "wrist"])
     (one,) = examples_for(policy, "put the cube on the star")
     one = replace(one, cameras={"wrist": one.image[:, ::-1].copy()})
     (roles,) = policy.roles([one])["backbone"]
@@ -240,9 +240,9 @@ def test_a_prompt_that_does_not_fit_is_refused_and_never_cut(
     long = "put the cube on " + "the red shape " * 30
     with pytest.raises(InstructionError, match="does not fit"):
         molmoact2.act([replace(seen[0], instruction=long)], [0])
-    check_molmoact2_words(str(molmoact2.folder), ["put the cube on the star"])
+    MolmoAct2.check_words(str(molmoact2.folder), ["put the cube on the star"])
     with pytest.raises(InstructionError, match="does not fit"):
-        check_molmoact2_words(str(molmoact2.folder), ["put the cube on the star", long])
+        MolmoAct2.check_words(str(molmoact2.folder), ["put the cube on the star", long])
 
 
 @pytest.mark.parametrize(("field", "value"), [("action_mode", "discrete"), ("enable_lora_vlm", True)])
@@ -254,7 +254,7 @@ def test_what_the_flow_expert_cannot_do_is_refused(
     config |= {field: value, "inference_action_mode": None}
     (tmp_path / "config.json").write_text(json.dumps(config), encoding="utf-8")
     with pytest.raises(CheckpointError):
-        load_molmoact2(str(tmp_path))
+        MolmoAct2.load(str(tmp_path))
 
 
 def test_weights_without_an_expert_are_refused(folder: Path, tmp_path: Path) -> None:
@@ -264,15 +264,15 @@ def test_weights_without_an_expert_are_refused(folder: Path, tmp_path: Path) -> 
         {name: own for name, own in tensors.items() if "action_expert" not in name}, tmp_path / "model.safetensors"
     )
     with pytest.raises(WeightsError, match="action_expert"):
-        load_molmoact2(str(tmp_path))
+        MolmoAct2.load(str(tmp_path))
 
 
 def test_half_precision_acts_as_captured_and_is_named_in_the_card(folder: Path, seen: list[Observation]) -> None:
-    policy = load_molmoact2(str(folder), dtype="bfloat16")
+    policy = MolmoAct2.load(str(folder), dtype="bfloat16")
     assert policy.card.dtype == "bfloat16"
     plain = policy.act(seen, [0, 1])
     with capture(policy, policy.sites()) as cache:
         np.testing.assert_array_equal(policy.act(seen, [0, 1]), plain)
     assert cache["backbone.01.residual"].dtype == torch.bfloat16
-    full = load_molmoact2(str(folder)).act(seen, [0, 1])
+    full = MolmoAct2.load(str(folder)).act(seen, [0, 1])
     np.testing.assert_allclose(plain, full, atol=0.05 * np.abs(full).max())

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from probe_kit.errors import InstructionError, ObservationError
-from probe_kit.hooks.families.smolvla.adapter import check_smolvla_words, load_smolvla
+from probe_kit.hooks.families.smolvla.adapter import SmolVLA
 from probe_kit.hooks.testing import example_observations
 from tests.support.smolvla_checkpoints import write_smolvla
 
@@ -26,7 +26,7 @@ from tests.support.smolvla_checkpoints import write_smolvla
 )
 def test_roles_name_the_positions_that_lerobot_masks(tmp_path: Path, fields: dict, shown: int) -> None:
     cameras = ("top", "wrist")
-    policy = load_smolvla(str(write_smolvla(tmp_path, cameras=cameras, **fields))).showing(cameras[:shown])
+    policy = SmolVLA.load(str(write_smolvla(tmp_path, cameras=cameras, **fields))).showing(cameras[:shown])
     seen = example_observations(["Put the cube on the star", "Put the cube on the red shape"], cameras)
     batch = policy.batch(seen)
     images, masks = policy.network.prepare_images(batch)
@@ -40,7 +40,7 @@ def test_roles_name_the_positions_that_lerobot_masks(tmp_path: Path, fields: dic
 
 
 def test_a_second_camera_is_needed_once_it_is_shown(tmp_path: Path) -> None:
-    policy = load_smolvla(str(write_smolvla(tmp_path, cameras=("top", "wrist")))).showing(["top", "wrist"])
+    policy = SmolVLA.load(str(write_smolvla(tmp_path, cameras=("top", "wrist")))).showing(["top", "wrist"])
     with pytest.raises(ObservationError, match=r"no camera\.wrist"):
         policy.act(example_observations(["Put the cube on the star"]), [0])
     with pytest.raises(ObservationError, match="in order"):
@@ -50,6 +50,6 @@ def test_a_second_camera_is_needed_once_it_is_shown(tmp_path: Path) -> None:
 def test_words_are_checked_without_the_network(tmp_path: Path) -> None:
     """An AttributeError refused every instruction before anything was loaded."""
     checkpoint = str(write_smolvla(tmp_path))
-    check_smolvla_words(checkpoint, ["Put the cube on the star"])
+    SmolVLA.check_words(checkpoint, ["Put the cube on the star"])
     with pytest.raises(InstructionError, match=r"does not know|tokens; this checkpoint reads"):
-        check_smolvla_words(checkpoint, ["Put the cube on the zebra " * 40])
+        SmolVLA.check_words(checkpoint, ["Put the cube on the zebra " * 40])

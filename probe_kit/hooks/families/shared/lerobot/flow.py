@@ -36,9 +36,9 @@ class DenoisingPolicy(LerobotPolicy):
         """
 
     @property
-    @abstractmethod
     def noise_shape(self) -> tuple[int, int]:
-        """The shape of one row's noise."""
+        """The shape of one row's noise: actions of a chunk, and the widest action."""
+        return self.config.chunk_size, self.config.max_action_dim
 
     def infer(self, batch: Mapping[str, Tensor], noise: Tensor) -> Tensor:
         """(B, chunk, D) normalised actions, as `denoise` makes them, without a graph."""
@@ -99,11 +99,6 @@ class LerobotFlow(DenoisingPolicy):
         with _with_graph(self.network.model):
             chunk: Tensor = undecorated(self.network.predict_action_chunk)(batch, noise=noise)
         return chunk
-
-    @property
-    def noise_shape(self) -> tuple[int, int]:
-        """Actions of a chunk, and the widest action."""
-        return self.config.chunk_size, self.config.max_action_dim
 
     # -- verification ------------------------------------------------------------------------------------
 

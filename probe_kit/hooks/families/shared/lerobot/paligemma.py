@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from transformers import AutoTokenizer
 
 from probe_kit.errors import CheckpointError
-from probe_kit.hooks.checkpoints.checkpoint import side_files
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.shared.lerobot.pipelines import tokenizer_folder, tokenizer_name
@@ -69,14 +68,14 @@ class PaliGemmaPolicy(LerobotPolicy):
         return next((folder for folder in places if (folder / "tokenizer.json").is_file()), None)
 
     def side_files(self) -> dict[str, Path]:
-        """Also the sizes and the tokenizer, where they lie beside the folder."""
-        files = super().side_files()
-        sizes, text = self.folder.parent / "dims.json", self._tokenizer_folder()
-        if "dims.json" not in files and sizes.is_file():
-            files["dims.json"] = sizes
-        if text is not None and text != self.folder:
-            files |= side_files(text, "tokenizer/")
-        return files
+        """Also the sizes, where they lie beside the folder."""
+        files, sizes = super().side_files(), self.folder.parent / "dims.json"
+        return {**({"dims.json": sizes} if sizes.is_file() else {}), **files}
+
+    def parts(self) -> dict[str, Path]:
+        """The tokenizer, where it lies beside the folder."""
+        folder = self._tokenizer_folder()
+        return {} if folder is None or folder == self.folder else {"tokenizer": folder}
 
     @property
     def masked_cameras(self) -> int:

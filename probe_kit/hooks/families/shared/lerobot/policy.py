@@ -9,6 +9,7 @@ from copy import copy
 from dataclasses import fields, replace
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, ClassVar, Self
 
 import draccus  # the decoder of lerobot, which installs it
@@ -20,7 +21,7 @@ from torch import Tensor, nn
 
 from probe_kit._system.bounded_json import read_json_object
 from probe_kit.errors import CheckpointError, InstructionError, ObservationError
-from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, PATTERNS, content_hashes, side_files
+from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, SMALL_FILES, content_hashes, side_files
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.checkpoints.weights import Weights, load_weights, read_weights
 from probe_kit.hooks.contract.card import ModelCard
@@ -65,6 +66,10 @@ UNCOMPARED = ("IDENTITY", "EXCLUDED")
 """Modes of units without statistics: the state is read as it is, or not at all."""
 _DIMENSIONS = 7
 """Of the arm's actions."""
+_TEXT_FILES = (*SMALL_FILES, "policy_*.safetensors")
+"""All that packing and tokenising read: of the weights only those of lerobot's processors."""
+_VISION = "vision"
+"""The stream of a vision tower."""
 
 
 class LerobotPolicy(Policy):
@@ -78,6 +83,8 @@ class LerobotPolicy(Policy):
     config_type: ClassVar[str]
     unread: ClassVar[tuple[str, ...]] = ()
     """Parameters that inference never reads and a file may lack."""
+    tied: ClassVar[Mapping[str, str]] = MappingProxyType({})
+    """By the name of a tensor that a file may lack, the one tied to it, which is read in its place."""
     newer_fields: ClassVar[Inert] = {}
     """Fields of its configuration in a newer lerobot than the installed one."""
     takes_unread: ClassVar[bool] = False
@@ -98,7 +105,7 @@ class LerobotPolicy(Policy):
         self.checkpoint, self.evaluation = str(folder), AS_STORED
         self.network, self.folder, self.config = network, folder, network.config
         self.stacks = self._stacks()
-        self.streams = {name: self.stacks[name].stream(name) for name in ("backbone", self.acting_stream)}
+        self._read_streams()
         keys = [key.removeprefix(IMAGES) for key in self.config.image_features]
         self.cameras = tuple(key for key in keys if not key.startswith("empty_camera"))
         self._show(self.cameras[:1])
@@ -120,14 +127,18 @@ class LerobotPolicy(Policy):
         other.card = replace(self.card, needs=needs, notes=other._notes())
         return other
 
+    def _read_streams(self) -> None:
+        self.streams = {name: stack.stream(name) for name, stack in self.stacks.items() if name != _VISION}
+
     def _show(self, cameras: tuple[str, ...]) -> None:
-        self.shown_cameras = cameras
-        self.stacks["vision"] = replace(self.stacks["vision"], iterations=len(cameras) + self.masked_cameras)
-        self.further_streams = {"vision": self.stacks["vision"].stream("vision")}
-        images = tuple(f"image.{camera}" for camera in cameras)
+        self.shown_cameras, self.further_streams = cameras, {}
+        if (vision := self.stacks.get(_VISION)) is not None:
+            if vision.iterations is not None:  # a tower without iterations reads all pictures at once
+                vision = self.stacks[_VISION] = replace(vision, iterations=len(cameras) + self.masked_cameras)
+            self.further_streams = {_VISION: vision.stream(_VISION)}
+        prompt = (*(f"image.{camera}" for camera in cameras), *self.other_roles, PADDING)
         self.role_names = {
-            "backbone": (*images, *self.other_roles, PADDING),
-            self.acting_stream: self.suffix_roles,
+            name: self.suffix_roles if name == self.acting_stream else prompt for name in self.streams
         }
 
     # -- what a family decides -------------------------------------------------------------------------
@@ -138,9 +149,13 @@ class LerobotPolicy(Policy):
         """The network with uninitialised weights."""
 
     @classmethod
-    @abstractmethod
     def current_keys(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """A file's tensors under the names the network has."""
+        """A file's tensors under the names the network has; see `tied`."""
+        stored = dict(tensors)
+        for name, other in cls.tied.items():
+            if other in stored:
+                stored.setdefault(name, stored[other])
+        return stored
 
     @classmethod
     def _current_key(cls, name: str) -> str:
@@ -149,20 +164,20 @@ class LerobotPolicy(Policy):
 
     @abstractmethod
     def _stacks(self) -> dict[str, Stack]:
-        """The stacks `backbone`, `vision` and the acting one."""
+        """The stacks in the order of the streams: `backbone`, others, the acting one, and `vision` if captured."""
 
     @property
     @abstractmethod
     def masked_cameras(self) -> int:
         """Cameras without a picture that still occupy positions, masked, after the shown ones."""
 
-    @abstractmethod
     def prefix_labels(self, language: Sequence[str]) -> list[str]:
         """The role of every backbone position of one row, from those of its language positions."""
+        return list(language)
 
-    @abstractmethod
     def suffix_labels(self) -> list[str]:
         """The role of every suffix position."""
+        return ["action"] * int(self.config.chunk_size)
 
     @cached_property
     @abstractmethod
@@ -291,7 +306,14 @@ class LerobotPolicy(Policy):
 
     def side_files(self) -> dict[str, Path]:
         """Every file besides the weights that loading and acting read: configuration, units, window, text."""
-        return side_files(self.folder)
+        files = side_files(self.folder)
+        for prefix, folder in self.parts().items():
+            files |= side_files(folder, f"{prefix}/")
+        return files
+
+    def parts(self) -> dict[str, Path]:
+        """Further folders that it reads, such as that of a vision-language model's tokenizer, by a name."""
+        return {}
 
     def _notes(self) -> tuple[str, ...]:
         masked = self.cameras[len(self.shown_cameras) :]
@@ -472,8 +494,11 @@ class LerobotPolicy(Policy):
 
     def _pictures(self, camera: str, observations: Sequence[Observation]) -> Tensor:
         """(B, 3, H, W) in [0, 1]: each picture as this checkpoint looks at it."""
-        images = [o.image if camera == self.cameras[0] else o.cameras[camera] for o in observations]
-        return self.look(camera, [checked_picture(image) for image in images])
+        return self.look(camera, [self.picture_of(camera, observation) for observation in observations])
+
+    def picture_of(self, camera: str, observation: Observation) -> NDArray[np.uint8]:
+        """(H, W, 3); the first camera is shown the environment's picture. Raises ObservationError."""
+        return checked_picture(observation.image if camera == self.cameras[0] else observation.cameras[camera])
 
     def look(self, camera: str, images: Sequence[NDArray[np.uint8]]) -> Tensor:
         """(B, 3, H, W) in [0, 1]: the part of each picture (H, W, 3) that this checkpoint looks at."""
@@ -519,10 +544,10 @@ class LerobotPolicy(Policy):
         cls._text_reader(checkpoint, evaluation).tokenise(instructions)
 
     @classmethod
-    def _text_reader(cls, checkpoint: str, evaluation: Evaluation, patterns: Sequence[str] = PATTERNS) -> Self:
-        """Return a policy without a network, which still packs and tokenises. patterns: the files it needs."""
+    def _text_reader(cls, checkpoint: str, evaluation: Evaluation) -> Self:
+        """Return a policy without a network, which still packs and tokenises."""
         text = cls.__new__(cls)
-        text.folder, text.evaluation = checkpoint_folder(checkpoint, patterns), evaluation
+        text.folder, text.evaluation = checkpoint_folder(checkpoint, _TEXT_FILES), evaluation
         text.config = cls._read_config(text.folder, evaluation)
         text.cameras = text.shown_cameras = tuple(key.removeprefix(IMAGES) for key in text.config.image_features)[
             :1
