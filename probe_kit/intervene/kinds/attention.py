@@ -118,17 +118,17 @@ class AttentionReadout(Intervention):
         attention = AttentionShares.of(context.measurement)
         means = attention.rows(("block",))
         roles = [role for role in dict.fromkeys(row.role for row in means) if role not in (CORRECT, OTHER)]
-        lines: list[tuple[str, tuple[dict[str, float], str]]] = []
+        lines: list[tuple[tuple[str, ...], tuple[dict[str, float], str]]] = []
         for category, part in attention.by_category():
             apart = part.correct_minus_other(context.measurement.seed_text)
             for block in dict.fromkeys(row.block for row in means if row.category == category):
                 shares = {row.role: row.share for row in means if (row.category, row.block) == (category, block)}
-                lines.append((f"{category} · block {block:02d}", (shares, _difference(apart.get(block or 0)))))
+                lines.append(((category, f"block {block:02d}"), (shares, _difference(apart.get(block or 0)))))
         parts: dict[str, Any] = {"Where the attention lies, %": {role: _share_column(role) for role in roles}}
         if set(TILE_ROLES) <= set(roles):
             parts["Tiles by answer"] = {"correct − other [95 %]": lambda row: row[1]}
         title = f"What does it attend to? {context.subject}, attention"
-        return effect_table(title, _LEGEND, "category · read", lines, parts)
+        return effect_table(title, _LEGEND, ("category", "read"), lines, parts)
 
     @staticmethod
     def notes(rows: "Sequence[AttentionRow]", measurement: Measurement) -> list[str]:

@@ -231,7 +231,7 @@ class AttributionPatching(Intervention):
         return effect_table(
             "; ".join([f"Which places to patch? {context.subject}, gradients", *void]),
             context.in_words(_LEGEND),
-            "category · cell",
+            ("category", "cell"),
             lines_of(rows, lambda row: row.name),
             {context.in_words("Share of the image swap"): _COLUMNS},
             lambda row: row.is_anchor,

@@ -476,38 +476,32 @@ def frame_of(rows: Sequence[Effect]) -> "pd.DataFrame":
 def effect_table[Row](
     title: str,
     caption: str,
-    heading: str,
-    lines: Sequence[tuple[str, Row]],
+    names: Sequence[str],
+    lines: Sequence[tuple[tuple[str, ...], Row]],
     parts: Mapping[str, Mapping[str, Callable[[Row], str]]],
     is_bold: Callable[[Row], bool] = lambda _: False,
 ) -> "Table":
-    """Return a table. lines: name and row of each. parts: by title, the text of a row's cell by column."""
+    """Return a table.
+
+    names: headings of the columns that name a line. lines: these names and the row of each. parts: by title, the
+    text of a row's cell by column.
+    """
     from probe_kit._tables.table import Cell, Heading, Table, grouped
 
-    names = heading.split(SEPARATOR_OF_NAMES)
     rows: list[tuple[Cell | str, ...]] = [
         (
-            *(Cell(text, strong=is_bold(row)) for text in _split_name(name, len(names))),
+            *(Cell(text, strong=is_bold(row)) for text in line),
             *(text(row) for columns in parts.values() for text in columns.values()),
         )
-        for name, row in lines
+        for line, row in lines
     ]
     headings = (*map(Heading, names), *grouped(*((part, tuple(columns)) for part, columns in parts.items())))
     return Table.of(title, headings, rows, names=len(names), notes=[caption])
 
 
-SEPARATOR_OF_NAMES = " · "
-
-
-def _split_name(name: str, count: int) -> list[str]:
-    """Return the names of a row, one per column that names it."""
-    texts = name.split(SEPARATOR_OF_NAMES, count - 1)
-    return [*texts, *[""] * (count - len(texts))]
-
-
-def lines_of[Row: Effect](rows: Iterable[Row], name: Callable[[Row], str]) -> list[tuple[str, Row]]:
-    """Return rows with the name of their line: the category, and the name of the row."""
-    return [(f"{row.category} · {name(row)}", row) for row in rows]
+def lines_of[Row: Effect](rows: Iterable[Row], name: Callable[[Row], str]) -> list[tuple[tuple[str, ...], Row]]:
+    """Return rows with the names of their lines: the category, and the name of the row."""
+    return [((row.category, name(row)), row) for row in rows]
 
 
 def text_of(value: float | None, form: str = ".2f", missing: str = "–") -> str:

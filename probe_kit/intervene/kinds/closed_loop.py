@@ -211,7 +211,7 @@ class ClosedLoop(AlongDirection):
         return effect_table(
             f"Is it so in closed loop? {context.subject}",
             _LEGEND,
-            "category · edit",
+            ("category", "edit"),
             lines_of(rows, lambda row: "identity patch" if row.place == CLEAN else row.name),
             {"Where the cube ends": _ENDS, "Compared with the identity patch": _COMPARED},
             lambda row: row.finding == "confirmed",

@@ -184,7 +184,7 @@ class ConceptErasure(Intervention):
         return effect_table(
             f"What is lost without it? {context.subject}, erase",
             _LEGEND,
-            "category · erased",
+            ("category", "erased"),
             lines_of(edits, lambda row: row.name),
             {"What the action does": _ACTION, "What a probe reads": _PROBE},
             lambda row: row.finding == "effect",

@@ -21,6 +21,7 @@ from probe_kit.intervene.kinds.base import (
     TableContext,
     effect_table,
     interval_text,
+    lines_of,
     text_of,
 )
 from probe_kit.intervene.outcomes import CLEAN, IMAGE_SWAP, ConditionOutcomes, Effect
@@ -308,8 +309,8 @@ class ImageSwap(Intervention):
         return effect_table(
             f"Is it used? {context.subject}, images swapped",
             "; ".join(filter(None, (_LEGEND, *notes))),
-            "category",
-            [(row.category, row) for row in rows],
+            ("category",),
+            [((row.category,), row) for row in rows],
             {
                 "Verdict": {
                     "verdict": lambda row: verdicts[row.category].verdict if row.category in verdicts else "–"
@@ -386,9 +387,9 @@ def exchanged_effects(measurement: Measurement, swapped: str) -> list[InputEffec
 def input_table(rows: Sequence[Any], context: TableContext) -> "Table":
     """Return one line per category and input."""
     title = f"Does the input decide? {context.subject}, {context.exchange}"
-    lines = [(f"{row.category} · {row.vary}", row) for row in rows]
+    lines = lines_of(rows, lambda row: str(row.vary))
     return effect_table(
-        title, INPUT_LEGEND, "category · input", lines, {"Does the action follow it?": INPUT_COLUMNS}
+        title, INPUT_LEGEND, ("category", "input"), lines, {"Does the action follow it?": INPUT_COLUMNS}
     )
 
 

@@ -173,8 +173,8 @@ class InstructionSwap(Intervention):
         return effect_table(
             f"Is the instruction read? {context.subject}",
             _LEGEND,
-            "category",
-            [(row.category, row) for row in rows],
+            ("category",),
+            [((row.category,), row) for row in rows],
             {"Does the action follow the instruction?": SWAP_COLUMNS, "What one step owes to": _STEP_COLUMNS},
         )
 

@@ -156,7 +156,7 @@ class Interchange(AlongDirection):
         return effect_table(
             f"Where is it used? {context.subject}, {context.measurement.settings['kind']}",
             context.in_words(_LEGEND),
-            "category · edit",
+            ("category", "edit"),
             lines_of(edits, lambda row: f"{row.name}{' (unread)' * (row.place in unread)}"),
             {"What the action does": _WITHOUT_SIDES if context.lacks_sides else _COLUMNS},
             lambda row: row.is_localised and not row.is_by_construction,

@@ -22,6 +22,7 @@ from probe_kit.intervene.kinds.base import (
     effect_table,
     flips_seed,
     interval_text,
+    lines_of,
 )
 from probe_kit.intervene.kinds.image_swap import share_of_swap, swap_sign
 from probe_kit.intervene.kinds.interchange import cells_at, check_sites_and_roles
@@ -217,11 +218,8 @@ class JointPlaces(Intervention):
         return effect_table(
             f"Where is it read, alone and jointly? {context.subject}, joint places",
             context.in_words(_LEGEND),
-            "category · cells",
-            [
-                (" ".join(filter(None, (f"{row.category} ·", _PARTS.get(row.part, ""), row.cells))), row)
-                for row in rows
-            ],
+            ("category", "cells"),
+            lines_of(rows, lambda row: f"{_PARTS.get(row.part, '')} {row.cells}".lstrip()),
             {context.in_words("Share of the image swap"): _COLUMNS},
             lambda row: row.finding.startswith("read"),
         )
