@@ -244,13 +244,12 @@ def is_upstream(site: str) -> bool:
     return PlaceName.parse(site).layer == 0
 
 
-def stored_localised_sites(run: RunReader) -> dict[str, tuple[str, ...]]:
-    """Return by category `localised_sites` of its maps; without categories that were not searched.
+def localised_by_category(maps: Mapping[str, Sequence[PatchEffect]]) -> dict[str, tuple[str, ...]]:
+    """Return by category `localised_sites` of `stored_site_effects`; without categories that were not searched.
 
     Searched is one of which all tokens of some layer of the backbone were patched, or of which a place was found:
     a null result for one role, iteration or block does not rule out the others.
     """
-    maps = stored_site_effects(run)
     searched = {
         category
         for category, rows in maps.items()
@@ -260,13 +259,14 @@ def stored_localised_sites(run: RunReader) -> dict[str, tuple[str, ...]]:
     return {category: places for category, places in localised.items() if places or category in searched}
 
 
-def stored_carrying_directions(run: RunReader) -> dict[str, tuple[str, ...]]:
-    """Return by category the directions that carry half of the effect, beyond random ones: `mean-difference at
-    backbone.02 image`.
+def carrying_directions(along: Mapping[str, Sequence[PatchEffect]]) -> dict[str, tuple[str, ...]]:
+    """Return by category the directions that carry half of the effect, beyond random ones.
+
+    along: as `stored_subspace_effects` gives it. A direction is spelt `mean-difference at backbone.02 image`.
     """
     return {
         category: tuple(f"{row.direction} at {row.place} {row.role}" for row in rows if _is_carrier(row))
-        for category, rows in stored_subspace_effects(run).items()
+        for category, rows in along.items()
     }
 
 

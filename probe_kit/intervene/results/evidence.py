@@ -1,6 +1,7 @@
 """The places at which stored interventions found that the answer passes and is read. Needs no model."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from functools import cached_property
 from itertools import starmap
 from typing import TYPE_CHECKING, Literal
 
@@ -20,10 +21,10 @@ from probe_kit.intervene.kinds.site_maps import (
     BACKBONE,
     PatchEffect,
     best_cell,
+    carrying_directions,
     is_backbone_layer,
     is_upstream,
-    stored_carrying_directions,
-    stored_localised_sites,
+    localised_by_category,
     stored_site_effects,
     stored_subspace_effects,
 )
@@ -39,13 +40,38 @@ if TYPE_CHECKING:
     from probe_kit.train.results.probe_results import ProbeResults
 
 
-def stored_places(run: RunReader) -> dict[str, Places]:
+class StoredEvidence:
+    """The rows of a run's stored interventions inside the network, by category; each is computed once.
+
+    maps: tokens patched in full. along: within directions. joint: sets of places. Raise RunDamagedError.
+    """
+
+    def __init__(self, run: RunReader) -> None:
+        self._run = run
+
+    @cached_property
+    def maps(self) -> dict[str, list[PatchEffect]]:
+        """Return `stored_site_effects`."""
+        return stored_site_effects(self._run)
+
+    @cached_property
+    def along(self) -> dict[str, list[PatchEffect]]:
+        """Return `stored_subspace_effects`."""
+        return stored_subspace_effects(self._run)
+
+    @cached_property
+    def joint(self) -> dict[str, list[JointEffect]]:
+        """Return `stored_joint_places`."""
+        return stored_joint_places(self._run)
+
+
+def stored_places(evidence: StoredEvidence) -> dict[str, Places]:
     """Return by category the places of interchanges and joint searches; without categories that were not searched.
 
     Raises RunDamagedError.
     """
-    located, carried = stored_localised_sites(run), stored_carrying_directions(run)
-    searched = {name: rows for name, rows in stored_joint_places(run).items() if _says_where(rows)}
+    located, carried = localised_by_category(evidence.maps), carrying_directions(evidence.along)
+    searched = {name: rows for name, rows in evidence.joint.items() if _says_where(rows)}
     jointly = {name: describe_joint_places(rows) for name, rows in searched.items()}
     remainders = {name: describe_remainder(rows) for name, rows in searched.items()}
     return {
@@ -145,7 +171,9 @@ def describe_tie(sites: Sites, is_joint: bool = False) -> str:
     return "the readable copy is not the one used: the answer passes elsewhere"
 
 
-def stored_ties(run: RunReader, results: "ProbeResults | None", view: str | None = None) -> dict[str, str]:
+def stored_ties(
+    evidence: StoredEvidence, results: "ProbeResults | None", view: str | None = None
+) -> dict[str, str]:
     """Return by category `describe_tie` of the sites at which probes of a view are significant.
 
     So are sites at which a direction of the same means carries the effect: it is read out of other episodes. The
@@ -160,8 +188,7 @@ def stored_ties(run: RunReader, results: "ProbeResults | None", view: str | None
     backbone_scores = scores[
         (scores["stream"] == BACKBONE) & (scores["view"] == (view or results.settings.views[0]))
     ]
-    in_full, along = stored_site_effects(run), _of_answers(stored_subspace_effects(run))
-    jointly = stored_joint_places(run)
+    in_full, along, jointly = evidence.maps, _of_answers(evidence.along), evidence.joint
     ties = {}
     for category, rows in backbone_scores.groupby("category", sort=False):
         name = str(category)
@@ -233,14 +260,18 @@ _TIES: dict[TieAtSite, str] = {
 
 
 def which_layer(
-    run: RunReader, results: "ProbeResults | None", places: Mapping[str, Places], categories: Sequence[str]
+    run: RunReader,
+    evidence: StoredEvidence,
+    results: "ProbeResults | None",
+    places: Mapping[str, Places],
+    categories: Sequence[str],
 ) -> dict[str, str]:
     """Return by category where the answer passes, where it is read, and whether the probes' best site is read.
 
     results: the newest probes, None without any. places: as `stored_places` gives them. Of stored interchanges and
     joint places; what was not tested is named with the command that tests it.
     """
-    maps, along = stored_site_effects(run), stored_subspace_effects(run)
+    maps, along = evidence.maps, evidence.along
     lines = {}
     for name in categories:
         rows, category_places = maps.get(name, []), places.get(name)

@@ -16,7 +16,13 @@ from probe_kit.intervene.kinds.base import Intervention, Measurement, TableConte
 from probe_kit.intervene.kinds.image_swap import ImageSwapEffect, stored_image_swaps, tiles_apart
 from probe_kit.intervene.outcomes import ConditionOutcomes, Effect, StoredIntervention, find_stored
 from probe_kit.intervene.places import unread_note
-from probe_kit.intervene.results.evidence import stored_other_readouts, stored_places, stored_ties, which_layer
+from probe_kit.intervene.results.evidence import (
+    StoredEvidence,
+    stored_other_readouts,
+    stored_places,
+    stored_ties,
+    which_layer,
+)
 from probe_kit.intervene.results.verdict import Places, UseVerdict, classify_all, describe_readouts, encoded_in
 from probe_kit.intervene.settings import PER_STEP
 from probe_kit.statistics.paired_tests import smallest_flip_p
@@ -212,20 +218,23 @@ def effects_of(run: RunReader, stored: StoredIntervention) -> InterventionResult
     if not result.outcomes.has_sides:
         return result
     swaps = result.effects if kind_of(result.kind).has_verdict else ()
-    results, places = _newest_probes(run), stored_places(run)
-    result.verdicts.update(_verdicts(run, results, places, swaps))
+    results, evidence = _newest_probes(run), StoredEvidence(run)
+    places = stored_places(evidence)
+    result.verdicts.update(_verdicts(run, evidence, results, places, swaps))
     if kind_of(result.kind).asks_where:
-        result.layers.update(which_layer(run, results, places, list(stored.settings["categories"])))
+        result.layers.update(which_layer(run, evidence, results, places, list(stored.settings["categories"])))
     return result
 
 
 def verdicts_of(run: RunReader) -> dict[str, UseVerdict]:
     """Return verdicts by category, from all interventions and the newest probes that are stored with a run."""
-    return _verdicts(run, _newest_probes(run), stored_places(run), ())
+    evidence = StoredEvidence(run)
+    return _verdicts(run, evidence, _newest_probes(run), stored_places(evidence), ())
 
 
 def _verdicts(
     run: RunReader,
+    evidence: StoredEvidence,
     results: "ProbeResults | None",
     places: Mapping[str, Places],
     swaps: Sequence[ImageSwapEffect],
@@ -233,7 +242,7 @@ def _verdicts(
     """Classify the stored image swaps. swaps: classified whatever else is stored of their categories."""
     effects = {**stored_image_swaps(run), **{row.category: row for row in swaps}}
     other_readouts = stored_other_readouts(run, effects)
-    return classify_all(effects, encoded_in(results), places, stored_ties(run, results), other_readouts)
+    return classify_all(effects, encoded_in(results), places, stored_ties(evidence, results), other_readouts)
 
 
 def _newest_probes(run: RunReader) -> "ProbeResults | None":

@@ -9,7 +9,7 @@ from probe_kit.env.scoring.rules import DEFAULT_RULE
 from probe_kit.errors import UnknownSiteError
 from probe_kit.hooks.contract.sites import first_of
 from probe_kit.intervene.kinds.image_swap import stored_image_swaps
-from probe_kit.intervene.results.evidence import stored_other_readouts, stored_places, stored_ties
+from probe_kit.intervene.results.evidence import StoredEvidence, stored_other_readouts, stored_places, stored_ties
 from probe_kit.retention.behaviour.success_rate import (
     SuccessRate,
     capture_only,
@@ -89,9 +89,10 @@ def run_rows(
         raise UnknownSiteError(f"{run.location} has probes of {probed}, not of {', '.join(sorted(unknown))}")
     judged = RunUnderRule.of(run, settings.rule, settings.last_steps, settings.with_behaviour)
     effects = stored_image_swaps(run)
-    places = stored_places(run) if effects else {}
+    evidence = StoredEvidence(run)
+    places = stored_places(evidence) if effects else {}
     readouts = stored_other_readouts(run, effects)
-    ties = {view: stored_ties(run, results, view) if effects else {} for view in views}
+    ties = {view: stored_ties(evidence, results, view) if effects else {} for view in views}
     drawn = [
         _row(judged, results, settings, group, str(category), episodes, view)
         for category, episodes in judged.run.episodes.groupby("category", sort=False)

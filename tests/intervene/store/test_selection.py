@@ -20,13 +20,13 @@ from probe_kit.intervene import (
     stored_image_swaps,
 )
 from probe_kit.intervene.kinds.site_maps import (
-    stored_localised_sites,
+    localised_by_category,
     stored_site_effects,
     stored_steering,
     stored_subspace_effects,
 )
 from probe_kit.intervene.outcomes import ATTENTION_FILE, StoredIntervention
-from probe_kit.intervene.results.evidence import stored_places
+from probe_kit.intervene.results.evidence import StoredEvidence, stored_places
 from probe_kit.intervene.results.inventory import listed_interventions
 from probe_kit.intervene.results.results import effects_of, verdicts_of
 from probe_kit.intervene.settings import FORMAT, key_of
@@ -190,7 +190,7 @@ def read(run: ArrayRun) -> dict[str, Any]:
         "along": stored_subspace_effects(run),
         "steering": stored_steering(run),
         "attention": {name: own.to_bytes() for name, own in stored_attention(run).items()},
-        "verdicts": classify_all(found, encoded, stored_places(run)),
+        "verdicts": classify_all(found, encoded, stored_places(StoredEvidence(run))),
         "targets": best_patch_targets(run, ["color"]),
     }
 
@@ -296,4 +296,4 @@ def test_a_category_is_searched_where_all_tokens_of_the_backbone_were_exchanged(
     alone = replace(run, path=tmp_path)
     for name in names:
         store(alone, name)
-    assert stored_localised_sites(alone).get("color") == said
+    assert localised_by_category(stored_site_effects(alone)).get("color") == said

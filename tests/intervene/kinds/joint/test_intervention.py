@@ -10,7 +10,7 @@ from probe_kit.errors import UnsupportedInterventionError, UsageError
 from probe_kit.hooks.contract.interventions import Interventions
 from probe_kit.intervene import Interchange, InterventionResult, ReplaySource, run_intervention
 from probe_kit.intervene.kinds.joint import JointPlaces, stored_joint_places
-from probe_kit.intervene.kinds.site_maps import stored_localised_sites, stored_site_effects
+from probe_kit.intervene.kinds.site_maps import localised_by_category, stored_site_effects
 from probe_kit.intervene.results.inventory import listed_interventions
 from probe_kit.runs import Run
 
@@ -81,7 +81,9 @@ def test_heads_of_one_block_are_cells_and_no_search_of_the_backbone(
         "backbone.01.heads.3",
     ]
     assert not any(row.is_by_construction for row in rows if "heads" in row.place)
-    assert "color" not in stored_localised_sites(copy), "heads alone are no search of the backbone"
+    assert "color" not in localised_by_category(stored_site_effects(copy)), (
+        "heads alone are no search of the backbone"
+    )
 
 
 def test_heads_of_two_blocks_come_one_after_the_other(copy: Run, source: ReplaySource, twin: "Policy") -> None:
