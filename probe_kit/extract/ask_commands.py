@@ -22,8 +22,8 @@ OWN_SCENE = frozenset(SceneOptions.model_fields) - {"scene"} | {"wordings"}
 @command_with(*AskSettings.option_models(), offers=lambda name: name not in OWN_SCENE)
 def ask(
     typed: Mapping[str, Any],
-    prompt: start.Prompts = start.P1_P2_SEEN,
-    picture_size: start.PictureSizes = start.SIZE_224,
+    prompt: start.Prompts = None,
+    picture_size: start.PictureSizes = None,
     out_folder: start.AskOutFolder = None,
     dry_run: common.DryRun = False,
     force: common.Force = False,
@@ -33,7 +33,8 @@ def ask(
     Makes one run per prompt and picture size. Use the --suite, --protocol, --scene and --seed of the policy runs
     to compare with. Every question is asked in both orders of the options. Answers are read from the text and from
     the logits of the options. Compare with policies by `probe-kit retention ASKED… ACTED…`, also with
-    --compare stages.
+    --compare stages. Recordings, environments and pictures have no objects: their instruction is the question, and
+    stored activations are probed for their labels.
 
     The same command resumes interrupted runs. With more items or categories they grow and keep what they have.
     Other settings in the same folder are an error.
@@ -63,14 +64,22 @@ def ask(
 
 def _print_answers(runs: "Sequence[Run]") -> None:
     """Print how each run went, what to look at, and what to do next."""
+    import pandas as pd
+
+    from probe_kit.runs.reader import SIDE
+
     for run in runs:
         episodes = run.episodes
         counts = ", ".join(f"{name} {count}" for name, count in episodes["outcome"].value_counts().items())
-        unread = episodes.loc[episodes["outcome"] == "oob", "parse"].value_counts()
+        unread = episodes.loc[episodes["outcome"] == "oob"].get("parse", pd.Series(dtype=str)).value_counts()
         reasons = f" ({', '.join(f'{name} {count}' for name, count in unread.items())})" if len(unread) else ""
-        mass = float(episodes["option_mass"].mean())
-        say(f"{run.label}: {counts}{reasons}; option mass {mass:.2f}")
+        mass = f"; option mass {episodes['option_mass'].mean():.2f}" if "option_mass" in episodes else ""
+        say(f"{run.label}: {counts}{reasons}{mass}")
         print_input_notes(run)
         out.print(str(run.location), soft_wrap=True)
+    if SIDE not in runs[0].episodes:
+        step = "targets {}" if runs[0].streams else "labels {}"
+        say(marked(f"next: [bold]probe-kit {step}[/]", runs[0].location))
+        return
     places = " ".join(str(run.location) for run in runs)
     say(marked("next: [bold]probe-kit retention {}[/], with policy runs behind", places))

@@ -54,18 +54,18 @@ AskOutFolder = Annotated[
     ),
 ]
 Prompts = Annotated[
-    Names,
+    Names | None,
     typer.Option(
         "--prompt",
         parser=_prompts,
         metavar="A,B,…",
+        show_default="p1,p2,seen; instruction where there are no objects",
         help="Prompts, comma-separated: seen, p1, p2 (from the paper), instruction (the words of the policies) "
         "or text files. A file contains {object}, and {A} and {B} for the sides.",
     ),
 ]
-P1_P2_SEEN = Names(("p1", "p2", "seen"))
 PictureSizes = Annotated[
-    Sizes,
+    Sizes | None,
     typer.Option(
         "--picture-size",
         parser=Sizes.parse,
@@ -74,7 +74,6 @@ PictureSizes = Annotated[
         help="Picture sizes in pixels, comma-separated. The paper uses 224x224 and 560x480.",
     ),
 ]
-SIZE_224 = Sizes([(224, 224)])
 
 Large = Annotated[
     bool, stored_option("--yes", help="Begin a run that would take more than 64 GB before compression.")

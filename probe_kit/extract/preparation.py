@@ -20,7 +20,6 @@ from probe_kit.extract.rollout.answer_controller import AnswerController, asked_
 from probe_kit.extract.rollout.controllers import SCRIPTED, Controller, PolicyController, ScriptedController
 from probe_kit.extract.settings import AskSettings, ExtractSettings, Settings, refuse, run_label
 from probe_kit.extract.sources.recording import IMAGES, STATE
-from probe_kit.extract.sources.scene_source import SceneSource
 from probe_kit.extract.sources.source import Source
 from probe_kit.extract.vqa.phrases import phrases
 from probe_kit.hashing import canonical_json, sha256_json
@@ -93,10 +92,7 @@ class Prepared:
         """
         hashed = [self.identity(), *self.plan.name_parts]
         # Without the weights' hash there is no name yet.
-        name = [self.settings.model.family, "…" if self.declared else sha256_json(hashed)[:8]]
-        if isinstance(self.settings, AskSettings):
-            name = ["ask", name[0], self.settings.short_name, name[1]]
-        return "-".join(name)
+        return self.settings.folder_name("…" if self.declared else sha256_json(hashed)[:8])
 
 
 def load(
@@ -125,14 +121,12 @@ def load(
         _check_before_loading(settings, source, fetch)
     if not fetch and (sizes := planned_sizes(settings, source.instructions)) is not None:
         settings, card = _planned_settings(settings, sizes), _declared_card(settings)
-        plan = _plan(settings, source, rows, sizes.streams, _declared_execute(settings, sizes))
+        plan = _plan(settings, source, rows, sizes.streams, settings.execute or sizes.execute)
         return Prepared(settings, source, plan, card, None, declared=sizes.source)
     if isinstance(settings, AskSettings):
-        assert isinstance(source, SceneSource)
-        loaded = load_answer_model(settings) if answer_model is None else answer_model
-        check_fit(loaded.card, settings, source)
-        asking = AnswerController(loaded, source, settings, settings.seed)
-        return Prepared(settings, source, _plan(settings, source, rows, asking.streams), asking.identity, asking)
+        return _with_answers(
+            settings, source, load_answer_model(settings) if answer_model is None else answer_model
+        )
     assert isinstance(settings, ExtractSettings)
     if settings.model.family in SCRIPTED:
         script = ScriptedController(settings.model.family)
@@ -140,6 +134,16 @@ def load(
     if policy is not None:
         _check_loaded(settings, policy)
     return _with_policy(settings, source, load_acting_policy(settings) if policy is None else policy)
+
+
+def _with_answers(settings: AskSettings, source: Source[Any], model: "AnswerModel") -> Prepared:
+    """The run of a model that answers and is loaded."""
+    source = source.watched(model.card.cameras)
+    settings = settings.changed(source=source.settings) if source.settings != settings.source else settings
+    check_fit(model.card, settings, source)
+    asking = AnswerController(model, source, settings)
+    plan = _plan(settings, source, _rows(settings, source), asking.streams, 0)
+    return Prepared(settings, source, plan, asking.identity, asking)
 
 
 def _with_policy(settings: ExtractSettings, source: Source[Any], policy: "Policy") -> Prepared:
@@ -168,14 +172,14 @@ def open_checked(
     `load`.
     """
     check_meaningless(settings)
-    if isinstance(settings, ExtractSettings):
-        settings = settings.followed()
+    settings = settings.followed()
     if not loaded:
         check_model(settings, fetch)
     if location is not None:
         _check_writable(location)
     source = settings.source.open(not fetch and _selects_only(settings, location))
-    if decided := source.decided():
+    source = source.asked() if isinstance(settings, AskSettings) else source
+    if decided := {name: value for name, value in source.decided().items() if name in settings.names()}:
         settings = settings.changed(**decided)
     if not loaded:
         _check_words(settings, source)
@@ -245,10 +249,10 @@ def _check_words(settings: Settings, source: Source[Any]) -> None:
         return
     texts: Iterable[str] = source.instructions
     if isinstance(settings, AskSettings):
-        assert isinstance(source, SceneSource)
-        objects = phrases(source.suite, settings.task.query, settings.seed)
-        texts = dict.fromkeys(phrase.text for phrase in objects.values())
-    if settings.source.command:  # said together with cameras and state, see `_check_before_loading`
+        if source.suite is not None:
+            objects = phrases(source.suite, settings.task.query, settings.seed)
+            texts = dict.fromkeys(phrase.text for phrase in objects.values())
+    elif settings.source.command:  # said together with cameras and state, see `_check_before_loading`
         return
     find_family(settings.model.family, tuple(SCRIPTED)).check_words(texts, settings.model.checkpoint)
 
@@ -429,8 +433,8 @@ def check_fit(card: "ModelCard", settings: Settings, source: Source[Any]) -> Non
         )
     if lacking := source.example(source.instructions[0]).lacks(card.needs):
         raise UsageError(
-            f"{card.family} reads {', '.join(lacking)}, which this scene lacks; it has one picture, its "
-            "intrinsics and the state"
+            f"{card.family} reads {', '.join(lacking)}, which {settings.source.subject} do not show; observations "
+            "have pictures and the state, in a scene also the intrinsics"
         )
 
 
@@ -469,10 +473,7 @@ def check_reachable(settings: ExtractSettings, card: "ModelCard", source: Source
 
 def _rows(settings: Settings, source: Source[Any]) -> tuple[Row, ...]:
     rows = source.rows(settings.seed)
-    if isinstance(settings, AskSettings):
-        assert isinstance(source, SceneSource)
-        rows = asked_rows(rows, source, settings)
-    return rows
+    return asked_rows(rows, source, settings) if isinstance(settings, AskSettings) else rows
 
 
 def _plan(
@@ -482,7 +483,7 @@ def _plan(
     streams: Iterable[StoredStream],
     execute: int = 1,
 ) -> Plan:
-    """The plan of rows that store these streams. execute: actions per inference."""
+    """The plan of rows that store these streams. execute: actions per inference, 0 where none are predicted."""
     capture, streams = settings.capture, tuple(streams)
     size = sum(stream.raw_bytes(capture.tokens == "all", capture.calls, capture.later_views) for stream in streams)
     return Plan(
@@ -499,21 +500,15 @@ def _plan(
 
 def _planned_settings(settings: Settings, sizes: PlannedSizes) -> Settings:
     """The settings with the inferences of an episode counted. Raises CheckpointError for who cannot act."""
-    if not isinstance(settings, ExtractSettings):
-        return settings
-    if not settings.source.command and sizes.outline is not None:
+    in_scene = not settings.source.command
+    if isinstance(settings, ExtractSettings) and in_scene and sizes.outline is not None:
         check_misfit(settings, sizes.outline.misfit(), sizes.outline.checkpoint)
-    return settings.with_every_call(_declared_execute(settings, sizes))
-
-
-def _declared_execute(settings: Settings, sizes: PlannedSizes) -> int:
-    return (settings.task.execute or sizes.execute) if isinstance(settings, ExtractSettings) else sizes.execute
+    return settings.with_every_call(settings.execute or sizes.execute)
 
 
 def _declared_card(settings: Settings) -> dict[str, Any]:
     """The part of the identity of a model that was not loaded."""
-    execute = settings.task.execute if isinstance(settings, ExtractSettings) else None
-    requested: Mapping[str, Any] = {"dtype": settings.model.dtype, "execute": execute}
+    requested: Mapping[str, Any] = {"dtype": settings.model.dtype, "execute": settings.execute}
     declared = {name: value for name, value in requested.items() if value is not None}
     model = {"model": settings.model.family, "random_weights": settings.model.random_weights}
     return {**model, "weights_sha256": None, **declared}

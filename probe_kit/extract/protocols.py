@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 from probe_kit.errors import UsageError
 from probe_kit.extract.parts import ActTask, ModelSettings
-from probe_kit.extract.sources.scene import SceneSettings
 from probe_kit.extract.sources.source import SourceSettings
 from probe_kit.hooks.contract.card import EMBEDDED
 from probe_kit.hooks.contract.protocol import ACT2ANSWER, PLAIN, ProtocolRow, as_text
@@ -67,9 +66,9 @@ def protocol_identity(model: ModelSettings, task: ActTask, source: SourceSetting
     differs_from_default: what the protocol has and what is the default here, by setting. deviations: what the
     protocol has and what the run has. unmatched: what cannot be done here.
     """
-    if task.protocol is None or not isinstance(source, SceneSettings):
+    if task.protocol is None or "protocol" in source.refuses:
         return {}
-    row, used = protocol_row(model, task.protocol), _used(model, task, source.scene)
+    row, used = protocol_row(model, task.protocol), _used(model, task, source.scene_spec)
     protocol = {**({} if row is None else row.settings()), **_scene(protocol_scene(task.protocol))}
     default = {**({} if row is None else _defaults(model.family, row)), **_scene(scene_of(model.family))}
     if task.capture_only:

@@ -10,7 +10,7 @@ from dataclasses import replace
 from difflib import get_close_matches
 from inspect import Parameter, Signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NoReturn, Self
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, Self
 
 import typer
 from pydantic import AfterValidator, BeforeValidator, SerializeAsAny
@@ -23,7 +23,7 @@ from probe_kit.extract.protocols import has_network, protocol_identity, protocol
 from probe_kit.extract.sources.kinds import SOURCES, kind_of
 from probe_kit.extract.sources.scene import SceneOptions, SceneSettings
 from probe_kit.extract.sources.source import SourceSettings
-from probe_kit.extract.vqa.templates import find_template
+from probe_kit.extract.vqa.templates import INSTRUCTION, find_template
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.checkpoints.checkpoint import is_on_hub
 from probe_kit.hooks.contract.protocol import PLAIN
@@ -34,6 +34,9 @@ if TYPE_CHECKING:
     from probe_kit.suite.wording import Wording
 
 _PARTS = ("model", "capture", "task", "machine")
+PAPER_PROMPTS = ("p1", "p2", "seen")
+DEFAULT_SIZE = (224, 224)
+SCENE = SceneSettings.model_fields["kind"].default
 
 
 def _read_source(value: Any) -> Any:
@@ -74,8 +77,6 @@ class Settings(Part):
             "--label", help="Name of the run in tables. Default: the model and the options in which it differs."
         ),
     ] = None
-
-    sources: ClassVar[tuple[type[SourceSettings], ...]] = SOURCES[:1]
 
     def model_post_init(self, _: Any) -> None:
         """Raise UsageError for more frames of an episode than one picture holds."""
@@ -128,6 +129,11 @@ class Settings(Part):
         parts["source"] = _with_scene(parts, scene)
         return parts
 
+    @classmethod
+    def names(cls) -> set[str]:
+        """Return the names of all fields but those of a source."""
+        return {*cls.model_fields}.union(*(_model_of(cls, part).model_fields for part in _PARTS))
+
     def changed(self, **values: Any) -> Self:
         """The settings with other fields, by their names; fields of a scene replace those of the scene."""
         return type(self)(**(dict(self) | values))
@@ -136,7 +142,7 @@ class Settings(Part):
     def option_models(cls) -> Iterator[Any]:
         """The models whose fields are the options of a command that makes these settings."""
         yield from (_model_of(cls, part) for part in _PARTS)
-        yield from (cls, SceneOptions, *cls.sources)
+        yield from (cls, SceneOptions, *SOURCES)
 
     @classmethod
     def of_command(
@@ -173,9 +179,9 @@ class Settings(Part):
         cls, typed: Mapping[str, Any], before: SourceSettings | None
     ) -> tuple[type[SourceSettings], dict[str, Any]]:
         """The kind of source that options name, and the values of its fields."""
-        options = {kind: {option.parameter: option for option in options_of(kind)} for kind in cls.sources}
+        options = {kind: {option.parameter: option for option in options_of(kind)} for kind in SOURCES}
         options[SceneSettings] |= {option.parameter: option for option in options_of(SceneOptions)}
-        keys = {kind: next(iter(options[kind].values())) for kind in cls.sources[1:]}
+        keys = {kind: next(iter(options[kind].values())) for kind in SOURCES[1:]}
         typed_kinds = [kind for kind, key in keys.items() if key.parameter in typed]
         if len(typed_kinds) > 1:
             flags = " and ".join(keys[kind].flag for kind in typed_kinds)
@@ -185,21 +191,20 @@ class Settings(Part):
             if kind is not SceneSettings:
                 _refuse(strange, kind)
             flags = ", ".join(f"--{name.replace('_', '-')}" for name in strange)
-            other = next(kind for kind in cls.sources if strange[0] in options[kind])
+            other = next(kind for kind in SOURCES if strange[0] in options[kind])
             raise UsageError(f"{flags} is for {other.subject}; give {other.command} too, or leave it out")
         return kind, {options[kind][name].field: value for name, value in typed.items()}
 
     @property
     def scene(self) -> "SceneSpec":
         """The scene that is played. Raises UsageError for another source."""
-        if not isinstance(self.source, SceneSettings):
-            raise UsageError(f"a run with {self.source.command} has no scene")
-        return self.source.scene
+        return self.source.scene_spec
 
     @property
     def wordings(self) -> "tuple[Wording, ...] | None":
         """The wordings that every item is asked in, None for its own words alone."""
-        return self.source.wordings if isinstance(self.source, SceneSettings) else None
+        wordings: tuple[Wording, ...] | None = dict(self.source).get("wordings")
+        return wordings
 
     def config(self) -> dict[str, Any]:
         """All settings by part as plain values, of which `--config` makes them again."""
@@ -229,6 +234,24 @@ class Settings(Part):
             name: value for name, value in values.items() if name != "family" and (name, value) != ("batch", 1)
         }
 
+    @property
+    def execute(self) -> int | None:
+        """Actions per inference; None for the model's own, and for one that does not act."""
+        return None
+
+    def followed(self) -> Self:
+        """The settings with all that a protocol decides of the task; of a question it decides the scene alone."""
+        return self
+
+    def with_every_call(self, execute: int) -> Self:
+        """The settings with a number in place of `captured_calls` `all`, of `execute` actions per inference."""
+        del execute
+        return self
+
+    def folder_name(self, digest: str) -> str:
+        """The default name of a run's folder. digest: of what the run depends on."""
+        return f"{self.model.family}-{digest}"
+
     def marks(self) -> list[str]:
         """The parts of a label behind the model and its checkpoint."""
         return []
@@ -245,8 +268,6 @@ class ExtractSettings(Settings):
     task: ActTask
     machine: ActMachine
 
-    sources: ClassVar[tuple[type[SourceSettings], ...]] = SOURCES
-
     def __init__(self, model: Any = None, checkpoint: str | None = None, **values: Any) -> None:
         super().__init__(model, checkpoint, **values)
 
@@ -257,9 +278,9 @@ class ExtractSettings(Settings):
         machine = parts["machine"]
         if machine.get("batch") is None:
             on_gpu = str(machine.get("device", "cpu")).startswith("cuda") and machine.get("env_workers") is None
-            measures = (
-                on_gpu and isinstance(parts["source"], SceneSettings) and has_network(parts["model"]["family"])
-            )
+            # A source whose player is measured does not refuse to be.
+            calibrates = "batch=auto" not in parts["source"].refuses
+            measures = on_gpu and calibrates and has_network(parts["model"]["family"])
             machine["batch"] = "auto" if measures else 1
         return parts
 
@@ -268,6 +289,11 @@ class ExtractSettings(Settings):
         task = {"execute": None, **self.task.model_dump(mode="json", exclude_none=True, exclude={"protocol"})}
         rotation = {"rotation": self.task.rotation or PLAIN}
         return {**super().identity(), **task, **rotation, **protocol_identity(self.model, self.task, self.source)}
+
+    @property
+    def execute(self) -> int | None:
+        """Actions per inference; None for the policy's own."""
+        return self.task.execute
 
     def most_inferences(self, execute: int) -> int:
         """Inferences that an episode can have with `execute` actions per inference."""
@@ -303,31 +329,53 @@ class ExtractSettings(Settings):
 class AskSettings(Settings):
     """All settings of one run of `probe-kit ask`: one model, one prompt, one size of the picture.
 
-    The size of the picture is that of `scene`.
+    The size of the picture is that of `scene`. Other sources have no objects and no sides: a model is asked with
+    the words of its instruction about the first observation of each row.
     """
 
     capture: AskCapture
     task: AskTask
     machine: AskMachine
 
+    def model_post_init(self, context: Any) -> None:
+        """Raise UsageError for a question about objects or sides, of a source that has none."""
+        super().model_post_init(context)
+        source = self.source
+        if not source.command:
+            return
+        if not self.task.prompt.is_instruction:
+            raise UsageError(
+                f"--prompt {self.task.prompt.name} asks for an object of a suite, and {source.subject} have none. "
+                "Use --prompt instruction, or a file that contains {instruction}"
+            )
+        refuse(self, ("picture=side-by-side", "query"), f"does not apply with {source.shows}; remove it")
+
     def __init__(self, model: Any = None, checkpoint: str | None = None, **values: Any) -> None:
         super().__init__(model, checkpoint, **values)
 
     @classmethod
     def per_prompt_and_size(
-        cls, prompts: Iterable[str], picture_sizes: Sequence[tuple[int, int]], typed: Mapping[str, Any]
+        cls,
+        prompts: Iterable[str] | None,
+        picture_sizes: Sequence[tuple[int, int]] | None,
+        typed: Mapping[str, Any],
     ) -> list[Self]:
         """Settings of one run per prompt and picture size, prompts outermost.
 
-        prompts: names or files of templates. picture_sizes: (width, height) in pixels. typed: see `of_command`.
+        prompts: names or files of templates; None for those of the paper, or for the instruction on a source
+        without objects. picture_sizes: (width, height) in pixels, of a scene. typed: see `of_command`.
         Raises UsageError for two runs of one name, and what `of_command` raises.
         """
-        templates = [find_template(prompt) for prompt in prompts]
-        every = [
-            cls.of_command(typed, prompt=template, picture_size=size)
-            for template in templates
-            for size in picture_sizes
-        ]
+        parameters = {option.parameter for kind in SOURCES for option in options_of(kind)}
+        options = {name: value for name, value in typed.items() if name in parameters}
+        kind, _ = cls._typed_source(options, None)
+        if kind.command and picture_sizes is not None:
+            _refuse(["picture_size"], kind)
+        sizes: list[dict[str, Any]] = [{"picture_size": size} for size in picture_sizes or [DEFAULT_SIZE]]
+        sizes = [{}] if kind.command else sizes
+        names = prompts or ([INSTRUCTION.name] if kind.command else PAPER_PROMPTS)
+        templates = [find_template(prompt) for prompt in names]
+        every = [cls.of_command(typed, prompt=template, **size) for template in templates for size in sizes]
         names = [settings.short_name for settings in every]
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise UsageError(
@@ -339,13 +387,12 @@ class AskSettings(Settings):
     def short_name(self) -> str:
         """Prompt, size of the picture and what is unusual, as a folder is called."""
         task = self.task
-        parts = [task.prompt.name, self._size, task.picture, task.query]
-        return "-".join(part for part in parts if part not in ("frame", "target"))
+        parts = [task.prompt.name, self.source.picture_words, task.picture, task.query]
+        return "-".join(part for part in parts if part not in ("", "frame", "target"))
 
-    @property
-    def _size(self) -> str:
-        height, width = self.scene.picture_shape
-        return f"{width}x{height}"
+    def folder_name(self, digest: str) -> str:
+        """The default name of a run's folder, with prompt and size of the picture."""
+        return f"ask-{self.model.family}-{self.short_name}-{digest}"
 
     def identity(self) -> dict[str, Any]:
         """Return the identity of every run, with the task."""
@@ -356,17 +403,17 @@ class AskSettings(Settings):
             "template_sha256": prompt.sha256,
             "object": self.task.query,
             "picture": self.task.picture,
-            "picture_size": self._size,
+            "picture_size": self.source.picture_words,
             "max_new_tokens": prompt.tokens,
         }
         return {**super().identity(), "ask": ask}
 
     def marks(self) -> list[str]:
         """Prompt and size, and what is unusual about picture and object."""
-        task = self.task
+        task, size = self.task, self.source.picture_words.replace("x", "×")
         return [
             task.prompt.name,
-            self._size.replace("x", "×") if task.picture != "none" else "no picture",
+            *filter(None, [size if task.picture != "none" else "no picture"]),
             *(["side by side"] if task.picture == "side-by-side" else []),
             *([f"asks for the {task.query}"] if task.query != "target" else []),
         ]
@@ -400,10 +447,9 @@ def _with_scene(parts: Mapping[str, Any], fields: dict[str, Any]) -> Any:
 
     Raises UsageError for such fields with another source.
     """
-    source = parts.get("source")
-    former = dict(source) if isinstance(source, SceneSettings | Mapping) else {}
-    if (isinstance(source, SourceSettings) and not former) or former.get("kind", "scene") != "scene":
-        settings = _read_source(source)
+    former = dict(parts.get("source") or {})
+    if former.get("kind", SCENE) != SCENE:
+        settings = _read_source(parts["source"])
         if refused := [name for name, value in fields.items() if value not in (None, False)]:
             _refuse(refused, type(settings))
         return settings

@@ -18,7 +18,7 @@ from probe_kit.extract.rollout.controllers import Inference, Turn
 from probe_kit.extract.rollout.input_check import Reach, check_inputs, check_not_ignored, varied
 from probe_kit.extract.settings import AskSettings
 from probe_kit.extract.sources.inputs import PICTURE
-from probe_kit.extract.sources.scene_source import SceneSource
+from probe_kit.extract.sources.source import Source
 from probe_kit.extract.vqa.letter_lens import letter_margins
 from probe_kit.extract.vqa.parsing import Said, read_answer
 from probe_kit.extract.vqa.phrases import Phrase, phrases
@@ -35,6 +35,12 @@ from probe_kit.suite.wording import side_words
 if TYPE_CHECKING:
     from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
     from probe_kit.hooks import AnswerModel, Prompt, Reading, Roles
+
+
+ANSWERED = "answered"
+"""Outcome of a question that has no right answer."""
+NO_OBJECT = Phrase("", "")
+"""The phrase of a question that is the instruction itself."""
 
 
 @dataclass(frozen=True)
@@ -66,15 +72,16 @@ class AnswerController:
     Raises UsageError if an item has no phrase for what is asked, or an option is none behind this prompt.
     """
 
-    def __init__(self, model: "AnswerModel", source: SceneSource, settings: AskSettings, seed: int) -> None:
-        """source: whose suite names the objects. seed: of the run, which draws objects that are absent."""
+    def __init__(self, model: "AnswerModel", source: Source[Any], settings: AskSettings) -> None:
+        """source: its suite, if it has one, names objects and sides; a question of another is the instruction."""
         suite = source.suite
         blank = source.example(min(source.instructions))
         self.model, self._settings, self.template = model, settings, settings.task.prompt
         self._choose_positions()
-        self._phrases = phrases(suite, settings.task.query, seed)
-        self._item_has_side_word = {item.item_id: item.side_word for item in suite.items}
-        self._instructions = sorted({item.instruction for item in suite.items})
+        self._has_sides = suite is not None
+        self._phrases = {} if suite is None else phrases(suite, settings.task.query, settings.seed)
+        self._item_has_side_word = {} if suite is None else {item.item_id: item.side_word for item in suite.items}
+        self._instructions = source.instructions
         card = model.card
         self.script: str | None = None
         self.limit = settings.machine.inference_limit
@@ -114,7 +121,7 @@ class AnswerController:
     def _asked(self, turns: Sequence[Turn]) -> list[dict[str, Any]]:
         self._choose_positions()
         observations = [self._shown(turn) for turn in turns]
-        phrases_asked = [self._phrases[turn.row.content.item.item_id] for turn in turns]
+        phrases_asked = [self._phrases.get(turn.row.columns["item_id"], NO_OBJECT) for turn in turns]
         buffers = {row: turn.buffers for row, turn in enumerate(turns)} if self.streams else {}
         spoken: list[list[str]] = []
         forced: list[list[Forced]] = []
@@ -258,6 +265,8 @@ class AnswerController:
     def _outcome(
         self, turn: Turn, question: str, spoken: Sequence[str], forced: Sequence[Forced]
     ) -> dict[str, Any]:
+        if not self._has_sides:
+            return self._statement(question, spoken[0], forced[0])
         episode = turn.row.content
         expected = side_expected(self._settings.task.query, episode.side_correct)
         choice = Choice([forced_choice.logits for forced_choice in forced])
@@ -293,6 +302,21 @@ class AnswerController:
             "side_word": self._item_has_side_word[episode.item.item_id] or bool(side_words(phrase.text)),
         }
 
+    def _statement(self, question: str, text: str, forced: Forced) -> dict[str, Any]:
+        """The columns of an answer that is neither right nor wrong; yes and no where the prompt asks for them."""
+        columns = {"outcome": ANSWERED if text.strip() else "oob", "answer": text, "question": question}
+        if not self.template.yes_or_no:
+            return columns
+        read = read_answer(text, self.template)
+        return columns | {
+            "said": read.meaning,
+            "parse": read.rule,
+            "parse_tier": read.tier or "none",
+            **{f"logit_{statement}": logit for statement, logit in forced.logits.items()},
+            "option_mass": forced.mass,
+            "near_tie": forced.near_tie,
+        }
+
     def _sizes(self, questions: Sequence["Prompt"]) -> list[dict[str, int]]:
         """The length of each prompt; its last position can lie outside the backbone's stream."""
         rows, after = self._backbone_roles(questions), int(not self.model.whole_prompt)
@@ -308,7 +332,9 @@ class AnswerController:
     # -- beforehand --------------------------------------------------------------------------------------
 
     def _blank_questions(self, blank: Observation) -> list["Prompt"]:
-        objects = sorted(set(self._phrases.values()), key=lambda phrase: (phrase.text, phrase.article))
+        objects = sorted(
+            set(self._phrases.values()) or {NO_OBJECT}, key=lambda phrase: (phrase.text, phrase.article)
+        )
         if self.template.is_instruction:
             blanks = [replace(blank, instruction=text) for text in self._instructions]
             return self._questions(blanks, objects[:1] * len(blanks), "original")
@@ -332,7 +358,7 @@ class AnswerController:
         """
         questions = self._blank_questions(blank)[:1]
         self.model.read(questions)
-        if self.template.lettered or self._settings.task.query == "absent":
+        if self.template.lettered or self._settings.task.query == "absent" or not self._has_sides:
             return None
         lead = self.model.lead
         begun = f"{lead}Yes," if self.template.yes_or_no else ""
@@ -348,14 +374,14 @@ class AnswerController:
         return None
 
 
-def asked_rows(rows: Sequence[Row], source: SceneSource, settings: AskSettings) -> tuple[Row, ...]:
+def asked_rows(rows: Sequence[Row], source: Source[Any], settings: AskSettings) -> tuple[Row, ...]:
     """The rows with what a question asks for, where that is not the object of the instruction.
 
     Raises UsageError for items without such a phrase.
     """
-    objects_by_item = phrases(source.suite, settings.task.query, settings.seed)
-    if settings.task.query == "target":
+    if settings.task.query == "target" or source.suite is None:
         return tuple(rows)
+    objects_by_item = phrases(source.suite, settings.task.query, settings.seed)
     objects = {item: phrase.with_article for item, phrase in objects_by_item.items()}
     return tuple(
         replace(row, columns={**row.columns, "asked_object": objects[row.columns["item_id"]]}) for row in rows

@@ -42,9 +42,8 @@ def show_dataset(
     from probe_kit.extract.sources.recording_source import RecordingSource
 
     settings = ExtractSettings.of_command({**typed, "model": model or "pi0-tiny", "dataset": folder})
-    assert isinstance(settings.source, LeRobotSource)
     with err.status("reading the data set"):
-        recording = RecordingSource.open(settings.source, False)
+        recording: RecordingSource = settings.source.open()  # type: ignore[assignment]  # of --dataset
         recording.check_frames()
         facts = recording.facts()
     if model is not None:

@@ -106,6 +106,17 @@ class EnvironmentSource(Source[EnvSource]):
 
     # -- a model -------------------------------------------------------------------------------------
 
+    def watched(self, cameras: Sequence[str]) -> Self:
+        """Set up the first chosen episode; no action is executed, so that facts are those of `reset`."""
+        environment = open_environment(self.settings)
+        try:
+            first = started(environment, self.episodes[0][1], self.name)
+        finally:
+            environment.close()
+        self.seen, self.cameras = first.observation, [*cameras[:1], *first.observation.cameras]
+        self._note_facts(first)
+        return self
+
     def check(self, policy: "Policy", accept_units: bool) -> "tuple[Self, Policy]":
         """Set up the first chosen episodes, let the policy predict once, and execute one action of the first.
 
@@ -130,9 +141,7 @@ class EnvironmentSource(Source[EnvSource]):
             chunk = self._predicted(policy, first.observation)
             with naming_environment(name, "step()"):
                 second = environment.step(np.array(chunk[0]))
-            facts = checked_step(second, self.episodes[0][1], f"{name}, step() 1").facts
-            self.columns = tuple(sorted(facts))
-            self.truths = [fact for fact in self.columns if isinstance(facts[fact], bool | np.bool_)]
+            self._note_facts(checked_step(second, self.episodes[0][1], f"{name}, step() 1"))
             later = [episode for _, episode in self.episodes[1:FIRST_EPISODES]]
             later = later if policy.state_numbers is not None else []
             begins = [first, *(started(environment, episode, name) for episode in later)]
@@ -144,6 +153,10 @@ class EnvironmentSource(Source[EnvSource]):
         self.seen, self.chunk = first.observation, len(chunk)
         check_units(unusual, self._state_names, f"{name}, the state after reset()", policy, accept_units)
         return self, policy
+
+    def _note_facts(self, step: Step) -> None:
+        self.columns = tuple(sorted(step.facts))
+        self.truths = [name for name in self.columns if isinstance(step.facts[name], bool | np.bool_)]
 
     def _with_cameras(self, policy: "Policy", observation: Observation) -> "Policy":
         self.cameras = [*policy.card.cameras[:1], *observation.cameras]
@@ -203,7 +216,7 @@ class EnvironmentSource(Source[EnvSource]):
             return {ENVIRONMENT: {}}
         settings, observation = self.settings, self.seen
         shapes: dict[str, list[int]] = {
-            "action": [execute, len(self.actions)],
+            **({"action": [execute, len(self.actions)]} if execute else {}),
             **({"columns": [len(self.columns)]} if self.columns else {}),
             "state": [int(observation.state.size)],
             **({"pixels": [1 + len(observation.cameras), SIDE, SIDE, 3]} if settings.pixels else {}),

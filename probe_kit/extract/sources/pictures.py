@@ -200,6 +200,11 @@ class PictureSource(Source[PictureFolder]):
         self.prediction = chunks.shape[1], chunks.shape[2]
         return self, policy
 
+    def watched(self, cameras: Sequence[str]) -> Self:
+        """Show the pictures to the model's first camera."""
+        self.cameras = list(cameras[:1])
+        return self
+
     def example(self, instruction: str) -> Observation:
         """A blank picture of the first one's shape."""
         return Observation(np.zeros(self._shape, np.uint8), np.zeros(ARM_NUMBERS, np.float32), instruction)
@@ -211,10 +216,9 @@ class PictureSource(Source[PictureFolder]):
 
     def identity(self, execute: int) -> dict[str, Any]:
         """The table by its content; rows hold the hashes of pictures."""
-        del execute
         # A table may have no numbers, and Zarr has no array without any.
         shapes = {"columns": [len(self.columns)]} if self.columns else {}
-        shapes |= {"prediction": list(self.prediction)}
+        shapes |= {"prediction": list(self.prediction)} if execute else {}
         shapes |= {"pixels": [1, SIDE, SIDE, 3]} if self.settings.pixels else {}
         data_set = {
             "kind": "pictures",

@@ -17,6 +17,7 @@ from probe_kit.errors import ProbeKitError, StageDiedError
 from probe_kit.extract.events import add_traceback
 from probe_kit.extract.plan import Row
 from probe_kit.hooks.contract.observation import Observation
+from probe_kit.runs.layout import CAPTURE_ONLY
 from probe_kit.runs.small_frames import SmallFrames
 
 SIDE = 32
@@ -99,6 +100,10 @@ class InputsPlayer(Player):
             self._hash.update(f"{picture.shape}".encode() + np.ascontiguousarray(picture).tobytes())
         if stored:
             self._keep("pixels", np.stack([small_picture(picture) for picture in pictures]), most)
+
+    def dismiss(self) -> Ending:
+        """End after the first observation: its model was asked."""
+        return self._ending({"outcome": CAPTURE_ONLY})
 
     def _ending(self, outcome: Mapping[str, Any], small_frames: SmallFrames = ()) -> Ending:
         inputs = {name: np.stack(values) for name, values in self._inputs.items()}

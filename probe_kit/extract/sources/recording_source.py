@@ -60,15 +60,15 @@ class RecordingSource(Source[LeRobotSource]):
 
     prediction: (chunk, D) of the policy that was checked. unusual: (D,) share of the chosen frames whose number of
     the state is unusual; empty where the policy normalises none. other_actions: why recorded actions are not what
-    the policy predicts; None if they are.
+    the policy predicts; None if they are. stretch: most frames of a row.
     """
 
     executes = False
     groups = "recorded episodes"
 
-    def __init__(self, settings: LeRobotSource, folder: LeRobotFolder) -> None:
+    def __init__(self, settings: LeRobotSource, folder: LeRobotFolder, stretch: int = MOST_FRAMES) -> None:
         """Raises RecordingError for an episode that is not there."""
-        self.settings, self.folder = settings, folder
+        self.settings, self.folder, self.stretch = settings, folder, stretch
         self.episodes = tuple(folder.chosen(settings.episodes))
         self.reader = LeRobotFrames(folder)
         self.prediction: tuple[int, int] = (0, 0)
@@ -83,9 +83,21 @@ class RecordingSource(Source[LeRobotSource]):
         if folder.repo is not None:
             settings = settings.changed(folder=f"{folder.repo}@{folder.revision}")
         opened = cls(settings, folder)
+        opened._check_features()
         fetched(opened.folder, opened.episodes, ())
         opened.folder.check_files(opened.episodes, ())
         return opened
+
+    def asked(self) -> Self:
+        """Return the same recordings with a row per chosen frame."""
+        return type(self)(self.settings, self.folder, 1)
+
+    def watched(self, cameras: Sequence[str]) -> Self:
+        """Map the model's first camera, and read all numbers of the chosen episodes."""
+        mapped = self.mapped(cameras[:1])
+        fetched(mapped.folder, mapped.episodes, mapped.features)
+        mapped.check_frames()
+        return mapped
 
     def decided(self) -> Mapping[str, Any]:
         """Return that every frame of a row is captured and nothing acts; a revision of the hub is its commit."""
@@ -105,7 +117,7 @@ class RecordingSource(Source[LeRobotSource]):
     @property
     def most_frames(self) -> int:
         """Chosen frames of the longest row that any episode of the data set can have."""
-        return min(MOST_FRAMES, -(-max(self.folder.lengths, default=1) // self.settings.every))
+        return min(self.stretch, -(-max(self.folder.lengths, default=1) // self.settings.every))
 
     @cached_property
     def instructions(self) -> tuple[str, ...]:
@@ -124,8 +136,8 @@ class RecordingSource(Source[LeRobotSource]):
             shown_frames = range(0, len(texts), every)
             for text, group in groupby(shown_frames, key=lambda frame, texts=texts: texts[frame]):  # type: ignore[misc]
                 frames = list(group)
-                for start in range(0, len(frames), MOST_FRAMES):
-                    stretch = frames[start : start + MOST_FRAMES]
+                for start in range(0, len(frames), self.stretch):
+                    stretch = frames[start : start + self.stretch]
                     columns = {
                         "episode_id": item + (f".{part}" if part else ""),
                         "item_id": item,
@@ -166,7 +178,7 @@ class RecordingSource(Source[LeRobotSource]):
             raise RecordingError(
                 f"--rotate {strange[0]}=…: that camera gets no picture; those with one are {', '.join(names)}"
             )
-        return type(self)(self.settings.changed(cameras=pairs), self.folder)
+        return type(self)(self.settings.changed(cameras=pairs), self.folder, self.stretch)
 
     def check_state_width(self, checkpoint: str, expected: int | None) -> None:
         """Raise RecordingError unless the recorded state has as many numbers as the model reads."""
@@ -186,13 +198,16 @@ class RecordingSource(Source[LeRobotSource]):
         here before that.
         """
         features = self.features or ([] if self.folder.repo is not None else self.folder.cameras)
-        if strange := [feature for feature in features if feature not in self.folder.cameras]:
+        self.folder.check_files(self.episodes, features)
+        self.reader.check(self.episodes, features)
+
+    def _check_features(self) -> None:
+        """Raise RecordingError for a mapped picture that the data set lacks, of which nothing could be hashed."""
+        if strange := [feature for feature in self.features if feature not in self.folder.cameras]:
             raise RecordingError(
                 f"{self.folder.path.name} has no picture {strange[0]!r}; it has "
                 f"{', '.join(self.folder.cameras) or 'none'}. Correct --camera"
             )
-        self.folder.check_files(self.episodes, features)
-        self.reader.check(self.episodes, features)
 
     def check(self, policy: "Policy", accept_units: bool) -> "tuple[Self, Policy]":
         """Map the cameras, read all numbers of the chosen episodes, and let the policy predict once about nothing.
@@ -285,13 +300,12 @@ class RecordingSource(Source[LeRobotSource]):
 
     def identity(self, execute: int) -> dict[str, Any]:
         """The data set by its content, and how it is shown."""
-        del execute
         settings, folder = self.settings, self.folder
         state, action = folder.width(STATE), folder.width(ACTION)
-        shapes: dict[str, list[int]] = {"prediction": list(self.prediction)}
+        shapes: dict[str, list[int]] = {"prediction": list(self.prediction)} if execute else {}
         shapes |= {"columns": [len(folder.columns)]} if folder.columns else {}
         shapes |= {} if state is None else {"state": [state]}
-        shapes |= {} if action is None else {"action": [self.prediction[0], action]}
+        shapes |= {"action": [self.prediction[0], action]} if action is not None and execute else {}
         shapes |= {"pixels": [len(settings.cameras), SIDE, SIDE, 3]} if settings.pixels else {}
         truths = [name for name in folder.columns if folder.features[name]["dtype"] == "bool"]
         data_set = {

@@ -2,7 +2,7 @@
 
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import typer
 from pydantic import BeforeValidator, Field
@@ -16,6 +16,9 @@ from probe_kit.extract.parts import LARGEST, Scene, option_of
 from probe_kit.extract.sources.source import SourceSettings
 from probe_kit.scene_names import ArmName, Rendering
 from probe_kit.suite.wording import WORDINGS, Wording, check_wordings
+
+if TYPE_CHECKING:
+    from probe_kit.env import SceneSpec
 
 _option = partial(typer.Option, rich_help_panel="Scene")
 
@@ -116,6 +119,18 @@ class SceneSettings(SourceSettings):
         """Raise UsageError for wordings that come twice, or none."""
         if self.wordings is not None:
             check_wordings(self.wordings)
+
+    @property
+    def scene_spec(self) -> "SceneSpec":
+        """The scene that is played."""
+        spec: SceneSpec = self.scene
+        return spec
+
+    @property
+    def picture_words(self) -> str:
+        """The size of the camera's picture, WIDTHxHEIGHT."""
+        height, width = self.scene.picture_shape
+        return f"{width}x{height}"
 
     def steps(self) -> int:
         """Count the actions that an episode can have."""

@@ -11,8 +11,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from probe_kit._terminal.field_options import Part
+from probe_kit.errors import UsageError
 
 if TYPE_CHECKING:
+    from probe_kit.env import SceneSpec
     from probe_kit.extract.plan import Row
     from probe_kit.extract.sources.player import Opens
     from probe_kit.hooks import Policy
@@ -50,6 +52,16 @@ class SourceSettings(Part):
         module, _, name = self.opens.partition(":")
         source: type[Source[Any]] = getattr(import_module(module), name)
         return source.open(self, selects_only)
+
+    @property
+    def scene_spec(self) -> "SceneSpec":
+        """The scene that is played. Raises UsageError for a source without one."""
+        raise UsageError(f"a run with {self.command} has no scene")
+
+    @property
+    def picture_words(self) -> str:
+        """The size of pictures in a run's label, WIDTHxHEIGHT; empty where the source decides it."""
+        return ""
 
     def steps(self) -> int:
         """Count the actions that an episode can have; 0 where nothing acts."""
@@ -103,6 +115,18 @@ class Source[Chosen: SourceSettings](ABC):
     def open(cls, settings: Chosen, selects_only: bool) -> Self:
         """Open the source that settings choose; see `SourceSettings.open`."""
 
+    def asked(self) -> Self:
+        """Return the source of which questions are asked: one row is one question, about its first observation."""
+        return self
+
+    def watched(self, cameras: Sequence[str]) -> Self:
+        """Return the source as a model sees it that answers and does not act. cameras: of the model.
+
+        Raises for cameras that get no picture.
+        """
+        del cameras
+        return self
+
     def decided(self) -> Mapping[str, Any]:
         """Return fields of a run's settings that the source itself decides, by name."""
         return {}
@@ -118,7 +142,10 @@ class Source[Chosen: SourceSettings](ABC):
 
     @abstractmethod
     def identity(self, execute: int) -> dict[str, Any]:
-        """The part of a run's identity that says where observations come from. execute: actions per inference."""
+        """The part of a run's identity that says where observations come from.
+
+        execute: actions per inference; 0 for a model that predicts none.
+        """
 
     @abstractmethod
     def selection(self, rows: "Sequence[Row]") -> dict[str, Any]:
