@@ -157,7 +157,7 @@ def test_an_episode_that_cannot_be_asked_is_given_up_and_the_others_stay(
 ) -> None:
     class Choosy(PositionModel):
         def read(self, questions: list[Prompt]) -> Reading:
-            if any("red" in own.text for own in questions) and any(own.seen.image.any() for own in questions):
+            if any("red" in own.text for own in questions) and any(own.observation.image.any() for own in questions):
                 raise InstructionError("no red, please")
             return super().read(questions)
 
@@ -227,7 +227,7 @@ def test_side_by_side_shows_the_two_pictures_and_no_scene(settings: AskSettings)
 
     class Watching(PositionModel):
         def read(self, questions: list[Prompt]) -> Reading:
-            seen.extend(own.seen.image for own in questions)
+            seen.extend(own.observation.image for own in questions)
             return super().read(questions)
 
     answers(settings.changed(picture="side-by-side"), Watching(likes("A"), always("A")))
