@@ -157,7 +157,9 @@ def test_an_episode_that_cannot_be_asked_is_given_up_and_the_others_stay(
 ) -> None:
     class Choosy(PositionModel):
         def read(self, questions: list[Prompt]) -> Reading:
-            if any("red" in own.text for own in questions) and any(own.observation.image.any() for own in questions):
+            if any("red" in own.text for own in questions) and any(
+                own.observation.image.any() for own in questions
+            ):
                 raise InstructionError("no red, please")
             return super().read(questions)
 
