@@ -10,7 +10,6 @@ model although models are left; what a model needs to start counts as its own ti
 import argparse
 import threading
 import time
-from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -48,12 +47,12 @@ EVERY_S = 0.1
 
 def tasks_of(plan: StudyPlan) -> list[ModelTask]:
     """A task per model, which takes one GPU of the cluster and computes on the CPU."""
-    found = []
-    for one in plan.cells:
-        settings = replace(one.cell.settings_to_play, device="cpu")
-        location = one.cell.location(plan.study.study.folder)
-        found.append(ModelTask(one.cell.model, (RunTask(one.cell.name, settings, location, 0),), 1, one.missing))
-    return found
+    tasks = []
+    for planned in plan.cells:
+        settings = planned.cell.settings_to_play.changed(device="cpu")
+        run = RunTask(planned.cell.name, settings, planned.location, 0)
+        tasks.append(ModelTask(planned.cell.model, (run,), 1, planned.missing))
+    return tasks
 
 
 class Waiting:

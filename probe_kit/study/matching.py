@@ -61,10 +61,13 @@ def check_same_items(runs: Sequence["Run"]) -> None:
 
 
 def check_same_weights(runs: Sequence[tuple[Cell, "Run"]]) -> None:
-    """Raise SettingsMismatchError for two runs of one model that were played with different weights."""
-    first: dict[str, Run] = {}
+    """Raise SettingsMismatchError for two runs of one model that were played with different weights.
+
+    A model that acts and answers may load other parts of its checkpoint for either.
+    """
+    first: dict[tuple[str, bool], Run] = {}
     for cell, run in runs:
-        other = first.setdefault(cell.model, run)
+        other = first.setdefault((cell.model, cell.asks), run)
         if other.weights_sha256 != run.weights_sha256:
             raise SettingsMismatchError(
                 f"{other.location} and {run.location} are runs of {cell.model!r} with different weights "

@@ -11,7 +11,7 @@ from probe_kit.retention.compare.common_items import common_items
 from probe_kit.runs import Run, open_run
 from probe_kit.runs.store import locate
 from probe_kit.study.cells import Cell
-from probe_kit.study.matching import check_same_items, differences
+from probe_kit.study.matching import check_same_items, check_same_weights, differences
 from probe_kit.study.planned_suite import planned_suite
 from probe_kit.study.schema import SuiteTable
 from probe_kit.suite import Suite
@@ -69,3 +69,38 @@ def test_a_run_of_another_checkpoint_of_the_hub_is_seen_though_its_card_has_a_co
     suite = planned_suite(SuiteTable(path=str(small_suite.folder)))[0]
     cell = Cell("base", "plain", 0, ExtractSettings("pi0", checkpoint), {}, suite)
     assert any(words.startswith("checkpoint: stored 'lab/first") for words in differences(run, cell)) is differs
+
+
+def cell_of(suite: Suite, checkpoint: Path | None, way: str = "plain") -> Cell:
+    planned = planned_suite(SuiteTable(path=str(suite.folder)))[0]
+    return Cell("base", way, 0, ExtractSettings("pi0", checkpoint and str(checkpoint)), {}, planned)
+
+
+def test_a_run_of_another_folder_of_weights_is_seen_unless_the_folder_was_moved(
+    small_suite: Suite, tmp_path: Path
+) -> None:
+    folders = [tmp_path / name for name in ("first", "second")]
+    for folder in folders:
+        folder.mkdir()
+        (folder / "model.safetensors").write_bytes(folder.name.encode())
+    run = run_of(small_suite, tmp_path / "run")
+    run.__dict__["certificate"] = {"policy": {"checkpoint": str(folders[0])}}
+    said = [
+        [words for words in differences(run, cell_of(small_suite, folder)) if words.startswith("checkpoint")]
+        for folder in (*folders, None)
+    ]
+    assert [len(words) for words in said] == [0, 1, 0]
+    folders[0].rename(tmp_path / "moved")
+    moved = cell_of(small_suite, tmp_path / "moved")
+    assert not [words for words in differences(run, moved) if words.startswith("checkpoint")]
+
+
+def test_runs_of_one_model_have_one_hash_of_weights(
+    small_suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    runs = [run_of(small_suite, tmp_path / name) for name in ("one", "other")]
+    cells = [cell_of(small_suite, None, way) for way in ("plain", "dark")]
+    check_same_weights(list(zip(cells, runs, strict=True)))
+    monkeypatch.setattr(Run, "weights_sha256", property(lambda run: run.location.name))
+    with pytest.raises(SettingsMismatchError, match="are runs of 'base' with different weights"):
+        check_same_weights(list(zip(cells, runs, strict=True)))
