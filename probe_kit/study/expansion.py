@@ -8,7 +8,7 @@ from typing import Any
 from probe_kit.errors import ProbeKitError
 from probe_kit.extract.parts import ModelSettings
 from probe_kit.extract.settings import AskSettings, ExtractSettings, Settings
-from probe_kit.hooks.registry import family_names, get_family
+from probe_kit.hooks.registry import get_family
 from probe_kit.study.cells import Cell, Selection
 from probe_kit.study.mistakes import Mistake, Place
 from probe_kit.study.planned_suite import PlannedSuite, slugs
@@ -16,11 +16,6 @@ from probe_kit.study.schema import AskTable, BlockTable, ConditionTable, ModelTa
 
 SCRIPTED = ("expert", "expert-mirrored", "idle")
 """Policies without a network, which stand in place of a family."""
-
-
-def is_known(model: ModelTable) -> bool:
-    """Whether there is such a family."""
-    return model.family in SCRIPTED or model.family in family_names()
 
 
 def answers(model: ModelTable) -> bool:
@@ -79,6 +74,8 @@ def expand(study: Study, suite: PlannedSuite) -> tuple[list[Cell], list[Mistake]
     cells: dict[tuple[str, str, int], Cell] = {}
     mistakes: list[Mistake] = []
     for member in members(study):
+        if not (answers if member.block.asks else acts)(study.models[member.model]):
+            continue  # which is a mistake of its block
         try:
             settings = _settings(study, member)
         except ProbeKitError as error:

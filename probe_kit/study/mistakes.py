@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import Any
@@ -71,8 +71,3 @@ def unknown(what: str, name: str, names: Collection[str], none: str = "there are
     near = get_close_matches(name, names, n=1)
     hint = f" Did you mean {near[0]!r}?" if near else ""
     return f"unknown {what} {shortened(name)!r}; known: {', '.join(names) or none}.{hint}"
-
-
-def each_unknown(path: Place, what: str, uses: Iterable[str], names: Collection[str]) -> list[Mistake]:
-    """A mistake per name that is not known."""
-    return [Mistake(path, unknown(what, name, names)) for name in uses if name not in names]

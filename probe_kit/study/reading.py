@@ -16,10 +16,11 @@ from probe_kit.errors import UsageError
 from probe_kit.study import schema
 from probe_kit.study.archive import RUNS, STUDY_FILE, Pack, open_archive
 from probe_kit.study.cells import Cell
-from probe_kit.study.checks import reference_mistakes
+from probe_kit.study.checks import misfits
 from probe_kit.study.expansion import expand
 from probe_kit.study.mistakes import Mistake, Place, StudyFileError, part_in_file, shortened
 from probe_kit.study.planned_suite import PlannedSuite, planned_suite
+from probe_kit.study.references import unknown_names
 
 _MOST_BYTES = 1 << 20
 _DEEP_KEY = re.compile(r"""(?:[\w"'-]+\s*\.\s*){64}""")
@@ -86,10 +87,11 @@ def load_study(name: str | Path) -> LoadedStudy:
         raise StudyFileError(str(file), content, _mistakes(error, content)) from None
     pack = None if archive is None else Pack.read(archive)
     suite, mistakes = planned_suite(study.suite) if pack is None else (_packed_suite(pack), [])
-    mistakes += reference_mistakes(study, suite)
+    mistakes += unknown_names(study, suite)
     cells: list[Cell] = []
-    if not mistakes:  # settings are made of names that exist
-        cells, mistakes = expand(study, suite)
+    if not mistakes:  # all else is about names that exist
+        cells, of_settings = expand(study, suite)
+        mistakes = [*misfits(study, suite), *of_settings]
     if mistakes:
         raise StudyFileError(str(file), content, mistakes)
     if pack is None:
@@ -134,7 +136,9 @@ def _mistakes(error: ValidationError, content: dict[str, Any]) -> list[Mistake]:
         elif complaint["type"] == "extra_forbidden":
             text = f"unknown key{_near(path)}"
         else:
-            text = f"{_plain(complaint['msg'])}, not {shortened(repr(complaint['input']))}"
+            text = _plain(complaint["msg"])
+            if not isinstance(complaint["input"], dict):  # a whole table is no help
+                text += f", not {shortened(repr(complaint['input']))}"
         texts.setdefault(path, []).append(text)
     return [Mistake(path, _joined(of_value)) for path, of_value in texts.items()]
 

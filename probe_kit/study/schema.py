@@ -1,10 +1,10 @@
 """The tables of a study file and their fields. Values are checked here, references to names in `checks`."""
 
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, Literal, Self, get_args
 from unicodedata import category
 
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from probe_kit.extract.parts import ModelSettings
 from probe_kit.extract.sources.scene import SceneOptions
@@ -158,6 +158,12 @@ class BlockTable(_Table):
     seeds: Annotated[list[Seed], Field(min_length=1), AfterValidator(_each_once)] = [0]
     tokens: AskTokens | None = None
     exclude: list[ExcludeTable] = []
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> Self:
+        if (self.conditions is None) == (self.asks is None):
+            raise ValueError("give either conditions, for policies, or asks, for VLMs")
+        return self
 
 
 class ProbesTable(_Table):

@@ -64,18 +64,29 @@ def test_a_mistake_is_named_with_its_path_and_nothing_else_is_raised(
     assert caught.value.exit_code == 2
 
 
-def test_all_mistakes_are_said_at_once_in_the_order_of_the_file(tmp_path: Path) -> None:
+def test_wrong_names_are_said_together_in_the_order_of_the_file(tmp_path: Path) -> None:
     text = changed(
-        ("items = 24", "items = 200  # here"),
         ('vlm = "reader"', 'vlm = "raeder"  # here'),
         ('asks = ["p1", "p2"]', 'asks = ["p1", "p3"]  # here'),
+        ("permutations = 100", "permutations = 3"),
         ('comparison = "light"', 'comparison = "dark"  # here'),
     )
     with pytest.raises(StudyFileError) as caught:
         load_study(written(tmp_path, text))
-    assert [mistake.place for mistake in caught.value.mistakes] == [
-        "suite.items", "models.base.vlm", "asks.p2", "runs[2].asks", "tables.light.comparison",
-    ]  # fmt: skip
+    assert [mistake.place for mistake in caught.value.mistakes] == fields_at(text, "# here")
+
+
+def test_what_does_not_fit_together_is_said_together_in_the_order_of_the_file(tmp_path: Path) -> None:
+    text = changed(
+        ("items = 24", "items = 200  # here"),
+        ("light_level = 0.7", "light_level = -1.0  # here"),
+        ('prompt = "p2"', 'prompt = "p9"  # here'),
+        ("permutations = 100", "permutations = 3  # here"),
+        ('comparison = "light"', 'comparison = "tuning"  # here'),
+    )
+    with pytest.raises(StudyFileError) as caught:
+        load_study(written(tmp_path, text))
+    assert [mistake.place for mistake in caught.value.mistakes] == fields_at(text, "# here")
 
 
 def test_wrong_values_are_said_together_before_names_are_looked_at(tmp_path: Path) -> None:
