@@ -8,7 +8,7 @@ import typer
 
 from probe_kit._terminal.console import err, out, print_json, say
 from probe_kit._terminal.options import LISTED, AsJson, Names, Partial, RunFolder
-from probe_kit.runs.layout import ExportFormat, SaeDtype
+from probe_kit.runs.layout import DIRECTION_FILES, ExportFormat, SaeDtype
 
 app = typer.Typer(help="Inspect, verify, copy and export runs.", no_args_is_help=True)
 DAMAGED = 1
@@ -74,7 +74,8 @@ def export(
         ExportFormat,
         typer.Option(
             "--format",
-            help="Format. lerobot and sae write a folder; lerobot needs a run with --frames all.",
+            help="Format. lerobot and sae write a folder; lerobot needs a run with --frames all. directions: for "
+            "intervene --direction FILE#NAME.",
         ),
     ],
     out_file: Annotated[
@@ -86,15 +87,15 @@ def export(
         typer.Option(
             "--sites",
             **LISTED,
-            help="Of parquet and sae: sites, such as backbone.07, expert or expert.*@9. Default: all.",
+            help="Of parquet, sae and directions: sites, such as backbone.07, expert or expert.*@9. Default: all.",
         ),
     ] = None,
     view: Annotated[
         str | None,
         typer.Option(
             "--view",
-            help="Of parquet and sae: a pooled view, tokens or tokens:ROLE. Default: all pooled views, or "
-            "mean in sae.",
+            help="Of parquet, sae and directions: a pooled view, tokens or tokens:ROLE. Default: all pooled "
+            "views, or mean in sae.",
         ),
     ] = None,
     dtype: Annotated[SaeDtype, typer.Option("--dtype", help="Of sae: type of the memory maps.")] = "bfloat16",
@@ -106,7 +107,7 @@ def export(
     from probe_kit.runs.store import locate
 
     location = locate(run)
-    target = out_file or location.beside(f"{location.name}.{style}")
+    target = out_file or location.beside(f"{location.name}.{DIRECTION_FILES.get(style, style)}")
     with err.status("exporting"):
         written = export_run(location, style, target, partial, sites=sites, view=view, dtype=dtype, seed=seed)
     out.print(str(written), soft_wrap=True)

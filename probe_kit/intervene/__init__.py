@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 from probe_kit._system.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from probe_kit.intervene.direction_files import write_directions
     from probe_kit.intervene.kinds.attention import (
         AttentionReadout,
         AttentionRow,
@@ -30,6 +29,7 @@ if TYPE_CHECKING:
     from probe_kit.intervene.results.verdict import Behaviour, Places, UseVerdict, classify_all, classify_use
     from probe_kit.intervene.runner import run_intervention
     from probe_kit.intervene.sessions.session import ReplaySession, ReplaySource
+    from probe_kit.runs.direction_files import write_directions
 
 __all__ = [
     "AttentionReadout",
@@ -111,6 +111,6 @@ __getattr__, __dir__ = lazy_names(
         "load_effects": "results.results",
         "stored_image_swaps": "kinds.image_swap",
         "stored_interventions": "outcomes",
-        "write_directions": "direction_files",
+        "write_directions": "probe_kit.runs.direction_files",
     },
 )

@@ -21,7 +21,6 @@ from probe_kit.errors import NoDirectionError, UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.hooks.contract.views import resolve_view
-from probe_kit.intervene.direction_files import FileDirection
 from probe_kit.intervene.erasers import (
     NO_DIRECTION,
     Eraser,
@@ -37,6 +36,7 @@ from probe_kit.intervene.places import SiteGroup, names_one_place, resolve_all
 from probe_kit.intervene.sessions.session import ReplaySession
 from probe_kit.intervene.settings import items_of
 from probe_kit.intervene.tokens import token_mask
+from probe_kit.runs.direction_files import FileDirection
 from probe_kit.runs.run import Run
 from probe_kit.statistics.folds import Fold, grouped_folds
 

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from probe_kit._terminal.options import LISTED, NAMED, Names, choices, some_of, speed_option
+from probe_kit._terminal.options import LISTED, NAMED, Names, choices, further_option, some_of, speed_option
 from probe_kit.statistics.folds import FoldUnit
 from probe_kit.train.choices import CONTROLS, Incomplete, Task
 
@@ -185,6 +185,14 @@ IncompleteItems = Annotated[
 
 # -- speed --------------------------------------------------------------------------------------------------
 
+DirectionFile = Annotated[
+    Path | None,
+    further_option(
+        "--directions",
+        metavar="FILE",
+        help="Also write the probes' directions, for intervene --direction FILE#NAME: safetensors or npz.",
+    ),
+]
 Jobs = Annotated[
     int | None,
     speed_option("--jobs", min=1, max=1024, help="Number of processes. Default: 1, or one per core with --ray."),

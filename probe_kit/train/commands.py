@@ -51,6 +51,7 @@ def train(
     device: own.SolverDevice = None,
     ray: common.RayAddress = None,
     details: common.WholeTable = False,
+    directions: own.DirectionFile = None,
 ) -> None:
     """Fit linear probes at every site and store their scores in the run.
 
@@ -58,7 +59,10 @@ def train(
     are loaded, not fitted again. To decode a label of your own, give its table and column:
     `probe-kit train RUN --labels labels.csv --target drawer --task classes`.
     """
+    from probe_kit.errors import UsageError
     from probe_kit.runs import open_run
+    from probe_kit.runs.direction_files import check_direction_file
+    from probe_kit.train.results.probe_directions import write_direction_file
     from probe_kit.train.train_options import TargetOptions, TransferOptions
 
     target_options = TargetOptions(target, labels, task, group_by, exchange_within, align_to)
@@ -78,6 +82,7 @@ def train(
                 "--controls": controls is not None, "--suite": suite, "--jobs": jobs, "--ray": ray,
                 "--device": device, "--untrained": untrained, "--align-to": align_to,
                 "--folds": folds != "groups", "--incomplete": incomplete != "keep",
+                "--directions": directions,
             },
             "a transfer",
         )  # fmt: skip
@@ -95,7 +100,14 @@ def train(
         "device": device,
         "ray": ray,
     }
-    _train(opened, target_options, categories, call, options, details)
+    if directions is not None:
+        check_direction_file(directions)
+        if not target_options.is_side:
+            raise UsageError(f"--directions with --target {target}: only probes of a side have directions")
+    fitted = _train(opened, target_options, categories, call, options, details)
+    if directions is not None:
+        count = write_direction_file(fitted[0].directions, directions, opened.weights_sha256)
+        say(marked("{} directions: {}", count, directions))
     of_target = "" if target_options.is_side else f" --target {shlex.quote(target)}"
     say(marked("next: [bold]probe-kit retention {}{}[/]", run, of_target))
 
@@ -107,8 +119,8 @@ def _train(
     call: str,
     options: Mapping[str, Any],
     details: bool,
-) -> None:
-    """Probe the target at the captured inferences that `call` names, and print the best sites."""
+) -> "list[ProbeResults]":
+    """Probe the target at the inferences that `call` names; print the best sites, and return the probes."""
     from probe_kit.train import train_probes
     from probe_kit.train.results.summary import best_sites_findings, best_sites_sentences, best_sites_table
 
@@ -145,6 +157,7 @@ def _train(
         )
     for sentence in (best_sites_sentences if details else best_sites_findings)(fitted[0]):
         out.print(sentence, markup=False, highlight=False)
+    return fitted
 
 
 def _transfer(

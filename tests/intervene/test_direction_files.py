@@ -10,12 +10,15 @@ import numpy as np
 import pytest
 
 from probe_kit.errors import UsageError
+from probe_kit.hooks import Site
 from probe_kit.intervene import Interchange, Steering
-from probe_kit.intervene.direction_files import names_file, read_direction, write_directions
 from probe_kit.intervene.kinds.steer import Steered
 from probe_kit.intervene.patching import run_with_hooks
 from probe_kit.intervene.replay import ConditionContext, replay
 from probe_kit.intervene.sessions.scene import SceneSession
+from probe_kit.runs import export_run
+from probe_kit.runs.direction_files import names_file, read_direction, write_directions
+from probe_kit.train.results.probe_directions import Direction, write_direction_file
 
 SITE, WIDTH = "backbone.02", 96
 
@@ -58,6 +61,51 @@ def test_a_feature_of_an_autoencoder_is_its_row_of_the_decoder(tmp_path: Path) -
         read_direction(f"{tmp_path}#9")
 
 
+def test_a_decoder_in_bfloat16_is_read(tmp_path: Path) -> None:
+    """numpy has no such numbers; large models have no others."""
+    import torch
+    from safetensors.torch import save_file
+
+    decoder = torch.arange(15, dtype=torch.bfloat16).reshape(5, 3) + 1
+    save_file({"W_dec": decoder}, tmp_path / "sae_weights.safetensors")
+    np.testing.assert_array_equal(read_direction(f"{tmp_path}#2").vectors, [[7, 8, 9]])
+
+
+def test_probes_directions_are_written_for_the_sites_and_weights_that_they_are_of(
+    session: SceneSession, tmp_path: Path
+) -> None:
+    weights = np.random.default_rng(0).normal(size=(3, WIDTH)).astype(np.float32)
+    place = ("color", "mean:image", Site("backbone", 2))
+    probes = {place: Direction(weights, np.zeros(3), np.array([1.0, 2.0, 3.0]))}
+    path = tmp_path / "probes.safetensors"
+    assert write_direction_file(probes, path, session.run.weights_sha256) == 1
+    direction = read_direction(f"{path}#color.mean:image.backbone.02")
+    assert (direction.site, direction.role, direction.weights) == (SITE, "image", session.run.weights_sha256)
+    np.testing.assert_allclose(direction.vectors[0], 2 * probes[place].unit, rtol=1e-5)
+    assert Interchange(sites=(SITE,), direction=str(path)).conditions(session)
+    write_direction_file(probes, path, "0" * 64)
+    with pytest.raises(UsageError, match="was found in the weights"):
+        Interchange(sites=(SITE,), direction=str(path)).conditions(session)
+
+
+def test_an_export_has_half_the_difference_of_the_class_means_and_steers_by_it(
+    session: SceneSession, tmp_path: Path
+) -> None:
+    run, file = session.run, tmp_path / "means.npz"
+    export_run(run.location, "directions", file, sites=[SITE], view="mean:image")
+    rows = (run.episodes["category"] == "color").to_numpy()
+    left = (run.episodes["side_correct"] == "left").to_numpy()
+    features = run.column(Site("backbone", 2), "mean:image").astype(np.float64)
+    half = (features[rows & left].mean(axis=0) - features[rows & ~left].mean(axis=0)) / 2
+    name = f"{file}#color.mean:image.base.{SITE}"
+    np.testing.assert_allclose(read_direction(name).vectors[0], half, rtol=1e-5, atol=1e-7)
+    asked = Steering(sites=(SITE,), role="image", direction=name, coefficients=(1.0,), controls=0)
+    (steered,) = (one for one in asked.conditions(session) if isinstance(one, Steered) and one.coefficient)
+    np.testing.assert_allclose(steered.axes.shift(steered.direction, "", "", 1.0), half, rtol=1e-5, atol=1e-7)
+    with pytest.raises(UsageError, match=r"ending \.safetensors or \.npz"):
+        export_run(run.location, "directions", tmp_path / "means.txt")
+
+
 @pytest.mark.parametrize(
     ("vectors", "name", "named"),
     [
@@ -83,15 +131,6 @@ def test_what_is_no_file_of_directions_is_refused(tmp_path: Path) -> None:
             read_direction(str(path))
     with pytest.raises(UsageError, match="there is no file"):
         read_direction(str(tmp_path / "absent.npz"))
-
-
-def test_a_type_of_numbers_that_numpy_lacks_is_refused(tmp_path: Path) -> None:
-    import torch
-    from safetensors.torch import save_file
-
-    save_file({"a": torch.ones(3, dtype=torch.bfloat16)}, tmp_path / "half.safetensors")
-    with pytest.raises(UsageError, match=r"half.safetensors holds no directions: .*bfloat16"):
-        read_direction(str(tmp_path / "half.safetensors"))
 
 
 @pytest.mark.parametrize("entry", ["[]", '{"a": 1}', '{"a": {}, "a": {}}', "{"])

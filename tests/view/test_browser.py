@@ -569,7 +569,7 @@ def test_nothing_overflows_and_every_word_can_be_read(
 ) -> None:
     browser.complaints.clear()
     page = browser.page(width, dark=dark)
-    for view in ("overview", "map", "episodes?ep=1", "compare", "questions"):
+    for view in ("overview", "map", "episodes?ep=1", "compare", "questions", "results"):
         page.open(f"{address}#/{view}")
         page.settle()
         assert page.read("document.documentElement.scrollWidth") <= width, (view, page.read(WIDE))

@@ -17,12 +17,12 @@ from probe_kit.hashing import derive_seed
 from probe_kit.hooks.capturing.edit_engine import LOG_FIELDS
 from probe_kit.hooks.contract.interventions import InterventionKind, Readout
 from probe_kit.hooks.contract.sites import KV_STREAM
-from probe_kit.intervene.direction_files import FileDirection, names_file, read_direction
 from probe_kit.intervene.outcomes import ConditionOutcomes, Effect
 from probe_kit.intervene.places import SEPARATOR
 from probe_kit.intervene.replay import Condition, ReplayBatch, replay
 from probe_kit.intervene.settings import FIRST_CHUNK, PairRow, categories_in, has_sides, items_of
 from probe_kit.intervene.tokens import TILES
+from probe_kit.runs.direction_files import FileDirection, names_file, read_direction
 from probe_kit.runs.run import Run
 from probe_kit.statistics.paired_tests import max_t
 from probe_kit.suite.categories import category_of

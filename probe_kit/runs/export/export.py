@@ -12,6 +12,8 @@ from pathlib import Path
 
 from probe_kit._system.drafts import draft_of, full_disk_in_words, write_whole
 from probe_kit.errors import UsageError
+from probe_kit.runs.direction_files import check_direction_file
+from probe_kit.runs.export.class_means import write_class_means
 from probe_kit.runs.export.lerobot_dataset import write_lerobot
 from probe_kit.runs.export.matrices import write_sae
 from probe_kit.runs.export.tables import write_parquet
@@ -44,8 +46,9 @@ def export_run(
     Axes of both are (episode, call, [iteration,] layer, view or token, feature).
     lerobot: a LeRobotDataset, of a run with `--frames all`.
 
-    Two formats hold the vectors that `sites` and `view` choose, see `choose`.
+    Three formats hold the vectors that `sites` and `view` choose, see `choose`.
     parquet: a row per vector with episode, group, inference, frame, site, view, role and token.
+    directions: a vector per category, view and site, see `write_class_means`; a .safetensors or .npz.
     sae: a folder with a memory map (N, D) per site in a drawn order, an index, and the scale of every site.
     Default are all sites, and all pooled views in Parquet, `mean` in matrices. dtype, seed: of `sae` alone.
 
@@ -60,6 +63,8 @@ def export_run(
         )
     if style != SAE and (dtype != "bfloat16" or seed):
         raise UsageError(f"--dtype or --seed with --format {style}; leave them out, or use --format sae")
+    if style == DIRECTIONS:
+        check_direction_file(out)
     if out.exists():
         raise UsageError(f"{out} exists; choose another --out or remove it")
     run = open_run(path, allow_partial)
@@ -68,7 +73,9 @@ def export_run(
     with full_disk_in_words(out), draft_of(out) as draft:
         if style in OF_VECTORS:
             choices = choose(run, sites, view or (MEAN_VIEW if style == SAE else None))
-            if style == SAE:
+            if style == DIRECTIONS:
+                write_class_means(run, choices, draft)
+            elif style == SAE:
                 write_sae(run, choices, draft, _about(run, choices), dtype, seed)
             else:
                 write_parquet(run, choices, draft, _about(run, choices))
@@ -123,6 +130,7 @@ WHOLE: dict[ExportFormat, Callable[[Run, Path], None]] = {
 }
 """Formats that hold all that was stored."""
 SAE: ExportFormat = "sae"
-OF_VECTORS: tuple[ExportFormat, ...] = ("parquet", SAE)
+DIRECTIONS: ExportFormat = "directions"
+OF_VECTORS: tuple[ExportFormat, ...] = ("parquet", SAE, DIRECTIONS)
 """Formats that hold chosen vectors."""
 FORMATS: tuple[ExportFormat, ...] = (*WHOLE, *OF_VECTORS)

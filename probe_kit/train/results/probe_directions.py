@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import BinaryIO
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 
 from probe_kit._system.bounded_arrays import open_arrays
 from probe_kit.hooks.contract.sites import Site
+from probe_kit.runs.direction_files import about_direction, write_directions
 from probe_kit.runs.results import Bundle
 
 Place = tuple[str, str, Site]
@@ -99,3 +101,19 @@ def read_directions(directions: Mapping[Place, Direction], places: Iterable[Plac
     if isinstance(directions, StoredDirections):
         return directions.read(places)
     return {key: directions[key] for key in places}
+
+
+def write_direction_file(directions: Mapping[Place, Direction], file: Path, weights: str | None) -> int:
+    """Write the probes' directions for `intervene --direction FILE#NAME`, and return how many.
+
+    A vector is the mean of the folds' unit weights, times the deviation of the samples along it: a coefficient
+    counts deviations, toward `left`. weights: hash of the network's. Probes without any weight are left out.
+    """
+    vectors, about = {}, {}
+    for (category, view, site), direction in read_directions(directions, directions).items():
+        if direction.unit.any():
+            name, about_name = about_direction(category, view, site, weights)
+            vectors[name] = direction.unit * direction.spread
+            about[name] = about_name
+    write_directions(file, vectors, about)
+    return len(vectors)

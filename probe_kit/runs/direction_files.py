@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from probe_kit._system.bounded_arrays import UNREADABLE, open_arrays
 from probe_kit._system.bounded_json import parse_json, read_json_object
 from probe_kit.errors import UsageError
+from probe_kit.hooks.contract.sites import Site
 
 ENTRY = "directions"
 SUFFIXES = (".safetensors", ".npz")
@@ -101,19 +102,36 @@ def write_directions(
     path: Path, vectors: Mapping[str, NDArray[Any]], about: Mapping[str, Mapping[str, str]]
 ) -> None:
     """Write directions as `read_direction` reads them. about: site, role, space and weights by name."""
+    check_direction_file(path)
     arrays = {name: np.ascontiguousarray(values, np.float32) for name, values in vectors.items()}
     if path.suffix == ".safetensors":
         from safetensors.numpy import save_file
 
         save_file(arrays, path, {ENTRY: json.dumps(about)})
-    elif path.suffix == ".npz":
-        np.savez(path, allow_pickle=False, **{ENTRY: np.array(json.dumps(about))}, **arrays)
     else:
+        np.savez(path, allow_pickle=False, **{ENTRY: np.array(json.dumps(about))}, **arrays)
+
+
+def about_direction(category: str, view: str, site: Site, weights: str | None) -> tuple[str, dict[str, str]]:
+    """Return the name of a direction of a category, view and site, and its entry in a file."""
+    name = _place_name(str(site))
+    role = view.removeprefix("mean").removeprefix(":") or "all"
+    return f"{category}.{view}.{name}", {"site": name, "role": role, "space": "raw", "weights": weights or ""}
+
+
+def _place_name(site: str) -> str:
+    """Return a site as interventions name it, without the residual stream's name."""
+    return site.replace(".residual", "")
+
+
+def check_direction_file(path: Path) -> None:
+    """Raise UsageError for a file name that directions are not written to."""
+    if path.suffix not in SUFFIXES:
         raise UsageError(f"{path} is no file of directions; expected the ending {' or '.join(SUFFIXES)}")
 
 
 def _contents(path: Path) -> tuple[dict[str, NDArray[Any]], Mapping[str, Mapping[str, str]]]:
-    """Return arrays by name, and what is said of each."""
+    """Return arrays by name, and the entry of each."""
     from safetensors import SafetensorError, safe_open
 
     try:
@@ -122,8 +140,9 @@ def _contents(path: Path) -> tuple[dict[str, NDArray[Any]], Mapping[str, Mapping
                 arrays = {name: np.asarray(opened[name]) for name in opened}
             entry_text = str(arrays.pop(ENTRY, "{}"))
         else:
-            with safe_open(path, "np") as opened:
-                arrays = {name: opened.get_tensor(name) for name in opened.keys()}  # noqa: SIM118 - no mapping
+            # Read by torch: numpy has no bfloat16, in which autoencoders of large models are stored.
+            with safe_open(path, "pt") as opened:
+                arrays = {name: _as_numpy(opened.get_tensor(name)) for name in opened.keys()}  # noqa: SIM118
                 entry_text = (opened.metadata() or {}).get(ENTRY, "{}")
         entry = parse_json(entry_text)
         if not isinstance(entry, dict) or not all(isinstance(about, dict) for about in entry.values()):
@@ -131,8 +150,13 @@ def _contents(path: Path) -> tuple[dict[str, NDArray[Any]], Mapping[str, Mapping
         return arrays, entry
     except SafetensorError as error:
         raise UsageError(f"{path} is no safetensors file: {str(error)[:200]}") from error
-    except (*UNREADABLE, TypeError) as error:  # numpy has no bfloat16
+    except (*UNREADABLE, TypeError) as error:
         raise UsageError(f"{path} holds no directions: {str(error)[:200]}") from error
+
+
+def _as_numpy(tensor: Any) -> NDArray[Any]:
+    """Return a tensor of any float type, integers as they are."""
+    return np.asarray((tensor.float() if tensor.is_floating_point() else tensor).numpy())
 
 
 def _of_autoencoder(folder: Path, name: str) -> FileDirection:
@@ -169,4 +193,5 @@ def _direction(name: str, vectors: NDArray[np.float64], about: Mapping[str, Any]
     digest = hashlib.sha256(np.ascontiguousarray(vectors).tobytes()).hexdigest()[:8]
     plain = "".join(letter if letter.isalnum() or letter in "-." else "-" for letter in name)
     parts = {part: str(about.get(part) or "") for part in ("site", "role", "weights")}
+    parts["site"] = _place_name(parts["site"])
     return FileDirection(f"{plain}-{digest}", vectors, **parts)
