@@ -1,6 +1,6 @@
 """`probe-kit diagnose`."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -11,12 +11,15 @@ from probe_kit._terminal.console import counter, err, marked, out, print_json, p
 from probe_kit._terminal.field_options import command_with
 from probe_kit._terminal.options import further_option
 from probe_kit.diagnose.choices import FRAMES, ITEMS_PER_FRAME
+from probe_kit.errors import UsageError
 from probe_kit.extract import command_options as start
 from probe_kit.extract.settings import ExtractSettings
 
 if TYPE_CHECKING:
-    from probe_kit.diagnose.diagnosis import Diagnosis
+    from probe_kit.diagnose.results import Diagnosis
+    from probe_kit.extract.extraction import Extraction
     from probe_kit.runs import Run
+    from probe_kit.runs.location import Location
 
 _ACTING = frozenset(
     {"model", "execute", "rotation", "no_act", "captured_calls", "later_views", "tokens", "frames", "video"}
@@ -40,6 +43,19 @@ Paraphrases = Annotated[
         "--paraphrases", help="CSV file with columns instruction, other: the same meaning in other words."
     ),
 ]
+Target = Annotated[
+    str | None,
+    typer.Option(
+        "--target",
+        metavar="COLUMN",
+        help="Probe this at every site too: a side, or a column, built in or of --labels.",
+    ),
+]
+Labels = Annotated[Path | None, further_option("--labels", help="Table with the column of --target.")]
+Base = Annotated[
+    str | None,
+    typer.Option("--base", metavar="CHECKPOINT", help="Compare with the checkpoint that this one was tuned from."),
+]
 Inside = Annotated[
     bool, further_option("--inside/--no-inside", help="Patch every site, to find where an input is lost.")
 ]
@@ -56,6 +72,9 @@ def diagnose(
     model_or_run: ModelOrRun,
     frames: Frames = FRAMES,
     require: Require = None,
+    target: Target = None,
+    labels: Labels = None,
+    base: Base = None,
     paraphrases: Paraphrases = None,
     inside: Inside = True,
     out_folder: start.OutFolder = None,
@@ -70,18 +89,32 @@ def diagnose(
     \b
     probe-kit diagnose pi0-tiny --categories color
     probe-kit diagnose pi0 --checkpoint DIR --dataset FOLDER --require instruction
-    probe-kit diagnose runs/mine
+    probe-kit diagnose pi0 --checkpoint DIR --dataset FOLDER --base lerobot/pi0_base
+    probe-kit diagnose runs/mine --target correct
     """
     from probe_kit.diagnose.diagnosis import diagnose_run
     from probe_kit.diagnose.paraphrases import read_paraphrases
+    from probe_kit.train.train_options import TargetOptions
 
     words = {} if paraphrases is None else read_paraphrases(paraphrases)
-    run = _run_of(model_or_run, typed, frames, out_folder, dry_run)
-    if run is None:
+    options = None if target is None else TargetOptions(target, labels, None, None, None)
+    if options is not None:
+        options.check(None)
+    elif labels is not None:
+        raise UsageError(f"--labels {labels} is a table of --target; name the column")
+    if dry_run:
+        _say_cost(_planned(model_or_run, typed, frames, out_folder), frames, inside, base is not None)
         return
+    run = _run_of(model_or_run, typed, frames, out_folder)
     with err.status("diagnosing") as status:
         diagnosis = diagnose_run(
-            run, frames=frames, inside=inside, paraphrases=words, progress=lambda text: status.update(text)
+            run,
+            frames=frames,
+            inside=inside,
+            paraphrases=words,
+            target=None if options is None else options.read(run),
+            base=base,
+            progress=lambda text: status.update(text),
         )
     _print(diagnosis, output_format)
     if html is not None:
@@ -93,18 +126,30 @@ def diagnose(
     raise typer.Exit(diagnosis.exit_code(require or ()))
 
 
-def _run_of(
-    name: str, typed: Mapping[str, Any], frames: int, out_folder: str | None, dry_run: bool
-) -> "Run | None":
-    """The stored run of this name, or one that is extracted now; None after a dry run."""
-    from probe_kit.errors import UsageError
+def _is_run(name: str, typed: Mapping[str, Any]) -> bool:
+    """Whether this is a stored run. Raises UsageError for one with settings of a new run."""
+    if "/" not in name and not (Path(name) / "run.json").exists():
+        return False
+    if typed:
+        option = next(iter(typed)).replace("_", "-")
+        raise UsageError(f"--{option} is a setting of a new run, and {name} is a stored one; leave it out")
+    return True
+
+
+def _run_of(name: str, typed: Mapping[str, Any], frames: int, out_folder: str | None) -> "Run":
+    """The stored run of this name, or one that is extracted now."""
     from probe_kit.runs import open_run
 
-    if "/" in name or (Path(name) / "run.json").exists():
-        if typed:
-            option = next(iter(typed)).replace("_", "-")
-            raise UsageError(f"--{option} is a setting of a new run, and {name} is a stored one; leave it out")
-        return None if dry_run else open_run(name)
+    if _is_run(name, typed):
+        return open_run(name)
+    extraction, location = _prepared(name, typed, frames, out_folder, fetch=True)
+    with progress() as bar:
+        return extraction.run(location, progress=counter(bar, "episodes"))
+
+
+def _prepared(
+    name: str, typed: Mapping[str, Any], frames: int, out_folder: str | None, *, fetch: bool
+) -> "tuple[Extraction, Location]":
     from probe_kit.extract import prepare
     from probe_kit.extract.commands import print_plan
     from probe_kit.runs.store import locate
@@ -116,16 +161,55 @@ def _run_of(
     ignored = {"accept_ignored_inputs": True}
     settings = ExtractSettings.of_command({**typed, **items, "model": name, **captured, **ignored}, None)
     with err.status(f"loading {settings.source.loads} and model"):
-        extraction = prepare(settings, out_folder, fetch=not dry_run)
+        extraction = prepare(settings, out_folder, fetch=fetch)
     location = locate(out_folder or Path("runs") / f"diagnose-{extraction.default_name()}")
     print_plan(extraction, location)
-    if dry_run:
-        sites, names = extraction.plan.sites, 3
-        inferences = frames * (2 + names * (2 + 2 * 3 + sites))
-        say(f"about {inferences:,} inferences: {frames} frames, {names} inputs, {sites} sites")
-        return None
-    with progress() as bar:
-        return extraction.run(location, progress=counter(bar, "episodes"))
+    return extraction, location
+
+
+Planned = tuple[str, Sequence[Any], list[str]]
+"""The family, the stored streams, and the inputs that can vary."""
+
+
+def _planned(name: str, typed: Mapping[str, Any], frames: int, out_folder: str | None) -> Planned:
+    """What a diagnosis of this run, or of a run that is only planned, would exchange and patch."""
+    from probe_kit.intervene.settings import has_sides
+    from probe_kit.runs import open_run
+
+    if _is_run(name, typed):
+        run = open_run(name)
+        texts, cameras, in_scene = (
+            run.episodes["instruction"],
+            run.certificate["policy"]["cameras"],
+            has_sides(run),
+        )
+        return run.model, list(run.streams.values()), _inputs(texts, len(cameras), in_scene)
+    extraction, _ = _prepared(name, typed, frames, out_folder, fetch=False)
+    source, rows = extraction.source, extraction.plan.episodes
+    cameras = source.example(rows[0].instruction).cameras
+    inputs = _inputs((row.instruction for row in rows), 1 + len(cameras), source.suite is not None)
+    return extraction.settings.model.family, extraction.plan.streams, inputs
+
+
+def _inputs(instructions: Iterable[str], cameras: int, in_scene: bool) -> list[str]:
+    """The inputs that can vary between the frames; the scene always begins with one state."""
+    pictures = ["picture"] if cameras == 1 else [f"{cameras} pictures"]
+    return [*["instruction"] * (len(set(instructions)) > 1), *pictures * cameras, *["state"] * (not in_scene)]
+
+
+def _say_cost(planned: Planned, frames: int, inside: bool, base: bool) -> None:
+    from probe_kit.diagnose.measure import count_inferences
+    from probe_kit.hooks.registry import get_family
+
+    family, streams, inputs = planned
+    layers = {stream.name: stream.layers for stream in streams}
+    declared = get_family(family)
+    # Keys and values are of every block of the backbone, which has one residual site more.
+    handed_over = layers["backbone"] - 1 if declared is not None and declared.interventions.prompt_kv else 0
+    sites = sum(layers.values()) + handed_over if inside else 0
+    most = count_inferences(frames, len(inputs), sites, base)
+    words = ", ".join(dict.fromkeys(inputs))
+    say(f"at most {most:,} inferences: {frames} frames, {words}, {sites} sites" + ", and a base" * base)
 
 
 def _print(diagnosis: "Diagnosis", output_format: str) -> None:

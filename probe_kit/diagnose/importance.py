@@ -6,20 +6,18 @@ Communications 117, 1999; Saltelli et al., Computer Physics Communications 181, 
 actions over frames and seeds. Both inferences of a pair have one seed.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit.diagnose.results import IDLE, MATTERS, BaseComparison, Change, InputDiagnosis, Verdict
 from probe_kit.hashing import derive_seed
 from probe_kit.statistics.paired_tests import max_t
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.statistics.student import unbounded_student_interval
 
-Matter = Literal["decides", "moves", "no effect", "open", "does not arrive", "not varied", "not an input"]
-MATTERS: tuple[Matter, ...] = ("decides", "moves")
 DECIDES = 0.5
 """Of what all inputs change together: from here on an input decides."""
 INPUTS_DECIDE = 0.25
@@ -77,41 +75,7 @@ class Exchanges:
     blanked: NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Importance:
-    """The importance of one input: does it arrive, and how much of the action does it decide?
-
-    share: the total-effect index, 1 where nothing else matters, with its 95 % interval by groups (Student).
-    control: the index of a change that should not matter. every: of all inputs together. p: exact, one-sided, by
-    sign flips of whole groups: the input changes more than its control. unchanged: inferences, of `n_inferences`
-    with another value or a blank, in which no number of the action changed. reason: of the verdict.
-    """
-
-    name: str
-    verdict: Matter
-    reason: str
-    share: float = np.nan
-    share_ci: tuple[float, float] = (np.nan, np.nan)
-    control: float = np.nan
-    every: float = np.nan
-    p: float = np.nan
-    n_pairs: int = 0
-    n_groups: int = 0
-    n_inferences: int = 0
-    unchanged: int = 0
-
-    @property
-    def arrives(self) -> bool:
-        """Whether any other value of the input changed any action."""
-        return self.verdict != "does not arrive"
-
-    @property
-    def matters(self) -> bool | None:
-        """True if the input decides or moves the action, False if not; None where that was not tested."""
-        return None if self.verdict in ("not varied", "not an input") else self.verdict in MATTERS
-
-
-def importance_of(name: str, exchanges: Exchanges) -> Importance:
+def importance_of(name: str, exchanges: Exchanges) -> InputDiagnosis:
     """The verdict on one input that was exchanged."""
     groups = exchanges.groups
     above = exchanges.exchanged - exchanges.control
@@ -133,7 +97,33 @@ def importance_of(name: str, exchanges: Exchanges) -> Importance:
         "unchanged": int((exchanges.largest == 0).sum() + (exchanges.blanked == 0).sum()),
     }
     verdict, reason = _verdict(exchanges, above, p)
-    return Importance(name, verdict, reason, **measured)
+    return InputDiagnosis(name, verdict, reason, **measured)
+
+
+def compare_with_base(
+    tuned: InputDiagnosis, base: InputDiagnosis, of_tuned: Exchanges, of_base: Exchanges
+) -> BaseComparison:
+    """Return what fine-tuning did to one input that was exchanged in the same pairs of both checkpoints."""
+    difference, groups, first = of_tuned.exchanged - of_base.exchanged, of_tuned.groups, of_tuned.first
+    seed = derive_seed(tuned.name, "base", *np.unique(groups).tolist())
+    signed = np.stack([difference[first], -difference[first]])
+    _, sides, _ = max_t(signed, _pairs_of(groups[first]), groups[first], seed)
+    p = min(1.0, 2 * float(sides.min()))
+    mean = float(difference.mean())
+    change = _change(tuned.verdict, base.verdict, mean, p)
+    limits = unbounded_student_interval(difference, groups)
+    return BaseComparison(change, base.verdict, base.share, mean, limits, p)
+
+
+def _change(tuned: Verdict, base: Verdict, difference: float, p: float) -> Change:
+    """Both verdicts and a difference that is shown are needed for a loss or a gain; anything less is open."""
+    if tuned in IDLE and base in IDLE:
+        return "never there"
+    if tuned in MATTERS and base in MATTERS:
+        return "in both" if p >= SIGNIFICANCE else "stronger" if difference > 0 else "weaker"
+    if p < SIGNIFICANCE and base in MATTERS and difference < 0:
+        return "lost in fine-tuning"
+    return "gained" if p < SIGNIFICANCE and tuned in MATTERS and difference > 0 else "open"
 
 
 def _pairs_of(groups: NDArray[np.str_]) -> NDArray[np.str_]:
@@ -141,7 +131,7 @@ def _pairs_of(groups: NDArray[np.str_]) -> NDArray[np.str_]:
     return np.array([f"{group} {index}" for index, group in enumerate(groups)])
 
 
-def _verdict(exchanges: Exchanges, above: NDArray[np.float64], p: float) -> tuple[Matter, str]:
+def _verdict(exchanges: Exchanges, above: NDArray[np.float64], p: float) -> tuple[Verdict, str]:
     groups = exchanges.groups
     if not exchanges.largest.any():
         changed = int((exchanges.blanked != 0).sum())
@@ -161,10 +151,3 @@ def _verdict(exchanges: Exchanges, above: NDArray[np.float64], p: float) -> tupl
     if float(exchanges.every.mean()) < INPUTS_DECIDE:
         return "moves", "the seed decides the action, and all inputs together hardly do"
     return "moves", "it changes less than half of what all inputs change together, or that was not shown"
-
-
-def exit_code(inputs: Sequence[Importance], required: Sequence[str] = ()) -> int:
-    """0 if every required input arrives and matters, else 1. required: names; empty for all that were tested."""
-    tested = [importance for importance in inputs if importance.matters is not None]
-    judged = [importance for importance in inputs if importance.name in required] if required else tested
-    return 0 if judged and all(importance.matters for importance in judged) else 1

@@ -1,18 +1,19 @@
 """The inferences of a diagnosis: clean, with every input exchanged, blanked and hardly changed."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.diagnose.importance import ActionScale, Exchanges, Importance, importance_of
+from probe_kit.diagnose.importance import ActionScale, Exchanges, compare_with_base, importance_of
 from probe_kit.diagnose.inputs import control_of, differing, inputs_of, spread_of_states
+from probe_kit.diagnose.results import InputDiagnosis
 from probe_kit.errors import InstructionError, UsageError
 from probe_kit.extract.sources.donors import Frame, draw_donors
-from probe_kit.extract.sources.inputs import STATE, blank_of, with_input
+from probe_kit.extract.sources.inputs import blank_of, with_input
 from probe_kit.hashing import derive_seed
 
 if TYPE_CHECKING:
@@ -25,6 +26,17 @@ Infer = Callable[[Sequence["Observation"], Sequence[int]], Actions]
 """From observations and seeds to actions (B, chunk, D), in any unit; deterministic for a seed."""
 
 
+def count_inferences(frames: int, inputs: int, sites: int = 0, base: bool = False) -> int:
+    """Return how many inferences a diagnosis takes at most.
+
+    sites: that are patched, 0 for none. base: whether a base checkpoint is compared.
+    """
+    checkpoints = 1 + base
+    # Clean ones twice and with another seed; per input the donors' value, all of their inputs, control and blank.
+    measured = frames * (3 + inputs * (2 * DONORS + 2)) * checkpoints
+    return measured + (frames * inputs * (2 + sites) if sites else 0)
+
+
 @dataclass(frozen=True)
 class InputExchange:
     """Exchanges of inputs between frames, and what they change. seed: of the draw of donors."""
@@ -32,14 +44,15 @@ class InputExchange:
     infer: Infer
     frames: Sequence[Frame]
     seed: int = 0
+    _exchanges: dict[str, Exchanges] = field(default_factory=dict, repr=False)
 
     def measure(
-        self, names: Sequence[str] = (), *, reads_state: bool = True, camera: str = ""
-    ) -> tuple[Importance, ...]:
+        self, names: Sequence[str] = (), *, absent: Collection[str] = (), camera: str = ""
+    ) -> tuple[InputDiagnosis, ...]:
         """Return how much of the action every input decides.
 
-        names: of the inputs; empty for all. reads_state: whether the model is given a state at all. camera: the
-        name of the first one. Raises UsageError for an unknown name, fewer than two groups, or a policy that gives
+        names: of the inputs; empty for all. absent: inputs that the model is said never to read. camera: the name
+        of the first one. Raises UsageError for an unknown name, fewer than two groups, or a policy that gives
         other actions for the same observation and seed.
         """
         available = inputs_of(self.frames, camera)
@@ -50,17 +63,41 @@ class InputExchange:
                 f"all {2 * len(self.frames)} actions are equal, whatever is seen; give frames that differ"
             )
         measured = map(self._measure, names or available)
-        return tuple(importance if reads_state else _without_state(importance) for importance in measured)
+        return tuple(_declared(diagnosed) if diagnosed.name in absent else diagnosed for diagnosed in measured)
+
+    def against(
+        self, base: Infer, inputs: Sequence[InputDiagnosis], absent: Collection[str] = ()
+    ) -> tuple[InputDiagnosis, ...]:
+        """Return the inputs with their comparison with a base checkpoint, of those that were exchanged.
+
+        base: infers with it. Raises what `measure` raises.
+        """
+        other = InputExchange(base, self.frames, self.seed)
+        compared = []
+        for diagnosed in inputs:
+            comparison = None
+            if diagnosed.matters is not None:
+                (of_base,) = other.measure(
+                    [diagnosed.name], absent=absent, camera=diagnosed.name.partition(".")[2]
+                )
+                exchanges = self._exchanges[diagnosed.name], other._exchanges[diagnosed.name]
+                comparison = compare_with_base(diagnosed, of_base, *exchanges)
+            compared.append(replace(diagnosed, base=comparison))
+        return tuple(compared)
 
     def donors(self, name: str) -> list[tuple[int, int]]:
         """Pairs (frame, donor) of an input, the same at every call; see `draw_donors`."""
         rng = np.random.default_rng(derive_seed(self.seed, "donors", name))
         return draw_donors(self.frames, name, rng, DONORS)
 
+    def first_donors(self, name: str) -> list[tuple[int, int]]:
+        """One donor per frame of an input, of those that `donors` draws."""
+        return list(dict(reversed(self.donors(name))).items())
+
     @cached_property
     def clean(self) -> Actions:
         """Actions of all frames. Raises UsageError unless they are the same again."""
-        actions, again = (self.infer(self._observations, self._seeds) for _ in range(2))
+        actions, again = (self.infer(self.observations, self._seeds) for _ in range(2))
         if not np.array_equal(actions, again):
             raise UsageError(
                 "the same observations and seeds gave actions that differ by "
@@ -72,66 +109,63 @@ class InputExchange:
     @cached_property
     def scale(self) -> ActionScale:
         """The spread of clean actions over frames and seeds."""
-        other = self.infer(self._observations, [derive_seed(seed, "other") for seed in self._seeds])
+        other = self.infer(self.observations, [derive_seed(seed, "other") for seed in self._seeds])
         return ActionScale.of(np.concatenate([self.clean, other]))
 
     @cached_property
     def _blank(self) -> "Observation":
-        return blank_of(self._observations)
+        return blank_of(self.observations)
 
     @cached_property
     def _spread(self) -> NDArray[np.float64]:
         return spread_of_states(self.frames)
 
-    @property
-    def _observations(self) -> "list[Observation]":
+    @cached_property
+    def observations(self) -> "list[Observation]":
+        """The observations of all frames, read once."""
         return [frame.observation for frame in self.frames]
 
     @property
     def _seeds(self) -> list[int]:
         return [frame.seed for frame in self.frames]
 
-    def _measure(self, name: str) -> Importance:
-        frames, clean, scale = self.frames, self.clean, self.scale
+    def _measure(self, name: str) -> InputDiagnosis:
+        frames, observations, clean, scale = self.frames, self.observations, self.clean, self.scale
         if not differing(frames, name):
-            return Importance(name, "not varied", f"all {len(frames)} frames hold one value")
+            return InputDiagnosis(name, "not varied", f"all {len(frames)} frames hold one value")
         pairs = self.donors(name)
         if not pairs:
-            return Importance(name, "not varied", "no two groups of frames hold different values")
+            return InputDiagnosis(name, "not varied", "no two groups of frames hold different values")
         rows = np.array([index for index, _ in pairs])
         seeds = [frames[index].seed for index in rows]
-        donors = [frames[donor].observation for _, donor in pairs]
-        varied = [
-            with_input(frames[index].observation, name, donor) for index, donor in zip(rows, donors, strict=True)
-        ]
+        donors = [observations[donor] for _, donor in pairs]
+        varied = [with_input(observations[index], name, donor) for index, donor in zip(rows, donors, strict=True)]
         exchanged, every = self.infer(varied, seeds), self.infer(donors, seeds)
         control = self.infer([control_of(frame, name, self._spread) for frame in frames], self._seeds)
         blanked = self._blanked(name)
-        return importance_of(
-            name,
-            Exchanges(
-                exchanged=scale.shares(exchanged, clean[rows]),
-                control=scale.shares(control, clean)[rows],
-                every=scale.shares(every, clean[rows]),
-                groups=np.array([frames[index].group for index in rows]),
-                first=np.concatenate([[True], np.diff(rows) != 0]),
-                largest=np.abs(exchanged - clean[rows]).max(axis=(1, 2)),
-                blanked=np.abs(blanked - clean[: len(blanked)]).max(axis=(1, 2), initial=0.0),
-            ),
+        self._exchanges[name] = Exchanges(
+            exchanged=scale.shares(exchanged, clean[rows]),
+            control=scale.shares(control, clean)[rows],
+            every=scale.shares(every, clean[rows]),
+            groups=np.array([frames[index].group for index in rows]),
+            first=np.concatenate([[True], np.diff(rows) != 0]),
+            largest=np.abs(exchanged - clean[rows]).max(axis=(1, 2)),
+            blanked=np.abs(blanked - clean[: len(blanked)]).max(axis=(1, 2), initial=0.0),
         )
+        return importance_of(name, self._exchanges[name])
 
     def _blanked(self, name: str) -> Actions:
         """Actions of all frames without one input; of none where the family refuses text without words."""
         try:
             return self.infer(
-                [with_input(observation, name, self._blank) for observation in self._observations], self._seeds
+                [with_input(observation, name, self._blank) for observation in self.observations], self._seeds
             )
         except InstructionError:
             return np.zeros((0, 1, 1), np.float32)
 
 
-def _without_state(measured: Importance) -> Importance:
-    """The state of a model that declares none is no input, where the measurement agrees."""
-    if measured.name != STATE or measured.verdict not in ("does not arrive", "not varied"):
+def _declared(measured: InputDiagnosis) -> InputDiagnosis:
+    """An input that the model is said never to read is none, where the measurement agrees."""
+    if measured.verdict not in ("does not arrive", "not varied"):
         return measured
-    return replace(measured, verdict="not an input", reason="the model reads no state")
+    return replace(measured, verdict="not an input", reason=f"the model reads no {measured.name}")

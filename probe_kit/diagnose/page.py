@@ -3,13 +3,13 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from probe_kit.diagnose.sentences import diagnosis_table, sentence
+from probe_kit.diagnose.sentences import diagnosis_table, sentences
 from probe_kit.retention.displays.base.style import footer, legend_above, panels, plain, series
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from probe_kit.diagnose.diagnosis import Diagnosis
+    from probe_kit.diagnose.results import Diagnosis
 
 _HEAD = (
     "<!doctype html><html lang=en><meta charset=utf-8><title>{title}</title><style>"
@@ -20,15 +20,26 @@ _HEAD = (
 
 
 def draw_passage(diagnosis: "Diagnosis") -> "Figure":
-    """A curve per input over the sites in the network's order: the difference, and the share carried on."""
+    """A curve per input over the sites in the network's order: the difference, and the share carried on.
+
+    Below them that of a target: its score above chance.
+    """
     curves = [diagnosed for diagnosed in diagnosis.inputs if diagnosed.passage]
     places = list(dict.fromkeys(site.name for diagnosed in curves for site in diagnosed.passage))
-    figure, axes = panels(2, width=max(4.2, 0.28 * len(places)), height=2.6, columns=1, share=False)
+    knowledge = diagnosis.knowledge
+    labels = ["relative difference", "share carried"]
+    labels += [f"{knowledge.metric} of {knowledge.target}\nabove chance"] if knowledge else []
+    width = max(4.2, 0.28 * len(places))
+    figure, axes = panels(len(labels), width=width, height=2.6, columns=1, share=False)
     for at, diagnosed in enumerate(curves):
         x = [places.index(site.name) for site in diagnosed.passage]
         axes[0].plot(x, [site.difference for site in diagnosed.passage], label=diagnosed.name, **_look(at))
         axes[1].plot(x, [site.carried for site in diagnosed.passage], label=diagnosed.name, **_look(at))
-    for panel, label in zip(axes, ("relative difference", "share carried"), strict=True):
+    if knowledge:
+        sites = [site for site in knowledge.sites if site.name in places]
+        heights = [site.score - site.chance for site in sites]
+        axes[2].plot([places.index(site.name) for site in sites], heights, "o", color="0.25")
+    for panel, label in zip(axes, labels, strict=True):
         plain(panel)
         panel.set_xticks(range(len(places)), places, rotation=90, fontsize=7)
         panel.set_ylabel(label, fontsize=8.5)
@@ -51,7 +62,7 @@ def write_page(diagnosis: "Diagnosis", file: Path) -> None:
 
     from probe_kit.retention.displays.base.display import picture_of
 
-    items = Markup("").join(Markup("<li>{}</li>").format(sentence(diagnosed)) for diagnosed in diagnosis.inputs)
+    items = Markup("").join(Markup("<li>{}</li>").format(line) for line in sentences(diagnosis))
     parts = [_HEAD.format(title=escape(f"Inputs of {diagnosis.label}")), diagnosis_table(diagnosis)._repr_html_()]
     parts.append(Markup("<ul>{}</ul>").format(items))
     if any(diagnosed.passage for diagnosed in diagnosis.inputs):

@@ -6,12 +6,12 @@ action follows when only this site is patched from the donor into the clean infe
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from probe_kit.diagnose.importance import ActionScale
+from probe_kit.diagnose.results import LIKE_NONE, SitePassage
 from probe_kit.hooks.contract.sites import KV_STREAM
 from probe_kit.intervene.pairs import Chunk, Given, Pair
 from probe_kit.intervene.patching.patch import Cell, patched
@@ -20,35 +20,6 @@ from probe_kit.intervene.places import ALL, SiteGroup, resolve_sites
 if TYPE_CHECKING:
     from probe_kit.hooks import ActivationCache, Model
     from probe_kit.intervene.sessions.session import ReplaySession
-
-LIKE_NONE = 1e-6
-"""Relative difference of activations that rounding can make."""
-CARRIES = 0.5
-"""Share of the change of the action from which a site is said to carry an input."""
-
-
-@dataclass(frozen=True)
-class SitePassage:
-    """One site of the network. Means over pairs.
-
-    name: as `--sites` names it. difference: norm of the difference of the activations, relative to the clean
-    ones. carried: the change of the action under the patch of this site, projected on the change under the donor's
-    input, 1 for all of it; NaN where the donor changes no action.
-    """
-
-    name: str
-    difference: float
-    carried: float
-
-    @property
-    def stream(self) -> str:
-        """The stream of the site."""
-        return self.name.partition(".")[0]
-
-    @property
-    def differs(self) -> bool:
-        """Whether the input reaches the site at all."""
-        return self.difference > LIKE_NONE
 
 
 def places_of(model: "Model") -> list[SiteGroup]:
@@ -107,35 +78,3 @@ def _relative_difference(group: SiteGroup, before: "ActivationCache", after: "Ac
         difference += float((donated - clean).square().sum())
         norm += float(clean.square().sum())
     return float(np.sqrt(difference / norm)) if norm else 0.0
-
-
-def describe_passage(passage: Sequence[SitePassage], matters: bool | None) -> str:
-    """Return where the input is lost, or which sites carry it, as a sentence without its stop; else empty."""
-    if not passage:
-        return ""
-    reached = [site for site in passage if site.differs]
-    if not reached:
-        return "no site inside the network differs: it ends before the first layer"
-    if passage[-1] is not reached[-1]:
-        following = passage[passage.index(reached[-1]) + 1]
-        return f"the difference ends behind {reached[-1].name}; {following.name} is bit-equal"
-    if matters:
-        carriers = [site for site in passage if site.carried >= CARRIES]
-        spans = [_span([site for site in carriers if site.stream == stream]) for stream in _streams(carriers)]
-        return f"carried by {', '.join(spans)}" if spans else "no site alone carries half of it"
-    strongest = max(passage, key=lambda site: site.difference)
-    last = passage[-1]
-    return (
-        f"it is strongest at {strongest.name} (relative difference {strongest.difference:.2g}) and reaches "
-        f"{last.name} ({last.difference:.2g}): the loss is in the action part itself"
-    )
-
-
-def _streams(sites: Sequence[SitePassage]) -> list[str]:
-    return list(dict.fromkeys(site.stream for site in sites))
-
-
-def _span(sites: Sequence[SitePassage]) -> str:
-    """The first and the last of some sites of one stream, such as `backbone.00–02`."""
-    first, last = sites[0].name, sites[-1].name
-    return first if first == last else f"{first}–{last.partition('.')[2]}"

@@ -7,7 +7,7 @@ from probe_kit._tables.numbers import p_text, whole, with_limits
 from probe_kit._tables.table import Cell, Heading, Table
 
 if TYPE_CHECKING:
-    from probe_kit.diagnose.diagnosis import Diagnosis, InputDiagnosis
+    from probe_kit.diagnose.results import Diagnosis, InputDiagnosis
 
 _HEADINGS = (
     Heading("input"),
@@ -29,36 +29,66 @@ _FINDINGS = {
 }
 
 
+_CHANGES = {
+    "lost in fine-tuning": "it was lost in fine-tuning",
+    "weaker": "it is weaker than in the base",
+    "never there": "the base does not use it either",
+    "in both": "the base uses it too",
+    "stronger": "it is stronger than in the base",
+    "gained": "it was gained in fine-tuning",
+    "open": "the difference to the base is open",
+}
+_OF_BASE = (
+    Heading("base %", "the share of the base checkpoint, on the same pairs"),
+    Heading("difference %", "of both shares, tuned minus base, 95 % by groups"),
+    Heading("p of the difference", "two-sided, by sign flips of whole groups"),
+    Heading("change"),
+)
+
+
 def diagnosis_table(diagnosis: "Diagnosis") -> Table:
-    """One line per input, with one sentence per input below it."""
-    rows = [_row(diagnosed) for diagnosed in diagnosis.inputs]
+    """One line per input, with one sentence per input below it, and one of the target."""
+    headings = (*_HEADINGS, *_OF_BASE) if diagnosis.base else _HEADINGS
+    rows = [_row(diagnosed, headings) for diagnosed in diagnosis.inputs]
     title = f"Inputs of {diagnosis.label}: {diagnosis.n_frames} frames of {diagnosis.n_groups} groups"
+    title += f"; base {diagnosis.base}" * bool(diagnosis.base)
     numbers = tuple(diagnosis.to_json()["inputs"])
-    return Table.of(
-        title, _HEADINGS, rows, notes=[sentence(diagnosed) for diagnosed in diagnosis.inputs], numbers=numbers
-    )
+    return Table.of(title, headings, rows, notes=sentences(diagnosis), numbers=numbers)
 
 
-def _row(diagnosed: "InputDiagnosis") -> Sequence[Cell]:
-    importance = diagnosed.importance
-    tested = importance.matters is not None
-    texts = (
+def _row(diagnosed: "InputDiagnosis", headings: Sequence[Heading]) -> Sequence[Cell]:
+    tested = diagnosed.matters is not None
+    texts = [
         diagnosed.name,
-        ("yes" if importance.arrives else "no") if tested else "–",
-        importance.verdict,
-        with_limits(importance.share, importance.share_ci, whole),
-        whole(importance.control),
-        whole(importance.every),
-        p_text(importance.p),
-    )
-    lost = ("arrives", "verdict") if importance.matters is False else ()
-    headed = zip(_HEADINGS, texts, strict=True)
-    return [Cell(text, alarm=heading.text in lost) for heading, text in headed]
+        ("yes" if diagnosed.arrives else "no") if tested else "–",
+        diagnosed.verdict,
+        with_limits(diagnosed.share, diagnosed.share_ci, whole),
+        whole(diagnosed.control),
+        whole(diagnosed.every),
+        p_text(diagnosed.p),
+    ]
+    if (base := diagnosed.base) is not None:
+        texts += [whole(base.share), with_limits(base.difference, base.ci, whole), p_text(base.p), base.change]
+    texts += ["–"] * (len(headings) - len(texts))
+    alarms = {"arrives", "verdict"} if diagnosed.matters is False else set()
+    if base is not None and base.change == "lost in fine-tuning":
+        alarms.add("change")
+    return [Cell(text, alarm=heading.text in alarms) for heading, text in zip(headings, texts, strict=True)]
+
+
+def sentences(diagnosis: "Diagnosis") -> list[str]:
+    """Return what became of every input, and of the target."""
+    lines = [sentence(diagnosed) for diagnosed in diagnosis.inputs]
+    if diagnosis.knowledge is not None:
+        decided = any(diagnosed.verdict == "decides" for diagnosed in diagnosis.inputs)
+        lines.append(diagnosis.knowledge.describe(decided))
+    return lines
 
 
 def sentence(diagnosed: "InputDiagnosis") -> str:
     """Return one sentence: what became of an input, and where."""
-    importance = diagnosed.importance
-    reason = f" ({importance.reason})" if importance.verdict in ("not varied", "not an input", "open") else ""
+    reasoned = diagnosed.verdict in ("not varied", "not an input", "open")
+    reason = f" ({diagnosed.reason})" if reasoned else ""
     where = f"; {diagnosed.where}" if diagnosed.where else ""
-    return f"{diagnosed.name} {_FINDINGS[importance.verdict]}{reason}{where}."
+    base = f"; {_CHANGES[diagnosed.base.change]}" if diagnosed.base is not None else ""
+    return f"{diagnosed.name} {_FINDINGS[diagnosed.verdict]}{reason}{where}{base}."

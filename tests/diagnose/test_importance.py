@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from probe_kit.diagnose.importance import exit_code
 from probe_kit.diagnose.inputs import PICTURE, STATE
-from probe_kit.diagnose.measure import InputExchange
+from probe_kit.diagnose.measure import InputExchange, count_inferences
+from probe_kit.diagnose.results import exit_code
 from probe_kit.errors import InstructionError, UsageError
 from probe_kit.extract.sources.donors import Frame
 from probe_kit.hooks.contract.observation import Observation
@@ -175,3 +175,56 @@ def test_a_family_that_refuses_an_empty_instruction_is_diagnosed_without_that_bl
     words, picture, _ = InputExchange(infer, frames()).measure()
     assert (words.verdict, words.n_inferences) == ("decides", words.n_pairs)
     assert picture.n_inferences == picture.n_pairs + 48
+
+
+def change_of(tuned: Sequence[float], base: Sequence[float]) -> dict[str, str]:
+    exchange = InputExchange(linear_policy(tuned), frames())
+    compared = exchange.against(linear_policy(base), exchange.measure())
+    return {diagnosed.name: diagnosed.base.change for diagnosed in compared if diagnosed.base is not None}
+
+
+def test_a_base_says_what_was_lost_gained_or_never_there() -> None:
+    changes = change_of([0.0, 1.0, 1.0], [1.0, 1.0, 0.0])
+    assert changes["instruction"] == "lost in fine-tuning"
+    assert changes["state"] == "gained"
+    assert changes["picture"] in ("in both", "stronger"), "its share of a variance that is another"
+    assert change_of([1.0, 0.0, 0.0], [1.0, 0.0, 0.0]) == {
+        "instruction": "in both",
+        "picture": "never there",
+        "state": "never there",
+    }
+    assert change_of([1.0, 0.3, 1.0], [0.3, 1.0, 1.0])["instruction"] == "stronger"
+    assert change_of([0.3, 1.0, 1.0], [1.0, 0.3, 1.0])["instruction"] == "weaker"
+
+
+def test_a_base_with_other_effects_by_chance_is_not_a_loss_in_more_than_five_of_a_hundred_draws() -> None:
+    alarms = 0
+    for seed in range(100):
+        exchange = InputExchange(linear_policy([1.0, 0.5, 0.0], wandering=0.5), frames(16, 8, seed), seed)
+        twin = linear_policy([0.5, 1.0, 0.0], wandering=0.5)
+        (state,) = exchange.against(twin, exchange.measure(["state"]))
+        alarms += state.base is not None and state.base.change in ("lost in fine-tuning", "gained")
+    assert alarms <= 10, "5 % of 100, and three standard deviations"
+
+
+def test_the_plan_counts_every_inference() -> None:
+    made = 0
+    policy = linear_policy([1.0, 1.0, 1.0])
+
+    def infer(observations: Sequence[Observation], seeds: Sequence[int]) -> Actions:
+        nonlocal made
+        made += len(seeds)
+        return policy(observations, seeds)  # type: ignore[no-any-return]
+
+    exchange = InputExchange(infer, frames())
+    inputs = exchange.measure()
+    assert made == count_inferences(len(frames()), len(inputs))
+    exchange.against(infer, inputs)
+    assert made == count_inferences(len(frames()), len(inputs), base=True)
+
+
+def test_an_input_that_is_declared_absent_is_none_unless_it_moves_the_action() -> None:
+    exchange = InputExchange(linear_policy([1.0, 1.0, 0.0]), frames())
+    inputs = {diagnosed.name: diagnosed for diagnosed in exchange.measure(absent={"state", "picture"})}
+    assert inputs["state"].verdict == "not an input"
+    assert inputs["picture"].matters, "a declaration does not outweigh what was measured"

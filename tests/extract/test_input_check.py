@@ -1,6 +1,5 @@
 """The input check in certificates: `extract` finds a deaf and a blind policy by its first observation."""
 
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ from probe_kit.hooks.families.pi0.adapter import load_pi0_tiny
 from probe_kit.runs import Run
 from probe_kit.runs.certificates import input_notes
 from tests.support.lerobot_recordings import CAMERA, write_recording
+from tests.support.pi0_organisms import Edit, make_blind, make_deaf
 from tests.support.prismatic_checkpoints import write_checkpoint
 
 SETTINGS = ExtractSettings(
@@ -28,23 +28,13 @@ SETTINGS = ExtractSettings(
 BOTH = {"picture": "output", "instruction": "output"}
 
 
-def make_blind(model: Any) -> None:
-    model.multi_modal_projector.linear.weight.zero_()
-    model.multi_modal_projector.linear.bias.zero_()
-
-
-def make_deaf(model: Any) -> None:
-    rows = model.language_model.embed_tokens.weight
-    rows[:] = rows[100].clone()
-
-
-def edited(*edits: Callable[[Any], None]) -> Policy:
+def edited(*edits: Edit) -> Policy:
     """The embedded policy with edited weights."""
-    policy: Any = load_pi0_tiny()
+    policy = load_pi0_tiny()
     with torch.no_grad():
         for edit in edits:
-            edit(policy.network.model.paligemma_with_expert.paligemma.model)
-    return policy  # type: ignore[no-any-return]
+            edit(policy)
+    return policy
 
 
 def extracted(folder: Path, policy: Policy, settings: ExtractSettings = SETTINGS) -> Run:
@@ -59,7 +49,7 @@ def test_a_sound_policy_is_certified_without_a_note(tmp_path: Path, pi0_tiny: Po
 
 
 @pytest.mark.parametrize(("edit", "lost"), [(make_blind, "picture"), (make_deaf, "instruction")])
-def test_a_blind_and_a_deaf_policy_are_noted(edit: Callable[[Any], None], lost: str, tmp_path: Path) -> None:
+def test_a_blind_and_a_deaf_policy_are_noted(edit: Edit, lost: str, tmp_path: Path) -> None:
     run = extracted(tmp_path / "run", edited(edit))
     assert run.certificate["input_check"] == {**BOTH, lost: "nothing"}
     output = " ".join(CliRunner().invoke(app, ["run", "show", str(run.path)]).output.split())

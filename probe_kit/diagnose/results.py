@@ -1,0 +1,258 @@
+"""The results of a diagnosis, input by input, as they are printed and stored. Loads no model."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from math import isfinite, nan
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import BeforeValidator, PlainSerializer
+
+from probe_kit.errors import UsageError
+
+if TYPE_CHECKING:
+    from pydantic import TypeAdapter
+
+Verdict = Literal["decides", "moves", "no effect", "open", "does not arrive", "not varied", "not an input"]
+MATTERS: tuple[Verdict, ...] = ("decides", "moves")
+IDLE: tuple[Verdict, ...] = ("no effect", "does not arrive")
+"""Verdicts that an input does not matter; `open` is none."""
+CARRIES = 0.5
+"""Share of the change of the action from which a site is said to carry an input."""
+LIKE_NONE = 1e-6
+"""Relative difference of activations that rounding can make."""
+Number = Annotated[
+    float,
+    BeforeValidator(lambda stored: nan if stored is None else stored),
+    PlainSerializer(lambda number: number if isfinite(number) else None),
+]
+"""A number that may be unknown: NaN here, null in JSON."""
+Limits = tuple[Number, Number]
+NO_LIMITS = (nan, nan)
+
+
+@dataclass(frozen=True)
+class SitePassage:
+    """One site of the network. Means over pairs.
+
+    name: as `--sites` names it. difference: norm of the difference of the activations, relative to the clean
+    ones. carried: the change of the action under the patch of this site, projected on the change under the donor's
+    input, 1 for all of it; NaN where the donor changes no action.
+    """
+
+    name: str
+    difference: float
+    carried: Number
+
+    @property
+    def stream(self) -> str:
+        """The stream of the site."""
+        return self.name.partition(".")[0]
+
+    @property
+    def differs(self) -> bool:
+        """Whether the input reaches the site at all."""
+        return self.difference > LIKE_NONE
+
+
+Change = Literal["lost in fine-tuning", "weaker", "never there", "in both", "stronger", "gained", "open"]
+
+
+@dataclass(frozen=True)
+class BaseComparison:
+    """One input in the base checkpoint, and the difference to it.
+
+    verdict, share: of the base, on the same pairs. difference: of the shares, tuned minus base; ci: its 95 %
+    interval by groups; p: two-sided, by sign flips of whole groups.
+    """
+
+    change: Change
+    verdict: Verdict
+    share: Number
+    difference: Number
+    ci: Limits
+    p: Number
+
+
+@dataclass(frozen=True)
+class InputDiagnosis:
+    """One input: does it arrive, how much of the action does it decide, and which sites lie on its way?
+
+    share: the total-effect index, 1 where nothing else matters, with its 95 % interval by groups (Student).
+    control: the index of a change that should not matter. every: of all inputs together. p: exact, one-sided, by
+    sign flips of whole groups: the input changes more than its control. unchanged: inferences, of `n_inferences`
+    with another value or a blank, in which no number of the action changed. reason: of the verdict. passage: the
+    sites in the order of the network; note: why there are none. base: the same in the base checkpoint.
+    """
+
+    name: str
+    verdict: Verdict
+    reason: str
+    share: Number = nan
+    share_ci: Limits = NO_LIMITS
+    control: Number = nan
+    every: Number = nan
+    p: Number = nan
+    n_pairs: int = 0
+    n_groups: int = 0
+    n_inferences: int = 0
+    unchanged: int = 0
+    passage: tuple[SitePassage, ...] = ()
+    note: str = ""
+    base: BaseComparison | None = None
+
+    @property
+    def arrives(self) -> bool:
+        """Whether any other value of the input changed any action."""
+        return self.verdict != "does not arrive"
+
+    @property
+    def matters(self) -> bool | None:
+        """True if the input decides or moves the action, False if not; None where that was not tested."""
+        return None if self.verdict in ("not varied", "not an input") else self.verdict in MATTERS
+
+    @property
+    def where(self) -> str:
+        """The place of the loss, or the sites that carry it; the note where nothing was measured inside."""
+        return describe_passage(self.passage, self.matters) or self.note
+
+
+def describe_passage(passage: Sequence[SitePassage], matters: bool | None) -> str:
+    """Return where the input is lost, or which sites carry it, as a sentence without its stop; else empty."""
+    if not passage:
+        return ""
+    reached = [site for site in passage if site.differs]
+    if not reached:
+        return "no site inside the network differs: it ends before the first layer"
+    if passage[-1] is not reached[-1]:
+        following = passage[passage.index(reached[-1]) + 1]
+        return f"the difference ends behind {reached[-1].name}; {following.name} is bit-equal"
+    if matters:
+        carriers = [site for site in passage if site.carried >= CARRIES]
+        spans = [_span([site for site in carriers if site.stream == stream]) for stream in _streams(carriers)]
+        return f"carried by {', '.join(spans)}" if spans else "no site alone carries half of it"
+    strongest = max(passage, key=lambda site: site.difference)
+    last = passage[-1]
+    return (
+        f"it is strongest at {strongest.name} (relative difference {strongest.difference:.2g}) and reaches "
+        f"{last.name} ({last.difference:.2g}): the loss is in the action part itself"
+    )
+
+
+def _streams(sites: Sequence[SitePassage]) -> list[str]:
+    return list(dict.fromkeys(site.stream for site in sites))
+
+
+def _span(sites: Sequence[SitePassage]) -> str:
+    """The first and the last of some sites of one stream, such as `backbone.00–02`."""
+    first, last = sites[0].name, sites[-1].name
+    return first if first == last else f"{first}–{last.partition('.')[2]}"
+
+
+@dataclass(frozen=True)
+class SiteKnowledge:
+    """One layer of a stream, at its best iteration.
+
+    name: as `--sites` names it. part: of the model, such as `backbone`. score: held out; chance: of this site.
+    signal: whether it exceeds chance, family-wise, and every control.
+    """
+
+    name: str
+    part: str
+    score: Number
+    chance: Number
+    signal: bool
+
+
+@dataclass(frozen=True)
+class Knowledge:
+    """The knowledge of one target. key: of the probes, which the run stores.
+
+    metric: of the scores. retention: share of the backbone's score above chance that the action part has, NaN
+    where it is undefined; note: why.
+    """
+
+    target: str
+    key: str
+    metric: str
+    sites: tuple[SiteKnowledge, ...]
+    retention: Number
+    retention_ci: Limits
+    note: str
+
+    def best(self, backbone: bool) -> SiteKnowledge | None:
+        """Return the site farthest above its chance, of the backbone or behind it; one with signal if there is."""
+        sites = [site for site in self.sites if (site.part == "backbone") == backbone]
+        return max(sites, key=lambda site: (site.signal, site.score - site.chance), default=None)
+
+    def describe(self, decided: bool) -> str:
+        """Return a sentence. decided: whether any input decides the action."""
+        best = [site for site in (self.best(True), self.best(False)) if site is not None]
+        carriers = [site for site in best if site.signal]
+        if not carriers:
+            return f"{self.target} is never known: {self._words(best[0])} is no signal."
+        where = " and ".join(self._words(site) for site in carriers)
+        if best[-1].part == "backbone":
+            return f"{self.target} is known: {where}."
+        if not best[-1].signal:
+            return f"{self.target} is known by {where}; {self._words(best[-1])} is no signal: it is not used."
+        used = "" if decided else ", and not shown to be used: no input decides the action"
+        return f"{self.target} is known up to the action by {where}{self._retained()}{used}."
+
+    def _words(self, site: SiteKnowledge) -> str:
+        return f"{site.name} ({self.metric} {site.score:.2f}, chance {site.chance:.2f})"
+
+    def _retained(self) -> str:
+        low, high = self.retention_ci
+        limits = f" [{low:.2f}, {high:.2f}]" if isfinite(low) and isfinite(high) else ""
+        return f"; retention {self.retention:.2f}{limits}" if isfinite(self.retention) and not self.note else ""
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """The diagnosis of every input of a run's model.
+
+    key: of the stored diagnosis. label: of the run. n_frames, n_groups: that were used. base: the checkpoint that
+    it is compared with. knowledge: of a target.
+    """
+
+    key: str
+    label: str
+    n_frames: int
+    n_groups: int
+    inputs: tuple[InputDiagnosis, ...]
+    base: str = ""
+    knowledge: Knowledge | None = None
+
+    def exit_code(self, required: Sequence[str] = ()) -> int:
+        """0 if every required input arrives and matters, else 1; see `exit_code`."""
+        names = [diagnosed.name for diagnosed in self.inputs]
+        if unknown := [name for name in required if name not in names]:
+            raise UsageError(f"no input is called {unknown[0]!r}; this source has {', '.join(names)}")
+        return exit_code(self.inputs, required)
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values; numbers that are not known are None."""
+        plain: dict[str, Any] = _adapter().dump_python(self, mode="json")
+        for values, diagnosed in zip(plain["inputs"], self.inputs, strict=True):
+            values["where"] = diagnosed.where
+        return plain
+
+    @classmethod
+    def from_json(cls, stored: Mapping[str, Any]) -> "Diagnosis":
+        """The diagnosis that `to_json` gave."""
+        return _adapter().validate_python(stored)
+
+
+@cache
+def _adapter() -> "TypeAdapter[Diagnosis]":
+    from pydantic import TypeAdapter
+
+    return TypeAdapter(Diagnosis)
+
+
+def exit_code(inputs: Sequence[InputDiagnosis], required: Sequence[str] = ()) -> int:
+    """0 if every required input arrives and matters, else 1. required: names; empty for all that were tested."""
+    tested = [diagnosed for diagnosed in inputs if diagnosed.matters is not None]
+    judged = [diagnosed for diagnosed in inputs if diagnosed.name in required] if required else tested
+    return 0 if judged and all(diagnosed.matters for diagnosed in judged) else 1
