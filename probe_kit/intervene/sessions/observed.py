@@ -61,7 +61,7 @@ class ObservedSession(ReplaySession):
         if choice is not None:
             self.vary, self.frames_each = choice.varied, choice.frames or FRAMES
             self.table, self.items = choice.pairs, choice.items_in(self.run)
-        self.check_vary()
+            self.check_vary()
 
     def close(self) -> None:
         """Close the environment."""
