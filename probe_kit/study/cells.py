@@ -93,6 +93,16 @@ class Cell:
             return self.episodes
         return self.episodes * ceil(self.settings.scene.max_steps / (self.settings.task.execute or 1))
 
+    @property
+    def units(self) -> float:
+        """The most inferences of an episode, in which conditions differ; 1 for what has no policy that acts."""
+        return self.inferences / self.episodes if self.inferences else 1.0
+
+    @property
+    def work(self) -> str:
+        """The kind of work that shares one rate: a model that acts, is captured without acting, or is asked."""
+        return f"{self.model}, {'asked' if self.asks else 'captured' if self.captured else 'acting'}"
+
     @cached_property
     def key(self) -> str:
         """The hash of all that the settings decide but the selection, by which the run's folder is named."""

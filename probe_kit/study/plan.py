@@ -3,20 +3,24 @@
 Everything is read from the runs themselves, and from the failures that are stored beside them.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from probe_kit._system.counting import counted
 from probe_kit.errors import ProbeKitError, RunIncompleteError, RunNotFoundError, UsageError
+from probe_kit.extract.needs import planned_sizes, space_of
+from probe_kit.extract.settings import ExtractSettings
+from probe_kit.hooks.registry import family_names
 from probe_kit.runs import verify_run
 from probe_kit.runs.disk import in_units
-from probe_kit.runs.layout import RUN_FILE
+from probe_kit.runs.layout import RUN_FILE, StoredStream
 from probe_kit.runs.root import read_root
 from probe_kit.runs.store import locate
 from probe_kit.study.cells import KEY_DIGITS, Cell
-from probe_kit.study.cost import Cost, Work, cost_of
 from probe_kit.study.failures import NOT_TRIED_AGAIN, Failure, Failures
 from probe_kit.study.matching import changed_settings
 from probe_kit.study.mistakes import unknown
@@ -36,7 +40,8 @@ class PlannedCell:
     """A cell with what lies at its location. stored: episodes of its selection. why: the state in words.
 
     failure: of the last time it was played. waits_for: failure of another run of its model. probes: those that the
-    file names of it. sealed: whether nothing is left to do after its last episode.
+    file names of it. sealed: whether nothing is left to do after its last episode. seconds: mean of a stored
+    episode. streams: of what is stored.
     """
 
     cell: Cell
@@ -48,6 +53,8 @@ class PlannedCell:
     waits_for: Failure | None = None
     probes: tuple[PlannedProbes, ...] = ()
     sealed: bool = True
+    seconds: float | None = None
+    streams: tuple[StoredStream, ...] | None = None
 
     @property
     def missing(self) -> int:
@@ -80,12 +87,10 @@ class PlannedCell:
 
 @dataclass(frozen=True)
 class StudyPlan:
-    """The cells of a study in the order in which models are loaded. cost: of what is missing. only: as planned."""
+    """The cells of a study in the order in which models are loaded."""
 
     study: LoadedStudy
     cells: tuple[PlannedCell, ...]
-    cost: Cost
-    only: str | None = None
 
     @property
     def played(self) -> list[PlannedCell]:
@@ -117,9 +122,47 @@ class StudyPlan:
             "unprobed": sum(len(planned.unprobed) for planned in self.played),
         }
 
+    @cached_property
+    def seconds(self) -> dict[str, float]:
+        """The seconds of missing episodes by run, where the model has stored episodes of the same kind of work."""
+        spent, counts = defaultdict[str, float](float), defaultdict[str, float](float)
+        for planned in self.played:
+            if planned.seconds is not None:
+                spent[planned.cell.work] += planned.seconds * planned.stored
+                counts[planned.cell.work] += planned.cell.units * planned.stored
+        return {
+            planned.cell.name: spent[work] / counts[work] * planned.missing * planned.cell.units
+            for planned in self.played
+            if planned.missing and counts[work := planned.cell.work]
+        }
+
+    def hours(self) -> dict[str, float | None]:
+        """Return the hours of missing episodes by model; None for a model whose rate is not known."""
+        return _by_model(
+            (
+                planned.cell.model,
+                None if (seconds := self.seconds.get(planned.cell.name)) is None else seconds / 3600,
+            )
+            for planned in self.played
+            if planned.missing
+        )
+
+    def bytes(self) -> dict[str, float | None]:
+        """Return the bytes of missing episodes by model, uncompressed, with columns and probes.
+
+        By stored streams of the model, else as its configuration or its family declares them; None where no stream
+        is known before the model is loaded.
+        """
+        stored = {planned.cell.work: planned.streams for planned in self.played if planned.streams is not None}
+        missing = [planned for planned in self.played if planned.missing]
+        sizes = [(planned, bytes_per_episode(planned.cell, stored.get(planned.cell.work))) for planned in missing]
+        return _by_model(
+            (planned.cell.model, None if size is None else size * planned.missing) for planned, size in sizes
+        )
+
     def lines(self) -> list[str]:
         """Return totals, hours and bytes with their source, and what is skipped, in words."""
-        totals, suite, cost = self.totals(), self.study.suite, self.cost
+        totals, suite = self.totals(), self.study.suite
         unprobed = f"; probes of {counted(totals['unprobed'], 'run')}" if totals["unprobed"] else ""
         lines = [
             f"suite: {suite.identity}; items from {suite.source}",
@@ -128,15 +171,17 @@ class StudyPlan:
             f"{counted(totals['inferences'], 'inference')} of policies (given by shape: no model was loaded)",
             f"missing: {counted(totals['missing'], 'episode')}{unprobed}",
         ]
-        if cost.hours:
-            each = ", ".join(f"{model} {hours:.2g}" for model, hours in cost.hours.items())
-            lines.append(f"hours, measured in stored episodes: {sum(cost.hours.values()):.2g} ({each})")
-        if cost.unmeasured:
-            lines.append(f"hours unknown before a first episode is stored: {', '.join(cost.unmeasured)}")
-        if cost.bytes:
-            lines.append(f"bytes: up to {in_units(sum(cost.bytes.values()))} before compression")
-        if cost.unsized:
-            lines.append(f"bytes unknown before the model is loaded: {', '.join(cost.unsized)}")
+        hours, unmeasured = _known(self.hours())
+        if hours:
+            each = ", ".join(f"{model} {value:.2g}" for model, value in hours.items())
+            lines.append(f"hours, measured in stored episodes: {sum(hours.values()):.2g} ({each})")
+        if unmeasured:
+            lines.append(f"hours unknown before a first episode is stored: {', '.join(unmeasured)}")
+        sizes, unsized = _known(self.bytes())
+        if sizes:
+            lines.append(f"bytes: up to {in_units(round(sum(sizes.values())))} before compression")
+        if unsized:
+            lines.append(f"bytes unknown before the model is loaded: {', '.join(unsized)}")
         return [*lines, *(f"skipped: {model}: {reason}" for model, reason in self.skipped().items())]
 
     def to_json(self) -> dict[str, Any]:
@@ -146,7 +191,8 @@ class StudyPlan:
             "suite": self.study.suite.identity,
             "totals": self.totals(),
             "skipped": self.skipped(),
-            **self.cost.to_json(),
+            "hours": self.hours(),
+            "bytes": self.bytes(),
             "runs": [
                 {
                     "model": planned.cell.model,
@@ -179,32 +225,38 @@ def plan_study(study: LoadedStudy, only: str | None = None) -> StudyPlan:
         raise UsageError(f"--only: {unknown('block or model', only, names)}")
     cells = [cell for cell in study.cells if only is None or only == cell.model or only in cell.selections]
     order = {name: position for position, name in enumerate(study.study.models)}
-    pairs = [_planned(study, cell) for cell in sorted(cells, key=lambda cell: order[cell.model])]
-    works = [work for _, work in pairs if work is not None]
-    return StudyPlan(study, tuple(_waiting([planned for planned, _ in pairs])), cost_of(works), only)
+    planned = [_planned(study, cell) for cell in sorted(cells, key=lambda cell: order[cell.model])]
+    return StudyPlan(study, tuple(_waiting(planned)))
 
 
-def _planned(study: LoadedStudy, cell: Cell) -> tuple[PlannedCell, Work | None]:
-    """Return a cell with what is stored of it, and its work, None for a skipped one."""
+def _planned(study: LoadedStudy, cell: Cell) -> PlannedCell:
+    """Return a cell with what is stored of it."""
     location = str(locate(cell.location(study.study.folder)))
     if cell.unavailable:
-        return PlannedCell(cell, location, "skipped", 0, f"skipped: {cell.unavailable}"), None
+        return PlannedCell(cell, location, "skipped", 0, f"skipped: {cell.unavailable}")
     try:
         run = open_matching(study, cell, partial=True)
     except (RunNotFoundError, RunIncompleteError):  # the second one was killed before it had a plan
-        new = PlannedCell(cell, location, "new", 0, _why_new(study, cell))
-        return _failed(study, new), Work(cell, 0, cell.episodes)
+        return _failed(study, PlannedCell(cell, location, "new", 0, _why_new(study, cell)))
     except ProbeKitError as error:
-        return PlannedCell(cell, location, "damaged", 0, f"damaged: {error}"), Work(cell, 0, cell.episodes)
-    stored = _stored_episodes(cell, run)
-    work = Work(cell, stored, cell.episodes - stored, _mean_seconds(run), list(run.root.streams.values()))
+        return PlannedCell(cell, location, "damaged", 0, f"damaged: {error}")
+    stored, streams = _stored_episodes(cell, run), tuple(run.root.streams.values())
     if stored < cell.episodes:
-        partial = PlannedCell(cell, location, "partial", stored, f"{stored} of {cell.episodes} episodes")
-        return _failed(study, partial), work
-    # An archive has the probes of its runs, and nothing is fitted to it.
-    probes = () if study.archive is not None else tuple(planned_probes(study, cell, run))
-    sealed = run.sealed or not run.streams or study.archive is not None
-    return PlannedCell(cell, location, "whole", cell.episodes, "whole", probes=probes, sealed=sealed), work
+        why = f"{stored} of {cell.episodes} episodes"
+        partial = PlannedCell(cell, location, "partial", stored, why, seconds=_mean_seconds(run), streams=streams)
+        return _failed(study, partial)
+    return PlannedCell(
+        cell,
+        location,
+        "whole",
+        cell.episodes,
+        "whole",
+        # An archive has the probes of its runs, and nothing is fitted to it.
+        probes=() if study.archive is not None else tuple(planned_probes(study, cell, run)),
+        sealed=run.sealed or not run.streams or study.archive is not None,
+        seconds=_mean_seconds(run),
+        streams=streams,
+    )
 
 
 def _why_new(study: LoadedStudy, cell: Cell) -> str:
@@ -289,6 +341,36 @@ def cells_by_model(cells: Sequence[PlannedCell]) -> Mapping[str, list[PlannedCel
     for planned in cells:
         by_model.setdefault(planned.cell.model, []).append(planned)
     return by_model
+
+
+def _by_model(amounts: Iterable[tuple[str, float | None]]) -> dict[str, float | None]:
+    """Return the sum of each model, None where an amount is not known."""
+    sums: dict[str, float | None] = {}
+    for model, amount in amounts:
+        before = sums.get(model, 0)
+        sums[model] = None if amount is None or before is None else before + amount
+    return sums
+
+
+def _known(sums: Mapping[str, float | None]) -> tuple[dict[str, float], list[str]]:
+    """Return the sums that are known, and the models of the others."""
+    return {model: value for model, value in sums.items() if value is not None}, [
+        model for model, value in sums.items() if value is None
+    ]
+
+
+def bytes_per_episode(cell: Cell, stored: Sequence[StoredStream] | None) -> int | None:
+    """Return the bytes of an episode with the most inferences, if every one is captured. stored: its streams."""
+    settings = cell.settings
+    if stored is None and settings.model.family in family_names():
+        sizes = planned_sizes(settings)
+        if sizes is None:
+            return None
+        stored = sizes.streams
+    if isinstance(settings, ExtractSettings):
+        settings = settings.with_every_call(settings.task.execute or 1)
+    space = space_of(stored or (), 1, settings)  # a script has no network, and no stream
+    return sum(space.values()) - space["report"]
 
 
 # -- checks of what is stored ------------------------------------------------------------------------------------

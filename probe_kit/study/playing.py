@@ -31,7 +31,6 @@ from probe_kit.extract.settings import AskSettings, ExtractSettings, Settings
 from probe_kit.runs import seal
 from probe_kit.runs.store import locate
 from probe_kit.study.cells import Cell
-from probe_kit.study.cost import units
 from probe_kit.study.expansion import control_of
 from probe_kit.study.failures import NOT_TRIED_AGAIN, Failure, Failures
 from probe_kit.study.plan import PlannedCell, StudyPlan, cells_by_model
@@ -158,9 +157,7 @@ def _checked_tasks(
             note(failure)
             continue
         size = sum(
-            plan.cost.seconds.get(
-                planned.cell.name, _SECONDS_PER_INFERENCE * planned.missing * units(planned.cell)
-            )
+            plan.seconds.get(planned.cell.name, _SECONDS_PER_INFERENCE * planned.missing * planned.cell.units)
             for planned in cells
         )
         runs = tuple(_task(planned, env_workers) for planned in cells)
