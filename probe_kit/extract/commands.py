@@ -214,6 +214,7 @@ def _print_outcomes(run: "Run") -> None:
 
     counts = run.episodes["outcome"].value_counts()
     text = ", ".join(f"{name} {count}" for name, count in counts.items())
+    text = "captured without acting" if run.capture_only else text
     say(f"{counted(len(run.episodes), 'episode')}: {text}")
     if ONCE in run.episodes and (lost := int((run.episodes[ONCE] & ~run.episodes[AT_END]).sum())):
         say(f"{lost} of them had success before their end only; see the columns {ONCE} and {AT_END}")
