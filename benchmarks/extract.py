@@ -193,7 +193,7 @@ def bench_loop(suite: Suite, folder: Path, items: int, repeats: int) -> None:
 
 def inference_cpu(extraction: Extraction) -> float:
     """CPU seconds of one inference by itself, the least of three."""
-    policy = extraction.controller.policy
+    policy = extraction.controller.model
     seen = Observation(
         np.zeros((480, 640, 3), np.uint8), np.zeros(8, np.float32), "Put the cube on the red square"
     )

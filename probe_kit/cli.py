@@ -26,8 +26,8 @@ from probe_kit.extract.ask_commands import ask
 from probe_kit.extract.commands import extract
 from probe_kit.extract.model_commands import models
 from probe_kit.extract.run_commands import app as run_app
-from probe_kit.extract.source_commands.dataset_commands import app as dataset_app
-from probe_kit.extract.source_commands.environment_commands import check_environment
+from probe_kit.extract.source_commands import app as dataset_app
+from probe_kit.extract.source_commands import check_environment
 from probe_kit.hooks.commands import new_adapter, verify
 from probe_kit.intervene.commands import KindHelp, intervene
 from probe_kit.intervene.run_commands import list_runs, show

@@ -72,7 +72,7 @@ def calibrated(
     if settings.machine.env_workers is not None:
         raise UsageError("--batch auto chooses batch and simulating processes: leave out --env-workers")
     example = source.example(plan.episodes[0].instruction)
-    most = largest_batch(controller.policy.card.batch, len(plan.episodes))
+    most = largest_batch(controller.model.card.batch, len(plan.episodes))
     with torch_threads(controller.threads):
         times = inference_times(lambda batch: _infer(controller, example, batch), most)
     calibration = choose(times, _turn(settings, controller, source, plan), cores_here())

@@ -105,7 +105,7 @@ def _weights_row(extraction: "Extraction") -> dict[str, str]:
     from probe_kit.extract.needs import weights_needed
 
     settings, controller = extraction.settings, extraction.controller
-    model: Any = getattr(controller, "policy", None) or getattr(controller, "model", None)
+    model: Any = getattr(controller, "model", None)
     loaded = None if model is None else model.card.parameters
     requested = settings.model
     words = weights_needed(requested.family, requested.checkpoint, requested.options, requested.dtype, loaded)

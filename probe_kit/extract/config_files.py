@@ -2,7 +2,7 @@
 
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from probe_kit._system.bounded_json import read_json_object
 from probe_kit._terminal.field_options import options_of
@@ -11,6 +11,9 @@ from probe_kit.extract.settings import Settings
 from probe_kit.extract.sources.kinds import kind_of
 from probe_kit.runs.layout import RUN_FILE
 from probe_kit.runs.origin import Origin, is_here
+
+if TYPE_CHECKING:
+    from probe_kit.runs import Run
 
 CONFIG = "config"
 """The part of a run's settings that holds them as they were requested, by part."""
@@ -56,17 +59,39 @@ def _of_run(folder: Path, typed: Collection[str]) -> Mapping[str, Any]:
     model = {**config["model"], "options": dict(origin.options)}
     if model["checkpoint"] is None and is_here(origin.checkpoint):
         model["checkpoint"] = origin.checkpoint
-    source = dict(config["source"])
-    kind = kind_of(source)
-    flags = {option.field: option for option in options_of(kind)}
-    for field, place in origin.files.items():
-        option = flags.get(field)
-        if not Path(place).exists() and (option is None or option.parameter not in typed):
-            again = f"Give it with {option.flag}" if option else "Put it there again, or type the options again"
-            raise UsageError(f"{folder} was made of {place}, its {field}, which is not here any more. {again}")
-        _put(source, field, place)
-    kind.find_again(origin.files)
+    options = list(options_of(kind_of(config["source"])))
+    replaced = [option.field for option in options if option.parameter in typed]
+    source = source_of_run(run, replaced, {option.field: option.flag for option in options})
     return {**config, "model": model, "source": source}
+
+
+def source_of_run(run: "Run", replaced: Collection[str], flags: Mapping[str, str]) -> dict[str, Any]:
+    """The settings of a run's source as values, with its files where the run found them.
+
+    replaced: fields that are given anew. flags: options of a command that give fields.
+    Raises UsageError for a run without its settings, and for files that are gone.
+    """
+    config = run.settings.get(CONFIG)
+    if config is None:
+        raise UsageError(f"{run.location} does not say with which settings it was requested; extract it again")
+    origin = run.origins[0] if run.origins else Origin()
+    source = dict(config["source"])
+    for field, place in origin.files.items():
+        if field not in replaced:
+            _check_there(run, field, Path(place), flags)
+            _put(source, field, place)
+    kind = kind_of(source)
+    kind.find_again(origin.files)
+    for field, path in kind(**source).files().items():  # of a run that does not say where they were
+        if field not in replaced:
+            _check_there(run, field, path, flags)
+    return source
+
+
+def _check_there(run: "Run", field: str, path: Path, flags: Mapping[str, str]) -> None:
+    if not path.exists():
+        again = f"Give it with {flags[field]}" if field in flags else "Put it there again"
+        raise UsageError(f"{run.location} was made of {path}, its {field}, which is not here any more. {again}")
 
 
 def _put(source: dict[str, Any], field: str, value: str) -> None:

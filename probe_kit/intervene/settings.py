@@ -12,8 +12,6 @@ from probe_kit.runs.run import Run
 FORMAT = 2  # raise when stored numbers would be others
 FIRST_CHUNK: Readout = "first-chunk"
 PER_STEP: Readout = "per-step"
-REPLAYED = ("scene", "lerobot", "env")
-"""Kinds of sources whose observations are shown again, see `sessions`."""
 
 
 PairRow = tuple[str, int, str, int]
@@ -115,16 +113,6 @@ def key_of(settings: Mapping[str, Any]) -> str:
     return sha256_json(settings)[:12]
 
 
-def why_not_replayed(run: Run) -> str | None:
-    """Return why the observations of a run are not shown again; None for recordings, environments and scenes."""
-    if run.source.kind in REPLAYED:
-        return None
-    return (
-        f"it showed {run.source.subject}, which are not replayed; expected frames of recordings. Take a run of "
-        "`probe-kit extract --dataset FOLDER`"
-    )
-
-
 def check_run_fits(run: Run) -> None:
     """Raise UsageError for a run whose policy did not act, or acted in a way that is not done again here."""
     settings = run.settings
@@ -133,8 +121,6 @@ def check_run_fits(run: Run) -> None:
         why = f"{run.model} was asked and did not act; intervene on a run of `probe-kit extract`"
     elif run.weights_sha256 is None or not run.streams:
         why = f"{run.model} is scripted: it has no network in which anything could be changed"
-    elif reason := why_not_replayed(run):
-        why = reason
     elif not has_sides(run) and run.inputs is None:
         why = "it stores no inputs, with which a repeated observation could be compared"
     elif run.capture_only and not run.recorded:

@@ -19,7 +19,9 @@ from probe_kit.extract.rollout.worker import torch_threads
 from probe_kit.extract.sources.pictures import PictureSource
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks import Observation, Policy
-from probe_kit.intervene import Interchange, ReplaySource, run_intervention
+from probe_kit.intervene import InstructionSwap, ReplaySource, run_intervention
+from probe_kit.intervene.sessions.observed import ObservedSession
+from probe_kit.intervene.sessions.opening import open_session
 from probe_kit.runs import verify_run
 
 COUNT = 12
@@ -114,16 +116,19 @@ def test_a_table_of_a_spreadsheet_is_read_by_the_rules_of_all_tables(folder: Pat
         source(tmp_path).open()
 
 
-@pytest.mark.parametrize("further", [ReplaySource(), ReplaySource(dataset=Path("photos"))])
-def test_interventions_and_diagnoses_say_that_pictures_are_not_replayed(
-    run: pk.Run, further: ReplaySource
+def test_pictures_are_shown_again_for_interventions_and_diagnoses(
+    run: pk.Run, folder: Path, pi0_tiny: Policy
 ) -> None:
-    for ask in (
-        lambda: run_intervention(run, Interchange(), source=further),
-        lambda: diagnose_run(run, source=further),
-    ):
-        with pytest.raises(UsageError, match=r"it showed pictures, which are not replayed; .* --dataset FOLDER"):
-            ask()
+    with open_session(run, ReplaySource(), lambda *_: pi0_tiny) as session:
+        assert isinstance(session, ObservedSession)
+        frames = session.frames.index
+        assert [frame.group for frame in frames] == [f"g{number}" for number in range(COUNT)]
+        for number in (0, COUNT - 1):
+            picture = np.asarray(Image.open(folder / f"{number}.png"))
+            np.testing.assert_array_equal(frames[number].observation.image, picture)
+    swapped = run_intervention(run, InstructionSwap(), load=lambda *_: pi0_tiny)
+    assert np.isfinite(swapped.outcomes.displacement).any()
+    assert diagnose_run(run, load=lambda *_: pi0_tiny).inputs
 
 
 def test_a_picture_that_changes_after_the_plan_is_not_shown(

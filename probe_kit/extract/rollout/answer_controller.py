@@ -13,22 +13,19 @@ import numpy as np
 
 from probe_kit.errors import PolicyFailedError, UsageError
 from probe_kit.extract.plan import Row
-from probe_kit.extract.rollout.capturing import SMALL, Capturer, stored_streams
-from probe_kit.extract.rollout.controllers import Inference, Turn
-from probe_kit.extract.rollout.input_check import Reach, check_inputs, check_not_ignored, varied
+from probe_kit.extract.rollout.capturing import stored_streams
+from probe_kit.extract.rollout.controllers import Inference, ModelController, Turn
+from probe_kit.extract.rollout.input_check import varied
 from probe_kit.extract.settings import AskSettings
 from probe_kit.extract.sources.inputs import PICTURE
 from probe_kit.extract.sources.source import Source
-from probe_kit.extract.vqa.letter_lens import letter_margins
 from probe_kit.extract.vqa.parsing import Said, read_answer
 from probe_kit.extract.vqa.phrases import Phrase, phrases
 from probe_kit.extract.vqa.pictures import side_by_side
-from probe_kit.extract.vqa.scores import Choice, outcome_of, side_expected, side_said
+from probe_kit.extract.vqa.scores import Choice, letter_margins, outcome_of, side_expected, side_said
 from probe_kit.extract.vqa.templates import Order, sides
 from probe_kit.hooks.checkpoints.containment import copied
-from probe_kit.hooks.checkpoints.third_party import while_acting
 from probe_kit.hooks.contract.observation import Observation
-from probe_kit.runs.certificates import INPUT_CHECK
 from probe_kit.runs.layout import StoredStream
 from probe_kit.suite.wording import side_words
 
@@ -65,12 +62,14 @@ class Forced:
     near_tie: bool
 
 
-class AnswerController:
+class AnswerController(ModelController["AnswerModel", "Prompt"]):
     """Asks an answer model, and captures the first inference of every episode unless nothing is stored.
 
     identity: `begun` is how the answer had begun where sides were forced in words.
     Raises UsageError if an item has no phrase for what is asked, or an option is none behind this prompt.
     """
+
+    outputs = "answers"
 
     def __init__(self, model: "AnswerModel", source: Source[Any], settings: AskSettings) -> None:
         """source: its suite, if it has one, names objects and sides; a question of another is the instruction."""
@@ -82,40 +81,16 @@ class AnswerController:
         self._phrases = {} if suite is None else phrases(suite, settings.task.query, settings.seed)
         self._item_has_side_word = {} if suite is None else {item.item_id: item.side_word for item in suite.items}
         self._instructions = source.instructions
-        card = model.card
-        self.script: str | None = None
-        self.limit = settings.machine.inference_limit
-        self.threads = 1 if card.parameters < SMALL else None
-        self.on_gpu = card.device.startswith("cuda")
-        self.streams: list[StoredStream] = []
-        if settings.capture.tokens != "none":
-            self.streams = self._streams(blank)
-        self._capturer = Capturer(model, self.streams, settings.capture.tokens == "all", "answers")
+        streams = [] if settings.capture.tokens == "none" else self._streams(blank)
+        super().__init__(model, settings, streams)
         self._lens_stream = self._find_lens_stream() if self.template.lettered else None
-        self.identity: dict[str, Any] = {
-            "model": settings.model.family,
-            "random_weights": card.random_weights,
-            "weights_sha256": card.weights_sha256,
-            "dtype": card.dtype,
-            **({"policy": dict(card.settings)} if card.settings else {}),
-        }
-        self._input_check: dict[str, Reach] | None = None
         self._form = self._choose_form(blank)
         if self._form is not None:
             self.identity["begun"] = self._form.begun
 
-    def certificate(self) -> dict[str, Any]:
-        """The answer model's card, fire counts of the last capture, and what the capture proved."""
-        return {
-            "policy": self.model.card.to_json(),
-            "fires_per_inference": self._capturer.fires,
-            "capture_check": self._capturer.check,
-            INPUT_CHECK: dict(self._input_check or {}),
-        }
-
     def infer(self, turns: Sequence[Turn]) -> list[Inference]:
         """Per turn the columns of its outcome; nothing is executed."""
-        with while_acting(self.identity["model"], self.model.card.checkpoint, self.limit):
+        with self._acting():
             return [Inference(None, columns=columns) for columns in self._asked(turns)]
 
     def _asked(self, turns: Sequence[Turn]) -> list[dict[str, Any]]:
@@ -134,7 +109,7 @@ class AnswerController:
                 self._record_lens(turns, reading)
         first = self._questions(observations, phrases_asked, "original")
         if self._input_check is None:
-            self._input_check = self._check_inputs(first[0])
+            self._try_inputs(first[0])
         sizes = self._sizes(first)
         return [
             self._outcome(
@@ -148,8 +123,7 @@ class AnswerController:
         """The ids of the words around a picture, where the prompt is the instruction; None for a question."""
         return self._ids_of(instruction) if self.template.is_instruction else None
 
-    def _check_inputs(self, question: "Prompt") -> dict[str, Reach]:
-        """How far changes of a question come. Raises IgnoredInputsError if none comes anywhere."""
+    def _try_inputs(self, question: "Prompt") -> None:
         asked = replace(question.observation, instruction=question.text)
         others = (other.text for other in self._blank_questions(question.observation))
         absent = self.model.absent_inputs | (set() if question.pictured else {PICTURE})
@@ -157,16 +131,7 @@ class AnswerController:
             name: (replace(question, observation=changed, text=changed.instruction) for changed in observations)
             for name, observations in varied(asked, others, self._ids_of, absent).items()
         }
-        reaches = check_inputs(
-            self.model, lambda prompt: self.model.read([prompt]).option_logits, question, variants
-        )
-        if not self._settings.machine.accept_ignored_inputs:
-            check_not_ignored(reaches, self.identity["model"])
-        return reaches
-
-    def _ids_of(self, text: str) -> tuple[int, ...] | None:
-        ids = self.model.token_ids([text])
-        return None if ids is None else tuple(map(int, ids[0]))
+        self._check_inputs(lambda prompt: self.model.read([prompt]).option_logits, question, variants)
 
     def _choose_positions(self) -> None:
         """Choose the positions of the backbone's stream; the model may serve other prompts too."""

@@ -1,10 +1,11 @@
 """Tasks of a model, act and capture: a policy whose inferences are captured, or a script that needs none."""
 
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from abc import ABC
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +29,8 @@ from probe_kit.runs.layout import StoredStream
 
 if TYPE_CHECKING:
     from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
-    from probe_kit.hooks import Policy
+    from probe_kit.extract.settings import Settings
+    from probe_kit.hooks import Model, Policy
 
 SCRIPTED = {
     "expert": "scripted: knows the answer and puts the cube on it; proves environment and scoring",
@@ -137,44 +139,84 @@ class ScriptedController:
         return {"policy": self.identity}
 
 
-class PolicyController:
+class ModelController[Loaded: "Model", Question](ABC):
+    """A model that infers: its capture, its part of a run's identity, and what it certifies.
+
+    outputs: of an inference, in a word.
+    """
+
+    script: str | None = None
+    outputs: ClassVar[str]
+
+    def __init__(self, model: Loaded, settings: "Settings", streams: list[StoredStream]) -> None:
+        card = model.card
+        self.model, self.streams, self._machine = model, streams, settings.machine
+        # Below this size a second thread costs more than it brings.
+        self.threads = 1 if card.parameters < SMALL else None
+        self.on_gpu = card.device.startswith("cuda")
+        self._capturer = Capturer(model, streams, settings.capture.tokens == "all", self.outputs)
+        self._input_check: dict[str, Reach] | None = None
+        self.identity: dict[str, Any] = {
+            "model": settings.model.family,
+            "random_weights": card.random_weights,
+            "weights_sha256": card.weights_sha256,
+            "dtype": card.dtype,
+            **({"policy": dict(card.settings)} if card.settings else {}),
+        }
+
+    def certificate(self) -> dict[str, Any]:
+        """The model's card, fire counts of the last capture, and what capture and input check proved."""
+        return {
+            "policy": self.model.card.to_json(),
+            "fires_per_inference": self._capturer.fires,
+            "capture_check": self._capturer.check,
+            INPUT_CHECK: dict(self._input_check or {}),
+        }
+
+    def _acting(self) -> AbstractContextManager[None]:
+        return while_acting(self.identity["model"], self.model.card.checkpoint, self._machine.inference_limit)
+
+    def _ids_of(self, text: str) -> tuple[int, ...] | None:
+        ids = self.model.token_ids([text])
+        return None if ids is None else tuple(map(int, ids[0]))
+
+    def _check_inputs(
+        self,
+        infer: Callable[[Question], NDArray[np.float32]],
+        clean: Question,
+        variants: Mapping[str, Iterable[Question]],
+    ) -> None:
+        """Note how far changes of an inference's inputs come. Raises IgnoredInputsError if none comes anywhere."""
+        self._input_check = check_inputs(self.model, infer, clean, variants)
+        if not self._machine.accept_ignored_inputs:
+            check_not_ignored(self._input_check, self.identity["model"])
+
+
+class PolicyController(ModelController["Policy", Observation]):
     """Infers, executes the head of the chunk, and captures the first inferences of every episode.
 
     In the checkpoint's own units where the source asks for them; where nothing is executed, the whole chunk goes
     back to the player. With `capture_only` in a scene, it infers and captures once per episode.
     """
 
+    outputs = "actions"
+
     def __init__(self, policy: "Policy", source: Source[Any], settings: ExtractSettings) -> None:
         """source: as the policy is shown it. Raises UsageError for more actions than a chunk has."""
-        task, card = settings.task, policy.card
-        self.policy, self._source, self._limit = policy, source, settings.machine.inference_limit
+        task, card, self._source = settings.task, policy.card, source
+        with while_acting(settings.model.family, card.checkpoint):
+            examples = [source.example(text) for text in source.instructions]
+            super().__init__(policy, settings, stored_streams(policy, policy.roles(examples)))
         self.capture_only = task.capture_only and source.executes
         self.execute = task.execute or card.execute
         self.rotation: Rotation = task.rotation or PLAIN
         self.captured_calls = settings.with_every_call(self.execute).capture.calls
         self._edits, self._vectors = task.edits, task.vectors
-        name = settings.model.family
-        with while_acting(name, card.checkpoint):
-            examples = [source.example(text) for text in source.instructions]
-            self.streams = stored_streams(policy, policy.roles(examples))
-        self._capturer = Capturer(policy, self.streams, settings.capture.tokens == "all", "actions")
-        self.script: str | None = None
-        self.threads = 1 if card.parameters < SMALL else None
-        self.on_gpu = card.device.startswith("cuda")
-        self.identity: dict[str, Any] = {
-            "model": name,
-            "random_weights": card.random_weights,
-            "weights_sha256": card.weights_sha256,
-            "dtype": card.dtype,
-            **({"execute": self.execute} if source.executes else {}),
-            **({"policy": dict(card.settings)} if card.settings else {}),
-        }
+        self.identity |= {"execute": self.execute} if source.executes else {}
         if self.capture_only and (deaf := policy.zero_filled_inputs()):
             self.identity["zeros_for"] = list(deaf)
         self._instruction_ids: dict[str, tuple[int, ...] | None] = {}
         self._edit_log: list[dict[str, Any]] = []
-        self._accepts_ignored = settings.machine.accept_ignored_inputs
-        self._input_check: dict[str, Reach] | None = None
 
     def infer(self, turns: Sequence[Turn]) -> list[Inference]:
         """Per turn the first `execute` actions of a fresh chunk, from one call of the policy.
@@ -183,17 +225,14 @@ class PolicyController:
         """
         with self._acting():
             if self._input_check is None:
-                self._input_check = self._check_inputs(turns[0])
+                self._try_inputs(turns[0])
             begin_randomness(derive_seed("global", *(turn.derived_seed("call") for turn in turns)))
             chunks = self._captured(turns)
-        flags = _own_flags(self.policy.flagged, len(turns))
+        flags = _own_flags(self.model.flagged, len(turns))
         return [
             Inference(self._executed(turn, chunk), None if flags is None else bool(flags[row]))
             for row, (turn, chunk) in enumerate(zip(turns, chunks, strict=True))
         ]
-
-    def _acting(self) -> AbstractContextManager[None]:
-        return while_acting(self.identity["model"], self.policy.card.checkpoint, self._limit)
 
     def _captured(self, turns: Sequence[Turn]) -> NDArray[np.float32]:
         """(B, chunk, D) of one call, whose activations are kept for the turns that are captured."""
@@ -206,7 +245,7 @@ class PolicyController:
         return self._capturer.run(
             lambda: self._chunks(turns, seeds),
             lambda actions: actions,
-            self.policy.roles(observations),
+            self.model.roles(observations),
             captured,
             lambda: self._edited(observations),
         )
@@ -221,12 +260,11 @@ class PolicyController:
         return np.array(chunks)
 
     def _called(self, observations: Sequence[Observation], seeds: Sequence[int]) -> Any:
-        policy = self.policy
+        policy = self.model
         acts = policy.infer_without_acting if self.capture_only else policy.act
         return (policy.predict if self._source.own_units else acts)(copied(observations), list(seeds))
 
-    def _check_inputs(self, turn: Turn) -> dict[str, Reach]:
-        """How far changes of a turn's inputs come. Raises IgnoredInputsError if none comes anywhere."""
+    def _try_inputs(self, turn: Turn) -> None:
         seed = turn.derived_seed("inference")
 
         def infer(observation: Observation) -> NDArray[np.float32]:
@@ -234,15 +272,8 @@ class PolicyController:
             return np.array(self._called([observation], [seed]))
 
         (observation,) = copied([turn.observation])
-        variants = varied(observation, self._source.instructions, self._ids_of, self.policy.absent_inputs)
-        reaches = check_inputs(self.policy, infer, observation, variants)
-        if not self._accepts_ignored:
-            check_not_ignored(reaches, self.identity["model"])
-        return reaches
-
-    def _ids_of(self, instruction: str) -> tuple[int, ...] | None:
-        ids = self.policy.token_ids([instruction])
-        return None if ids is None else tuple(map(int, ids[0]))
+        variants = varied(observation, self._source.instructions, self._ids_of, self.model.absent_inputs)
+        self._check_inputs(infer, observation, variants)
 
     def run_preflight(self, observations: Sequence[Observation], seeds: Sequence[int]) -> None:
         """One inference of which nothing is kept: what another one will take."""
@@ -261,7 +292,7 @@ class PolicyController:
             return None
         if self._source.own_units:
             return chunk[: self.execute] if self._source.executes else chunk
-        exponent = self.policy.card.ensemble
+        exponent = self.model.card.ensemble
         chunks = [chunk]
         if exponent is not None:
             turn.past.append(chunk)
@@ -269,15 +300,9 @@ class PolicyController:
         return executed_actions(chunks, self.execute, exponent, self.rotation)
 
     def certificate(self) -> dict[str, Any]:
-        """The policy's card, fire counts of the last capture, and what the capture proved."""
-        return {
-            "policy": self.policy.card.to_json(),
-            **({} if self.capture_only or self._source.own_units else {"rotation": self.rotation}),
-            "fires_per_inference": self._capturer.fires,
-            "capture_check": self._capturer.check,
-            INPUT_CHECK: dict(self._input_check or {}),
-            **({"edits": self._edit_log} if self._edits else {}),
-        }
+        """The certificate of every model, with the rotation that reached the controller of the arm, and edits."""
+        rotation = {} if self.capture_only or self._source.own_units else {"rotation": self.rotation}
+        return {**super().certificate(), **rotation, **({"edits": self._edit_log} if self._edits else {})}
 
     @contextmanager
     def _edited(self, observations: Sequence[Observation]) -> Iterator[None]:
@@ -287,7 +312,7 @@ class PolicyController:
             return
         from probe_kit.hooks import apply_edits
 
-        with apply_edits(self.policy, self._edits, observations, self._vectors) as edit_log:
+        with apply_edits(self.model, self._edits, observations, self._vectors) as edit_log:
             yield
         self._edit_log = [asdict(entry) for entry in edit_log.entries]
 

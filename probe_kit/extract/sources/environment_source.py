@@ -1,6 +1,6 @@
 """Opened environments of the user's own: chosen episodes, and the player that plays them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, Self
 
@@ -8,7 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit._terminal.plain_text import terminal_safe
-from probe_kit.errors import CheckpointError, ObservationError, OwnEnvironmentError, UsageError
+from probe_kit.errors import (
+    CheckpointError,
+    ObservationError,
+    OtherFramesError,
+    OwnEnvironmentError,
+    UsageError,
+)
 from probe_kit.extract.plan import Row
 from probe_kit.extract.sources.environment import EnvSource
 from probe_kit.extract.sources.environment_contract import SUCCESS, EnvEpisode, Step
@@ -237,6 +243,13 @@ class EnvironmentSource(Source[EnvSource]):
             },
         }
         return {ENVIRONMENT: environment}
+
+    def check_same(self, settings: Mapping[str, Any]) -> None:
+        """Raise OtherFramesError for another revision."""
+        if (stored := settings[ENVIRONMENT]["revision"]) != self.revision:
+            raise OtherFramesError(
+                f"{self.name} has the revision {self.revision!r}; the run was played in {stored!r}. Use that one"
+            )
 
     def selection(self, rows: Sequence[Row]) -> dict[str, Any]:
         """Return the numbers of the selected episodes."""

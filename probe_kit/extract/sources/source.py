@@ -186,6 +186,10 @@ class Source[Chosen: SourceSettings](ABC):
         """The settings of a run that are known before a model is loaded; None where there are none."""
         return None
 
+    def check_same(self, settings: Mapping[str, Any]) -> None:
+        """Raise OtherFramesError for another version of the source than that of a run with these `settings`."""
+        del settings
+
     def name_parts(self) -> list[Any]:
         """The parts of a run's default name beside its identity."""
         return []

@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING
 
 from probe_kit.intervene.pairs import Pair
-from probe_kit.intervene.sessions.frames import frames_of
+from probe_kit.intervene.sessions.frames import Frames
 from probe_kit.intervene.sessions.observed import ObservedSession
 from probe_kit.intervene.sessions.scene import SceneSession
 from probe_kit.intervene.sessions.session import (
@@ -37,7 +37,7 @@ def open_session(
     if has_sides(run):
         session = SceneSession.of(run, source, policy)
     else:
-        frames = frames_of(run, source)
+        frames = Frames(run, source)
         session = ObservedSession(run, policy().with_cameras(list(frames.cameras)), frames)
         session.choose(choice)
     try:

@@ -226,7 +226,7 @@ def test_the_command_prints_a_line_per_promise_and_exits_with_the_result(
 ) -> None:
     import typer
 
-    from probe_kit.extract.source_commands.environment_commands import check_environment as command
+    from probe_kit.extract.source_commands import check_environment as command
 
     run: Callable[..., None] = command
     with pytest.raises(typer.Exit) as ended:

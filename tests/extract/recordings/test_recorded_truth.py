@@ -19,7 +19,7 @@ from PIL import Image
 
 from probe_kit.errors import InstructionError, RecordingError, SettingsMismatchError, UnitsError
 from probe_kit.extract import ExtractSettings, LeRobotSource, prepare
-from probe_kit.extract.source_commands.dataset_commands import show_dataset
+from probe_kit.extract.source_commands import show_dataset
 from probe_kit.extract.sources.hashed_files import HashedFiles
 from probe_kit.extract.sources.lerobot_folder import LeRobotFolder, open_lerobot
 from probe_kit.extract.sources.lerobot_frames import LeRobotFrames

@@ -1,1 +1,0 @@
-"""Commands about sources of observations beside scenes: data sets of recordings, own environments."""
