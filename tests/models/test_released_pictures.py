@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from probe_kit.models.internvl import TiledPictures
-from probe_kit.models.ovis2_5 import OvisPictures, VisionConfig
+from probe_kit.models.ovis2_5 import OvisPictures, full_size_ovis2_5
 from probe_kit.models.paligemma import SquarePictures
 from probe_kit.models.qwen import QwenPictures, merged_tokens
 
@@ -50,7 +50,7 @@ def _paligemma(folder: Path, picture: NDArray[np.uint8]) -> Prepared:
 
 
 def _ovis(folder: Path, picture: NDArray[np.uint8]) -> Prepared:
-    vision = VisionConfig(1152, 27, 16, 4304, patch=16, stride=2, table=32, window=112, epsilon=1e-6)
+    vision = full_size_ovis2_5().config.vision
     pictures = OvisPictures.from_folder(folder, vision)
     return pictures.patches([picture])[0].numpy(), pictures.tokens(*picture.shape[:2]) + 2
 

@@ -40,10 +40,10 @@ def write_pi05(
 
     words = write_tokenizer(folder, further_words)
     size = Pi0Size(
-        GemmaSize(width=32, depth=3, mlp_dim=48, num_heads=8, num_kv_heads=1, head_dim=8),
-        GemmaSize(width=24, depth=3, mlp_dim=40, num_heads=8, num_kv_heads=1, head_dim=8),
-        SiglipSize(hidden=24, layers=2, heads=3, inter=40, patch=8),
-        words,
+        vlm=GemmaSize(width=32, depth=3, mlp_dim=48, num_heads=8, num_kv_heads=1, head_dim=8),
+        expert=GemmaSize(width=24, depth=3, mlp_dim=40, num_heads=8, num_kv_heads=1, head_dim=8),
+        vision=SiglipSize(hidden=24, layers=2, heads=3, inter=40, patch=8),
+        vocab_size=words,
     )
     config = PI05Config(
         input_features={

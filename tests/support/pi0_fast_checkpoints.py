@@ -43,9 +43,9 @@ def write_pi0_fast(
 
     fast = write_fast_tokenizer(folder / "fast")
     size = Pi0FastSize(
-        GemmaSize(width=32, depth=3, mlp_dim=48, num_heads=8, num_kv_heads=1, head_dim=8),
-        SiglipSize(hidden=24, layers=2, heads=3, inter=40, patch=8),
-        write_text_tokenizer(folder, fast, further_words),
+        vlm=GemmaSize(width=32, depth=3, mlp_dim=48, num_heads=8, num_kv_heads=1, head_dim=8),
+        vision=SiglipSize(hidden=24, layers=2, heads=3, inter=40, patch=8),
+        vocab_size=write_text_tokenizer(folder, fast, further_words),
     )
     config = PI0FastConfig(
         input_features={

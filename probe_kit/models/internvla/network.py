@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from transformers import Qwen2_5_VLConfig, Qwen2_5_VLForConditionalGeneration
 
-from probe_kit.models.internvla.config import DinoConfig, HeadConfig, InternVLAConfig, QueryConfig
+from probe_kit.models.internvla.config import FRAMEWORKS, DinoConfig, HeadConfig, InternVLAConfig, QueryConfig
 from probe_kit.models.internvla.diffusion import DiffusionTransformer, Schedule, guided
 from probe_kit.models.internvla.dino import DinoV2
 from probe_kit.models.internvla.query import QueryTransformer
@@ -117,13 +117,10 @@ def full_size_internvla() -> InternVLANetwork:
         "num_key_value_heads": 2,
         "rope_parameters": {"rope_type": "default", "rope_theta": 1000000.0, "mrope_section": [16, 24, 24]},
     }
-    config = InternVLAConfig(
-        vlm=Qwen2_5_VLConfig(vision_config=vision, text_config=text, tie_word_embeddings=True),
-        dino=DinoConfig(384, 12, 6),
-        query=QueryConfig(36, 37, 64, 2048, 768, 8),
-        head=HeadConfig(768, 12, 12, 7, 16),
-        base="Qwen/Qwen2.5-VL-3B-Instruct",
-        cot=None,
-        picture=None,
-    )
-    return build_internvla(config, torch.float32)
+    queries = {
+        "qformer_start_layer": 36, "qformer_end_layer": 37, "num_query_tokens": 64, "input_dim": 2048,
+        "output_dim": 768,
+    }  # fmt: skip
+    run = {"framework": {"framework_py": FRAMEWORKS[0], "layer_qformer": queries}}
+    vlm = {"vision_config": vision, "text_config": text, "tie_word_embeddings": True}
+    return build_internvla(InternVLAConfig.from_values(run, vlm, "released"), torch.float32)

@@ -6,10 +6,9 @@ lerobot knows two sizes by name and reads no width from `config.json`. Checkpoin
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any, cast
+from typing import Any, Self, cast
 
 import torch
 from lerobot.policies.pi0 import modeling_pi0
@@ -17,63 +16,54 @@ from lerobot.policies.pi0.configuration_pi0 import PI0Config
 from lerobot.policies.pi0.modeling_pi0 import PI0Policy
 
 from probe_kit._system.bounded_json import load_json
-from probe_kit.errors import CheckpointError
 from probe_kit.models.building import replaced
+from probe_kit.models.config_file import ConfigFile, Count
 from probe_kit.models.sizes_only import building_device
 
 
-@dataclass(frozen=True)
-class GemmaSize:
+class GemmaSize(ConfigFile, extra="forbid"):
     """One Gemma stack. Backbone and expert must agree in depth, KV heads and head size."""
 
-    width: int
-    depth: int
-    mlp_dim: int
-    num_heads: int
-    num_kv_heads: int
-    head_dim: int
+    width: Count
+    depth: Count
+    mlp_dim: Count
+    num_heads: Count
+    num_kv_heads: Count
+    head_dim: Count
 
 
-@dataclass(frozen=True)
-class SiglipSize:
+class SiglipSize(ConfigFile, extra="forbid"):
     """The vision tower; `patch` in pixels."""
 
-    hidden: int
-    layers: int
-    heads: int
-    inter: int
-    patch: int
+    hidden: Count
+    layers: Count
+    heads: Count
+    inter: Count
+    patch: Count
 
 
-@dataclass(frozen=True)
-class Pi0Size:
+class SizeFile(ConfigFile, extra="forbid"):
+    """Every dimension that a policy's `config.json` cannot express."""
+
+    @classmethod
+    def from_file(cls, path: Path) -> Self:
+        """Read `dims.json`. Raises CheckpointError if a dimension is missing, unknown or out of bounds."""
+        return cls.read(load_json(path), str(path))
+
+    def to_json(self) -> dict[str, Any]:
+        """The content of `dims.json`."""
+        return self.model_dump()
+
+
+class Pi0Size(SizeFile):
     """Every dimension of a pi0 that its `config.json` cannot express."""
+
+    network = "pi0"
 
     vlm: GemmaSize
     expert: GemmaSize
     vision: SiglipSize
-    vocab_size: int
-
-    @classmethod
-    def from_file(cls, path: Path) -> "Pi0Size":
-        """Read `dims.json`. Raises CheckpointError if a dimension is missing or unknown."""
-        values = load_json(path)
-        try:
-            return cls(
-                GemmaSize(**values["vlm"]),
-                GemmaSize(**values["expert"]),
-                SiglipSize(**values["vision"]),
-                int(values["vocab_size"]),
-            )
-        except (KeyError, TypeError) as error:
-            raise CheckpointError(
-                f"{path} does not describe a pi0: {error}. Expected vlm, expert, vision and vocab_size "
-                f"with the fields of probe_kit.models.lerobot.pi0.Pi0Size."
-            ) from error
-
-    def to_json(self) -> dict[str, Any]:
-        """The content of `dims.json`."""
-        return asdict(self)
+    vocab_size: Count
 
 
 def build_pi0(config: PI0Config, size: Pi0Size | None = None, device: str = "cpu") -> PI0Policy:

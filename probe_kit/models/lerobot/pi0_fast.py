@@ -9,8 +9,7 @@ Source: arXiv 2501.09747, through lerobot's `PI0FastPytorch`.
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -21,39 +20,23 @@ from lerobot.policies.pi0_fast.configuration_pi0_fast import PI0FastConfig
 from lerobot.policies.pi0_fast.modeling_pi0_fast import PI0FastPolicy
 from torch import Tensor
 
-from probe_kit._system.bounded_json import load_json
-from probe_kit.errors import CheckpointError
 from probe_kit.models.building import replaced
-from probe_kit.models.lerobot.pi0 import GemmaSize, SiglipSize, sized_paligemma
+from probe_kit.models.config_file import Count
+from probe_kit.models.lerobot.pi0 import GemmaSize, SiglipSize, SizeFile, sized_paligemma
 from probe_kit.models.prompt_kv import PromptKV
 from probe_kit.models.sizes_only import building_device
 
 _NO_TOKENIZER = SimpleNamespace(from_pretrained=lambda *_, **__: None)
 
 
-@dataclass(frozen=True)
-class Pi0FastSize:
+class Pi0FastSize(SizeFile):
     """Every dimension of a pi0-FAST that its `config.json` cannot express."""
+
+    network = "pi0-FAST"
 
     vlm: GemmaSize
     vision: SiglipSize
-    vocab_size: int
-
-    @classmethod
-    def from_file(cls, path: Path) -> "Pi0FastSize":
-        """Read `dims.json`. Raises CheckpointError if a dimension is missing or unknown."""
-        values = load_json(path)
-        try:
-            return cls(GemmaSize(**values["vlm"]), SiglipSize(**values["vision"]), int(values["vocab_size"]))
-        except (KeyError, TypeError) as error:
-            raise CheckpointError(
-                f"{path} does not describe a pi0-FAST: {error}. Expected vlm, vision and vocab_size with the "
-                "fields of probe_kit.models.lerobot.pi0_fast.Pi0FastSize."
-            ) from error
-
-    def to_json(self) -> dict[str, Any]:
-        """The content of `dims.json`."""
-        return asdict(self)
+    vocab_size: Count
 
 
 def build_pi0_fast(config: PI0FastConfig, size: Pi0FastSize | None = None, device: str = "cpu") -> PI0FastPolicy:

@@ -7,14 +7,13 @@ under `model` and no part for the language model; that is then the published one
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
+from pydantic import Field
 from transformers import CONFIG_MAPPING
 
-from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import CheckpointError
+from probe_kit.models.config_file import ConfigFile, Count, Index
 
 _DINO = "vit_large_patch14_reg4_dinov2.lvd142m"
 _CLIP = ("vit_large_patch14_clip_224.openai", 224, "quick_gelu")
@@ -73,30 +72,30 @@ _PHI = {
 _PUBLISHED: Mapping[str, Mapping[str, Any]] = {"llama": _LLAMA, "mistral": _MISTRAL, "phi": _PHI}
 # Where the files of their tokenizers are; Llama 2's own repository is gated, OpenVLA's copy of it is not.
 _TOKENIZERS = {"llama": "openvla/openvla-7b", "mistral": "mistralai/Mistral-7B-v0.1", "phi": "microsoft/phi-2"}
-MODEL_TYPES = ("prismatic", "openvla")
 RESIZE_STRATEGIES = ("resize-naive", "letterbox", "resize-crop")
 
 
-@dataclass(frozen=True)
-class TowerConfig:
+class TowerConfig(ConfigFile):
     """One vision tower: a timm id, the side of its square input in pixels, and changes to timm's constructor."""
 
     timm_id: str
-    image_size: int
-    act_layer: str | None
-    overrides: Mapping[str, Any]
+    image_size: Count
+    act_layer: str | None = None
+    overrides: dict[str, Any]
 
 
-@dataclass(frozen=True)
-class PrismaticConfig:
+class PrismaticConfig(ConfigFile):
     """A checkpoint's configuration.
 
     towers: one, or two whose patch features are joined (`fused`). text: transformers' configuration of the
-    language model. action_vocabulary: text ids below the embedding's padding; the last ones name action bins.
+    language model. padded: rows of the embedding without a text id.
     empty_token: the id that ends every OpenVLA prompt. dtype: as stored, None if the file does not say.
     statistics: per data set, what un-normalises its actions. tokenizer_id: hub id of the tokenizer's files, of a
     training run, whose folder has none; None for checkpoints that come with theirs.
     """
+
+    model_types = ("prismatic", "openvla")
+    network = "Prismatic or OpenVLA"
 
     model_type: str
     vision_id: str
@@ -104,12 +103,17 @@ class PrismaticConfig:
     towers: tuple[TowerConfig, ...]
     resize: str
     text: Any
-    action_vocabulary: int
-    action_bins: int
-    empty_token: int
-    dtype: str | None
-    statistics: Mapping[str, Any]
+    padded: Index = Field(default=64, validation_alias="pad_to_multiple_of")
+    action_bins: Count = Field(default=256, validation_alias="n_action_bins")
+    empty_token: Index = Field(default=29871, validation_alias="empty_token_id")
+    dtype: str | None = None
+    statistics: dict[str, Any]
     tokenizer_id: str | None = None
+
+    @property
+    def action_vocabulary(self) -> int:
+        """Text ids below the embedding's padding; the last ones name action bins."""
+        return int(self.text.vocab_size) - self.padded
 
     @property
     def fused(self) -> bool:
@@ -117,27 +121,18 @@ class PrismaticConfig:
         return len(self.towers) == 2
 
     @classmethod
-    def from_folder(cls, folder: Path) -> "PrismaticConfig":
-        """Read `folder/config.json`. Raises CheckpointError if it is missing or describes another model."""
-        file = folder / "config.json"
-        if not file.is_file():
-            raise CheckpointError(f"{file} is missing; {folder} is not a Prismatic or OpenVLA checkpoint")
-        return cls.from_json(load_json(file), str(file))
-
-    @classmethod
-    def from_json(cls, values: Mapping[str, Any], source: str = "config") -> "PrismaticConfig":
+    def from_json(cls, values: Mapping[str, Any], source: str = "config") -> Self:
         """Read the content of a `config.json`. Raises CheckpointError naming `source`."""
         if (run := values.get("model")) is not None:
             if not isinstance(run, Mapping):
                 raise CheckpointError(f"{source} has no fields under `model`; download the checkpoint again")
             config = cls.from_json(_of_run(run, source), source)
-            return replace(config, tokenizer_id=_TOKENIZERS[config.text.model_type])
-        model_type = values.get("model_type")
-        if model_type not in MODEL_TYPES:
-            raise CheckpointError(
-                f"{source} holds a {model_type!r} model; expected {' or '.join(MODEL_TYPES)}. "
-                "Pass the right --model"
-            )
+            return config.model_copy(update={"tokenizer_id": _TOKENIZERS[config.text.model_type]})
+        return super().from_json(values, source)
+
+    @classmethod
+    def read(cls, values: Mapping[str, Any], source: str) -> Self:
+        """Read the fields, and those of the table. Raises CheckpointError."""
         vision = values.get("vision_backbone_id", "siglip-vit-so400m")
         language = values.get("llm_backbone_id", "vicuna-v15-7b")
         resize = values.get("image_resize_strategy", "letterbox")
@@ -149,18 +144,19 @@ class PrismaticConfig:
             if value not in supported:
                 raise CheckpointError(f"{source}: {name} {value!r} is not one of {', '.join(supported)}")
         text = _text_config(values, _LANGUAGE[language], source)
-        return cls(
-            model_type=model_type,
-            vision_id=vision,
-            language_id=language,
-            towers=_towers(values, vision, source),
-            resize=resize,
-            text=text,
-            action_vocabulary=text.vocab_size - int(values.get("pad_to_multiple_of", 64)),
-            action_bins=int(values.get("n_action_bins", 256)),
-            empty_token=int(values.get("empty_token_id", 29871)),
-            dtype=values.get("torch_dtype") or values.get("dtype"),
-            statistics=values.get("norm_stats") or {},
+        return super().read(
+            {
+                "model_type": values["model_type"],
+                "vision_id": vision,
+                "language_id": language,
+                "towers": _towers(values, vision, source),
+                "resize": resize,
+                "text": text,
+                **{name: values.get(name) for name in ("pad_to_multiple_of", "n_action_bins", "empty_token_id")},
+                "dtype": values.get("torch_dtype") or values.get("dtype"),
+                "statistics": values.get("norm_stats") or {},
+            },
+            source,
         )
 
 
@@ -180,7 +176,7 @@ def _of_run(run: Mapping[str, Any], source: str) -> dict[str, Any]:
     }
 
 
-def _towers(values: Mapping[str, Any], vision: str, source: str) -> tuple[TowerConfig, ...]:
+def _towers(values: Mapping[str, Any], vision: str, source: str) -> list[dict[str, Any]]:
     defaults = _TOWERS[vision]
     count = len(defaults)
     columns: list[list[Any]] = [
@@ -195,10 +191,8 @@ def _towers(values: Mapping[str, Any], vision: str, source: str) -> tuple[TowerC
             f"{source}: {vision} has {count} vision tower(s), but the fields that describe them "
             "(timm_model_ids, image_sizes, timm_override_act_layers, use_fused_vision_backbone) say otherwise"
         )
-    return tuple(
-        TowerConfig(timm_id, int(size), act_layer, dict(overrides))
-        for timm_id, size, act_layer, overrides in zip(*columns, strict=True)
-    )
+    names = ("timm_id", "image_size", "act_layer", "overrides")
+    return [dict(zip(names, tower, strict=True)) for tower in zip(*columns, strict=True)]
 
 
 def _text_config(values: Mapping[str, Any], model_type: str, source: str) -> Any:

@@ -12,7 +12,7 @@ from transformers import Qwen3VLConfig, Qwen3VLForConditionalGeneration
 
 from probe_kit.models.prompt_kv import PromptKV
 from probe_kit.models.qwen import QwenInputs, build_empty, fill_rotary
-from probe_kit.models.xiaomi.config import FlowConfig, XiaomiConfig
+from probe_kit.models.xiaomi.config import XiaomiConfig
 from probe_kit.models.xiaomi.transformer import Cache, FlowTransformer, Projector, TimeEmbedder
 
 STEPS = 5
@@ -130,4 +130,6 @@ def full_size_xiaomi() -> XiaomiNetwork:
         },
     }
     vlm = Qwen3VLConfig(vision_config=vision, text_config=text, tie_word_embeddings=True)
-    return build_xiaomi(XiaomiConfig(vlm, FlowConfig(), 1, 32, 30, 32, None), torch.float32)
+    return build_xiaomi(
+        XiaomiConfig.read({"vlm_config": vlm, "state_dim": 32, "action_dim": 32}, "released"), torch.float32
+    )

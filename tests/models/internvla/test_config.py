@@ -46,7 +46,7 @@ def test_the_spelling_of_the_released_file_and_the_right_one_are_read() -> None:
         ("framework_py", "QwenGR00T", "'QwenGR00T'"),
         ("dino", {"dino_backbone": "dinov3_vits16"}, "dinov3_vits16"),
         ("action_model", {"action_model_type": "DiT-XL"}, "DiT-XL"),
-        ("action_model", {"past_action_window_size": 2}, "2 past actions"),
+        ("action_model", {"past_action_window_size": 2}, "past_action_window_size is 2"),
         ("layer_qformer", {"input_dim": 64}, "reads width 64"),
         ("layer_qformer", {"qformer_end_layer": 9}, "hidden states 3 to 9"),
         ("layer_qformer", {"ouptput_dim": 30}, "width 30 and 8 heads"),

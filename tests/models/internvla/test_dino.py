@@ -6,8 +6,9 @@ from transformers import Dinov2Config, Dinov2Model
 from probe_kit.models.initialisation import initialise
 from probe_kit.models.internvla.config import DinoConfig
 from probe_kit.models.internvla.dino import DinoV2
+from tests.support.internvla_checkpoints import dims_values
 
-CONFIG = DinoConfig(width=24, blocks=2, heads=3, trained_side=70, patch=14, side=56)
+CONFIG = DinoConfig.read(dims_values()["dino"], "test")
 
 
 @pytest.fixture(scope="module")

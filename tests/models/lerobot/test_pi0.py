@@ -42,5 +42,5 @@ def test_full_size_has_the_recorded_names_and_shapes(golden_pi0: Path) -> None:
 
 def test_an_incomplete_size_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "dims.json").write_text(json.dumps({"vlm": {"width": 8}}), encoding="utf-8")
-    with pytest.raises(CheckpointError, match="does not describe a pi0"):
+    with pytest.raises(CheckpointError, match="does not describe pi0"):
         Pi0Size.from_file(tmp_path / "dims.json")
