@@ -1,68 +1,27 @@
 """InternVLA-M1's actions: from the head's output to the units of a data set."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.errors import CheckpointError
-from probe_kit.hashing import sha256_json
-from probe_kit.models.bounds import check_bounds
-from probe_kit.models.statistics_choice import chosen_name
+from probe_kit.hooks.families.shared.action_statistics import ActionStatistics
 
 _GRIPPER, _OPEN = 6, 0.5
 
 
-@dataclass(frozen=True)
-class ActionUnits:
-    """Per dimension the 1 % and 99 % quantiles of a data set.
+class ActionUnits(ActionStatistics):
+    """The statistics of a run. Its head puts out numbers beyond [-1, 1], and a gripper between open and closed."""
 
-    mask: False for dimensions that stay as the head puts them out, such as a gripper that is 0 or 1.
-    """
+    lacking: ClassVar[str] = (
+        "the checkpoint has no dataset_statistics.json: its actions have no physical unit. Take the file that the "
+        "run was released with"
+    )
 
-    key: str
-    low: NDArray[np.float64]
-    high: NDArray[np.float64]
-    mask: NDArray[np.bool_]
-
-    @classmethod
-    def choose(
-        cls, statistics: Mapping[str, Any], key: str | None, source: str = "the checkpoint"
-    ) -> "ActionUnits":
-        """The units of data set `key`; without one, of the only data set. source: the file that holds them.
-
-        Raises UsageError for a key that is not there or has to be chosen, CheckpointError for bad statistics.
-        """
-        if not statistics:
-            raise CheckpointError(
-                "the checkpoint has no dataset_statistics.json: its actions have no physical unit. "
-                "Take the file that the run was released with"
-            )
-        name = chosen_name(statistics, key, "unnorm_key", source)
-        return cls.of(name, statistics[name].get("action") or {})
-
-    @classmethod
-    def of(cls, key: str, action: Mapping[str, Any]) -> "ActionUnits":
-        """Read q01, q99 and, if there is one, mask. Raises CheckpointError if they do not fit each other."""
-        if missing := [name for name in ("q01", "q99") if name not in action]:
-            raise CheckpointError(f"the action statistics of {key} lack {' and '.join(missing)}")
-        low, high = np.asarray(action["q01"], np.float64), np.asarray(action["q99"], np.float64)
-        mask = np.asarray(action.get("mask", np.ones(low.shape, bool)), bool)
-        if not low.shape == high.shape == mask.shape or not np.isfinite([low, high]).all():
-            raise CheckpointError(f"the action statistics of {key} are not one finite number per dimension")
-        check_bounds(low[mask], high[mask], f"the action statistics of {key}")
-        return cls(key, low, high, mask)
-
-    @property
-    def sha256(self) -> str:
-        """The hash of the numbers."""
-        return sha256_json([self.low.tolist(), self.high.tolist(), self.mask.tolist()])
-
-    def restore(self, actions: NDArray[np.float32]) -> NDArray[np.float64]:
+    def restore(self, values: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
         """(…, D) in the data set's units: clipped to [-1, 1], the gripper open or closed, then stretched."""
-        clipped = np.clip(actions.astype(np.float64), -1, 1)
+        clipped = np.clip(values.astype(np.float64), -1, 1)
         if clipped.shape[-1] > _GRIPPER:
             clipped[..., _GRIPPER] = clipped[..., _GRIPPER] >= _OPEN
+        # In the order of the original's operations, for the last bit.
         return np.where(self.mask, 0.5 * (clipped + 1) * (self.high - self.low) + self.low, clipped)

@@ -34,7 +34,8 @@ from probe_kit.hooks.families.magma.checkpoint import (
     magma_statistics,
 )
 from probe_kit.hooks.families.magma.text import ChatText, TokenPrompt
-from probe_kit.hooks.families.openvla.actions import ActionStatistics, ActionTokens
+from probe_kit.hooks.families.openvla.actions import ActionTokens
+from probe_kit.hooks.families.shared.action_statistics import ActionStatistics
 from probe_kit.hooks.families.shared.attention_weights import Note, of_decoder
 from probe_kit.hooks.families.shared.capabilities import MAPS
 from probe_kit.hooks.families.shared.decoder_tap import decoder_tap

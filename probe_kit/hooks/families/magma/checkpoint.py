@@ -13,11 +13,11 @@ from probe_kit.errors import UsageError, WeightsError
 from probe_kit.hooks.checkpoints.checkpoint import chosen_dtype
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.checkpoints.weights import Weights, WeightsAudit, load_weights, read_weights
+from probe_kit.hooks.families.shared.network_loading import DTYPES, as_dtype, audit_of_twin, check_filled
 from probe_kit.models.initialisation import initialise
 from probe_kit.models.magma import UNUSED_WEIGHTS, MagmaConfig, MagmaNetwork, build_magma, shipped_statistics
 from probe_kit.models.statistics_choice import STATISTICS_FILE, chosen_name, read_statistics, stored_statistics
 
-_DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 _BLOCK = re.compile(r"(?P<block>vision_tower\..*\.blocks\.\d+)\.(?P<name>gamma|weight)")
 
 
@@ -64,13 +64,13 @@ def load_checkpoint(
     """
     folder = checkpoint_folder(checkpoint)
     config = MagmaConfig.from_folder(folder)
-    name = chosen_dtype(dtype, config.dtype, _DTYPES)
+    name = chosen_dtype(dtype, config.dtype, DTYPES)
     if random_weights:
-        network, audit = _random(config, _DTYPES[name], checkpoint, weights_seed)
+        network, audit = _random(config, DTYPES[name], checkpoint, weights_seed)
         notes: tuple[str, ...] = ()
         stored_name = "gamma"
     else:
-        network, audit, notes, stored_name = _stored(config, folder, _DTYPES[name], layer_scale)
+        network, audit, notes, stored_name = _stored(config, folder, DTYPES[name], layer_scale)
     network.requires_grad_(False)
     by_data_set, statistics_source = magma_statistics(folder, statistics)
     return LoadedMagma(
@@ -98,8 +98,7 @@ def _random(
         for name, parameter in network.named_parameters():
             if name.endswith(".gamma"):
                 parameter.fill_(1)  # at timm's 1e-6 the blocks of the trunk would do nothing
-    weights = Weights(network.state_dict(), f"random twin of {checkpoint}", random=True)
-    return network, load_weights(network, weights, weights.tensors)
+    return network, audit_of_twin(network, checkpoint)
 
 
 def _stored(
@@ -112,12 +111,10 @@ def _stored(
         notes += (f"{len(unread)} tensors of the contrastive head are in the file and never read",)
     network = build_magma(config, dtype)
     tied = {"language_model.lm_head.weight"} if config.text.tie_word_embeddings else set()
-    cast = {key: tensor.to(dtype) if tensor.is_floating_point() else tensor for key, tensor in tensors.items()}
-    audit = load_weights(network, weights, cast, tied, assign=True)
+    audit = load_weights(network, weights, as_dtype(tensors, dtype), tied, assign=True)
     if tied:
         network.language_model.tie_weights()
-    if empty := [key for key, tensor in network.state_dict().items() if tensor.is_meta]:
-        raise WeightsError(f"weights in {folder}: {len(empty)} tensors were never filled: {', '.join(empty[:8])}")
+    check_filled(network, f"weights in {folder}")
     return network, audit, notes, stored_name
 
 

@@ -19,7 +19,7 @@ from probe_kit.errors import CheckpointError, InstructionError, UsageError
 from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES
 from probe_kit.hooks.contract.model import Policy
 from probe_kit.hooks.contract.observation import Observation, checked_picture
-from probe_kit.hooks.families.openvla.actions import ActionStatistics, ActionTokens
+from probe_kit.hooks.families.openvla.actions import ActionTokens
 from probe_kit.hooks.families.prismatic.adapter import PrismaticModel
 from probe_kit.hooks.families.prismatic.checkpoint import (
     LoadedPrismatic,
@@ -28,6 +28,7 @@ from probe_kit.hooks.families.prismatic.checkpoint import (
     prismatic_statistics,
 )
 from probe_kit.hooks.families.prismatic.tokenizer import BYTES, find_tokenizer
+from probe_kit.hooks.families.shared.action_statistics import ActionStatistics
 from probe_kit.hooks.families.shared.attention_weights import Note, of_decoder
 from probe_kit.hooks.families.shared.capabilities import TOKENS
 from probe_kit.hooks.families.shared.prompt_kv import kept_prompt

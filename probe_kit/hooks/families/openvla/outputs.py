@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from probe_kit.hooks.families.openvla.actions import ActionStatistics
 from probe_kit.hooks.families.openvla.adapter import OpenVLA
 from probe_kit.hooks.families.prismatic.outputs import INPUTS, Reference
+from probe_kit.hooks.families.shared.action_statistics import ActionStatistics
 from probe_kit.hooks.verification.outputs import Arrays, Outputs, Produce
 from probe_kit.models.prismatic import PrismaticConfig
 

@@ -6,22 +6,21 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
-from probe_kit.errors import CheckpointError, WeightsError
+from probe_kit.errors import CheckpointError
 from probe_kit.hooks.checkpoints.adapter_files import AdapterFiles, adapter_in
 from probe_kit.hooks.checkpoints.checkpoint import PATTERNS, RUN_WEIGHTS, chosen_dtype
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
-from probe_kit.hooks.checkpoints.weights import Weights, WeightsAudit, load_weights, read_weights, with_adapter
+from probe_kit.hooks.checkpoints.weights import WeightsAudit, load_weights, read_weights, with_adapter
 from probe_kit.hooks.families.prismatic.quantised import check_quantisation, quantise
 from probe_kit.hooks.families.prismatic.release import read_release
+from probe_kit.hooks.families.shared.network_loading import DTYPES, as_dtype, audit_of_twin, check_filled
 from probe_kit.models.initialisation import initialise
 from probe_kit.models.prismatic import PrismaticConfig, PrismaticNetwork, build_prismatic
 from probe_kit.models.statistics_choice import stored_statistics
 
 FILES = (*PATTERNS, RUN_WEIGHTS)
 """What is needed of a hub repository, or of the folder of one model of it."""
-_DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 # Files of OpenVLA-OFT: its actions come from heads that its language model's checkpoint does not name.
 _OTHER_HEADS = ("action_head--*", "proprio_projector--*", "noisy_action_projector--*", "vision_backbone--*")
 
@@ -83,11 +82,11 @@ def load_checkpoint(
     base = folder if adapter is None else adapter.base_folder()
     _check_other_heads((folder, base))
     config = PrismaticConfig.from_folder(base)
-    name = chosen_dtype(dtype, config.dtype, _DTYPES)
+    name = chosen_dtype(dtype, config.dtype, DTYPES)
     if random_weights:
-        network, audit = _random(config, _DTYPES[name], checkpoint, weights_seed)
+        network, audit = _random(config, DTYPES[name], checkpoint, weights_seed)
     else:
-        network, audit = _stored(config, base, _DTYPES[name], adapter)
+        network, audit = _stored(config, base, DTYPES[name], adapter)
     network.requires_grad_(False)
     notes: tuple[str, ...] = (audit.adapter,) if audit.adapter else ()
     if bits is not None:
@@ -126,8 +125,7 @@ def _random(
 ) -> tuple[PrismaticNetwork, WeightsAudit]:
     network = build_prismatic(config, dtype, device="cpu")
     initialise(network, seed)
-    weights = Weights(network.state_dict(), f"random twin of {checkpoint}", random=True)
-    return network, load_weights(network, weights, weights.tensors)
+    return network, audit_of_twin(network, checkpoint)
 
 
 def _stored(
@@ -139,16 +137,11 @@ def _stored(
         weights = with_adapter(weights, adapter)
     network = build_prismatic(config, dtype)
     tied = {"language_model.lm_head.weight"} if config.text.tie_word_embeddings else set()
-    audit = load_weights(network, weights, _as_dtype(weights.tensors, dtype), tied, assign=True)
+    audit = load_weights(network, weights, as_dtype(weights.tensors, dtype), tied, assign=True)
     if tied:
         network.language_model.tie_weights()
-    if empty := [name for name, tensor in network.state_dict().items() if tensor.is_meta]:
-        raise WeightsError(f"weights in {folder}: {len(empty)} tensors were never filled: {', '.join(empty[:8])}")
+    check_filled(network, f"weights in {folder}")
     return network, audit
-
-
-def _as_dtype(tensors: Mapping[str, Tensor], dtype: torch.dtype) -> dict[str, Tensor]:
-    return {name: t.to(dtype) if t.is_floating_point() else t for name, t in tensors.items()}
 
 
 def prismatic_statistics(config: PrismaticConfig, folders: tuple[Path, ...]) -> tuple[Mapping[str, Any], str]:

@@ -1,11 +1,11 @@
-"""Loading of native networks that contain a Qwen vision-language model: from files or seeded random weights."""
+"""Loading of native networks: from files or seeded random weights."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from probe_kit.errors import UsageError, WeightsError
 from probe_kit.hooks.checkpoints.weights import Weights, WeightsAudit, load_weights
@@ -31,7 +31,7 @@ def fill[Network: nn.Module](
     tied: Callable[[Network], tuple[str, ...]],
     name_in_module: Callable[[str], str] = str,
 ) -> Filled[Network]:
-    """The network that `build(dtype, device)` makes, with exactly the weights that `read()` gives.
+    """The network with a Qwen VLM that `build(dtype, device)` makes, with exactly the weights of `read()`.
 
     dtype: float32 or bfloat16; default that of the tensors in the file. tied: parameters that are another one's
     double, which a file may leave out; called with the network. name_in_module: the network's name of a tensor in
@@ -40,10 +40,7 @@ def fill[Network: nn.Module](
     weights = read()
     name = checked_dtype(dtype or _stored_dtype(weights))
     network = build(DTYPES[name], "meta")
-    tensors = {
-        name_in_module(key): value.to(DTYPES[name]) if value.is_floating_point() else value
-        for key, value in weights.tensors.items()
-    }
+    tensors = as_dtype({name_in_module(key): value for key, value in weights.tensors.items()}, DTYPES[name])
     if len(tensors) < len(weights.tensors):
         raise WeightsError(f"{weights.source}: two tensors have the same name here; nothing was run")
     audit = load_weights(network, weights, tensors, tied(network), assign=True, name_in_module=name_in_module)
@@ -55,9 +52,7 @@ def fill[Network: nn.Module](
                 f"{weights.source}: {double} differs from the tensor that config.json ties it to "
                 "(tie_word_embeddings); one of the two files is another model's"
             )
-    every = {**network.state_dict(), **dict(network.named_buffers())}
-    if empty := [key for key, tensor in every.items() if tensor.is_meta]:
-        raise WeightsError(f"{weights.source}: {len(empty)} tensors were never filled: {', '.join(empty[:8])}")
+    check_filled(network, weights.source)
     network.requires_grad_(False)
     return Filled(network, audit, name, None)
 
@@ -69,10 +64,27 @@ def twin[Network: nn.Module](
     name = checked_dtype(dtype or "float32")
     network = build(DTYPES[name], "cpu")
     initialise(network, seed)
-    weights = Weights(network.state_dict(), f"random twin of {checkpoint}", random=True)
-    audit = load_weights(network, weights, weights.tensors)
+    audit = audit_of_twin(network, checkpoint)
     network.requires_grad_(False)
     return Filled(network, audit, name, seed)
+
+
+def audit_of_twin(network: nn.Module, checkpoint: str) -> WeightsAudit:
+    """The audit of a network whose weights were drawn."""
+    weights = Weights(network.state_dict(), f"random twin of {checkpoint}", random=True)
+    return load_weights(network, weights, weights.tensors)
+
+
+def as_dtype(tensors: Mapping[str, Tensor], dtype: torch.dtype) -> dict[str, Tensor]:
+    """The tensors, those of real numbers in `dtype`."""
+    return {name: value.to(dtype) if value.is_floating_point() else value for name, value in tensors.items()}
+
+
+def check_filled(network: nn.Module, source: str) -> None:
+    """Raise WeightsError for tensors and buffers without memory."""
+    every = {**network.state_dict(), **dict(network.named_buffers())}
+    if empty := [name for name, tensor in every.items() if tensor.is_meta]:
+        raise WeightsError(f"{source}: {len(empty)} tensors were never filled: {', '.join(empty[:8])}")
 
 
 def checked_dtype(name: str) -> str:

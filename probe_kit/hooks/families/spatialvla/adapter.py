@@ -28,8 +28,8 @@ from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import HEADS, Site, Stream
 from probe_kit.hooks.contract.unembedding import Unembedding
 from probe_kit.hooks.contract.views import PADDING
-from probe_kit.hooks.families.openvla.actions import ActionStatistics
 from probe_kit.hooks.families.prismatic.tokenizer import BYTES
+from probe_kit.hooks.families.shared.action_statistics import ActionStatistics
 from probe_kit.hooks.families.shared.attention_weights import Note, of_decoder
 from probe_kit.hooks.families.shared.capabilities import TOKENS
 from probe_kit.hooks.families.shared.decoder_tap import decoder_tap

@@ -11,12 +11,12 @@ from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import CheckpointError
 from probe_kit.hooks.checkpoints.checkpoint import chosen_dtype
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
-from probe_kit.hooks.checkpoints.weights import Weights, WeightsAudit, load_weights, read_weights
+from probe_kit.hooks.checkpoints.weights import WeightsAudit, load_weights, read_weights
+from probe_kit.hooks.families.shared.network_loading import DTYPES, as_dtype, audit_of_twin
 from probe_kit.models.initialisation import initialise
 from probe_kit.models.spatialvla import SpatialVLAConfig, SpatialVLANetwork, build_spatialvla
 
 PROCESSOR_FILE = "processor_config.json"
-_DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 
 
 @dataclass(frozen=True)
@@ -65,12 +65,12 @@ def load_checkpoint(
     """
     folder = checkpoint_folder(checkpoint)
     config = SpatialVLAConfig.from_folder(folder)
-    name = chosen_dtype(dtype, config.dtype, _DTYPES)
+    name = chosen_dtype(dtype, config.dtype, DTYPES)
     processor = read_processor(folder)
     if random_weights:
-        network, audit = _random(config, _DTYPES[name], checkpoint, weights_seed)
+        network, audit = _random(config, DTYPES[name], checkpoint, weights_seed)
     else:
-        network, audit = _stored(config, _DTYPES[name], folder)
+        network, audit = _stored(config, DTYPES[name], folder)
     network.requires_grad_(False)
     network.embed_actions()
     return LoadedSpatialVLA(
@@ -100,12 +100,10 @@ def _random(
 ) -> tuple[SpatialVLANetwork, WeightsAudit]:
     network = build_spatialvla(config, dtype, device="cpu")
     initialise(network, seed)
-    weights = Weights(network.state_dict(), f"random twin of {checkpoint}", random=True)
-    return network, load_weights(network, weights, weights.tensors)
+    return network, audit_of_twin(network, checkpoint)
 
 
 def _stored(config: SpatialVLAConfig, dtype: torch.dtype, folder: Path) -> tuple[SpatialVLANetwork, WeightsAudit]:
     weights = read_weights(folder)
     network = build_spatialvla(config, dtype)
-    tensors = {name: t.to(dtype) if t.is_floating_point() else t for name, t in weights.tensors.items()}
-    return network, load_weights(network, weights, tensors, assign=True)
+    return network, load_weights(network, weights, as_dtype(weights.tensors, dtype), assign=True)

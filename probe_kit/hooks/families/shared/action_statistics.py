@@ -1,0 +1,64 @@
+"""The statistics that give normalised actions the units of a data set."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import CheckpointError
+from probe_kit.hashing import sha256_json
+from probe_kit.models.bounds import check_bounds
+from probe_kit.models.statistics_choice import chosen_name
+
+
+@dataclass(frozen=True)
+class ActionStatistics:
+    """Per dimension the 1 % and 99 % quantiles of a data set.
+
+    mask: False for dimensions that stay as the model puts them out, such as a gripper that is 0 or 1 in the data.
+    """
+
+    lacking: ClassVar[str] = (
+        "the checkpoint has no norm_stats in its config.json and no dataset_statistics.json: its actions have no "
+        "physical unit. Take the statistics of the data set it was trained on"
+    )
+    """The message for a checkpoint without statistics."""
+
+    key: str
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    mask: NDArray[np.bool_]
+
+    @classmethod
+    def choose(cls, statistics: Mapping[str, Any], key: str | None, source: str = "the checkpoint") -> Self:
+        """The statistics of data set `key`; without one, of the only data set. source: the file that holds them.
+
+        Raises UsageError for a key that is not there or has to be chosen, CheckpointError for bad statistics.
+        """
+        if not statistics:
+            raise CheckpointError(cls.lacking)
+        name = chosen_name(statistics, key, "unnorm_key", source)
+        return cls.of(name, statistics[name].get("action") or {})
+
+    @classmethod
+    def of(cls, key: str, action: Mapping[str, Any]) -> Self:
+        """Read q01, q99 and, if there is one, mask. Raises CheckpointError if they do not fit each other."""
+        if missing := [name for name in ("q01", "q99") if name not in action]:
+            raise CheckpointError(f"the action statistics of {key} lack {' and '.join(missing)}")
+        low, high = np.asarray(action["q01"], np.float64), np.asarray(action["q99"], np.float64)
+        mask = np.asarray(action.get("mask", np.ones(low.shape, bool)), bool)
+        if not low.shape == high.shape == mask.shape or not np.isfinite([low, high]).all():
+            raise CheckpointError(f"the action statistics of {key} are not one finite number per dimension")
+        check_bounds(low[mask], high[mask], f"the action statistics of {key}")
+        return cls(key, low, high, mask)
+
+    @property
+    def sha256(self) -> str:
+        """The hash of the numbers."""
+        return sha256_json([self.low.tolist(), self.high.tolist(), self.mask.tolist()])
+
+    def restore(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(…, D) normalised values in the data set's units."""
+        return np.where(self.mask, (values + 1) / 2 * (self.high - self.low) + self.low, values)
