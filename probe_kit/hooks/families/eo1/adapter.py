@@ -23,7 +23,7 @@ from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.eo1 import INTERVENTIONS
 from probe_kit.hooks.families.shared.lerobot.evaluation import Evaluation
 from probe_kit.hooks.families.shared.lerobot.packed import PackedBatch, PackedPolicy, Tokens, chat_labels
-from probe_kit.hooks.families.shared.lerobot.pipelines import PREPROCESSOR, saved_steps
+from probe_kit.hooks.families.shared.lerobot.pipelines import PREPROCESSOR, check_same, saved_steps
 from probe_kit.hooks.families.shared.lerobot.policy import IMAGES, STATE, checked_steps
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack, TokenStack
 from probe_kit.hooks.families.shared.prompt_kv import kept_prompt
@@ -52,8 +52,6 @@ class Eo1(PackedPolicy):
         self.passages = network.model.prompt_kv
         self.prompt_kv = kept_prompt(network.model.vlm_backbone.config.text_config)
 
-    # -- loading -----------------------------------------------------------------------------------------
-
     @classmethod
     def current_values(cls, values: dict[str, Any], path: Path) -> dict[str, Any]:
         """Raise CheckpointError for a file without the sizes of its vision-language model."""
@@ -67,16 +65,10 @@ class Eo1(PackedPolicy):
         config = super().parse_config(folder, evaluation)
         saved = {step.name: step.config for step in saved_steps(folder, PREPROCESSOR)}
         template = saved.get(TEMPLATE, {})
-        keys = [
-            key for key, feature in (template.get("input_features") or {}).items() if feature["type"] == "VISUAL"
-        ]
-        expected = {"chunk_size": config.chunk_size, "pictures": list(config.image_features)}
-        packed = {
-            "chunk_size": template.get("chunk_size", config.chunk_size),
-            "pictures": keys or expected["pictures"],
-        }
-        if packed != expected:
-            raise CheckpointError(f"{folder}: its step {TEMPLATE} packs {packed}; config.json says {expected}")
+        features = template.get("input_features") or {}
+        pictures = [name for name, feature in features.items() if feature["type"] == "VISUAL"] or None
+        expected = {"chunk_size": config.chunk_size, "input_features": list(config.image_features)}
+        check_same(folder, TEMPLATE, {**template, "input_features": pictures}, expected)
         names = ("image_min_pixels", "image_max_pixels", "use_fast_processor")
         config.packing = {name: getattr(config, name) for name in names} | dict(saved.get(PROCESSOR, {}))
         processor = str(config.packing.get("processor_name", config.vlm_base))
@@ -95,8 +87,6 @@ class Eo1(PackedPolicy):
     def parts(self) -> dict[str, Path]:
         """The processor's folder."""
         return {"vlm": self.config.processor_folder}
-
-    # -- the prompt --------------------------------------------------------------------------------------
 
     @cached_property
     def packing(self) -> EO1QwenProcessorStep:
@@ -138,8 +128,6 @@ class Eo1(PackedPolicy):
             labels = [label if valid else PADDING for label, valid in zip(labels, mask, strict=False)]
             rows.append(list(zip(prompt, labels, strict=True)))
         return rows
-
-    # -- acting and capture ------------------------------------------------------------------------------
 
     def denoise(self, batch: Mapping[str, Tensor], noise: Tensor) -> Tensor:
         """See the base; lerobot's own sampling makes no graph."""

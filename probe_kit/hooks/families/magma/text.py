@@ -10,7 +10,14 @@ from tokenizers import Tokenizer
 
 from probe_kit._system.bounded_files import read_regular_text
 from probe_kit._system.bounded_json import load_json
-from probe_kit.errors import CheckpointError, InstructionError, UsageError
+from probe_kit.errors import CheckpointError
+from probe_kit.hooks.families.shared.vlm.text import (
+    check_marks,
+    check_vocabulary,
+    first_behind,
+    positions_of,
+    words_of,
+)
 from probe_kit.models.magma import MagmaConfig, chat_text, conversation, picture_question
 
 _FILE = "tokenizer.json"
@@ -82,12 +89,7 @@ class ChatText:
                 f"{self.folder / _FILE} has {counts[0]} ids before the added ones, config.json says {counts[1]} "
                 "(tokenizer_vocab_size): every action would be decoded wrongly. Take the checkpoint's tokenizer"
             )
-        highest = max(self._tokenizer.get_vocab(with_added_tokens=True).values())
-        if highest >= self.config.text.vocab_size:
-            raise CheckpointError(
-                f"{self.folder / _FILE} has ids up to {highest}; this model has {self.config.text.vocab_size}. "
-                "The tokenizer belongs to another checkpoint"
-            )
+        check_vocabulary(self._tokenizer, self.folder / _FILE, int(self.config.text.vocab_size))
 
     @property
     def vocabulary(self) -> int:
@@ -109,18 +111,14 @@ class ChatText:
         begun: how the answer has begun already.
         Raises InstructionError for a question that holds a token of the frames.
         """
-        self._check_markers(question + begun)
+        check_marks(self._tokenizer, question + begun)
         before = picture_question("", self.config.image_start_end) if pictured else ""
         turn = before + question
         frames = chat_text(conversation(turn, self.user_first), self._template, **self._beginning)
         start, stop = self._place(turn, frames)
         start += len(before)
         encoding = self._tokenizer.encode(frames + begun)
-        inside = tuple(
-            not special and first < stop and last > start
-            for (first, last), special in zip(encoding.offsets, encoding.special_tokens_mask, strict=True)
-        )
-        return TokenPrompt(tuple(encoding.ids), inside)
+        return TokenPrompt(tuple(encoding.ids), positions_of(encoding, start, stop))
 
     def _place(self, turn: str, frames: str) -> tuple[int, int]:
         """The beginning and end of the user's words in `frames`."""
@@ -133,25 +131,11 @@ class ChatText:
             )
         return start, start + len(words)
 
-    def _check_markers(self, text: str) -> None:
-        for token in self._tokenizer.get_added_tokens_decoder().values():
-            if token.special and token.content in text:
-                raise InstructionError(
-                    f"the text {text!r} holds {token.content!r}, which stands for something else in the prompt; "
-                    "write it without"
-                )
-
     def option(self, question: str, begun: str, option: str, pictured: bool = True) -> int:
         """The first id of an option behind a prompt. Raises UsageError if it changes the prompt's own ids."""
         before, behind = (self.prompt(question, text, pictured).ids for text in (begun, begun + option))
-        if len(behind) == len(before) or behind[: len(before)] != before:
-            raise UsageError(
-                f"the option {option!r} merges with the end of the prompt: {list(behind[len(before) - 2 :])} "
-                f"instead of {list(before[-2:])} and more. Give it as it stands behind the prompt"
-            )
-        return int(behind[len(before)])
+        return first_behind(before, behind, option)
 
     def decode(self, ids: Sequence[int]) -> str:
         """The text of ids up to the end of the turn, without special tokens."""
-        end = next((position for position, number in enumerate(ids) if number in self.ends), len(ids))
-        return str(self._tokenizer.decode(list(ids[:end]), skip_special_tokens=True)).strip()
+        return words_of(self._tokenizer, ids, self.ends)

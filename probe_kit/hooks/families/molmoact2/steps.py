@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import CheckpointError
 from probe_kit.hooks.families.molmoact2.units import SAME_FRAME, JointFrame
-from probe_kit.hooks.families.shared.lerobot.pipelines import MASKED, every_step
+from probe_kit.hooks.families.shared.lerobot.pipelines import MASKED, check_same, every_step
 from probe_kit.hooks.families.shared.lerobot.policy import STATE
 
 _PACK, _CLAMP_STATE, _CLAMP_ACTION = (
@@ -58,17 +58,7 @@ def read_steps(folder: Path, config: Any) -> MolmoAct2Steps:
     if _PACK not in saved:
         frame = _frame(vars(config), folder)
         return MolmoAct2Steps({}, frame, frame, clamps_state=True, clamps_action=True, unclamped=None)
-    own_fields = saved[_PACK]
-    wrong = [
-        f"{name}: {own_fields[name]!r} ({theirs}: {getattr(config, theirs)!r})"
-        for name, theirs in _SAME.items()
-        if own_fields.get(name) not in (None, getattr(config, theirs))
-    ]
-    if wrong:
-        raise CheckpointError(
-            f"{folder} packs with {', '.join(wrong)}: in brackets what config.json says. Save the two files "
-            "together"
-        )
+    check_same(folder, _PACK, saved[_PACK], {name: getattr(config, theirs) for name, theirs in _SAME.items()})
     state_frame, action_frame = (_frame(saved.get(name, {}), folder) for name in _FRAMES)
     scaled = (saved.get(_CLAMP_STATE, {}).get("normalization_masks") or {}).get(STATE, [])
     return MolmoAct2Steps(

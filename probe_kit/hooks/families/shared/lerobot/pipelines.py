@@ -169,6 +169,17 @@ def check_values(values: Mapping[str, Any], honoured: Mapping[str, tuple[Any, ..
             )
 
 
+def check_same(folder: Path, step: str, saved: Mapping[str, Any], configured: Mapping[str, Any]) -> None:
+    """Raise CheckpointError for what a step was saved with, None for nothing, and `config.json` says otherwise."""
+    wrong = [
+        f"{name}: {saved[name]!r} (config.json: {value!r})"
+        for name, value in configured.items()
+        if saved.get(name) not in (None, value)
+    ]
+    if wrong:
+        raise CheckpointError(f"{folder}: the step {step} has {', '.join(wrong)}. Save the two files together")
+
+
 def tokenizer_name(folder: Path) -> str | None:
     """The name of the tokenizer in the saved step; None where no step has one."""
     step = next((step for step in saved_steps(folder, PREPROCESSOR) if step.name == TOKENIZER), None)

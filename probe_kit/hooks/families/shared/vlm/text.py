@@ -3,7 +3,7 @@
 Read by the `tokenizers` library from the checkpoint's own `tokenizer.json`; no template is rendered.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import takewhile
@@ -75,11 +75,7 @@ class FramedText:
                 "model's page, or name a folder that has it with -M tokenizer=DIR"
             )
         text = cls(folder, frame, int(config.vocab_size), _ends(generation, config))
-        if (highest := max(text._tokenizer.get_vocab(with_added_tokens=True).values())) >= text.vocabulary:
-            raise CheckpointError(
-                f"{folder / TOKENIZER_FILE} has ids up to {highest}; this model has {text.vocabulary}. "
-                "The tokenizer belongs to another checkpoint"
-            )
+        check_vocabulary(text._tokenizer, folder / TOKENIZER_FILE, text.vocabulary)
         return text
 
     @cached_property
@@ -112,16 +108,13 @@ class FramedText:
         `marks` of them at either end are no picture but say where it begins and ends.
         Raises InstructionError for text that holds a token of the frames or one the tokenizer does not know.
         """
-        self._check_markers(question + begun)
+        check_marks(self._tokenizer, question + begun)
         lead = self.frame.bare if picture is None else self.frame.behind
         text = lead + question + self.frame.end + begun
         before = [] if picture is None else [*self._encode(self.frame.before).ids, *picture]
         behind = self._encode(text)
         start, stop = len(lead), len(lead) + len(question)
-        is_question = [
-            first < stop and last > start and not special
-            for (first, last), special in zip(behind.offsets, behind.special_tokens_mask, strict=True)
-        ]
+        is_question = positions_of(behind, start, stop)
         picture_span = (len(before) - len(picture or ()) + marks, len(before) - marks) if picture else (0, 0)
         return TokenPrompt(text, (*before, *behind.ids), (*[False] * len(before), *is_question), picture_span)
 
@@ -135,28 +128,60 @@ class FramedText:
             )
         return encoding
 
-    def _check_markers(self, text: str) -> None:
-        for token in self._tokenizer.get_added_tokens_decoder().values():
-            if token.special and token.content in text:
-                raise InstructionError(
-                    f"the text {text!r} holds {token.content!r}, which stands for something else in the prompt; "
-                    "write it without"
-                )
-
     def option(self, prompt: TokenPrompt, option: str) -> int:
         """The first id of `option` behind a prompt. Raises UsageError if it changes the prompt's own ids."""
-        before, extended = self._encode(prompt.text).ids, self._encode(prompt.text + option).ids
-        if extended[: len(before)] != before or len(extended) == len(before):
-            raise UsageError(
-                f"the option {option!r} merges with the end of the prompt: {extended[len(before) - 2 :]} instead "
-                f"of {before[len(before) - 2 :]} and more. Give it as it stands behind the prompt"
-            )
-        return int(extended[len(before)])
+        return first_behind(self._encode(prompt.text).ids, self._encode(prompt.text + option).ids, option)
 
     def decode(self, ids: Sequence[int]) -> str:
         """The text of ids up to an end, without special tokens."""
-        answer = list(takewhile(lambda number: number not in self.ends, ids))
-        return str(self._tokenizer.decode(answer, skip_special_tokens=True)).strip()
+        return words_of(self._tokenizer, ids, self.ends)
+
+
+def check_vocabulary(tokenizer: Any, file: Path, vocabulary: int) -> None:
+    """Raise CheckpointError for a tokenizer with ids that the model does not have."""
+    if (highest := max(tokenizer.get_vocab(with_added_tokens=True).values())) >= vocabulary:
+        raise CheckpointError(
+            f"{file} has ids up to {highest}; this model has {vocabulary}. The tokenizer belongs to another "
+            "checkpoint"
+        )
+
+
+def check_marks(tokenizer: Any, text: str) -> None:
+    """Raise InstructionError for a text that holds a token of the frames."""
+    for token in tokenizer.get_added_tokens_decoder().values():
+        if token.special and token.content in text:
+            raise InstructionError(
+                f"the text {text!r} holds {token.content!r}, which stands for something else in the prompt; "
+                "write it without"
+            )
+
+
+def positions_of(encoding: Any, start: int, stop: int) -> tuple[bool, ...]:
+    """True for ids, special ones left out, that hold characters from `start` up to `stop` of the text."""
+    return tuple(
+        first < stop and last > start and not special
+        for (first, last), special in zip(encoding.offsets, encoding.special_tokens_mask, strict=True)
+    )
+
+
+def first_behind(before: Sequence[int], extended: Sequence[int], option: str) -> int:
+    """The first id of an option. before, extended: the ids of a prompt without it and with it behind.
+
+    Raises UsageError for an option that changes the prompt's own ids.
+    """
+    count = len(before)
+    if len(extended) == count or extended[:count] != before:
+        raise UsageError(
+            f"the option {option!r} merges with the end of the prompt: {list(extended[count - 2 :])} instead of "
+            f"{list(before[-2:])} and more. Give it as it stands behind the prompt"
+        )
+    return int(extended[count])
+
+
+def words_of(tokenizer: Any, ids: Sequence[int], ends: Collection[int]) -> str:
+    """The text of ids up to one of `ends`, without special tokens."""
+    answer = list(takewhile(lambda number: number not in ends, ids))
+    return str(tokenizer.decode(answer, skip_special_tokens=True)).strip()
 
 
 def _ends(folder: Path, config: Any) -> frozenset[int]:
