@@ -16,7 +16,7 @@ Index = Annotated[int, Field(ge=0, lt=1 << 31)]
 
 
 class ConfigFile(BaseModel):
-    """What a configuration file says of a network, each field under the file's own name.
+    """The content of a configuration file that describes a network, each field under the file's own name.
 
     null is as if a field were missing. Further fields of the file are not read.
     model_types: what it may hold. network: for messages.

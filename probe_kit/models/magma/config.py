@@ -74,8 +74,13 @@ class MagmaConfig(ConfigFile):
     @model_validator(mode="before")
     @classmethod
     def _text_at_the_top(cls, values: Mapping[str, Any]) -> dict[str, Any]:
-        others = {name: value for name, value in values.items() if name not in ("model_type", "vision_config")}
-        return {"text_config": others, **{name: value for name, value in values.items() if value is not None}}
+        other_fields = {
+            name: value for name, value in values.items() if name not in ("model_type", "vision_config")
+        }
+        return {
+            "text_config": other_fields,
+            **{name: value for name, value in values.items() if value is not None},
+        }
 
     @model_validator(mode="after")
     def _fits(self) -> Self:
