@@ -128,7 +128,6 @@ ELSEWHERE = {
     "hooks/new_adapter/__init__.py": "files of the package",
     "hooks/families/shared/statistics_bounds.py": "files of the package",
     "hooks/conformance/loading.py": "a copy of a checkpoint that was read",
-    "models/magma/statistics.py": "files of the package",
     "suite/generators/art.py": "files of the package",
     "suite/pictures.py": "`stored_picture`: files of the package",
     "suite/build.py": "files of the package",

@@ -4,7 +4,7 @@ Names of modules and parameters are those of the released files, so that a check
 Capture and actions are in its adapter in `probe_kit.hooks`.
 """
 
-from probe_kit.models.magma.config import MagmaConfig, VisionConfig
+from probe_kit.models.magma.config import MagmaConfig, VisionConfig, shipped_statistics
 from probe_kit.models.magma.network import (
     UNUSED_WEIGHTS,
     Choose,
@@ -25,7 +25,6 @@ from probe_kit.models.magma.pictures import (
     shrink_picture,
 )
 from probe_kit.models.magma.prompt import ACTION_QUESTION, Message, chat_text, conversation, picture_question
-from probe_kit.models.magma.statistics import shipped_statistics
 
 __all__ = [
     "ACTION_QUESTION",

@@ -6,11 +6,13 @@
 
 import re
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, InstanceOf, model_validator
 from transformers import LlamaConfig
 
+from probe_kit._system.bounded_json import load_json
 from probe_kit.models.config_file import STORED_TYPE, ConfigFile, Count, Index, part
 
 # Older checkpoints append the number of trace tokens; the modules are the same.
@@ -89,3 +91,11 @@ class MagmaConfig(ConfigFile):
                 f"vision_config.hidden_size {self.vision.width} is not the text's {self.text.hidden_size}"
             )
         return self
+
+
+def shipped_statistics() -> dict[str, Any]:
+    """Per data set, the quantiles that un-normalise its actions; `statistics.json` names their source.
+
+    No checkpoint holds them: the evaluation's client has them in its code.
+    """
+    return dict(load_json(Path(__file__).parent / "statistics.json")["norm_stats"])

@@ -4,8 +4,7 @@ The networks themselves are transformers' own Qwen classes. Capture and actions 
 """
 
 from probe_kit.models.building import build_empty, fill_rotary, without_precision
-from probe_kit.models.qwen.chat import IMAGE, image_slots
-from probe_kit.models.qwen.inputs import QwenInputs, pack_inputs
+from probe_kit.models.qwen.inputs import IMAGE, QwenInputs, image_slots, pack_inputs
 from probe_kit.models.qwen.networks import (
     QWEN2_5_NAMES,
     build_qwen2_5_vl,
