@@ -42,7 +42,7 @@ class SiglipSize(ConfigFile, extra="forbid"):
     patch: Count
 
 
-class SizeFile(ConfigFile, extra="forbid"):
+class SizeFile(ConfigFile):
     """Every dimension that a policy's `config.json` cannot express."""
 
     @classmethod
