@@ -38,7 +38,7 @@ _READERS = min(8, max(4, os.cpu_count() or 1))
 """Objects that are read and hashed at once: both let other threads work."""
 _BATCH = 256
 _RESULT_READERS = (
-    "probe_kit.train.every_result:readers_of_results",
+    "probe_kit.train.results.inventory:readers_of_results",
     "probe_kit.intervene.results.inventory:readers_of_results",
 )
 """Functions that give a reader per stored result of a run. They lie in folders above."""

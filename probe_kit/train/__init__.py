@@ -14,12 +14,11 @@ if TYPE_CHECKING:
     from probe_kit.train.data.array_run import ArrayRun
     from probe_kit.train.data.run_reader import RunReader
     from probe_kit.train.probe_sweep import Progress, train_probes
-    from probe_kit.train.results.by_call import load_results_by_call
     from probe_kit.train.results.control_scores import ControlComparison, Controls, ControlScore, UntrainedScore
     from probe_kit.train.results.probe_curve import ProbeCurve
     from probe_kit.train.results.probe_directions import Direction
     from probe_kit.train.results.probe_results import ProbeResults
-    from probe_kit.train.results.store import load_results, save_results
+    from probe_kit.train.results.store import load_results, load_results_by_call, save_results
     from probe_kit.train.settings import ProbeSettings
     from probe_kit.train.target import Target
     from probe_kit.train.transfer.transfer import transfer_probes
@@ -82,7 +81,7 @@ __getattr__, __dir__ = lazy_names(
         "Progress": "probe_sweep",
         "RunReader": "data.run_reader",
         "UntrainedScore": "results.control_scores",
-        "load_results_by_call": "results.by_call",
+        "load_results_by_call": "results.store",
         "load_results": "results.store",
         "save_results": "results.store",
         "train_probes": "probe_sweep",

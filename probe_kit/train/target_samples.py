@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from probe_kit.errors import UsageError
 from probe_kit.train.choices import Incomplete
 from probe_kit.train.columns.table import EPISODE, INFERENCE
-from probe_kit.train.data.captured_call import check_call, reached_calls
-from probe_kit.train.data.run_reader import RunReader
+from probe_kit.train.data.run_reader import RunReader, check_call, reached_calls
 from probe_kit.train.target import Target
 
 REACHED = 0.9

@@ -16,10 +16,9 @@ from probe_kit.retention import RetentionRow, RetentionTable, retention_table
 from probe_kit.retention.behaviour.vlm_answers import ask_of
 from probe_kit.runs import Run
 from probe_kit.runs.thumbnails import FrameSheet, as_thumbnail, read_sheet
-from probe_kit.train.results.by_call import load_results_by_call
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeResults
-from probe_kit.train.results.store import how_to_probe, load_results, stored_targets
+from probe_kit.train.results.store import how_to_probe, load_results, load_results_by_call, stored_targets
 from probe_kit.view.frozen_probes import FrozenProbes, Values, count_inferences
 
 UNREAD = "unread"

@@ -32,7 +32,7 @@ from probe_kit.runs.store import locate
 from probe_kit.runs.writer import RunWriter
 from probe_kit.suite import Suite
 from probe_kit.train import load_results, train_probes
-from probe_kit.train.results.by_call import load_results_by_call
+from probe_kit.train.results.store import load_results_by_call
 from tests.support.little_run import suite_record
 from tests.support.plans import make_plan
 

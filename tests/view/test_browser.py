@@ -21,7 +21,7 @@ from probe_kit.runs.store import locate
 from probe_kit.runs.thumbnails import decode_frames, read_sheet, read_thumbnail
 from probe_kit.suite import Suite
 from probe_kit.train import load_results
-from probe_kit.train.results.by_call import load_results_by_call
+from probe_kit.train.results.store import load_results_by_call
 from probe_kit.view import write_viewer
 from probe_kit.view.catalogue import Catalogue
 from probe_kit.view.payloads.coding import code_words, pack_log_odds, payload_script

@@ -40,8 +40,8 @@ from probe_kit.retention.estimators.by_call import (
 from probe_kit.retention.text import spell
 from probe_kit.statistics.estimates.balanced import CHANCE
 from probe_kit.train.data.run_reader import RunReader
-from probe_kit.train.results.by_call import load_results_by_call
 from probe_kit.train.results.probe_results import ProbeResults
+from probe_kit.train.results.store import load_results_by_call
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist

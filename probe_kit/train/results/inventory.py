@@ -1,16 +1,19 @@
 """The content of a run: `probe-kit run show`."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from probe_kit.runs.results import Bundle
+from probe_kit.runs.run import Run
 from probe_kit.train.choices import CORRECT
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.control_scores import UNTRAINED
 from probe_kit.train.results.resume import unfinished_sweeps
 from probe_kit.train.results.store import (
     is_current,
+    load_results,
     newest_bundle,
     read_controls,
     read_probes,
@@ -137,3 +140,15 @@ def _words(run: RunReader, name: str) -> str:
     stream = run.streams[name]
     steps = f" × {stream.iterations} iterations" if stream.iterations else ""
     return f"{stream.layers} layers{steps}, width {stream.width}; views {', '.join(run.views(name))}"
+
+
+def readers_of_results(run: Run) -> Iterator[Callable[[], object]]:
+    """Yield a function per stored result, which reads all of it. Raises RunDamagedError for damaged ones."""
+    for key in read_probes(run.location):
+        yield partial(_read, run, key)
+    yield partial(stored_probes, run)
+
+
+def _read(run: Run, key: str) -> object:
+    results = load_results(run, key)
+    return results.scores, results.controls

@@ -6,7 +6,7 @@ Results are there when their settings are, which are written last, with the hash
 import json
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from datetime import UTC, datetime
 from io import BytesIO
 from pathlib import Path
@@ -132,6 +132,19 @@ def newest_bundle(run: RunReader, stored: Mapping[str, Bundle], target: str) -> 
     """Return the results of a target that `load_results` reads without a key; None without any."""
     of_target = [bundle for bundle in _current(run, stored).values() if _is_default(bundle, target)]
     return max(of_target, key=_rank, default=None)
+
+
+def load_results_by_call(run: RunReader, like: ProbeResults) -> dict[int, ProbeResults]:
+    """Return the stored probes of `run` that differ from `like` in their captured inference alone, by inference.
+
+    Episodes that ended before an inference have no part in its probes. `like` itself is among them.
+    """
+    by_call = {like.settings.call: like}
+    for key, bundle in read_probes(run.location).items():
+        settings = settings_of(bundle)
+        if settings.call not in by_call and replace(settings, call=like.settings.call) == like.settings:
+            by_call[settings.call] = load_results(run, key)
+    return dict(sorted(by_call.items()))
 
 
 def load_side_results(run: RunReader, key: str | None = None) -> ProbeResults:

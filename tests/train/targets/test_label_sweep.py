@@ -203,6 +203,13 @@ def test_groups_that_cannot_exchange_have_scores_and_no_p(run: Run) -> None:
     assert not results.scores["signal"].any()
 
 
+def test_a_column_of_a_table_may_be_called_as_a_side_is_without_its_prefix(run: Run) -> None:
+    frame = by_group(run, lambda draw: float(draw.normal())).rename(columns={"y": "correct"})
+    results = train_probes(run, target=Target.read(frame, "correct"), permutations=1, controls=())
+    assert not results.settings.is_side
+    assert load_results(run, target="correct").key == results.key
+
+
 def test_the_command_prints_one_table_and_a_sentence(run: Run, tmp_path: Path) -> None:
     file = tmp_path / "own.csv"
     by_group(run, lambda draw: float(draw.normal())).to_csv(file, index=False)
