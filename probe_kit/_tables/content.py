@@ -4,7 +4,7 @@ A renderer knows no subject: a cell says what is bold, red, coloured or sorted, 
 """
 
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Self
 
@@ -127,8 +127,10 @@ class Content:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """The notes as sentences."""
-        return tuple(map(_sentence, self.notes))
+        """The notes as sentences, without the terms of marks such as `*` that no cell has."""
+        text = " ".join(cell for row in self.texts for cell in row)
+        notes = (_without_terms(note, lambda term: not term.isalnum() and term not in text) for note in self.notes)
+        return tuple(map(_sentence, filter(None, notes)))
 
     @property
     def are_numeric(self) -> tuple[bool, ...]:
@@ -147,8 +149,9 @@ class Content:
         """Return the table with some of its columns, those that name the rows first."""
         rows = tuple(replace(row, cells=tuple(row.cells[at] for at in columns)) for row in self.rows)
         headings = tuple(self.headings[at] for at in columns)
-        absent = {heading.text for heading in self.headings} - {heading.text for heading in headings}
-        notes = tuple(filter(None, (_without_terms(note, absent) for note in self.notes)))
+        texts = {heading.text for heading in self.headings} - {heading.text for heading in headings}
+        absent = {_UNITS.sub("", text).lower() for text in texts}
+        notes = tuple(filter(None, (_without_terms(note, absent.__contains__) for note in self.notes)))
         return replace(
             self, headings=headings, rows=rows, notes=notes, names=sum(at < self.names for at in columns)
         )
@@ -176,16 +179,15 @@ def grouped(*groups: tuple[str, Sequence[str]]) -> tuple[Heading, ...]:
     return tuple(Heading(text, group=group) for group, texts in groups for text in texts)
 
 
-def _without_terms(legend: str, absent: Collection[str]) -> str:
-    """Return a legend, `term: meaning; term: meaning`, without the terms of headings that are absent.
+def _without_terms(legend: str, is_unused: Callable[[str], bool]) -> str:
+    """Return a legend, `term: meaning; term: meaning`, without the terms that a table does not use.
 
     A part without a term belongs to the one before it.
     """
-    terms = {_UNITS.sub("", heading) for heading in absent}
     parts, is_absent = [], False
     for part in legend.split("; "):
         term, colon, _ = part.partition(": ")
-        is_absent = term.lower() in terms if colon else is_absent
+        is_absent = is_unused(term.lower()) if colon else is_absent
         if not is_absent:
             parts.append(part)
     return "; ".join(parts)

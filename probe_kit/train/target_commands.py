@@ -10,7 +10,7 @@ from probe_kit._system.counting import counted
 from probe_kit._terminal import options as common
 from probe_kit._terminal.console import marked, out, say
 from probe_kit.errors import ProbeKitError, UsageError
-from probe_kit.train.choices import SIDES
+from probe_kit.train.choices import CORRECT, SIDES
 
 if TYPE_CHECKING:
     from probe_kit.runs import Run
@@ -37,7 +37,7 @@ def targets(run: common.RunFolder, wording: common.Wording = None, partial: comm
         say(marked("next: [bold]probe-kit labels {}[/] writes a table to which you add labels of your own", run))
         return
     name, task, *_ = possible[0]
-    options = "" if name == "correct" else f" --target {name}{' --task classes' * (task == DOUBTFUL)}"
+    options = "" if name == CORRECT else f" --target {name}{' --task classes' * (task == DOUBTFUL)}"
     say(marked("next: [bold]probe-kit train {}{}[/]", run, options))
 
 

@@ -274,3 +274,9 @@ def test_a_legend_explains_only_the_columns_that_are_there() -> None:
     assert table.only([0, 1, 3]).notes == ("effect: share, n/a without one; p: exact; *: by construction",)
     assert table.only([0, 2]).notes == ("net rate: flips; minus returns; *: by construction",)
     assert table.only([0, 1, 2, 3]).notes == (legend,)
+
+
+def test_a_mark_that_no_cell_has_is_not_explained() -> None:
+    for cell, notes in (("0.9*", ("*: by construction.",)), ("0.9", ())):
+        table = Table.of("Edits", ("edit", "effect"), [("a", cell)], notes=["*: by construction"])
+        assert table.sentences == notes

@@ -193,7 +193,14 @@ class InterventionResult:
 
     @property
     def _context(self) -> TableContext:
-        subject = f"{self.label}{' (random weights)' if self.random_weights else ''} on {self.suite}"
+        random = " (random weights)" * self.random_weights
+        # The label of a run of recordings says on what already.
+        name = self.suite.partition("#")[0]
+        subject = (
+            f"{self.label}{random}"
+            if self.label.endswith(f" on {name}")
+            else f"{self.label}{random} on {self.suite}"
+        )
         uses = (self.verdicts.get(row.category) for row in self.effects)
         vary = str(self.settings.get("vary") or "")
         exchange = "image swap" if self.outcomes.has_sides else f"exchange of the {vary}"

@@ -7,6 +7,7 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._system.counting import enumerated
 from probe_kit.errors import NoProbesError, UnknownSiteError, UsageError
 from probe_kit.hooks.contract.sites import label_of
 from probe_kit.retention.estimators.retention import Iterations, stream_rows
@@ -207,7 +208,7 @@ def _refusal(
         advice = "Label more groups, or choose a label that these controls do not decode"
         if remedy := results.remedy(*curve_of, tests):
             advice = f"No p can be below it: {remedy}"
-        return f"n/a (backbone not shown to exceed {_listed(missed)})", (
+        return f"n/a (backbone not shown to exceed {enumerated(missed)})", (
             f"{best} ({'; '.join(facts)}). Expected p < {SIGNIFICANCE} and more than every control that was run. "
             f"{advice}"
         )
@@ -217,11 +218,6 @@ def _refusal(
             f"{LEAST_EXCESS} or more to divide by. Label more groups"
         )
     return "", ""
-
-
-def _listed(names: tuple[str, ...]) -> str:
-    *first, last = names
-    return f"{', '.join(first)} and {last}" if first else last
 
 
 def check_same_label(results: Sequence[ProbeResults], places: Sequence[str]) -> None:

@@ -57,6 +57,8 @@ class ProbeResults:
             case "permutations":
                 return f"train with --{'token-' * is_token}permutations {permutations_for(tests)} or more"
             case "groups":
+                if self.curves[category, view].least_p >= 1:
+                    return "take groups in which the label differs"
                 return "extract more items" if own.is_side else "label more groups"
         return ""
 

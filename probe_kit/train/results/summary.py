@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
-from probe_kit._system.counting import counted
+from probe_kit._system.counting import counted, enumerated
 from probe_kit._tables.table import Table
 from probe_kit.hooks.contract.sites import label_of
 from probe_kit.suite.categories import category_of
@@ -15,7 +15,8 @@ from probe_kit.train.results.probe_results import ProbeResults
 if TYPE_CHECKING:
     import pandas as pd
 
-_LEGEND = "+: as many other sites tie with it. The score of a chosen site is too high"
+_TIES = "+: as many other sites tie with it"
+_LEGEND = "the score of a chosen site is too high"
 _OF_SIDE = "; `retention` corrects it"
 _OF_LABEL = ". Chance: mean score of this site with exchanged labels"
 _SIDES = {
@@ -57,7 +58,7 @@ def best_sites_table(fitted: Sequence[ProbeResults], splits: bool = True) -> Tab
         "n",
         "first iteration",
     )
-    notes = [_LEGEND + (_OF_SIDE if first.is_side else _OF_LABEL)]
+    notes = [_TIES, _LEGEND + (_OF_SIDE if first.is_side else _OF_LABEL)]
     overflow = "split" if splits else "leave out"
     return Table.of(", ".join(_title(fitted, several_views)), headings, rows, notes=notes, overflow=overflow)
 
@@ -172,13 +173,13 @@ def _findings(results: ProbeResults, rows: "Sequence[pd.Series]") -> Iterator[st
             # Without enough of them nothing can be shown, whatever the network holds.
             open_.setdefault(f"not testable in {{}}: {remedy}", []).append(stream)
         elif missed:
-            open_.setdefault(f"not shown in {{}} beyond {' and '.join(missed)}", []).append(stream)
+            open_.setdefault(f"not shown in {{}} beyond {enumerated(missed)}", []).append(stream)
         else:
             decodable.append(f"{stream}, {score}" if len(decodable) < 2 else stream)
     if decodable:
-        yield f"decodable in {' and '.join(decodable)}"
+        yield f"decodable in {enumerated(decodable)}"
     for words, streams in open_.items():
-        yield words.format(" and ".join(streams))
+        yield words.format(enumerated(streams))
 
 
 def _subject(results: ProbeResults, category: str, view: str, row: "pd.Series") -> str:
@@ -198,8 +199,7 @@ def _in_stream(results: ProbeResults, row: "pd.Series") -> str:
     if remedy := results.remedy(row["category"], row["view"]):
         return f"not testable {where} {numbers}: {remedy}"
     if missed:
-        beyond = " and ".join(filter(None, [", ".join(missed[:-1]), missed[-1]]))
-        return f"not shown {where} beyond {beyond} {numbers}"
+        return f"not shown {where} beyond {enumerated(missed)} {numbers}"
     return f"decodable {where} at {row['site']} {numbers}"
 
 

@@ -333,7 +333,7 @@ def test_recordings_have_a_table_and_a_page_though_they_have_no_success_rate(tmp
     assert "data:image/webp" not in page.read_text(encoding="utf-8"), "no picture of a recording"
     done = CliRunner().invoke(app, ["retention", str(run.path)])
     assert done.exit_code == 2
-    assert "probe-kit retention RUN --target COLUMN" in " ".join(done.stderr.split())
+    assert f"probe-kit targets {run.path}" in " ".join(done.stderr.split())
 
 
 def test_runs_without_outcomes_have_a_name(trained: Run) -> None:
