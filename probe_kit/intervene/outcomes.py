@@ -4,6 +4,7 @@ settings.json      the head: what was asked, of which commits, and the hashes of
 episodes.npz       per condition and episode where the action would go, and how far it changed
 effects.csv        the same in numbers per category, for people and other programs
 attention.npz      of the kind `attention`: shares per inference, block, iteration, head and role
+attention_patches.npz  of it, where the family says which token sees what: shares per inference, block and patch
 certificate.json   what was loaded, and what was checked
 """
 
@@ -39,6 +40,8 @@ ERASE, PROBE_ACCURACY = "erase", "probe_accuracy"
 """A kind, and what its certificate calls what probes read behind its conditions."""
 ATTENTION, RECORDED, ATTENTION_FILE = "attention", "recorded", "attention.npz"
 """A kind, its condition with recorded weights, and the file in which they are."""
+PATCHES_FILE = "attention_patches.npz"
+"""The attention on single patches of the first camera's picture, and where they lie in it."""
 DONOR, CONTROL_INPUT = "frame_swap", "control_input"
 """Conditions without sides: all inputs of the donor, and a change of the input that means nothing."""
 UNCHANGED = frozenset({CLEAN, IMAGE_SWAP, INSTRUCTION_SWAP, NOISE, RECORDED, DONOR, CONTROL_INPUT})

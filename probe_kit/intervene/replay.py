@@ -48,13 +48,15 @@ class ConditionContext:
 class ConditionResult:
     """The actions (chunk, D) of one inference, and the log of its edits, if any.
 
-    mass: (B, I, H, R) the attention shares of it, if recorded; see `AttentionShares`. estimated: displacement that
+    mass: (B, I, H, R) the attention shares of it, if recorded; see `AttentionShares`. patches: (B, P) those on the
+    patches of the first camera's picture, means over iterations and heads. estimated: displacement that
     an estimate adds to the chunk's, without an inference that makes it.
     """
 
     chunk: Chunk
     edit_log: EditLog | None = None
     mass: NDArray[np.float32] | None = None
+    patches: NDArray[np.float32] | None = None
     estimated: float = 0.0
 
 
@@ -135,8 +137,8 @@ class Patched:
         return ConditionResult(chunk, edit_log)
 
 
-AttentionRecord = tuple[int, int, NDArray[np.float32]]
-"""The attention of one inference: row in the run's episodes, call, (B, I, H, R) shares."""
+AttentionRecord = tuple[int, int, NDArray[np.float32], NDArray[np.float32] | None]
+"""The attention of one inference: row in the run's episodes, call, (B, I, H, R) shares, (B, P) of patches."""
 
 
 @dataclass(frozen=True)
@@ -149,7 +151,8 @@ class ReplayBatch:
     where the run does not say. episode_outcomes: (K, E) where the cube ended, correct, wrong or oob, for episodes
     that were played to their end; then `displacement` is the cube's, and `max_action_change` and `replay_error`
     are of the trajectory; None where nothing was executed. mass: (N, B, I, H, R) the attention of N inferences,
-    inferences: (N, 2) their rows and calls; None where attention was not recorded. chunks: (K, E, N) all numbers
+    inferences: (N, 2) their rows and calls; None where attention was not recorded. patches: (N, B, P) of single
+    patches; None where they are not known. chunks: (K, E, N) all numbers
     of the actions of first inferences.
     """
 
@@ -162,14 +165,20 @@ class ReplayBatch:
     episode_outcomes: NDArray[np.str_] | None = None
     mass: NDArray[np.float32] | None = None
     inferences: NDArray[np.int64] | None = None
+    patches: NDArray[np.float32] | None = None
     chunks: NDArray[np.float32] | None = None
 
     def with_mass(self, attention_records: "Sequence[AttentionRecord]") -> "ReplayBatch":
         """Return the same with the attention of its inferences, if any was recorded."""
         if not attention_records:
             return self
-        rows, calls, masses = zip(*attention_records, strict=True)
-        return replace(self, mass=np.stack(masses), inferences=np.stack([rows, calls], axis=1).astype(np.int64))
+        rows, calls, masses, patches = zip(*attention_records, strict=True)
+        return replace(
+            self,
+            mass=np.stack(masses),
+            inferences=np.stack([rows, calls], axis=1).astype(np.int64),
+            patches=None if patches[0] is None else np.stack(patches),
+        )
 
     @classmethod
     def empty(cls, pairs: Sequence[Pair], conditions: Sequence[Condition]) -> "ReplayBatch":
@@ -213,6 +222,8 @@ def replay(session: "ReplaySession", pairs: Sequence[Pair], conditions: Sequence
             chunks[-1].append(played.chunk.ravel())
             if played.edit_log is not None:
                 batch.edit_log[number, column] = played.edit_log.row()
-            attention_records += [] if played.mass is None else [(pair.row, pair.step, played.mass)]
+            attention_records += (
+                [] if played.mass is None else [(pair.row, pair.step, played.mass, played.patches)]
+            )
     by_condition = np.array(chunks, np.float32).swapaxes(0, 1) if chunks else None
     return replace(batch.with_mass(attention_records), chunks=by_condition)

@@ -115,7 +115,9 @@ def _evaluate(
             change = float(np.abs(played.chunk - clean.chunk).max())
             batch.max_action_change[number, column] = max(batch.max_action_change[number, column], change)
             edit_logs[number] += [] if played.edit_log is None else [played.edit_log]
-            attention_records.extend([] if played.mass is None else [(current.row, current.step, played.mass)])
+            attention_records.extend(
+                [] if played.mass is None else [(current.row, current.step, played.mass, played.patches)]
+            )
         return clean.chunk
 
     batch.replay_error[column] = apart_from_stored(session, pair, _step_through(session, pair, act, True))

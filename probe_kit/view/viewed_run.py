@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import Site
+from probe_kit.intervene.kinds.attention import PatchAttention, stored_patch_attention
 from probe_kit.intervene.settings import has_sides
 from probe_kit.retention import RetentionRow, RetentionTable, retention_table
 from probe_kit.retention.behaviour.vlm_answers import ask_of
@@ -117,6 +118,11 @@ class ViewedRun:
         if self.results is None or self.view is None:
             return None
         return self.results.curves.get((category, self.view))
+
+    @cached_property
+    def patch_attention(self) -> dict[str, PatchAttention]:
+        """Return by category the stored attention on the patches of the first camera's picture."""
+        return stored_patch_attention(self.run)
 
     @cached_property
     def target_curves(self) -> list[tuple[ProbeResults, str]]:

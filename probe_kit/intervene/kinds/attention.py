@@ -5,7 +5,7 @@ is edited. Every inference runs twice, with and without recording, and both acti
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields
 from io import BytesIO
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, get_args
 
@@ -15,14 +15,15 @@ from numpy.typing import NDArray
 from probe_kit._system.bounded_arrays import open_arrays
 from probe_kit.errors import CaptureChangedActionError, CaptureError, EmptyRoleError, UsageError
 from probe_kit.hooks.contract.interventions import InterventionKind
+from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.sites import first_of
 from probe_kit.intervene.kinds.base import Intervention, Measurement, TableContext, effect_table
-from probe_kit.intervene.outcomes import ATTENTION, ATTENTION_FILE, RECORDED, Effect
+from probe_kit.intervene.outcomes import ATTENTION, ATTENTION_FILE, PATCHES_FILE, RECORDED, Effect
 from probe_kit.intervene.places import ALL, TILE_ROLES, roles_of
 from probe_kit.intervene.replay import CleanRun, Condition, ConditionContext, ConditionResult, ReplayBatch
 from probe_kit.intervene.selection import StoredResult, stored_results
 from probe_kit.intervene.settings import has_sides
-from probe_kit.intervene.tokens import TILES, role_token_mask
+from probe_kit.intervene.tokens import TILES, role_token_mask, token_boxes
 from probe_kit.runs.run import Run
 from probe_kit.statistics.bootstrap import GAINS, units_seed
 from probe_kit.statistics.student import student_interval
@@ -68,7 +69,12 @@ class AttentionReadout(Intervention):
 
     def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
         """Clean, and the same with its attention recorded. Raises UsageError for a role it lacks."""
-        return CleanRun(), AttentionRecorded(backbone_of(session.policy), self._roles(session.policy))
+        policy, boxes = session.policy, None
+        if policy.interventions.supports("tiles"):
+            observations = (pair.clean for item in self.items_in(session.run) for pair in session.pairs(item))
+            first = next(observations, None)
+            boxes = token_boxes(policy, first) if isinstance(first, Observation) else None
+        return CleanRun(), AttentionRecorded(backbone_of(policy), self._roles(policy), boxes=boxes)
 
     def certificate_entries(self, conditions: Sequence[Condition], batch: ReplayBatch) -> dict[str, Any]:
         """Return the axes of the stored array. Raises CaptureChangedActionError if recording changed an action."""
@@ -104,7 +110,12 @@ class AttentionReadout(Intervention):
         attention_records = AttentionShares(
             recording.roles, **columns, sides=sides, calls=batch.inferences[:, 1], mass=batch.mass
         )
-        return {ATTENTION_FILE: attention_records.to_bytes()}
+        files = {ATTENTION_FILE: attention_records.to_bytes()}
+        if batch.patches is not None and recording.boxes is not None:
+            files[PATCHES_FILE] = PatchAttention(
+                columns["episodes"], batch.inferences[:, 1], batch.patches.astype(np.float16), recording.boxes
+            ).to_bytes()
+        return files
 
     @staticmethod
     def effects(measurement: Measurement) -> "list[AttentionRow]":
@@ -159,11 +170,15 @@ class AttentionReadout(Intervention):
 
 @dataclass(frozen=True)
 class AttentionRecorded:
-    """The clean inference with attention weights recorded. stream: whose tokens are attended to."""
+    """The clean inference with attention weights recorded. stream: whose tokens are attended to.
+
+    boxes: (P, 4) where the patches of the first camera lie; None where the family does not say.
+    """
 
     stream: str
     roles: tuple[str, ...]
     name: str = RECORDED
+    boxes: NDArray[np.float32] | None = field(default=None, repr=False)
 
     def play(self, context: ConditionContext) -> ConditionResult:
         """Nothing is changed."""
@@ -173,7 +188,22 @@ class AttentionRecorded:
         masks = [self._mask(context, role) for role in self.roles]
         with capture_attention(session.policy) as mass:
             chunk = session.act(pair.clean, pair.seed)
-        return ConditionResult(chunk, mass=shares_by_role(mass, masks))
+        return ConditionResult(chunk, mass=shares_by_role(mass, masks), patches=self._patches(context, mass))
+
+    def _patches(self, context: ConditionContext, mass: "AttentionMass") -> NDArray[np.float32] | None:
+        """Return (B, P) shares on the patches of the first camera's picture, means over iterations and heads."""
+        if self.boxes is None:
+            return None
+        policy, memo = context.session.policy, context.memo
+        role = f"image.{policy.card.cameras[0]}"
+        tokens = np.flatnonzero(role_token_mask(policy, context.pair, self.stream, role, memo))
+        blocks = max(block for block, _ in mass.by_head) + 1
+        shares = [
+            [weights[0][:, tokens].mean(axis=0) for (at, _), weights in mass.by_head.items() if at == block]
+            for block in range(blocks)
+        ]
+        empty = np.full((1, tokens.size), np.nan)
+        return np.array([np.mean(block or empty, axis=0) for block in shares], np.float32)
 
     def _mask(self, context: ConditionContext, role: str) -> NDArray[np.bool_] | None:
         """None where no token plays it now: a family may have the role, and a tile be hidden by the arm."""
@@ -181,6 +211,46 @@ class AttentionRecorded:
             return role_token_mask(context.session.policy, context.pair, self.stream, role, context.memo)
         except EmptyRoleError:
             return None
+
+
+@dataclass(frozen=True)
+class PatchAttention:
+    """The attention of N inferences on the P patches of the first camera's picture.
+
+    episodes, calls: (N,), as of `AttentionShares`. weights: (N, B, P) float16, shares of the acting stream's
+    attention, means over iterations and heads. boxes: (P, 4), see `token_boxes`.
+    """
+
+    episodes: NDArray[np.str_]
+    calls: NDArray[np.int64]
+    weights: NDArray[np.float16]
+    boxes: NDArray[np.float32]
+
+    def to_bytes(self) -> bytes:
+        """Return a `.npz`; the same numbers give the same bytes."""
+        file = BytesIO()
+        np.savez_compressed(file, allow_pickle=False, **vars(self))
+        return file.getvalue()
+
+    @classmethod
+    def from_bytes(cls, content: bytes) -> Self:
+        """Load what `to_bytes` made."""
+        with open_arrays(content) as arrays:
+            return cls(**{part.name: arrays[part.name] for part in fields(cls)})
+
+
+def stored_patch_attention(run: RunReader) -> dict[str, PatchAttention]:
+    """Return by category the patches of the attention that tables read; without those stored without patches.
+
+    Raises RunDamagedError.
+    """
+    bundles = {category: result.stored.bundle for category, (result, _) in preferred_attention(run).items()}
+    read = {
+        bundle.key: PatchAttention.from_bytes(bundle.read(PATCHES_FILE))
+        for bundle in bundles.values()
+        if bundle.has(PATCHES_FILE)
+    }
+    return {category: read[bundle.key] for category, bundle in bundles.items() if bundle.key in read}
 
 
 def shares_by_role(mass: "AttentionMass", masks: Sequence[NDArray[np.bool_] | None]) -> NDArray[np.float32]:

@@ -115,10 +115,21 @@ function frameAt(frames, now, steps) {
   if (frames.all) return Math.min(now, frames.count - 1);
   return frames.count > 1 && now >= steps && steps > 0 ? 1 : 0;
 }
-function Film({ run, one, frames, now, steps, bare }) {
+/* Attention of the acting stream on the patches of the picture: means over heads and iterations, of one block or of all. */
+function attendedAt(attention, now, block) {
+  const k = Math.max(0, attention.steps.findLastIndex((step) => step <= now)), all = floats(attention.weights[k]), P = all.length / attention.blocks;
+  return Array.from({ length: P }, (_, p) => { const blocks = block === "mean" ? [...Array(attention.blocks).keys()] : [Number(block)], known = blocks.map((b) => all[b * P + p]).filter((v) => !Number.isNaN(v)); return known.length ? known.reduce((a, b) => a + b, 0) / known.length : NaN; });
+}
+function Attended({ attention, now, block }) {
+  const boxes = floats(attention.boxes), values = attendedAt(attention, now, block), most = Math.max(...values.filter((v) => !Number.isNaN(v)), 1e-9), share = values.reduce((sum, v) => sum + (v || 0), 0);
+  return html`<svg class="attended" style=${{ width: `${100 / attention.cameras}%` }} viewBox="0 0 1 1" preserveAspectRatio="none" role="img" aria-label=${`${(100 * share).toFixed(1)} % of the attention lies on this picture`}>
+    ${values.map((v, p) => !Number.isNaN(v) && !Number.isNaN(boxes[4 * p]) && html`<rect x=${boxes[4 * p]} y=${boxes[4 * p + 1]} width=${boxes[4 * p + 2] - boxes[4 * p]} height=${boxes[4 * p + 3] - boxes[4 * p + 1]} fill-opacity=${0.8 * (v / most)} />`)}</svg>`;
+}
+function Film({ run, one, frames, now, steps, bare, attention, block }) {
   if (!frames) return html`<div class="film none">No picture of this episode is stored.${!bare && html` <code>extract --frames all</code> stores every frame.`}</div>`;
   const i = frameAt(frames, now, steps), rows = Math.ceil(frames.count / frames.columns), at = (k, of) => (of > 1 ? `${(100 * k) / (of - 1)}%` : "0%");
   return html`<div class="film" role="img" data-frame=${i} aria-label=${`Camera picture at step ${now}`} style=${{ aspectRatio: `${frames.width} / ${frames.height}`, backgroundImage: `url("data/${run}/f/${numbered(one.number)}.webp")`, backgroundSize: `${100 * frames.columns}% ${100 * rows}%`, backgroundPosition: `${at(i % frames.columns, frames.columns)} ${at(Math.floor(i / frames.columns), rows)}` }}>
+    ${attention && block && html`<${Attended} attention=${attention} now=${now} block=${block} />`}
     ${!frames.all && !bare && html`<span class="stamp">${i ? "last" : "first"} frame${frames.count > 1 ? " of two stored" : ""}</span>`}</div>`;
 }
 const opposite = (side) => (side === "left" ? "right" : "left");
@@ -129,6 +140,7 @@ function sideways(trajectory, one) {
   const along = (a, i) => 100 * (a[3 * i] * unit[0] + a[3 * i + 1] * unit[1]);
   return { along, tool: Array.from({ length: trajectory.frames }, (_, i) => along(tool, i) - 100 * (middle[0] * unit[0] + middle[1] * unit[1])) };
 }
+const blockOf = (episode, place) => (episode.attention && (place.attention === "mean" || Number(place.attention) < episode.attention.blocks) && place.attention ? place.attention : "");
 function Episode({ run, one, place, near }) {
   const hasMap = probed(run).includes(one.category);
   const [[episode, map], trouble] = useLoaded(`${run.key}/e/${numbered(one.number)}`, hasMap && `${run.key}/map/${one.category}`);
@@ -152,7 +164,9 @@ function Episode({ run, one, place, near }) {
   const names = { [one.side_correct]: one.target, [opposite(one.side_correct)]: one.distractor };
   return html`<article class="episode" aria-label=${`Episode ${one.number}`}>
     <header><h2>“<${Delivered} text=${one.instruction ?? one.id} lost=${episode.lost_words} />”</h2><${Facts} run=${run} one=${one} episode=${episode} /></header>
-    <div class="stage"><div><${Film} run=${run.key} one=${one} frames=${episode.frames} now=${now} steps=${last} />
+    <div class="stage"><div><${Film} run=${run.key} one=${one} frames=${episode.frames} now=${now} steps=${last} attention=${episode.attention} block=${blockOf(episode, place)} />
+      ${episode.attention && html`<label class="choice inline"><span>attention</span><select name="attention" value=${blockOf(episode, place)} onChange=${(e) => go({ attention: e.target.value }, true)}><option value="">not shown</option><option value="mean">mean of all blocks</option>${[...Array(episode.attention.blocks).keys()].map((b) => html`<option value=${String(b)}>block ${b}</option>`)}</select></label>
+        ${blockOf(episode, place) && html`<p class="note">Attention of the acting stream on the patches of the first camera, mean over heads. Descriptive: an attended patch need not be used.</p>`}`}
       ${last > 0 && html`<div class="scrub"><button type="button" onClick=${play} aria-label=${playing ? "Pause" : "Play"}>${playing ? "❚❚" : "▶"}</button>
         <input type="range" min="0" max=${last} value=${now} aria-label="Control step" onInput=${(e) => step(+e.target.value)} /><output>${now} / ${last}</output></div>`}</div>
       ${episode.trajectory && html`<div><${Plan} trajectory=${episode.trajectory} inferences=${episode.inferences} now=${now} scene=${run.scene} correct=${one.side_correct} names=${names} /><p class="note"><span class="mark toolmark"></span>tool <span class="mark cubemark"></span>cube <span class="mark callmark"></span>inference · circle: zone of the rule disc</p></div>`}

@@ -57,6 +57,7 @@ def episode_payload(viewed: ViewedRun, number: int) -> dict[str, Any]:
         "instruction_tokens": len(run.instruction_ids(position) or ()),
         "answers": _answers(viewed, row),
         "inputs": _inputs(viewed, position),
+        "attention": _attention(viewed, row, position),
     }
 
 
@@ -104,6 +105,33 @@ def _frames(viewed: ViewedRun, number: int, row: dict[str, Any]) -> dict[str, An
     cell = {"width": width // columns, "height": height // -(-count // columns)}
     steps = None if stored else viewed.inference_steps(viewed.position_of[number])
     return {"count": count, "columns": columns, **cell, "all": sheet.count is not None, "steps": steps}
+
+
+def _attention(viewed: ViewedRun, row: dict[str, Any], position: int) -> dict[str, Any] | None:
+    """Return the attention on the patches of the first camera's picture, by step; None where none is stored.
+
+    boxes: packed (P, 4) shares of the picture. weights: packed (B, P) of every inference.
+    """
+    stored = viewed.patch_attention.get(str(row["category"]))
+    rows = [] if stored is None else np.flatnonzero(stored.episodes == row["episode_id"]).tolist()
+    if stored is None or not rows:
+        return None
+    steps, inputs = viewed.inference_steps(position), viewed.run.inputs
+    # Interventions count inferences of an episode, and name frames of recordings by their number.
+    calls = [int(call) for call in stored.calls[rows]]
+    return {
+        "blocks": stored.weights.shape[1],
+        "cameras": 1 if viewed.has_sides or inputs is None else max(1, _cameras(viewed)),
+        "boxes": pack_floats(stored.boxes),
+        "steps": calls if viewed.run.recorded else [steps[call] for call in calls],
+        "weights": [pack_floats(stored.weights[at]) for at in rows],
+    }
+
+
+def _cameras(viewed: ViewedRun) -> int:
+    """Return how many pictures stand side by side in a frame that is made of stored pixels."""
+    stored = viewed.run.settings.get("dataset") or viewed.run.settings.get("environment") or {}
+    return len(stored.get("cameras", ())) if "pixels" in stored.get("inputs", {}) else 1
 
 
 def _inputs(viewed: ViewedRun, position: int) -> list[dict[str, Any]]:

@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.errors import CaptureChangedActionError, CaptureError, UnsupportedInterventionError, UsageError
+from probe_kit.hooks import Observation
 from probe_kit.hooks.capturing.attention import AttentionMass, capture_attention
 from probe_kit.hooks.registry import find_family
 from probe_kit.intervene import (
@@ -24,11 +25,11 @@ from probe_kit.intervene import (
     run_intervention,
     stored_attention,
 )
-from probe_kit.intervene.kinds.attention import AttentionRecorded, shares_by_role
+from probe_kit.intervene.kinds.attention import AttentionRecorded, shares_by_role, stored_patch_attention
 from probe_kit.intervene.kinds.base import Measurement, TableContext
 from probe_kit.intervene.replay import ReplayBatch
 from probe_kit.intervene.sessions.session import ReplaySession
-from probe_kit.intervene.tokens import TILES
+from probe_kit.intervene.tokens import TILES, tokens_overlapping
 from probe_kit.runs import Run, open_run, verify_run
 from tests.intervene.answers import follower, outcomes_of
 
@@ -66,6 +67,29 @@ def test_it_is_what_the_policy_tells_by_block_iteration_and_head(
     by_head, by_role_alone = mass.heads_on(words), mass.on(words)
     for read, share in by_head.items():
         np.testing.assert_allclose(share.mean(axis=1), by_role_alone[read])
+
+
+def test_attention_on_patches_adds_up_to_the_pictures_share_and_patches_lie_where_they_look(
+    copy: Run, session: ReplaySession, weighed: AttentionShares
+) -> None:
+    patches = stored_patch_attention(copy)["color"]
+    assert list(patches.episodes) == list(weighed.episodes)
+    picture = weighed.mass[..., weighed.roles.index("image")].mean(axis=(2, 3))
+    np.testing.assert_allclose(patches.weights.astype(float).sum(axis=2), picture, atol=2e-3)
+    (pair, _) = session.pairs(str(weighed.episodes[0]).partition(":")[0])
+    assert isinstance(pair.clean, Observation)
+    left, top, right, bottom = patches.boxes.T
+    assert (left < right).all()
+    assert (top < bottom).all()
+    height, width = pair.clean.image.shape[:2]
+    for side, pixels in pair.tiles.items():
+        rows, columns = np.nonzero(pixels)
+        seen = tokens_overlapping(session.policy, pair.clean, pixels)
+        crosses = (left * width <= columns.max()) & (right * width > columns.min())
+        crosses &= (top * height <= rows.max()) & (bottom * height > rows.min())
+        assert seen.any()
+        assert crosses[seen].all(), side
+        assert not crosses.all()
 
 
 def test_noting_changes_no_action_bit_for_bit(attention_records: InterventionResult) -> None:
