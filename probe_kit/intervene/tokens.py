@@ -26,6 +26,8 @@ TILES: Mapping[str, Side] = dict(zip(TILE_ROLES, ("left", "right"), strict=True)
 """Roles by tile, and the tile."""
 ENOUGH = 0.1
 """Share of the largest change of any patch by which a patch of the tile changes; less is the filter's blur."""
+HALF, NEARLY = 0.5, 0.9
+"""Shares of a token's largest change from which a band is its own, and of the largest share in that band."""
 BANDS = 32
 """Bands of rows, and of columns, in which a token is looked for."""
 ANSWERS_NOTHING = "{} answers no questions: give it an observation"
@@ -117,17 +119,28 @@ def tokens_overlapping(
     """
     if not pixels.any():
         return np.zeros(int(policy.patch_order().max()) + 1, bool)
-    # Every pixel changes by at least half of what it can.
-    turned = np.where(pixels[..., None], np.where(observation.image < 128, 255, 0), observation.image).astype(
-        np.uint8
-    )
     before = patch_embeddings(policy, observation) if before is None else before
+    moved = _patch_changes(policy, observation, pixels, before)
+    return _by_token(policy, moved > ENOUGH * moved.max())
+
+
+def _patch_changes(
+    policy: "Policy", observation: Observation, pixels: NDArray[np.bool_], before: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Return (V,) by how much the embeddings of patches change with some pixels (H, W)."""
+    # Every pixel changes by at least half of what it can.
+    inverted = np.where(observation.image < 128, 255, 0)
+    turned = np.where(pixels[..., None], inverted, observation.image).astype(np.uint8)
     after = patch_embeddings(policy, replace(observation, image=turned))
-    moved = np.linalg.norm(after - before, axis=-1)
+    return np.asarray(np.linalg.norm(after - before, axis=-1))
+
+
+def _by_token[T: np.generic](policy: "Policy", values: NDArray[T]) -> NDArray[T]:
+    """Return (tokens of the picture,) the largest of the values (V,) of their patches; patches may be dropped."""
     order = policy.patch_order()
-    overlapping = np.zeros(int(order.max()) + 1, bool)
-    overlapping[order[(moved > ENOUGH * moved.max()) & (order >= 0)]] = True
-    return overlapping
+    largest = np.zeros(int(order.max()) + 1, values.dtype)
+    np.maximum.at(largest, order[order >= 0], values[order >= 0])
+    return largest
 
 
 def token_boxes(policy: "Policy", observation: Observation) -> NDArray[np.float32]:
@@ -140,13 +153,18 @@ def token_boxes(policy: "Policy", observation: Observation) -> NDArray[np.float3
     for axis in (1, 0):
         size = observation.image.shape[axis]
         bands = min(BANDS, size)
-        seen_in = []
+        changes = []
         for band in range(bands):
             pixels = np.zeros(observation.image.shape[:2], bool)
             inside = slice(band * size // bands, (band + 1) * size // bands)
             pixels[(slice(None), inside) if axis == 1 else inside] = True
-            seen_in.append(tokens_overlapping(policy, observation, pixels, before))
-        sees = np.array(seen_in)
+            changes.append(_by_token(policy, _patch_changes(policy, observation, pixels, before)))
+        moved = np.array(changes)
+        most = moved.max(axis=0)
+        looks = most > ENOUGH * most.max()
+        # Shares of each token's own largest change: filters blur a band into the neighbours of its token.
+        own = np.where(looks, moved / np.where(looks, most, 1.0), 0.0)
+        sees = (own > HALF) & (own >= NEARLY * own.max(axis=1, keepdims=True))
         first, last = sees.argmax(axis=0) / bands, 1 - sees[::-1].argmax(axis=0) / bands
         ends.append(np.where(sees.any(axis=0), [first, last], np.nan))
     (left, right), (top, bottom) = ends

@@ -29,7 +29,7 @@ from probe_kit.intervene.kinds.attention import AttentionRecorded, shares_by_rol
 from probe_kit.intervene.kinds.base import Measurement, TableContext
 from probe_kit.intervene.replay import ReplayBatch
 from probe_kit.intervene.sessions.session import ReplaySession
-from probe_kit.intervene.tokens import TILES, tokens_overlapping
+from probe_kit.intervene.tokens import BANDS, TILES, tokens_overlapping
 from probe_kit.runs import Run, open_run, verify_run
 from tests.intervene.answers import follower, outcomes_of
 
@@ -85,11 +85,14 @@ def test_attention_on_patches_adds_up_to_the_pictures_share_and_patches_lie_wher
     for side, pixels in pair.tiles.items():
         rows, columns = np.nonzero(pixels)
         seen = tokens_overlapping(session.policy, pair.clean, pixels)
-        crosses = (left * width <= columns.max()) & (right * width > columns.min())
-        crosses &= (top * height <= rows.max()) & (bottom * height > rows.min())
+        blur = 1 / BANDS
+        crosses = ((left - blur) * width <= columns.max()) & ((right + blur) * width > columns.min())
+        crosses &= ((top - blur) * height <= rows.max()) & ((bottom + blur) * height > rows.min())
         assert seen.any()
         assert crosses[seen].all(), side
         assert not crosses.all()
+    areas = (right - left) * (bottom - top)
+    assert areas.sum() <= 1.2, "patches lie beside each other"
 
 
 def test_noting_changes_no_action_bit_for_bit(attention_records: InterventionResult) -> None:
