@@ -47,7 +47,7 @@ def groups_for_not_used() -> int:
 
 
 def _net_limit_of_none(groups: int) -> float:
-    """How far from zero the interval of a net follow rate reaches if no episode follows."""
+    """Return how far from zero the interval of a net follow rate reaches if no episode follows."""
     low, high = group_bootstrap(np.zeros((groups, 1)), np.arange(groups), 0, bounds=GAINS)
     return float(max(-low[0], high[0]))
 
