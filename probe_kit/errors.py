@@ -237,7 +237,7 @@ class TooFewGroupsError(ProbeKitError):
 
 
 class UnbalancedEpisodesError(ProbeKitError):
-    """So many episodes of one side are missing that the other is right without any knowledge."""
+    """A run lacks so many episodes of one side that the other is right without any knowledge."""
 
     exit_code = 3
 

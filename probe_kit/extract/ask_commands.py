@@ -9,6 +9,7 @@ from probe_kit._terminal.console import counter, err, marked, out, progress, say
 from probe_kit._terminal.field_options import command_with
 from probe_kit.extract import command_options as start
 from probe_kit.extract.commands import print_input_notes, print_plan, print_sufficiency
+from probe_kit.extract.config_files import read_config
 from probe_kit.extract.settings import AskSettings
 from probe_kit.extract.sources.scene import SceneOptions
 
@@ -25,6 +26,7 @@ def ask(
     prompt: start.Prompts = None,
     picture_size: start.PictureSizes = None,
     out_folder: start.AskOutFolder = None,
+    config: start.ConfigFile = None,
     dry_run: common.DryRun = False,
     force: common.Force = False,
 ) -> None:
@@ -42,7 +44,9 @@ def ask(
     from probe_kit.extract.extraction import prepare_asks
     from probe_kit.runs.store import locate
 
-    requested = AskSettings.per_prompt_and_size(prompt, picture_size, typed)
+    requested = AskSettings.per_prompt_and_size(
+        prompt, picture_size, typed, None if config is None else read_config(config, typed, asks=True)
+    )
     places = [
         None if out_folder is None else f"{out_folder.rstrip('/')}/{settings.short_name}" for settings in requested
     ]

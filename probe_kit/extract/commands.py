@@ -144,8 +144,8 @@ def _acts_row(identity: Mapping[str, Any], subject: str) -> dict[str, str]:
     """Return why a model does not act. subject: of the source."""
     if not identity.get("capture_only"):
         return {}
-    shown = {"recordings": "recorded frames are shown", "pictures": "pictures are shown"}
-    reason = shown.get(subject, "only captured, once per episode")
+    reasons = {"recordings": "recorded frames are shown", "pictures": "pictures are shown"}
+    reason = reasons.get(subject, "only captured, once per episode")
     return {"acts": f"no: {reason}; no success rate"}
 
 

@@ -33,19 +33,20 @@ def portable(settings: Settings) -> dict[str, Any]:
     return config
 
 
-def read_config(path: Path, typed: Collection[str] = ()) -> Mapping[str, Any]:
+def read_config(path: Path, typed: Collection[str] = (), asks: bool = False) -> Mapping[str, Any]:
     """Settings by part, from a file of `--print-config`, or from a run that its folder or `run.json` names.
 
-    typed: parameters that a command line names; what they replace is not searched for.
+    typed: parameters that a command line names; what they replace is not searched for. asks: whether the run is
+    one of `probe-kit ask`.
     Raises UsageError for a file that holds neither, for a run without its settings, and for files of a run that
     are gone.
     """
     if path.is_dir() or path.name == RUN_FILE:
-        return _of_run(path if path.is_dir() else path.parent, typed)
+        return _of_run(path if path.is_dir() else path.parent, typed, asks)
     return read_json_object(path, UsageError, "Write one with `probe-kit extract … --print-config`")
 
 
-def _of_run(folder: Path, typed: Collection[str]) -> Mapping[str, Any]:
+def _of_run(folder: Path, typed: Collection[str], asks: bool) -> Mapping[str, Any]:
     """The settings of a run, with its checkpoint and the files of its source where the run found them."""
     from probe_kit.runs.run import open_run
 
@@ -53,8 +54,9 @@ def _of_run(folder: Path, typed: Collection[str]) -> Mapping[str, Any]:
     config: dict[str, Any] | None = run.settings.get(CONFIG)
     if config is None:
         raise UsageError(f"{folder} does not say with which settings it was requested; type the options again")
-    if "prompt" in config["task"]:
-        raise UsageError(f"{folder} was asked; repeat it with `probe-kit ask`, and its prompt and picture size")
+    if asks != ("prompt" in config["task"]):
+        words, command = ("was not asked", "extract") if asks else ("was asked", "ask")
+        raise UsageError(f"{folder} {words}; repeat it with `probe-kit {command} --config {folder}`")
     origin = run.origins[0] if run.origins else Origin()
     model = {**config["model"], "options": dict(origin.options)}
     if model["checkpoint"] is None and is_here(origin.checkpoint):
@@ -76,10 +78,10 @@ def source_of_run(run: "Run", replaced: Collection[str], flags: Mapping[str, str
         raise UsageError(f"{run.location} does not say with which settings it was requested; extract it again")
     origin = run.origins[0] if run.origins else Origin()
     source = dict(config["source"])
-    for field, place in origin.files.items():
+    for field, stored_path in origin.files.items():
         if field not in replaced:
-            _check_there(run, field, Path(place), flags)
-            _put(source, field, place)
+            _check_there(run, field, Path(stored_path), flags)
+            _put(source, field, stored_path)
     kind = kind_of(source)
     kind.find_again(origin.files)
     for field, path in kind(**source).files().items():  # of a run that does not say where they were

@@ -359,23 +359,28 @@ class AskSettings(Settings):
         prompts: Iterable[str] | None,
         picture_sizes: Sequence[tuple[int, int]] | None,
         typed: Mapping[str, Any],
+        file: Mapping[str, Any] | None = None,
     ) -> list[Self]:
         """Settings of one run per prompt and picture size, prompts outermost.
 
-        prompts: names or files of templates; None for those of the paper, or for the instruction on a source
-        without objects. picture_sizes: (width, height) in pixels, of a scene. typed: see `of_command`.
+        prompts: names or files of templates; None for those of the file, else those of the paper, or for the
+        instruction on a source without objects. picture_sizes: (width, height) in pixels, of a scene; None for the
+        file's, else 224 x 224. typed, file: see `of_command`.
         Raises UsageError for two runs of one name, and what `of_command` raises.
         """
         parameters = {option.parameter for kind in SOURCES for option in options_of(kind)}
         options = {name: value for name, value in typed.items() if name in parameters}
-        kind, _ = cls._typed_source(options, None)
+        kind, _ = cls._typed_source(options, None if file is None else _read_source(file["source"]))
         if kind.command and picture_sizes is not None:
             _refuse(["picture_size"], kind)
         sizes: list[dict[str, Any]] = [{"picture_size": size} for size in picture_sizes or [DEFAULT_SIZE]]
-        sizes = [{}] if kind.command else sizes
-        names = prompts or ([INSTRUCTION.name] if kind.command else PAPER_PROMPTS)
-        templates = [find_template(prompt) for prompt in names]
-        every = [cls.of_command(typed, prompt=template, **size) for template in templates for size in sizes]
+        if kind.command or (file is not None and picture_sizes is None):
+            sizes = [{}]
+        chosen_prompts = prompts or ([INSTRUCTION.name] if kind.command else PAPER_PROMPTS)
+        templates: list[dict[str, Any]] = [{"prompt": find_template(prompt)} for prompt in chosen_prompts]
+        if file is not None and prompts is None:
+            templates = [{}]
+        every = [cls.of_command(typed, file, **template, **size) for template in templates for size in sizes]
         names = [settings.short_name for settings in every]
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise UsageError(

@@ -127,7 +127,7 @@ class RunReader(Protocol):
         """
 
     def iter_token_blocks(self, site: Site, role: str | None = None) -> Iterable[Tokens]:
-        """Those tokens, some positions of all episodes at a time. Raises UnknownSiteError as `token_mask`."""
+        """Yield those tokens, some positions of all episodes at a time. Raises as `token_mask`."""
 
     # -- parts that arrays in memory do not have -------------------------------------------------------
 

@@ -124,12 +124,12 @@ class AnswerController(ModelController["AnswerModel", "Prompt"]):
         return self._ids_of(instruction) if self.template.is_instruction else None
 
     def _try_inputs(self, question: "Prompt") -> None:
-        asked = replace(question.observation, instruction=question.text)
-        others = (other.text for other in self._blank_questions(question.observation))
+        clean = replace(question.observation, instruction=question.text)
+        texts = (other.text for other in self._blank_questions(question.observation))
         absent = self.model.absent_inputs | (set() if question.pictured else {PICTURE})
         variants = {
             name: (replace(question, observation=changed, text=changed.instruction) for changed in observations)
-            for name, observations in varied(asked, others, self._ids_of, absent).items()
+            for name, observations in varied(clean, texts, self._ids_of, absent).items()
         }
         self._check_inputs(lambda prompt: self.model.read([prompt]).option_logits, question, variants)
 

@@ -67,12 +67,12 @@ def draw_donors(
     scaled = states / np.where(spread > 0, spread, 1.0)
     pairs = []
     for index in range(len(frames)) if of is None else of:
-        others = groups != groups[index]
+        is_candidate = groups != groups[index]
         if vary == INSTRUCTION:
-            others &= instructions != instructions[index]
+            is_candidate &= instructions != instructions[index]
         elif vary == STATE:
-            others &= (states != states[index]).any(axis=1)
-        candidates = np.flatnonzero(others)
+            is_candidate &= (states != states[index]).any(axis=1)
+        candidates = np.flatnonzero(is_candidate)
         if vary.startswith(PICTURE):
             distances = np.linalg.norm(scaled[candidates] - scaled[index], axis=1)
             candidates = _nearest(frames, index, vary, candidates[np.argsort(distances, kind="stable")], distances)

@@ -30,14 +30,12 @@ from probe_kit.extract.sources.player import SIDE, Answer, Ending, InputsPlayer,
 from probe_kit.extract.sources.source import Played, Source
 from probe_kit.extract.sources.units import (
     FIRST_EPISODES,
-    check_predictions,
     check_units,
     exchanged_names,
+    predicted_once,
     unusual_shares,
 )
 from probe_kit.hashing import derive_seed
-from probe_kit.hooks.checkpoints.containment import copied
-from probe_kit.hooks.checkpoints.third_party import while_acting
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.runs.layout import AT_END, ENVIRONMENT, ONCE, TRUTHS
 from probe_kit.runs.small_frames import SmallFrames, shrink
@@ -184,19 +182,16 @@ class EnvironmentSource(Source[EnvSource]):
 
     def _predicted(self, policy: "Policy", observation: Observation) -> NDArray[np.float32]:
         """(chunk, D) of one prediction. Raises OwnEnvironmentError for actions of another width or order."""
-        with while_acting(policy.card.family, policy.card.checkpoint):
-            chunks = policy.predict(copied([observation]), [0])
-            check_predictions(chunks, 1)
-        if chunks.shape[2] != len(self.actions):
+        predicted = predicted_once(policy, observation)
+        if predicted.shape[1] != len(self.actions):
             raise OwnEnvironmentError(
                 f"{self.name} takes {len(self.actions)} numbers as an action ({', '.join(self.actions)}); "
-                f"{policy.card.checkpoint} predicts {chunks.shape[2]}. Take a checkpoint of this environment"
+                f"{policy.card.checkpoint} predicts {predicted.shape[1]}. Take a checkpoint of this environment"
             )
         if (reason := exchanged_names(policy, self.actions)) is not None:
             raise OwnEnvironmentError(
                 f"{self.name}: {reason}. Let step() take actions in the checkpoint's order, and name them so"
             )
-        predicted: NDArray[np.float32] = chunks[0]
         return predicted
 
     def example(self, instruction: str) -> Observation:

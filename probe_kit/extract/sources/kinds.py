@@ -61,8 +61,8 @@ def _problem(settings: Any, kinds: set[str], options: set[str]) -> str:
         return "it lacks `opens` or `command`"
     parameters = {option.parameter for option in options_of(settings)}
     if not parameters or parameters & options:
-        taken = ", ".join(sorted(parameters & options)) or "none"
-        return f"of its options other sources have {taken}; expected at least one option, and names of its own"
+        shared = ", ".join(sorted(parameters & options)) or "none"
+        return f"of its options other sources have {shared}; expected at least one option, and names of its own"
     return ""
 
 

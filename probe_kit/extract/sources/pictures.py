@@ -23,10 +23,8 @@ from probe_kit.extract.plan import Row
 from probe_kit.extract.sources.player import SIDE, Answer, InputsPlayer, Opens
 from probe_kit.extract.sources.recording import Pixels
 from probe_kit.extract.sources.source import Played, Source, SourceSettings
-from probe_kit.extract.sources.units import check_predictions
+from probe_kit.extract.sources.units import predicted_once
 from probe_kit.hashing import derive_seed
-from probe_kit.hooks.checkpoints.containment import copied
-from probe_kit.hooks.checkpoints.third_party import while_acting
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.state_layout import ARM_NUMBERS
 from probe_kit.runs.layout import CAPTURE_ONLY, DATASET, OTHER_ACTIONS, RECORDED_EPISODES
@@ -194,10 +192,8 @@ class PictureSource(Source[PictureFolder]):
             )
         self.cameras = list(policy.card.cameras[:1])
         policy = policy.with_cameras(self.cameras)
-        with while_acting(policy.card.family, policy.card.checkpoint):
-            chunks = policy.predict(copied([self.example(self.instructions[0])]), [0])
-            check_predictions(chunks, 1)
-        self.prediction = chunks.shape[1], chunks.shape[2]
+        chunk = predicted_once(policy, self.example(self.instructions[0]))
+        self.prediction = chunk.shape[0], chunk.shape[1]
         return self, policy
 
     def watched(self, cameras: Sequence[str]) -> Self:

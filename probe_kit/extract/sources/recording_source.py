@@ -21,14 +21,12 @@ from probe_kit.extract.sources.recording import ACTION, IMAGES, STATE, LeRobotSo
 from probe_kit.extract.sources.source import Played, Source
 from probe_kit.extract.sources.units import (
     MOST_UNUSUAL,
-    check_predictions,
     check_units,
     other_order,
+    predicted_once,
     unusual_shares,
 )
 from probe_kit.hashing import derive_seed
-from probe_kit.hooks.checkpoints.containment import copied
-from probe_kit.hooks.checkpoints.third_party import while_acting
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.state_layout import ARM_NUMBERS
 from probe_kit.runs.layout import CAPTURE_ONLY, DATASET, OTHER_ACTIONS, RECORDED_EPISODES, TRUTHS
@@ -232,11 +230,9 @@ class RecordingSource(Source[LeRobotSource]):
             raise RecordingError(f"{error}. Map the model's first cameras with --camera") from error
         numbers = fitted._chosen_numbers()
         fitted.unusual = fitted._unusual(policy, numbers.get(STATE))
-        with while_acting(card.family, card.checkpoint):
-            chunk = policy.predict(copied([fitted.example(fitted.instructions[0])]), [0])
-            check_predictions(chunk, 1)
-        fitted.prediction = chunk.shape[1], chunk.shape[2]
-        fitted.other_actions = fitted._other_actions(policy, chunk.shape[2], numbers.get(ACTION))
+        chunk = predicted_once(policy, fitted.example(fitted.instructions[0]))
+        fitted.prediction = chunk.shape[0], chunk.shape[1]
+        fitted.other_actions = fitted._other_actions(policy, chunk.shape[1], numbers.get(ACTION))
         return fitted, policy
 
     def check_recorded_units(self, policy: "Policy", accepted: bool) -> None:

@@ -7,6 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import PolicyFailedError, UnitsError
+from probe_kit.hooks.checkpoints.containment import copied
+from probe_kit.hooks.checkpoints.third_party import while_acting
+from probe_kit.hooks.contract.observation import Observation
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
@@ -65,6 +68,15 @@ def exchanged_names(policy: "Policy", names: Sequence[str]) -> str | None:
     places = {name: position for position, name in enumerate(predicted)}
     moved = [name for position, name in enumerate(names) if places.get(name, position) != position]
     return other_order(policy, names) if moved else None
+
+
+def predicted_once(policy: "Policy", observation: Observation) -> NDArray[np.float32]:
+    """(chunk, D): one prediction of a policy, in its own units. Raises PolicyFailedError for anything else."""
+    with while_acting(policy.card.family, policy.card.checkpoint):
+        chunks = policy.predict(copied([observation]), [0])
+        check_predictions(chunks, 1)
+    chunk: NDArray[np.float32] = chunks[0]
+    return chunk
 
 
 def check_predictions(chunks: Any, count: int) -> None:

@@ -32,11 +32,15 @@ def write_class_means(run: Run, choices: Sequence[StreamChoice], file: Path) -> 
                 features = run.column(site, view).astype(np.float64)
                 for category in dict.fromkeys(episodes["category"].astype(str)):
                     rows = (episodes["category"] == category).to_numpy()
-                    left, right = features[rows & is_left], features[rows & ~is_left]
-                    if not len(left) or not len(right) or np.array_equal(left.mean(axis=0), right.mean(axis=0)):
+                    left_rows, right_rows = features[rows & is_left], features[rows & ~is_left]
+                    if (
+                        not len(left_rows)
+                        or not len(right_rows)
+                        or np.array_equal(left_rows.mean(axis=0), right_rows.mean(axis=0))
+                    ):
                         continue
                     name, entry = about_direction(category, view, site, run.weights_sha256)
-                    vectors[name] = ((left.mean(axis=0) - right.mean(axis=0)) / 2).astype(np.float32)
+                    vectors[name] = ((left_rows.mean(axis=0) - right_rows.mean(axis=0)) / 2).astype(np.float32)
                     about[name] = entry
     if not vectors:
         raise UsageError(f"{run.location}: the means of left and right are equal at all of these sites")

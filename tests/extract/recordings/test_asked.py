@@ -68,6 +68,18 @@ def test_a_model_is_asked_about_every_frame_episode_or_picture(source: str, home
         pk.retention_table([run])
 
 
+def test_a_run_of_questions_is_repeated_from_its_own_settings(home: Path) -> None:
+    options, _ = SOURCES["pictures"]
+    assert ask(*options, "--tokens", "pooled", "--out", "asked").exit_code == 0
+    first = home / "asked" / "instruction"
+    again = CliRunner().invoke(app, ["ask", "--config", str(first), "--env-workers", "0", "--out", "again"])
+    assert again.exit_code == 0, again.output
+    assert (first / "run.json").read_bytes() == (home / "again" / "instruction" / "run.json").read_bytes()
+    refused = CliRunner().invoke(app, ["extract", "--config", str(first)])
+    assert refused.exit_code == 2
+    assert "repeat it with `probe-kit ask --config" in " ".join(refused.stderr.split())
+
+
 def test_activations_are_those_of_the_model_itself_and_numbers_of_the_table_are_probed(home: Path) -> None:
     options, _ = SOURCES["pictures"]
     assert ask(*options, "--tokens", "pooled", "--out", "asked").exit_code == 0
