@@ -51,15 +51,15 @@ class ProbeResults:
 
         tests: the number that p is corrected for.
         """
-        own, is_token = self.settings, is_token_view(view)
-        asked = own.token_permutations if is_token else own.permutations
-        match shortage(self.curves[category, view].least_p, asked, tests):
+        settings, is_token = self.settings, is_token_view(view)
+        permutations = settings.token_permutations if is_token else settings.permutations
+        match shortage(self.curves[category, view].least_p, permutations, tests):
             case "permutations":
                 return f"train with --{'token-' * is_token}permutations {permutations_for(tests)} or more"
             case "groups":
                 if self.curves[category, view].least_p >= 1:
                     return "take groups in which the label differs"
-                return "extract more items" if own.is_side else "label more groups"
+                return "extract more items" if settings.is_side else "label more groups"
         return ""
 
     def __repr__(self) -> str:
