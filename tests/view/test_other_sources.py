@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from probe_kit.diagnose.diagnosis import FILE, FORMAT, Diagnosis, InputDiagnosis
-from probe_kit.diagnose.importance import Importance
+from probe_kit.diagnose.diagnosis import FILE, FORMAT
+from probe_kit.diagnose.results import Diagnosis, InputDiagnosis
 from probe_kit.hashing import sha256_json
 from probe_kit.intervene.kinds.image_swap import ImageSwap
 from probe_kit.intervene.outcomes import ConditionOutcomes, save
@@ -42,10 +42,10 @@ def swap_inputs(run: Run) -> str:
 
 def diagnose(run: Run) -> str:
     """Store a diagnosis of one input that decides, and of one that does not arrive."""
-    measured = Importance("picture", "decides", "", 0.8, (0.6, 0.9), 0.01, 0.9, 0.001, 36, 6, 36)
+    measured = InputDiagnosis("picture", "decides", "", 0.8, (0.6, 0.9), 0.01, 0.9, 0.001, 36, 6, 36)
     settings = {"format": FORMAT, "stamp": run.stamp}
     key = sha256_json(settings)[:12]
-    diagnosis = Diagnosis(key, run.label, 12, 6, (InputDiagnosis(measured),))
+    diagnosis = Diagnosis(key, run.label, 12, 6, (measured,))
     write_bundle(run.location, DIAGNOSES, key, {"settings": settings}, {FILE: as_json(diagnosis.to_json())}, {})
     return key
 
