@@ -66,7 +66,7 @@ UNCOMPARED = ("IDENTITY", "EXCLUDED")
 """Modes of units without statistics: the state is read as it is, or not at all."""
 _DIMENSIONS = 7
 """Of the arm's actions."""
-_TEXT_FILES = (*SMALL_FILES, "policy_*.safetensors")
+TEXT_FILES = (*SMALL_FILES, "policy_*.safetensors")
 """All that packing and tokenising read: of the weights only those of lerobot's processors."""
 _VISION = "vision"
 """The stream of a vision tower."""
@@ -547,7 +547,7 @@ class LerobotPolicy(Policy):
     def _text_reader(cls, checkpoint: str, evaluation: Evaluation) -> Self:
         """Return a policy without a network, which still packs and tokenises."""
         text = cls.__new__(cls)
-        text.folder, text.evaluation = checkpoint_folder(checkpoint, _TEXT_FILES), evaluation
+        text.folder, text.evaluation = checkpoint_folder(checkpoint, TEXT_FILES), evaluation
         text.config = cls._read_config(text.folder, evaluation)
         text.cameras = text.shown_cameras = tuple(key.removeprefix(IMAGES) for key in text.config.image_features)[
             :1
