@@ -57,6 +57,10 @@ def _of_run(folder: Path, typed: Collection[str], asks: bool) -> Mapping[str, An
     if asks != ("prompt" in config["task"]):
         words, command = ("was not asked", "extract") if asks else ("was asked", "ask")
         raise UsageError(f"{folder} {words}; repeat it with `probe-kit {command} --config {folder}`")
+    if any(edit.get("vector") for edit in config["task"].get("edits", ())):
+        raise UsageError(
+            f"{folder} was edited by vectors, which no run stores; repeat it in Python with `vectors`"
+        )
     origin = run.origins[0] if run.origins else Origin()
     model = {**config["model"], "options": dict(origin.options)}
     if model["checkpoint"] is None and is_here(origin.checkpoint):

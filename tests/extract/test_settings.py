@@ -2,8 +2,10 @@
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import typer
 from typer.testing import CliRunner
@@ -249,3 +251,15 @@ def test_the_settings_of_a_run_repeat_it_wherever_it_lies(small_suite: Suite, tm
         assert again == asked
     assert str(tmp_path) not in json.dumps(run.settings)
     assert prepare(again).identity() == prepare(asked).identity()
+
+
+def test_a_run_whose_edits_need_vectors_is_not_repeated_without_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    edit = Edit("add", (Site("backbone", 1),), vector="left")
+    config = ExtractSettings("pi0", edits=(edit,), vectors={"left": np.zeros(4, np.float32)}).config()
+    monkeypatch.setattr(
+        "probe_kit.runs.run.open_run", lambda *_, **__: SimpleNamespace(settings={"config": config})
+    )
+    with pytest.raises(UsageError, match="vectors, which no run stores"):
+        read_config(tmp_path)
