@@ -15,12 +15,13 @@ import pandas as pd
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 import probe_kit as pk
+from probe_kit._tables.numbers import number, with_limits
 from probe_kit.extract.rollout.controllers import PolicyController, Turn
 from probe_kit.hooks import Observation
 from probe_kit.hooks.contract.sites import label_of
-from probe_kit.retention import LabelRetentionTable, label_retention_table
-from probe_kit.retention.displays import label_curves, label_figures, save_figures
-from probe_kit.retention.report import write_label_report
+from probe_kit.retention import RetentionTable, retention_table
+from probe_kit.retention.displays import collect_figures, layer_curve, save_figures
+from probe_kit.retention.report import write_report
 from probe_kit.train import ProbeResults
 from probe_kit.train.columns.builtin import label_frame
 from probe_kit.train.results.score_rows import exceeds_column
@@ -52,10 +53,10 @@ def main() -> None:
         )
         for name in LABELS
     ]
-    retained = label_retention_table([run], LABELS)
-    list(save_figures(label_figures([run], retained), folder / "figures"))
-    write_label_report([run], folder / "report.html", retained)
-    label_curves(results[0]).savefig(FIGURE, dpi=FIGURE_DPI)
+    retained = retention_table([run], target=LABELS)
+    list(save_figures(collect_figures([run], retained), folder / "figures"))
+    write_report([run], folder / "report.html", retained)
+    layer_curve(results[0], iterations="best").savefig(FIGURE, dpi=FIGURE_DPI)
     filled = f"{table_of(run, results)}\n\n{retention_of(retained)}"
     page = _BLOCK.sub(lambda block: f"{block[1]}\n{filled}\n\n{block[2]}", PAGE.read_text(encoding="utf-8"))
     PAGE.write_text(page, encoding="utf-8")
@@ -143,14 +144,14 @@ def table_of(run: pk.Run, results: list[ProbeResults]) -> str:
     return "\n".join(rows) + f"\n\n{note}"
 
 
-def retention_of(table: LabelRetentionTable) -> str:
+def retention_of(table: RetentionTable) -> str:
     """Retention of every label, as Markdown."""
     rows = ["| label | metric | backbone above chance | action above chance | retention |", "|---" * 5 + "|"]
     for row in table.rows:
-        own = row.retention
-        above = [f"{peak.above:.2f} [{peak.ci[0]:.2f}, {peak.ci[1]:.2f}]" for peak in (own.backbone, own.action)]
-        value = f"{own.value:.2f} [{own.ci[0]:.2f}, {own.ci[1]:.2f}]" if own.defined else own.note
-        rows.append(f"| `{own.target}` | {own.metric} | {above[0]} | {above[1]} | {value} |")
+        above = [with_limits(part.above, part.above_ci, number) for part in (row.backbone, row.action)]
+        retained = row.retention
+        value = with_limits(retained.value, retained.ci, number) if retained.defined else retained.note
+        rows.append(f"| `{row.target}` | {row.metric} | {above[0]} | {above[1]} | {value} |")
     return "\n".join(rows)
 
 

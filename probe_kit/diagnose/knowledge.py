@@ -6,11 +6,8 @@ Probes are those of `probe-kit train`: they are stored in the run, and `probe-ki
 from math import nan
 from typing import TYPE_CHECKING
 
-from probe_kit.diagnose.results import NO_LIMITS, Knowledge, Limits, SiteKnowledge
-from probe_kit.errors import NoProbesError
-from probe_kit.retention.estimators.retention import measure_retention, stream_peaks
-from probe_kit.retention.estimators.stream_scores import BACKBONE
-from probe_kit.retention.labels.estimate import measure_label_retention
+from probe_kit.diagnose.results import Knowledge, Limits, SiteKnowledge
+from probe_kit.retention.rows.label_rows import target_row
 
 if TYPE_CHECKING:
     from probe_kit.runs.run import Run
@@ -36,29 +33,16 @@ def measure_knowledge(run: "Run", target: "Target | str", seed: int = 0) -> Know
             *(best[name] for name in ("stream", "layer", "part", "score", "chance", "signal")), strict=True
         )
     )
-    value, limits, note = _retention(results)
+    value, limits, note = _retention(run, results)
     metric = str(frame["metric"].iloc[0])
     return Knowledge(results.settings.target, results.key, metric, sites, value, limits, note)
 
 
-def _retention(results: "ProbeResults") -> tuple[float, Limits, str]:
-    if not results.settings.is_side:
-        try:
-            label = measure_label_retention(results)
-        except NoProbesError as error:
-            return nan, NO_LIMITS, str(error)
-        return label.value, _limits(*label.ci), label.note
-    view = results.settings.views[0]
-    curve = results.curves[ALL, view]
-    backbone = stream_peaks(curve).get(BACKBONE)
-    exceeds = None
-    if backbone is not None:
-        exceeds = results.controls.exceeds(ALL, view, str(backbone.site), backbone.p_fwe)
-    side = measure_retention(curve, seed_text=results.settings.seed_text, exceeds=exceeds)
-    if side is None:
-        return nan, NO_LIMITS, "the model has no backbone, or no action part"
-    return side.value, _limits(side.interval.low, side.interval.high), side.note
+def _retention(run: "Run", results: "ProbeResults") -> tuple[float, Limits, str]:
+    retained = target_row(run, results, ALL, results.settings.views[0]).retention
+    low, high = retained.ci or (None, None)
+    return _or_nan(retained.value), (_or_nan(low), _or_nan(high)), retained.note
 
 
-def _limits(low: float | None, high: float | None) -> Limits:
-    return (nan if low is None else low, nan if high is None else high)
+def _or_nan(value: float | None) -> float:
+    return nan if value is None else value

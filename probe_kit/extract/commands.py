@@ -195,10 +195,14 @@ def _describe(stored: Any) -> str:
     return f"{stored.name} {stored.layers} layers{steps} x {stored.tokens} tokens x {stored.width}"
 
 
-def _has_groups_for_probes(run: "Run") -> bool:
-    from probe_kit.suite.validation.sufficiency import GROUPS_FOR_PROBES
+def _next_command(run: "Run") -> str:
+    """Return the command that reads the run: its targets, its probes where it has groups enough, else success."""
+    from probe_kit.suite.validation.sufficiency import probe_command
 
-    return bool(run.episodes.groupby("category")["group_id"].nunique().min() >= GROUPS_FOR_PROBES)
+    if run.streams and run.inputs is not None:
+        return f"probe-kit targets {run.location}"
+    groups = run.episodes.groupby("category")["group_id"].nunique().to_dict() if run.streams else {}
+    return probe_command(run.location, groups) or f"probe-kit retention {run.location}"
 
 
 def print_input_notes(run: "Run") -> None:
@@ -219,7 +223,5 @@ def _print_outcomes(run: "Run") -> None:
     if ONCE in run.episodes and (lost := int((run.episodes[ONCE] & ~run.episodes[AT_END]).sum())):
         say(f"{lost} of them had success before their end only; see the columns {ONCE} and {AT_END}")
     print_input_notes(run)
-    can_probe = bool(run.streams) and (run.inputs is not None or _has_groups_for_probes(run))
-    step = "retention" if not can_probe else "targets" if run.inputs is not None else "train"
-    say(marked("next: [bold]probe-kit {} {}[/]", step, run.location))
+    say(marked("next: [bold]{}[/]", _next_command(run)))
     out.print(str(run.location), soft_wrap=True)

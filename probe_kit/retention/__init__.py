@@ -36,8 +36,6 @@ if TYPE_CHECKING:
     )
     from probe_kit.retention.estimators.by_call import event_calls
     from probe_kit.retention.estimators.retention import Peak, Retention, best_site, measure_retention
-    from probe_kit.retention.labels.estimate import LabelRetention, measure_label_retention
-    from probe_kit.retention.labels.table import LabelRetentionTable, label_retention_table
     from probe_kit.retention.rows.row import RetentionRow
     from probe_kit.retention.table import RetentionTable, retention_table
     from probe_kit.statistics.significance import chance_margin
@@ -48,8 +46,6 @@ __all__ = [
     "FinalPositionsDisplay",
     "IterationMapDisplay",
     "KnowledgeActionDisplay",
-    "LabelRetention",
-    "LabelRetentionTable",
     "LayerCurveDisplay",
     "ModelDepthDisplay",
     "OutcomeRulesDisplay",
@@ -68,10 +64,8 @@ __all__ = [
     "best_site",
     "chance_margin",
     "event_calls",
-    "label_retention_table",
     "layer_curve",
     "match_runs",
-    "measure_label_retention",
     "measure_retention",
     "normalised_score",
     "retention_table",
@@ -92,8 +86,6 @@ __getattr__, __dir__ = lazy_names(
         "FinalPositionsDisplay": "displays",
         "IterationMapDisplay": "displays",
         "KnowledgeActionDisplay": "displays",
-        "LabelRetention": "labels.estimate",
-        "LabelRetentionTable": "labels.table",
         "LayerCurveDisplay": "displays",
         "ModelDepthDisplay": "displays",
         "OutcomeRulesDisplay": "displays",
@@ -112,8 +104,6 @@ __getattr__, __dir__ = lazy_names(
         "best_site": "estimators.retention",
         "chance_margin": "probe_kit.statistics.significance",
         "layer_curve": "displays",
-        "label_retention_table": "labels.table",
-        "measure_label_retention": "labels.estimate",
         "measure_retention": "estimators.retention",
         "normalised_score": "behaviour.success_rate",
         "retention_table": "table",

@@ -11,3 +11,9 @@ Family = Literal["label", "table"]
 """Tests of labels that are corrected together: a stream's sites, or those of every label of the table (Holm)."""
 TableFormat = str
 """`table`, `json`, `csv` or a format of `probe_kit._tables.formats`."""
+Iterations = Literal["all", "best", "last"] | int
+"""Which iterations of the expert, or which action tokens, take part: all, the last one, or one by number.
+
+Where one number is made of all of them it is the best one's, so that `best` is another word for `all`; a layer
+curve draws a line for each of `all`, and one line for the `best` of every layer.
+"""

@@ -14,7 +14,7 @@ from probe_kit.retention.choices import AnswerScore, Family, Section, TableForma
 from probe_kit.scene_names import RuleName
 
 if TYPE_CHECKING:
-    from probe_kit.retention.estimators.retention import Iterations
+    from probe_kit.retention.choices import Iterations
 
 RUNS = "Probes"
 RULES = "Outcome rule"

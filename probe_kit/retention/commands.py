@@ -9,11 +9,11 @@ from probe_kit._terminal import options as common
 from probe_kit._terminal.console import err, marked, out, print_text, say, split
 from probe_kit.errors import UsageError
 from probe_kit.retention import command_options as own
-from probe_kit.retention.label_commands import print_text_of, save_all, say_report
+from probe_kit.retention.output import print_text_of, save_all, say_report
 
 if TYPE_CHECKING:
     from probe_kit._tables.table import Table
-    from probe_kit.retention.choices import Family, Section, TableFormat
+    from probe_kit.retention.choices import Section, TableFormat
     from probe_kit.retention.table import RetentionTable
     from probe_kit.train.data.run_reader import RunReader
 
@@ -83,12 +83,7 @@ def retention(
         return
     if target:
         _check_only(values, WITH_TARGET, "target", "labels of your own")
-        _show_labels(
-            runs or (), target, family, probes, views, iterations, wording, partial, style, html, figures,
-            "all" in details,
-        )  # fmt: skip
-        return
-    if family != "label":
+    elif family != "label":
         raise UsageError("--family is for labels of your own; give --target COLUMN too, or leave it out")
     if as_paper:
         _check_only(values, WITH_AS_PAPER, "as_paper", "the paper's own numbers (--as-paper)")
@@ -116,14 +111,14 @@ def retention(
         opened if kind == "groups" else listed, views, iterations=steps, keys=keys,
         epsilons=epsilons or SENSITIVITY_RADII, rule=rule, last_steps=last_steps, absent_below=absent_below,
         score=score, vlm_vla=kind == "vlm-vla", with_side_words=with_side_words,
-        against=runs_compared if kind in ("run", "groups") else None,
+        against=runs_compared if kind in ("run", "groups") else None, target=target or None, family=family,
     )  # fmt: skip
     if as_paper:
         _print(table.as_paper, style, table.notes)
     elif kind == "steps":
         _show_steps(table, training, style, figures)
     else:
-        scored_runs = [scored(run, score, with_side_words) for run in listed]
+        scored_runs = listed if target else [scored(run, score, with_side_words) for run in listed]
         _write_files(scored_runs, table, figures, html, "all" in details)
         _print_sections(table, style, details)
 
@@ -185,35 +180,6 @@ def _show_steps(
         lines = [ProvenanceLine.of_row(mean) for mean in table.means]
         save_all([training_step_figure(by_step, lines)], figures)
     _print(by_step, style, (*table.unpaired, *table.notes))
-
-
-def _show_labels(
-    runs: Sequence[str],
-    columns: Sequence[str],
-    family: "Family",
-    probes: list[str] | None,
-    views: Sequence[str] | None,
-    iterations: str,
-    wording: str | None,
-    partial: bool,
-    style: "TableFormat",
-    html: Path | None,
-    figures: Path | None,
-    details: bool,
-) -> None:
-    """The retention of labels of one's own, whose columns are given."""
-    from probe_kit.retention.label_commands import show_label_retention
-    from probe_kit.retention.labels.table import label_retention_table
-    from probe_kit.runs import open_run
-
-    if not runs:
-        raise UsageError("give run folders whose probes of a label are stored")
-    _check_doubles(runs)
-    _check_places(html, figures)
-    opened = [open_run(path, allow_partial=partial).in_wording(wording) for path in runs]
-    steps, keys = own.read_iterations(iterations), _keys(list(runs), probes or [])
-    table = label_retention_table(opened, columns, views, iterations=steps, keys=keys, family=family)
-    show_label_retention(opened, table, style, html, figures, details)
 
 
 def _check_only(values: Mapping[str, object], allowed: Collection[str], option: str, table: str) -> None:

@@ -34,7 +34,7 @@ def joins_of(runs: Sequence[RunReader], table: RetentionTable) -> Joins:
     for vlm, policy in product(vlms, policies):
         judged = under_rule(policy, table.rule, table.last_steps)
         try:
-            joined = match_runs(vlm, judged, table.results.get(str(policy.location)))
+            joined = match_runs(vlm, judged, table.results_of(policy.location))
         except (UsageError, OtherFramesError) as error:
             refused.append(f"Not joined: {error}.")
             continue

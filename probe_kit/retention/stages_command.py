@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from probe_kit._terminal.console import marked, out, print_json
 from probe_kit.errors import NoProbesError, UsageError
-from probe_kit.retention.label_commands import save_all
+from probe_kit.retention.output import save_all
 
 if TYPE_CHECKING:
     from probe_kit.retention.choices import AnswerScore

@@ -2,7 +2,7 @@
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Literal, Self, get_args
 
 from probe_kit._system.escaping import csv_of_frame
 from probe_kit._tables.formats import render
@@ -15,7 +15,7 @@ from probe_kit.retention.behaviour.mixed_settings import chosen_wordings, mixed_
 from probe_kit.retention.behaviour.run_labels import distinct_labels
 from probe_kit.retention.behaviour.success_rate import capture_only
 from probe_kit.retention.behaviour.vlm_answers import ask_of, left_out, scored
-from probe_kit.retention.choices import Section
+from probe_kit.retention.choices import Family, Iterations, Section
 from probe_kit.retention.columns.columns import averaged_fields
 from probe_kit.retention.columns.comparisons import size_table, vlm_vla_tables, wording_tables
 from probe_kit.retention.columns.findings import next_step
@@ -30,13 +30,14 @@ from probe_kit.retention.compare.pairing import (
     compare_with_vlms,
     compare_wordings,
 )
-from probe_kit.retention.estimators.retention import Iterations
 from probe_kit.retention.formats.dataframe import frame_of, part_frame, peak_frame
 from probe_kit.retention.formats.json import table_json
 from probe_kit.retention.rows.build import RowSettings, RowWithEstimates, run_rows
 from probe_kit.retention.rows.category_mean import mean_row
+from probe_kit.retention.rows.label_rows import label_notes, label_rows, read_labels
 from probe_kit.retention.rows.outcome_rules import can_be_judged, check_epsilons, under_rule
 from probe_kit.retention.rows.row import RetentionRow
+from probe_kit.runs.location import Location
 from probe_kit.runs.reader import check_sides
 from probe_kit.statistics.estimates.verdict import ABSENT_BELOW
 from probe_kit.train.data.run_reader import RunReader
@@ -54,8 +55,8 @@ class RetentionTable:
 
     Runs are never averaged with each other, so no mean mixes suites. differences: between runs, or groups of runs.
     unpaired: which runs of several have none, or leave items out, and why, a sentence each.
-    results: the probes that the rows were made of, by `row.run.location`; figures and
-    reports of the table draw these.
+    results: the probes that the rows were made of, by location of the run and target; figures and reports of the
+    table draw these. Rows of targets that are no side have no mean, as their metrics differ.
     wordings: of runs that were asked in several, every two against each other.
     iterations: of the expert, or action tokens, that take part. notes: what a reader must know, a sentence each:
     which runs have no probes, and which settings the rows mix. vlm_vla: VLM − VLA, if that was requested.
@@ -64,7 +65,7 @@ class RetentionTable:
     rows: list[RetentionRow]
     means: list[RetentionRow]
     differences: list[Difference] = field(default_factory=list)
-    results: Mapping[str, ProbeResults] = field(default_factory=dict, repr=False)
+    results: Mapping[tuple[str, str], ProbeResults] = field(default_factory=dict, repr=False)
     iterations: Iterations = "all"
     notes: tuple[str, ...] = ()
     wordings: list[Difference] = field(default_factory=list)
@@ -91,6 +92,25 @@ class RetentionTable:
         return f"{self.summary_table._repr_html_()}<ul>{sentences}</ul>{details}"
 
     @property
+    def targets(self) -> tuple[str, ...]:
+        """The targets of the rows, in order."""
+        return tuple(dict.fromkeys(row.target for row in self.rows))
+
+    @property
+    def is_of_sides(self) -> bool:
+        """Whether the rows are of sides of a picture, which have success rates and a mean."""
+        return all(row.is_side for row in self.rows)
+
+    def results_of(self, location: Location | str) -> ProbeResults | None:
+        """Return the probes of a run, of its first target; None without any."""
+        return next((results for (of_run, _), results in self.results.items() if of_run == str(location)), None)
+
+    def of_target(self, target: str) -> Self:
+        """Return the table of one target; p stays as it is."""
+        results = {name: probes for name, probes in self.results.items() if name[1] == target}
+        return replace(self, rows=[row for row in self.rows if row.target == target], results=results, notes=())
+
+    @property
     def rule(self) -> str:
         """The outcome rule by which episodes were judged."""
         return self.rows[0].rules.rule if self.rows else DEFAULT_RULE
@@ -102,7 +122,9 @@ class RetentionTable:
 
     @property
     def all_rows(self) -> list[RetentionRow]:
-        """Category rows of each run and view, each followed by its mean."""
+        """Category rows of each run and view, each followed by its mean where there is one."""
+        if not self.means:
+            return list(self.rows)
         return [
             row
             for mean in self.means
@@ -272,6 +294,8 @@ def retention_table(
     runs: Sequence[RunReader] | Mapping[str, Sequence[RunReader]],
     views: Sequence[str] | None = None,
     *,
+    target: str | Sequence[str] | None = None,
+    family: Family = "label",
     iterations: Iterations = "all",
     keys: Sequence[str | None] | None = None,
     epsilons: Sequence[float] = SENSITIVITY_RADII,
@@ -288,7 +312,7 @@ def retention_table(
     categories: Sequence[str] | None = None,
     with_behaviour: bool = True,
 ) -> RetentionTable:
-    """Success rates, probe peaks and retention of several runs, per category and view.
+    """Return success rates, best sites of probes and retention of several runs, per category and view.
 
     runs: a list, of which the first is compared with every other on the same questions (see `compare_runs`), or
     lists by the name of a group, such as `{"vqa": [a], "no vqa": [b, c]}`; groups are compared with each other.
@@ -307,19 +331,26 @@ def retention_table(
     origin count as one. By default checkpoints of one training do. categories: rows of these alone, and means over
     them; probes are those of the
     whole runs. with_behaviour: False leaves empty what the rule `disc` does not need (other rules and behaviour),
-    so that no trajectory is read. Raises UnknownSiteError for a view that was not probed, UsageError for an
-    unknown key or a number of keys that is not that of the runs, for a run that is given twice, or for `against`
-    or `pairs` where they are none of the runs; SceneError for overlapping zones.
+    so that no trajectory is read. target: columns of labels, whose retention it is instead of that of a side; of
+    these runs, views, iterations, keys, family and labels alone count. family: `table` corrects p for all targets
+    by Holm's method, per run, category, view and stream. Raises UnknownSiteError for a view that was not probed,
+    UsageError for an unknown key or a number of keys that is not that of the runs, for a run that is given twice,
+    for `against` or `pairs` where they are none of the runs, for a side as target, and for labels that differ
+    between runs; NoProbesError for a run without probes of a target; SceneError for overlapping zones.
     """
+    if target is not None:
+        if isinstance(runs, Mapping) or against or pairs or vlm_vla:
+            raise UsageError("labels are not compared between runs or groups; give runs alone, or no target")
+        return _label_table(
+            runs, [target] if isinstance(target, str) else target, views, iterations, keys, family, labels
+        )
     check_epsilons(check_rule(rule), epsilons is not SENSITIVITY_RADII)
     groups = runs if isinstance(runs, Mapping) else {None: runs}
     for run in (of_category for of_group in groups.values() for of_category in of_group):
         check_sides(run, "a retention table")
     listed = [(name, scored(run, score, with_side_words)) for name, of_group in groups.items() for run in of_group]
-    if keys is not None and len(keys) != len(listed):
-        raise UsageError(f"{len(keys)} keys for {len(listed)} runs; give one per run, or None for the newest")
+    key_of_run = _key_of_run(keys, len(listed))
     _check_doubles([run for _, run in listed])
-    key_of_run = list(keys or [None] * len(listed))
     order = sorted(range(len(listed)), key=lambda at: ask_of(listed[at][1]) is None)
     listed, key_of_run = [listed[at] for at in order], [key_of_run[at] for at in order]
     results, notes = _read_probes([run for _, run in listed], key_of_run)
@@ -373,13 +404,42 @@ def retention_table(
         rows,
         means,
         compared.differences,
-        results,
+        {(location, probes.settings.target): probes for location, probes in results.items()},
         iterations,
         tuple(notes),
         worded,
         found_differences,
         compared.unpaired,
     )
+
+
+def _label_table(
+    runs: Sequence[RunReader],
+    targets: Sequence[str],
+    views: Sequence[str] | None,
+    iterations: Iterations,
+    keys: Sequence[str | None] | None,
+    family: Family,
+    labels: Mapping[str, str] | None,
+) -> RetentionTable:
+    """Return the table of targets that are no side."""
+    if not runs or not targets:
+        raise UsageError("retention of a label needs at least one run and one target")
+    results = read_labels(runs, targets, _key_of_run(keys, len(runs)))
+    names = distinct_labels(runs, labels)
+    rows = [
+        replace(row, run=replace(row.run, label=names[row.run.location]))
+        for row in label_rows(runs, results, views, iterations, family)
+    ]
+    full = {row.run.location: row.run.name for row in rows}
+    notes = [*label_notes(runs, rows, family, full), *mixed_episodes(runs)]
+    return RetentionTable(rows, [], results=results, iterations=iterations, notes=tuple(notes))
+
+
+def _key_of_run(keys: Sequence[str | None] | None, runs: int) -> list[str | None]:
+    if keys is not None and len(keys) != runs:
+        raise UsageError(f"{len(keys)} keys for {runs} runs; give one per run, or None for the newest")
+    return list(keys or [None] * runs)
 
 
 def _not_scored(run: RunReader, rule: str, last_steps: int) -> str | None:

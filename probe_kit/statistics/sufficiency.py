@@ -1,10 +1,11 @@
 """The conclusions that a number of groups is enough for: one definition for plans and for later refusals."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache, lru_cache
 from itertools import count
 from math import sqrt
 from statistics import NormalDist
+from typing import Any
 
 import numpy as np
 
@@ -23,6 +24,18 @@ GROUPS_FOR_RETENTION = FEWEST_GROUPS
 """With fewer there are no cross-fitted scores."""
 SMALLEST_EFFECT_OF_INTEREST = 0.25
 """Net share of episodes below which a category is not acted on, and an edit or erasure is without effect."""
+
+
+def probe_command(run: object, groups: Mapping[Any, int]) -> str:
+    """Return the command that fits probes of the categories with groups enough for them; empty without any.
+
+    run: its location. groups: number of independent groups by category.
+    """
+    enough = [name for name, count in groups.items() if count >= GROUPS_FOR_PROBES]
+    if not enough:
+        return ""
+    chosen = "" if len(enough) == len(groups) else f" --categories {','.join(enough)}"
+    return f"probe-kit train {run}{chosen}"
 
 
 def least_probe_p(groups: int) -> float:

@@ -57,7 +57,7 @@ class ViewedRun:
     @property
     def own_results(self) -> ProbeResults | None:
         """The probes of the table; None without any."""
-        return self.table.results.get(str(self.run.location)) if self.has_sides else None
+        return self.table.results_of(self.run.location) if self.has_sides else None
 
     @property
     def is_lent(self) -> bool:

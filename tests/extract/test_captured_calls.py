@@ -211,7 +211,7 @@ def test_tables_are_of_the_first_inference_unless_a_key_says_otherwise(run: Run)
     first = train_probes(run, permutations=5)
     later = train_probes(run, permutations=5, call=1)
     assert load_results(run).key == first.key
-    assert retention_table([run]).results[str(run.location)].key == first.key
+    assert retention_table([run]).results_of(run.location).key == first.key
     table = retention_table([run], keys=[later.key])
     assert any("captured inference 1" in note for note in table.notes)
     assert not any("other episodes" in note for note in table.notes)

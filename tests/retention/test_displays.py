@@ -99,14 +99,16 @@ def test_the_caption_names_model_weights_suite_sizes_and_random_weights(probed_r
 def test_a_layer_curve_carries_the_best_iteration_and_the_span_of_all(probed_run: ProbedRun) -> None:
     display = LayerCurveDisplay.from_results(load_results(probed_run({"color": SIGNAL})), "color")
     backbone, expert = display.streams
-    np.testing.assert_allclose(backbone.accuracy, [0.5, 0.9, 0.7])
+    np.testing.assert_allclose(backbone.score, [0.5, 0.9, 0.7])
     np.testing.assert_allclose(backbone.depth, [0, 0.5, 1])
-    np.testing.assert_allclose(expert.accuracy, [0.6, 0.7])
+    np.testing.assert_allclose(expert.score, [0.6, 0.7])
     np.testing.assert_allclose(expert.least, [0.5, 0.65])
     assert (expert.iterations, backbone.iterations) == (2, 1)
-    assert (backbone.low < backbone.accuracy).all()
-    assert display.chance == 0.5
-    assert display.null_band == pytest.approx((0.405, 0.595), abs=0.002), "the null is even from 0.4 to 0.6"
+    assert (backbone.low < backbone.score).all()
+    assert (display.grounds[0].chance == 0.5).all()
+    low, high = display.grounds[0].null_band or (None, None)
+    assert low == pytest.approx(0.405, abs=0.002), "the null is even from 0.4 to 0.6"
+    assert high == pytest.approx(0.595, abs=0.002)
 
 
 def test_significant_sites_are_filled(probed_run: ProbedRun) -> None:
@@ -164,7 +166,7 @@ def test_the_maps_of_one_figure_share_one_scale(probed_run: ProbedRun) -> None:
 def test_role_curves_have_a_line_per_view(probed_run: ProbedRun) -> None:
     results = load_results(probed_run({"color": SIGNAL}))
     display = RoleCurvesDisplay.from_results(results, "color", "expert")
-    np.testing.assert_allclose(display.curves["mean"].accuracy, [0.6, 0.7])
+    np.testing.assert_allclose(display.curves["mean"].score, [0.6, 0.7])
     role_curves(results).savefig(io.BytesIO())
 
 
@@ -275,9 +277,9 @@ def test_the_caret_of_the_best_layer_stands_above_its_error_bar(probed_run: Prob
     axes = layer_curve(load_results(probed_run({"color": SIGNAL}))).axes[0]
     (caret,) = [line for line in axes.get_lines() if line.get_gid() == "peak"]
     best = LayerCurveDisplay.from_results(load_results(probed_run({"color": SIGNAL})), "color").streams[0].lines[0]
-    highest = int(np.argmax(best.accuracy))
+    highest = int(np.argmax(best.score))
     assert caret.get_xdata() == [best.layers[highest]]
-    assert caret.get_ydata() == pytest.approx([100 * max(best.accuracy[highest], best.high[highest])])
+    assert caret.get_ydata() == pytest.approx([100 * max(best.score[highest], best.high[highest])])
 
 
 def test_paired_layouts_count_items_and_draw_their_shares(tmp_path: Path, outcome_table: Any) -> None:

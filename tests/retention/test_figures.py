@@ -139,7 +139,7 @@ def test_iterations_choose_the_lines_in_figures_as_they_do_in_tables(
     backbone, expert = display.streams
     assert [line.iteration for line in expert.lines] == shown
     assert [line.iteration for line in backbone.lines] == [None]
-    np.testing.assert_allclose(expert.accuracy, accuracy)
+    np.testing.assert_allclose(expert.score, accuracy)
     display.plot()
 
 

@@ -92,7 +92,7 @@ def of_probes(table: RetentionTable) -> Iterator[Found]:
             for stream in LayerCurveDisplay.from_results(results, category).streams
             for line in stream.lines
         ):
-            for at, value in enumerate(line.accuracy):
+            for at, value in enumerate(line.score):
                 yield f"curve, layer {at}", value, line.low[at], line.high[at]
 
 
@@ -134,7 +134,7 @@ def test_equal_runs_differ_by_nothing_and_not_surely_so(table: RetentionTable) -
 
 def test_one_number_has_one_interval_in_rows_curves_and_scores(table: RetentionTable) -> None:
     for row in table.rows:
-        curve = table.results[row.run.location].curves[row.category, "mean"]
+        curve = table.results[row.run.location, row.target].curves[row.category, "mean"]
         streams = curve_scores(curve, seed_text=row.run.suite)
         assert streams is not None
         for name, part in (("backbone", row.backbone), ("action", row.action)):
@@ -201,7 +201,9 @@ def test_a_mean_is_as_wide_as_its_only_category_and_else_as_its_parts_together(t
 
 
 def scores_of(table: RetentionTable, row: RetentionRow) -> Scores:
-    found = curve_scores(table.results[row.run.location].curves[row.category, "mean"], seed_text=row.run.suite)
+    found = curve_scores(
+        table.results[row.run.location, row.target].curves[row.category, "mean"], seed_text=row.run.suite
+    )
     assert found is not None
     return found.scores
 
@@ -264,10 +266,10 @@ def test_an_untrained_network_that_is_beaten_alike_in_every_group_has_an_interva
 
 def test_a_band_of_few_permuted_labels_is_not_drawn(probed_run: ProbedRun) -> None:
     results = load_results(probed_run({"color": GOOD}))
-    assert LayerCurveDisplay.from_results(results, "color").null_band is not None
+    assert LayerCurveDisplay.from_results(results, "color").grounds[0].null_band is not None
     for count, is_drawn in ((5, False), (19, False), (20, True)):
         few = {place: replace(curve, null=curve.null[:, :count]) for place, curve in results.curves.items()}
-        band = LayerCurveDisplay.from_results(replace(results, curves=few), "color").null_band
+        band = LayerCurveDisplay.from_results(replace(results, curves=few), "color").grounds[0].null_band
         assert (band is not None) == is_drawn
         layer_curve(replace(results, curves=few))
 
@@ -281,8 +283,8 @@ def test_the_band_holds_the_middle_95_percent_of_the_accuracies_of_permuted_labe
         for place, curve in results.curves.items()
     }
     display = LayerCurveDisplay.from_results(replace(results, curves=curves), "color")
-    assert display.null_band is not None
-    low, high = display.null_band
+    assert display.grounds[0].null_band is not None
+    low, high = (float(end[0]) for end in display.grounds[0].null_band)
     assert ((accuracies < low).sum(), (accuracies > high).sum()) == (5, 5)
     axes = display.plot().ax_
     assert axes is not None

@@ -42,7 +42,7 @@ def test_the_report_of_an_asked_and_an_acting_run_holds_their_join(tmp_path: Pat
     vlm, policy = pair(tmp_path)
     runs = [vlm, policy]
     table = retention_table(runs)  # type: ignore[arg-type]
-    (joined,) = joins_of(runs, table).found  # type: ignore[arg-type]
+    (joined,) = joins_of(runs, table).tables  # type: ignore[arg-type]
     assert [one.name for one in collect_figures(runs, table) if one.subject == "join"] == ["known-used-1"]  # type: ignore[arg-type]
     page = report_html(runs, table)  # type: ignore[arg-type]
     section = page.split('<details class="part" id="join">')[1].split("</details>")[0]
@@ -59,7 +59,7 @@ def test_runs_that_saw_other_frames_are_not_joined_and_the_report_says_so(tmp_pa
     runs = [vlm, policy]
     table = retention_table(runs)  # type: ignore[arg-type]
     found = joins_of(runs, table)  # type: ignore[arg-type]
-    assert found.found == ()
+    assert found.tables == ()
     assert "begin with another frame" in found.refused[0]
     assert "begin with another frame" in report_html(runs, table)  # type: ignore[arg-type]
 

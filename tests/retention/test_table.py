@@ -26,7 +26,7 @@ CONTRACT_KEYS = {
     "retention": {"value", "ci", "published", "defined", "note"},
     "controls": {"missing", "probe_minus_sr", "n_groups"},
 }  # fmt: skip
-FORMER_KEYS = {"accuracy", "debiased", "bounded", "area", "chance", "beats", "plain"}
+FORMER_KEYS = {"accuracy", "debiased", "bounded", "area", "beats", "plain"}
 """A key that changed its meaning would be read as before."""
 
 
@@ -188,7 +188,7 @@ FLOATS = (
     "chance",
     "p_fwe",
 )
-TEXTS = ("retention.note", "answers.score", "minus", "minus_run", "only_minus")
+TEXTS = ("retention.note", "retention.reason", "answers.score", "minus", "minus_run", "only_minus")
 
 
 def test_the_first_iteration_stands_beside_the_best(probed_run: ProbedRun) -> None:

@@ -30,7 +30,7 @@ def test_figures_and_report_draw_the_probes_of_the_table_not_the_newest(probed_r
     older = load_results(run)
     newer = probed_again(run, permutations=50)
     table = retention_table([run], keys=[older.key])
-    assert table.results[str(run.location)].key == older.key
+    assert table.results_of(run.location).key == older.key
     assert {row.run.probes for row in table.all_rows} == {older.key}
     (curves,) = [exhibit for exhibit in collect_figures([run], table) if exhibit.name.endswith("layer-curves")]
     with curves.drawn() as figure:
@@ -38,7 +38,7 @@ def test_figures_and_report_draw_the_probes_of_the_table_not_the_newest(probed_r
     page = report_html([run], table)
     assert older.key in page
     assert newer.key not in page
-    assert retention_table([run]).results[str(run.location)].key == newer.key
+    assert retention_table([run]).results_of(run.location).key == newer.key
 
 
 def test_a_table_is_not_drawn_with_runs_it_was_not_made_of(probed_run: ProbedRun) -> None:

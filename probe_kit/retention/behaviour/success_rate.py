@@ -49,10 +49,11 @@ class PairedItems:
 class SuccessRate:
     """Outcomes of the episodes of one category (or of any table of episodes); rates are shares, 0 to 1.
 
-    ci: 95 % interval of `sr`, groups of items as the unit (`Share.interval`). sr_original, sr_swapped: per
-    layout, and layout_mean their mean. sr_left, sr_right: per side of the correct picture. share_wrong,
-    share_outside: ended on the other picture, or on neither. share_never_moved: share that ended where it
-    started, a failed grasp; part of share_outside, None if it was not recorded. share_invalid_action: share of
+    n_groups: independent groups of items. ci: 95 % interval of `sr`, groups of items as the unit
+    (`Share.interval`). sr_original, sr_swapped: per layout, and layout_mean their mean. sr_left, sr_right: per
+    side of the correct picture. share_wrong, share_outside: ended on the other picture, or on neither.
+    share_never_moved: share that ended where it started, a failed grasp; part of share_outside, None if it was not
+    recorded. share_invalid_action: share of
     inferences that put out no action, None for a policy that cannot tell. chance_margin_episodes: half-width of
     the band around 0.5 that guessing explains, for N = episodes (the paper's); chance_margin_items: the same for
     N = items; chance_margin: for as many items as count, fewer where items of a group answer alike, and what
@@ -63,6 +64,7 @@ class SuccessRate:
 
     n_episodes: int
     n_items: int
+    n_groups: int | None = None
     sr: float | None = None
     ci: tuple[float | None, float | None] | None = None
     sr_original: float | None = None
@@ -172,6 +174,7 @@ def success_rate(episodes: "pd.DataFrame") -> SuccessRate:
     return SuccessRate(
         n_episodes=len(episodes),
         n_items=n_items,
+        n_groups=np.unique(units_of(episodes)).size,
         sr=sr,
         ci=(interval.low, interval.high),
         sr_original=original,

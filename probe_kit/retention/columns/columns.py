@@ -29,6 +29,7 @@ from probe_kit.retention.columns.text import (
     verdict_text,
 )
 from probe_kit.retention.compare.compare import Difference
+from probe_kit.retention.rows.parts import StreamPart
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.statistics.significance import SIGNIFICANCE
 
@@ -72,7 +73,7 @@ class Column:
         return replace(self, heading=both, help=f"{self.help} Of a model that was asked: {_lower(meaning)}")
 
     def sort_value(self, row: RetentionRow) -> Any:
-        """What a row is sorted by in this column; None for last."""
+        """Return what a row is sorted by in this column; None for last."""
         return attrgetter(self.key)(row) if self.sort is None else self.sort(row)
 
 
@@ -507,7 +508,12 @@ BACKBONE_VERDICT = Column(
 )
 BACKBONE_LAYER = Column(key="backbone.layer", heading="backbone layer", help=_LAYER, text=backbone_place)
 BACKBONE_P = p_value("backbone.p_fwe", "backbone p", _P)
-BACKBONE_PEAK = share("backbone.peak", "backbone peak %", _PEAK)
+BACKBONE_PEAK = share(
+    "backbone.peak",
+    "backbone peak %",
+    _PEAK,
+    text=lambda row: percent(row.backbone.peak if row.is_side else None),
+)
 EXCEEDS = Column(
     key="backbone.exceeds",
     heading="backbone exceeds",
@@ -542,7 +548,13 @@ ACTION_LAYER = Column(
     answers=("answer layer", _LAYER),
 )
 ACTION_P = p_value("action.p_fwe", "action p", _P, answers=("answer p", _P))
-ACTION_PEAK = share("action.peak", "action peak %", _PEAK, answers=("answer peak %", _PEAK))
+ACTION_PEAK = share(
+    "action.peak",
+    "action peak %",
+    _PEAK,
+    text=lambda row: percent(row.action.peak if row.is_side else None),
+    answers=("answer peak %", _PEAK),
+)
 FIRST_ITERATION = share(
     "action.first_peak",
     "first iteration %",
@@ -550,6 +562,48 @@ FIRST_ITERATION = share(
     "itself, as a noisy action or as the tokens before.",
     answers=("first iteration %", "Best layer at the first iteration."),
 )
+_SITE = "The site of a label that has the largest score above its own chance."
+_CHANCE = "Mean score with labels exchanged between groups, at that site."
+_LABEL_SCORE = (
+    "Held-out score of a probe of a label at that site: accuracy balanced between classes, or R². Bold: the "
+    "signal is shown."
+)
+_ABOVE_CHANCE = (
+    "Score of a label above chance at sites that other groups chose, with its 95 % interval. Chance is subtracted "
+    "at each site. Bold: the signal is shown."
+)
+METRIC = Column(
+    key="task",
+    heading="metric",
+    help="The score of a label: accuracy balanced between its classes, or R² of a quantity.",
+    text=lambda row: "–" if row.is_side else row.metric,
+)
+
+
+def _of_label(part: str, name: str, meaning: str, text: Callable[[StreamPart], str], **more: Any) -> Column:
+    """A column of one stream's probes of a label; empty for a side, whose accuracy has columns of its own."""
+    stream, read = part.partition(".")[0], attrgetter(part.partition(".")[0])
+
+    def cell(row: RetentionRow) -> str:
+        return "–" if row.is_side else text(read(row))
+
+    return replace(Column(key=part, heading=f"{stream} {name}", help=meaning, text=cell), **more)
+
+
+def _label_columns(part: str) -> tuple[Column, ...]:
+    strong = {"strong": lambda row: not row.is_side and attrgetter(part)(row).has_signal}
+    return (
+        _of_label(f"{part}.site", "site", _SITE, lambda of: of.site or "–"),
+        _of_label(f"{part}.peak", "score", _LABEL_SCORE, lambda of: number(of.peak), **strong),
+        _of_label(f"{part}.chance", "chance", _CHANCE, lambda of: number(of.chance)),
+        _of_label(f"{part}.above", "above chance", _ABOVE_CHANCE, _above_chance, **strong),
+    )
+
+
+def _above_chance(part: StreamPart) -> str:
+    return "–" if part.chance is None else with_limits(part.above, part.above_ci, number)
+
+
 GROUPS = Column(
     key="controls.n_groups",
     heading="groups",
@@ -600,14 +654,18 @@ TABLES: Mapping[str, tuple[ColumnGroup, ...]] = {
     ),
     "Retention": (
         ColumnGroup(
-            "What is retained", (RETENTION, RETENTION_MODELS, PUBLISHED, PROBE_MINUS_SR), section="retention"
+            "What is retained",
+            (METRIC, RETENTION, RETENTION_MODELS, PUBLISHED, PROBE_MINUS_SR),
+            section="retention",
         ),
         ColumnGroup(
-            "In the backbone", (BACKBONE, BACKBONE_VERDICT, BACKBONE_LAYER, BACKBONE_P, EXCEEDS), section="probes"
+            "In the backbone",
+            (*_label_columns("backbone"), BACKBONE, BACKBONE_VERDICT, BACKBONE_LAYER, BACKBONE_P, EXCEEDS),
+            section="probes",
         ),
         ColumnGroup(
             "Where the action is made",
-            (ACTION, ACTION_VERDICT, ACTION_LAYER, ACTION_P, FIRST_ITERATION),
+            (*_label_columns("action"), ACTION, ACTION_VERDICT, ACTION_LAYER, ACTION_P, FIRST_ITERATION),
             section="probes",
         ),
         ColumnGroup(

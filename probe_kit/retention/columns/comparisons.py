@@ -50,7 +50,7 @@ def wording_tables(wordings: Sequence[Difference], names: Mapping[str, str]) -> 
 
 
 def _items(row: Difference) -> str:
-    """How many are compared, and of how many where some are left out."""
+    """Return how many are compared, and of how many where some are left out."""
     if row.n_items is None:
         return "other items"
     return str(row.n_items) if row.of_items in (None, row.n_items) else f"{row.n_items} of {row.of_items}"
@@ -58,14 +58,14 @@ def _items(row: Difference) -> str:
 
 def size_table(means: Sequence[RetentionRow]) -> list[Table]:
     """Mean accuracy by model and prompt, a column per size of the picture; none for fewer than two VLM runs."""
-    asked = [row for row in once_per_category(means) if is_vlm(row) and row.category == MEAN]
-    if len(asked) < 2:
+    of_vlms = [row for row in once_per_category(means) if is_vlm(row) and row.category == MEAN]
+    if len(of_vlms) < 2:
         return []
     sizes = sorted(
-        {str(row.answers.picture_size) for row in asked}, key=lambda size: [int(n) for n in size.split("x")]
+        {str(row.answers.picture_size) for row in of_vlms}, key=lambda size: [int(n) for n in size.split("x")]
     )
     lines: dict[tuple[str, str], dict[str, str]] = {}
-    for row in asked:
+    for row in of_vlms:
         name = f"{row.run.model} (random weights)" if row.run.random_weights else row.run.model
         extras = [
             str(part) for part in (row.answers.picture, row.answers.asked_for) if part not in ("frame", "target")
@@ -75,7 +75,7 @@ def size_table(means: Sequence[RetentionRow]) -> list[Table]:
         while str(row.answers.picture_size) in lines.get((name, prompt), {}):
             name = model_name(row) if name != model_name(row) else f"{name} '"
         lines.setdefault((name, prompt), {})[str(row.answers.picture_size)] = success_interval(row)
-    cells = [(*name, *(found.get(size, "–") for size in sizes)) for name, found in lines.items()]
+    cells = [(*name, *(rates.get(size, "–") for size in sizes)) for name, rates in lines.items()]
     title, note = "Accuracy by prompt and size of the picture", "mean over categories in %, with its 95 % interval"
     return [Table.of(title, ("model", "prompt", *sizes), cells, names=2, notes=[note])]
 
@@ -92,12 +92,12 @@ _SOURCES: Mapping[Relation, str] = {
 def vlm_vla_tables(gaps: Sequence[Difference]) -> list[Table]:
     """One table per pair of a VLM run and a policy run."""
     return [
-        _gap_table(asked, acted, list(rows))
-        for (asked, acted), rows in groupby(gaps, key=lambda gap: (gap.group, gap.minus))
+        _gap_table(vlm, policy, list(rows))
+        for (vlm, policy), rows in groupby(gaps, key=lambda gap: (gap.group, gap.minus))
     ]
 
 
-def _gap_table(asked: str, acted: str, rows: Sequence[Difference]) -> Table:
+def _gap_table(vlm: str, policy: str, rows: Sequence[Difference]) -> Table:
     frames = {row.same_frames for row in rows}
     first = (
         "the same first frames" if frames == {True} else "OTHER first frames" if False in frames else "no hashes"
@@ -121,7 +121,7 @@ def _gap_table(asked: str, acted: str, rows: Sequence[Difference]) -> Table:
     ]
     columns = ("category", "VLM %", "VLA %", "VLM − VLA [95 %]", "p", "p (Holm)", "items")
     notes = [items, first, _SOURCES[rows[0].source or "unknown"], tests]
-    return Table.of(f"VLM − VLA: {asked} − {acted}", columns, cells, mean=MEAN, notes=["; ".join(notes)])
+    return Table.of(f"VLM − VLA: {vlm} − {policy}", columns, cells, mean=MEAN, notes=["; ".join(notes)])
 
 
 # -- answer, probe, success --------------------------------------------------------------------------------------
@@ -216,12 +216,12 @@ def _tests() -> Columns:
 
 def _test_of(first: str, second: str) -> Callable[[CategoryCounts], str]:
     def cell(row: CategoryCounts) -> str:
-        found = [one for one in row.comparisons if (one.first, one.second) == (first, second)]
-        return _spell_test(found[0]) if found else "–"
+        tests = [test for test in row.comparisons if (test.first, test.second) == (first, second)]
+        return _spell_test(tests[0]) if tests else "–"
 
     return cell
 
 
-def _spell_test(one: Comparison) -> str:
-    corrected = "" if one.p_holm is None else f" ({number(one.p_holm, 4)})"
-    return f"{one.only_first} against {one.only_second}, {number(one.p, 4)}{corrected}"
+def _spell_test(test: Comparison) -> str:
+    corrected = "" if test.p_holm is None else f" ({number(test.p_holm, 4)})"
+    return f"{test.only_first} against {test.only_second}, {number(test.p, 4)}{corrected}"

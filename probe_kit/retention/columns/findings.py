@@ -1,4 +1,4 @@
-"""What a command ends on: one short sentence per category that says where the answer is lost, and the next step.
+"""The end of a command: a short sentence per category that says where the answer is lost, and the next step.
 
 A sentence has at most 25 words, two numbers and no brackets. Intervals, reasons and controls stand in the table,
 in `--details`, in reports and in JSON; `probe_kit.retention.columns.sentences` has the long form.
@@ -11,11 +11,13 @@ from collections.abc import Sequence
 from probe_kit._tables.numbers import whole
 from probe_kit.intervene.results.verdict import UseVerdict
 from probe_kit.retention.behaviour.success_rate import Regime
+from probe_kit.retention.columns.label_sentences import label_finding
 from probe_kit.retention.columns.sentences import is_probed, knows, unprobed
-from probe_kit.retention.columns.text import can_be_probed, is_vlm
+from probe_kit.retention.columns.text import is_vlm
 from probe_kit.retention.rows.parts import StreamPart
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.statistics.label_permutations import permutations_for
+from probe_kit.statistics.sufficiency import probe_command
 from probe_kit.train.results.control_scores import RANDOM_FEATURES, UNTRAINED
 
 MOST_WORDS = 25
@@ -24,19 +26,21 @@ MOST_NUMBERS = 2
 _CONTROLS = {RANDOM_FEATURES: "random features", UNTRAINED: "an untrained network"}
 
 
-def finding(row: RetentionRow, asked: RetentionRow | None = None) -> str:
+def finding(row: RetentionRow, vlm: RetentionRow | None = None) -> str:
     """Return what is found in a category: a verdict, a colon, and where on the way to the action it is lost.
 
-    asked: the row of a VLM that answered the same questions.
+    vlm: the row of a VLM that answered the same questions.
     """
+    if not row.is_side:
+        return label_finding(row)
     if is_vlm(row):
         return _of_vlm(row)
     use = row.image_swap.use
     if use is None:
-        return _without_swap(row, asked)
+        return _without_swap(row, vlm)
     if use.is_bounded and is_probed(row) and not _is_encoded(row):
-        return f"{_without_signal(row, asked)}: {_unread(row)}; the action does not follow it."
-    return _of_use(row, asked, use)
+        return f"{_without_signal(row, vlm)}: {_unread(row)}; the action does not follow it."
+    return _of_use(row, vlm, use)
 
 
 def count_words(sentence: str) -> int:
@@ -71,8 +75,8 @@ def _sentence(head: str, *clauses: str, row: RetentionRow) -> str:
     guessing = "" if row.success.sr is None else _beside_guessing(row)
     stream = _in_action(row)
     for in_action, guess in ((stream, guessing), (stream, ""), ("", guessing), ("", "")):
-        said = [clause.replace(_READ, f"{_READ}{in_action}") for clause in before]
-        sentence = f"{head}: {'; '.join([*said, success])}{guess}."
+        clauses_of = [clause.replace(_READ, f"{_READ}{in_action}") for clause in before]
+        sentence = f"{head}: {'; '.join([*clauses_of, success])}{guess}."
         if count_words(sentence) < MOST_WORDS and len(re.findall(r"\d+", sentence)) <= MOST_NUMBERS:
             break
     return sentence
@@ -89,27 +93,27 @@ def _in_action(row: RetentionRow) -> str:
     return f"{words} the {row.run.action_name}"
 
 
-def _head(row: RetentionRow, asked: RetentionRow | None, used: str) -> str:
+def _head(row: RetentionRow, vlm: RetentionRow | None, used: str) -> str:
     """Return the verdict: whether the VLM knows the answer, the policy encodes it, and the action uses it."""
-    stages = ["known"] * (asked is not None and knows(asked)) + ["encoded"] * _is_encoded(row)
+    stages = ["known"] * (vlm is not None and knows(vlm)) + ["encoded"] * _is_encoded(row)
     return ", ".join(filter(None, (" and ".join(stages), used)))
 
 
-def _of_use(row: RetentionRow, asked: RetentionRow | None, use: UseVerdict) -> str:
+def _of_use(row: RetentionRow, vlm: RetentionRow | None, use: UseVerdict) -> str:
     """Return the sentence of a row whose pictures were swapped."""
     verdict, what = use.finding
     if verdict == "used":
         return _sentence(verdict, *_read_and(row, "the action follows"), row=row)
     if verdict == "not used" and use.is_of_first_chunk and knows(row):
         what = "the first actions do not follow the answer, later ones may"
-        return _sentence(_head(row, asked, "not used at first"), what, *_missing(row), row=row)
+        return _sentence(_head(row, vlm, "not used at first"), what, *_missing(row), row=row)
     if verdict == "not used":
-        return _sentence(_head(row, asked, verdict), *_read_and(row, "the action does not follow"), row=row)
+        return _sentence(_head(row, vlm, verdict), *_read_and(row, "the action does not follow"), row=row)
     if use.behaviour == "inconclusive" and not use.lacks_control:
         read = [_READ] if _is_encoded(row) else _missing(row, "the answer")
-        return _sentence(_head(row, asked, verdict), *read, what, row=row)
+        return _sentence(_head(row, vlm, verdict), *read, what, row=row)
     if verdict in ("not decisive", "use undecided"):
-        return _sentence(_head(row, asked, verdict), what, *_missing(row), row=row)
+        return _sentence(_head(row, vlm, verdict), what, *_missing(row), row=row)
     return _sentence(verdict, what, row=row)
 
 
@@ -167,24 +171,24 @@ def _success(row: RetentionRow) -> str:
     return f"success {whole(row.success.sr)} %"
 
 
-def _without_signal(row: RetentionRow, asked: RetentionRow | None) -> str:
+def _without_signal(row: RetentionRow, vlm: RetentionRow | None) -> str:
     missing = "absent" if row.backbone.verdict == "absent" else "not shown"
-    return f"known, {missing} in the backbone" if asked is not None and knows(asked) else missing
+    return f"known, {missing} in the backbone" if vlm is not None and knows(vlm) else missing
 
 
-def _without_swap(row: RetentionRow, asked: RetentionRow | None) -> str:
+def _without_swap(row: RetentionRow, vlm: RetentionRow | None) -> str:
     """Return the sentence of a row whose pictures were not swapped."""
     if is_probed(row) and _is_encoded(row):
         tested = "use not tested" if row.success.sr is not None else ""
-        return _sentence(_head(row, asked, tested), _READ, row=row)
+        return _sentence(_head(row, vlm, tested), _READ, row=row)
     if is_probed(row):
-        return _sentence(_without_signal(row, asked), _unread(row), row=row)
+        return _sentence(_without_signal(row, vlm), _unread(row), row=row)
     if row.success.sr is None:
         return f"not measured: {_success(row)}, and {unprobed(row)}."
     words = {Regime.KNOWLEDGE: "success", Regime.FAILURE: "failure"}
     head = words.get(row.success.regime or Regime.NO_RELIABLE_KNOWLEDGE, "success not shown")
-    beside = "" if head == "success" else f", {_against_guessing(row)}"
-    return f"{head}: the cube ends right in {whole(row.success.sr)} %{beside}; {unprobed(row)}."
+    against_guessing = "" if head == "success" else f", {_against_guessing(row)}"
+    return f"{head}: the cube ends right in {whole(row.success.sr)} %{against_guessing}; {unprobed(row)}."
 
 
 # -- what to do next ----------------------------------------------------------------------------------------------
@@ -192,19 +196,20 @@ def _without_swap(row: RetentionRow, asked: RetentionRow | None) -> str:
 
 def next_step(rows: Sequence[RetentionRow]) -> str:
     """Return the command for what is open in the first run, and what it answers; empty without a policy."""
-    acts = [row for row in rows if row.category != MEAN and not is_vlm(row)]
+    acts = [row for row in rows if row.is_side and row.category != MEAN and not is_vlm(row)]
     if not acts:
         return ""
-    own = [row for row in acts if row.key == acts[0].key]
-    run = shlex.quote(own[0].run.location)
-    has_activations = own[0].run.action_stream is not None
-    if has_activations and not any(map(is_probed, own)) and any(map(can_be_probed, own)):
-        return f"next: probe-kit train {run}  where inside the answer can be read"
-    if has_activations and any(row.image_swap.use is None for row in own) and not own[0].run.capture_only:
+    of_run = [row for row in acts if row.key == acts[0].key]
+    run = shlex.quote(of_run[0].run.location)
+    has_activations = of_run[0].run.action_stream is not None
+    command = probe_command(run, {row.category: row.success.n_groups or 0 for row in of_run})
+    if has_activations and not any(map(is_probed, of_run)) and command:
+        return f"next: {command}  where inside the answer can be read"
+    if has_activations and any(row.image_swap.use is None for row in of_run) and not of_run[0].run.capture_only:
         return f"next: probe-kit intervene {run}  whether the action follows the answer"
-    if any("permutations" in row.backbone.remedy for row in own):
+    if any("permutations" in row.backbone.remedy for row in of_run):
         fewest = permutations_for()
         return f"next: probe-kit train {run} --permutations 200  because fewer than {fewest} show nothing"
-    if any(is_probed(row) and not _is_encoded(row) and row.backbone.verdict != "absent" for row in own):
+    if any(is_probed(row) and not _is_encoded(row) and row.backbone.verdict != "absent" for row in of_run):
         return "next: probe-kit power  how many items would show what is open"
     return f"next: probe-kit view {run}  episode by episode, in a browser"

@@ -1,4 +1,4 @@
-"""What the rows of a table did: a policy acts and succeeds, a model that was asked answers right."""
+"""The mode of the rows of a table: a policy acts and succeeds, a model that was asked answers right."""
 
 from collections.abc import Iterable, Mapping
 from typing import Literal
@@ -18,7 +18,7 @@ _HEADINGS: Mapping[str, str] = {"SR": "accuracy", "outside": "unread", "goes lef
 
 
 def modes_of(rows: Iterable[RetentionRow]) -> Modes:
-    """What all rows did, `both` for a mixture."""
+    """Return what all rows did, `both` for a mixture."""
     modes = {row.run.mode for row in rows}
     return "both" if len(modes) > 1 else "answers" if modes == {"answers"} else "acts"
 

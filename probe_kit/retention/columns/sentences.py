@@ -1,4 +1,4 @@
-"""What a row says in words: its verdict, and the sentence about it."""
+"""The verdict of a row, and the sentence about it."""
 
 from collections.abc import Sequence
 from typing import Literal, cast
@@ -7,9 +7,11 @@ from probe_kit._system.counting import counted
 from probe_kit._tables.numbers import Limits, whole
 from probe_kit.intervene.results.verdict import UNTESTED, UseVerdict, describe_swap
 from probe_kit.retention.behaviour.success_rate import Regime
-from probe_kit.retention.columns.text import can_be_probed, is_vlm, model_name
+from probe_kit.retention.columns.label_sentences import label_details
+from probe_kit.retention.columns.text import is_vlm, model_name
 from probe_kit.retention.rows.parts import StreamPart
 from probe_kit.retention.rows.row import RetentionRow
+from probe_kit.statistics.sufficiency import GROUPS_FOR_PROBES
 from probe_kit.train.results.control_scores import RANDOM_FEATURES, UNTRAINED
 
 
@@ -50,9 +52,9 @@ _READABLE_HELP = {
     **{name: f"{meaning}." for name, meaning in _EVIDENCE.items()},
     **{name: f"{_capital(meaning)}. No probes are stored." for name, meaning in _SUCCESS.items()},
     **{
-        f"{evidence}, {success}": f"{read}; {done}. Only an intervention shows whether the answer is used."
+        f"{evidence}, {success}": f"{read}; {behaviour}. Only an intervention shows whether the answer is used."
         for evidence, read in _EVIDENCE.items()
-        for success, done in _SUCCESS.items()
+        for success, behaviour in _SUCCESS.items()
         if evidence == "shown" or success != "success not shown"
     },
 }
@@ -69,7 +71,7 @@ VERDICT_HELP = _READABLE_HELP | _BEHAVIOUR_HELP
 
 
 def verdict(row: RetentionRow) -> str:
-    """What a row of the retention table says: is the answer in the backbone, and does the policy act on it?
+    """Return what a row says: is the answer in the backbone, and does the policy act on it?
 
     With a stored image swap the verdict is that of `probe_kit.intervene.classify_use`. Where the answer is neither
     used nor read in the backbone, and without an image swap, it is `readable`.
@@ -119,14 +121,16 @@ def knows(row: RetentionRow) -> bool:
     return row.success.regime == Regime.KNOWLEDGE
 
 
-def describe_category(row: RetentionRow, asked: RetentionRow | None = None) -> str:
+def describe_category(row: RetentionRow, vlm: RetentionRow | None = None) -> str:
     """The finding in plain words, to be set behind the category's name.
 
     Number of items; what the VLM answers, what the streams hold and what the policy does, each with its
-    uncertainty; what follows, and what to do next. asked: the VLM's row of the same category.
+    uncertainty; what follows, and what to do next. vlm: the VLM's row of the same category.
     """
+    if not row.is_side:
+        return label_details(row)
     items = row.success.n_items
-    answered = row if is_vlm(row) else asked
+    answered = row if is_vlm(row) else vlm
     parts = [] if answered is None or answered.success.sr is None else [_answered(answered)]
     parts += _streams(row)
     parts += [] if is_vlm(row) else [_acted(row)]
@@ -142,32 +146,33 @@ _LATER = "Yet the policy succeeds: actions after the first inference may follow.
 
 
 def conclusion(row: RetentionRow) -> str:
-    """What follows from a row, and what to do next."""
+    """Return what follows from a row, and what to do next."""
     if is_vlm(row):
         return "The VLM knows the answer." if knows(row) else "Not shown that the VLM knows the answer."
     use = row.image_swap.use
     is_later = use is not None and use.is_bounded and use.is_of_first_chunk and knows(row)
     parts = [_finding(row) if use is None else _used(row, use), _LATER * is_later]
     if not is_probed(row):
-        parts.append(f"{_capital(unprobed(row))}{': run `probe-kit train`' * can_be_probed(row)}.")
+        can_be_probed = (row.success.n_groups or 0) >= GROUPS_FOR_PROBES
+        parts.append(f"{_capital(unprobed(row))}{': run `probe-kit train`' * can_be_probed}.")
     return " ".join(filter(None, parts))
 
 
 def _used(row: RetentionRow, use: UseVerdict) -> str:
-    """Of a row with a stored image swap: behaviour; place; tie."""
+    """Return the sentence of a row with a stored image swap: behaviour; place; tie."""
     if _is_nowhere(row, use):
         return f"{_nothing_shown(row)} {use.sentence}"
     return use.sentence
 
 
 def _finding(row: RetentionRow) -> str:
-    """Of a row without one."""
-    found = readable(row)
+    """Return the sentence of a row without one."""
+    reading = readable(row)
     if not is_probed(row):
         return _unprobed(row)
-    if found == "shown":
+    if reading == "shown":
         return "Shown in the backbone."
-    if found.startswith("shown, "):
+    if reading.startswith("shown, "):
         return f"Shown in the backbone; {_behaviour(row)}; {_UNTESTED}."
     if not knows(row):
         return _nothing_shown(row)
@@ -175,25 +180,25 @@ def _finding(row: RetentionRow) -> str:
 
 
 def _unprobed(row: RetentionRow) -> str:
-    """Of behaviour alone; empty where the sentence has said all."""
+    """Return the sentence of behaviour alone; empty where the other one has said all."""
     if row.success.sr is None:
         return ""
     return f"{_capital(_behaviour(row))}; {_UNTESTED}."
 
 
 def _nothing_shown(row: RetentionRow) -> str:
-    """Of a backbone without signal: what is decided first, then what is open."""
+    """Return the sentence of a backbone without signal: what is decided first, then what is open."""
     absent = row.backbone.verdict == "absent"
     behaviour = _behaviour(row)
     backbone = _backbone(row)
     parts = [backbone, behaviour] if absent or behaviour == _NOT_SHOWN else [behaviour, backbone]
-    said = "; ".join(filter(None, parts))
+    clauses = "; ".join(filter(None, parts))
     remedy = ""
     if not absent:
         remedy = f": {row.backbone.remedy or _MORE_ITEMS}"
     elif behaviour == _NOT_SHOWN:
         remedy = f": {_MORE_ITEMS}"
-    return f"{_capital(said)}{remedy}."
+    return f"{_capital(clauses)}{remedy}."
 
 
 _NOT_SHOWN = "success is not shown"
@@ -241,21 +246,21 @@ def _rate(row: RetentionRow) -> str:
 
 
 def _regime_reason(row: RetentionRow) -> str:
-    """By which margin the regime decides, where the interval excludes one half and nothing is shown.
+    """Return the margin by which the regime decides, where the interval excludes one half and nothing is shown.
 
     Also where the rate is above guessing and its interval is not, and why a failure is one.
     """
-    found = row.success
-    if found.sr is None or found.regime in (None, Regime.KNOWLEDGE) or found.chance_margin is None:
+    success = row.success
+    if success.sr is None or success.regime in (None, Regime.KNOWLEDGE) or success.chance_margin is None:
         return ""
-    points, reach = 100 * abs(found.sr - 0.5), f"the {100 * found.chance_margin:.1f} that guessing can reach"
-    side = "above" if found.sr > 0.5 else "below"
-    if found.regime == Regime.FAILURE:
+    points, reach = 100 * abs(success.sr - 0.5), f"the {100 * success.chance_margin:.1f} that guessing can reach"
+    side = "above" if success.sr > 0.5 else "below"
+    if success.regime == Regime.FAILURE:
         return f", {points:.1f} points {side} one half, more than {reach} ({_failure(row)})"
-    low, high = found.ci or (None, None)
+    low, high = success.ci or (None, None)
     if low is not None and high is not None and not low <= 0.5 <= high:
         return f", {points:.1f} points {side} one half, less than {reach}"
-    return ", which includes one half" if found.sr > 0.5 + found.chance_margin else ""
+    return ", which includes one half" if success.sr > 0.5 + success.chance_margin else ""
 
 
 def _failure(row: RetentionRow) -> str:
@@ -271,7 +276,7 @@ _CONTROLS = {RANDOM_FEATURES: "random features", UNTRAINED: "the untrained netwo
 
 
 def _streams(row: RetentionRow) -> list[str]:
-    """What can be read in the backbone, and where the action is made. The first clause names the answer."""
+    """Return what can be read in the backbone, and where the action is made. The first clause names the answer."""
     action = f"the {row.run.action_name}"
     if is_probed(row) and row.backbone.score is None:
         return ["the probes have no score: too few groups of items, or a fold with one side only"]
@@ -301,7 +306,7 @@ def _in_stream(name: str, part: StreamPart, what: str) -> str:
 
 
 def _accuracy(part: StreamPart) -> str:
-    """Of a stream with signal; a signal that no control was compared with may be in the pictures themselves."""
+    """Return the score of a stream with signal; one without a control may be in the pictures themselves."""
     against = "" if part.is_controlled else "; against chance only"
     return f"{whole(part.score)} %{_range(part.ci)}{against}"
 
@@ -324,7 +329,7 @@ def chance_only(rows: Sequence[RetentionRow]) -> str:
 
 
 def _acted(row: RetentionRow) -> str:
-    """What the action does when the pictures are swapped, and where the cube ends."""
+    """Return what the action does when the pictures are swapped, and where the cube ends."""
     use = row.image_swap.use
     swap = "" if use is None else describe_swap(row.image_swap, use)
     if row.success.sr is None:

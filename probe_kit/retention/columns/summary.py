@@ -15,6 +15,7 @@ from probe_kit.retention.columns.text import (
     is_vlm,
     model_name,
     models_p,
+    name_of,
     title_of,
 )
 from probe_kit.retention.compare.compare import Difference
@@ -24,19 +25,22 @@ from probe_kit.retention.rows.row import MEAN, RetentionRow
 MARK = "✓"
 """After a share: the stream exceeds chance and a control, or the regime of the behaviour is knowledge."""
 _LEGENDS = {
+    "metric": "Metric: of a label, balanced accuracy of classes, R² of quantities",
+    "backbone above chance": "Above chance: score of sites that other groups chose minus its mean score with "
+    "permuted labels, 95 % intervals over groups",
     "VLM %": "VLM: share of its answers that are right; its name ends on the prompt and the size of the picture",
     "backbone %": "Backbone: accuracy of probes in the backbone, at sites that other questions chose",
     "action %": "Action: the same at the action's sites",
     "success %": "Success: the cube ends on the correct picture",
     "retention": "Retention: share of the backbone's signal left in the action",
 }
-"""What a column shows."""
+"""The meaning of a column."""
 _TESTS = {
     "p (Holm)": "p: exact, of a difference in success or answers, (corrected for all categories and pairs); "
     f"{P_DECIDES}",
     "p over models (least)": "p over models: exact, models as the unit (the least that so few models allow)",
 }
-"""What a column of differences shows."""
+"""The meaning of a column of differences."""
 HEADING_HELP = {
     heading: f"{meaning[:1].upper()}{meaning[1:]}."
     for heading, legend in (_LEGENDS | _TESTS).items()
@@ -47,23 +51,27 @@ HEADING_HELP = {
 
 @dataclass(frozen=True)
 class CategorySummary:
-    """One category of a policy, or of a VLM alone. asked: the VLM's row of the same category."""
+    """One category of a policy, or of a VLM alone; or a label. vlm: the VLM's row of the same category."""
 
     row: RetentionRow
-    asked: RetentionRow | None = None
+    vlm: RetentionRow | None = None
 
     @property
     def name(self) -> str:
-        """The category as it is spelt at the beginning of a sentence."""
-        return title_of(self.row.category)
+        """The category as it is spelt at the beginning of a sentence, or the label."""
+        return name_of(self.row)
 
     @property
     def cells(self) -> tuple[str, ...]:
-        """What stands under `HEADINGS`."""
-        row, asked = self.row, self.row if is_vlm(self.row) else self.asked
+        """The texts under `HEADINGS`."""
+        row, vlm = self.row, self.row if is_vlm(self.row) else self.vlm
         acts = None if is_vlm(row) else row
+        if not row.is_side:
+            label = row.metric, *map(_above, (row.backbone, row.action))
+            return (*label, *["–"] * 4, _retention(row), "")
         return (
-            "–" if asked is None else _share(asked.success.sr, asked.success.ci, knows(asked)),
+            *["–"] * 3,
+            "–" if vlm is None else _share(vlm.success.sr, vlm.success.ci, knows(vlm)),
             _share(row.backbone.score, row.backbone.ci, _is_marked(row.backbone)),
             _share(row.action.score, row.action.ci, _is_marked(row.action)),
             "–" if acts is None else _share(acts.success.sr, acts.success.ci, knows(acts)),
@@ -74,15 +82,19 @@ class CategorySummary:
     @property
     def finding(self) -> str:
         """The finding in one short sentence, to be set behind the category's name."""
-        return finding(self.row, self.asked)
+        return finding(self.row, self.vlm)
 
     @property
     def details(self) -> str:
         """The finding with all its numbers, their uncertainty and the number of items."""
-        return f"{self.name} {describe_category(self.row, self.asked)}"
+        return f"{self.name} {describe_category(self.row, self.vlm)}"
 
 
-HEADINGS = ("VLM %", "backbone %", "action %", "success %", "retention", "verdict")
+HEADINGS = (
+    "metric", "backbone above chance", "action above chance",
+    "VLM %", "backbone %", "action %", "success %", "retention", "verdict",
+)  # fmt: skip
+"""Columns in which no row has anything to show are left out: the first three are of labels, others of sides."""
 
 
 def _is_marked(part: StreamPart) -> bool:
@@ -94,8 +106,14 @@ def _share(value: float | None, limits: Limits | None, marked: bool) -> str:
     return f"{text} {MARK}" if marked and value is not None else text
 
 
+def _above(part: StreamPart) -> str:
+    """Return the score of a label above chance with its interval, marked where there is signal."""
+    text = with_limits(part.above, part.above_ci, number) if part.chance is not None else "–"
+    return f"{text} {MARK}" if _is_marked(part) else text
+
+
 def _retention(row: RetentionRow) -> str:
-    if row.backbone.score is None or row.action.score is None:
+    if any(part.score is None and part.above is None for part in (row.backbone, row.action)):
         return "–"
     if not row.retention.defined:
         return "n/a"
@@ -107,64 +125,81 @@ def _retention(row: RetentionRow) -> str:
 
 @dataclass(frozen=True)
 class RunSummary:
-    """A row and a sentence per category of a run. beside: the VLM that was asked the same questions, or empty."""
+    """A row and a sentence per category of a run. vlm: the model that was asked the same questions, or empty.
+
+    mean: over the categories; None of labels, whose metrics differ.
+    """
 
     run: str
-    beside: str
+    vlm: str
     categories: tuple[CategorySummary, ...]
-    mean: CategorySummary
+    mean: CategorySummary | None
 
     @property
     def title(self) -> str:
-        """Whose summary it is."""
-        return " · ".join(name for name in (self.run, self.beside) if name)
+        """The names of the run and of the VLM beside it."""
+        return " · ".join(name for name in (self.run, self.vlm) if name)
+
+    @property
+    def rows(self) -> tuple[CategorySummary, ...]:
+        """The categories, and their mean where there is one."""
+        return self.categories if self.mean is None else (*self.categories, self.mean)
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """One per category, all beginning at one column."""
-        width = max(len(one.name) for one in self.categories)
-        return tuple(f"{one.name.ljust(width)}  {one.finding}" for one in self.categories)
+        """The findings, a sentence per category, all beginning at one column."""
+        width = max(len(category.name) for category in self.categories)
+        return tuple(f"{category.name.ljust(width)}  {category.finding}" for category in self.categories)
 
 
-def summary_table(found: Sequence[RunSummary], differences: Sequence[Difference] = ()) -> Table:
-    """A row per category and run, and the mean; below them the differences of runs. Empty columns are left out."""
-    names = list(dict.fromkeys(one.row.category for run in found for one in run.categories))
-    if any(len(run.categories) > 1 for run in found):
-        names.append(MEAN)
+def summary_table(summaries: Sequence[RunSummary], differences: Sequence[Difference] = ()) -> Table:
+    """Return a row per category and run, and the mean; below them the differences of runs.
+
+    Labels have a row per target, category and view. Columns in which no row has anything to show are left out.
+    """
+    every = [category for run in summaries for category in run.rows]
+    names = list(dict.fromkeys(category.name for category in every if category.row.category != MEAN))
+    if any(len(run.categories) > 1 for run in summaries):
+        names += [category.name for category in every if category.row.category == MEAN][:1]
     lines: list[Row] = []
     for name in names:
-        for run in found:
-            own = [one for one in (*run.categories, run.mean) if one.row.category == name]
-            lines += [_row(name, run.run, (*one.cells, *[""] * len(_TESTS))) for one in own]
+        for run in summaries:
+            of_name = [category for category in run.rows if category.name == name]
+            lines += [_row(summary, run.run) for summary in of_name]
         for row in differences:
-            if row.category == name:
-                lines.append(_row(name, f"{row.group} − {row.minus}", _difference_cells(row), is_difference=True))
-    headings = ("category", "run", *HEADINGS, *_TESTS)
+            if title_of(row.category) == name:
+                texts = (name, f"{row.group} − {row.minus}", "", *_difference_cells(row))
+                lines.append(Row(tuple(map(Cell, texts)), row.category == MEAN, is_difference=True))
+    is_of_sides = all(category.row.is_side for category in every)
+    headings = ("category" if is_of_sides else "label", "run", "view", *HEADINGS, *_TESTS)
+    title = " · ".join(dict.fromkeys(run.title for run in summaries))
     table = Table(
-        title=f"Summary: {' · '.join(dict.fromkeys(run.title for run in found))}",
+        title=f"Summary: {title}" if is_of_sides else f"Labels, and what reaches the action: {title}",
         headings=tuple(Heading(name, HEADING_HELP.get(name, "")) for name in headings),
         rows=tuple(lines),
-        names=2,
+        names=3,
         overflow="fold",
     )
-    if len(found) < 2 and not differences:
-        table = table.only([at for at in range(len(headings)) if at != 1])
-    table = table.filled()
+    has_views = not is_of_sides and len({category.row.view for category in every}) > 1
+    left_out = [*[1] * (len(summaries) < 2 and not differences), *[2] * (not has_views)]
+    table = table.only([at for at in range(len(headings)) if at not in left_out]).filled()
     legends = _LEGENDS | _TESTS
     legend = [legends[name] for name in table.columns if name in legends]
-    readouts = describe_readouts(one.row.image_swap.use for run in found for one in run.categories)
-    return replace(table, notes=(*legend, *filter(None, [readouts]), *_marks(found, table)))
+    readouts = describe_readouts(summary.row.image_swap.use for run in summaries for summary in run.categories)
+    return replace(table, notes=(*legend, *filter(None, [readouts]), *_marks(summaries, table)))
 
 
-def _row(category: str, run: str, cells: Sequence[str], is_difference: bool = False) -> Row:
-    texts = (title_of(category), run, *cells)
-    return Row(tuple(map(Cell, texts)), category == MEAN, is_difference)
+def _row(category: CategorySummary, run: str) -> Row:
+    texts = (category.name, run, category.row.view or "", *category.cells, *[""] * len(_TESTS))
+    return Row(tuple(map(Cell, texts)), category.row.category == MEAN)
 
 
-def _marks(found: Sequence[RunSummary], table: Table) -> list[str]:
-    """What the mark says where it stands, and a warning where it cannot stand because no control was run."""
+def _marks(summaries: Sequence[RunSummary], table: Table) -> list[str]:
+    """Return what the mark says where it stands, and a warning where it cannot stand as no control was run."""
     marked = any(MARK in text for line in table.texts for text in line)
-    warning = chance_only([one.row for run in found for one in run.categories])
+    warning = chance_only(
+        [category.row for run in summaries for category in run.categories if category.row.is_side]
+    )
     return [f"{MARK} above chance, and above every control that was run"] * marked + [warning] * bool(warning)
 
 
@@ -176,34 +211,39 @@ def _difference_cells(row: Difference) -> tuple[str, ...]:
     answered, acted = (sr, "") if row.mode == "answers" else ("", sr)
     ratio = with_limits(row.retention, row.retention_ci, signed)
     over_models = "" if row.sr_models is None else models_p(row.sr_models)
-    return answered, backbone, action, acted, ratio, "", "" if over_models else difference_test(row), over_models
+    test = "" if over_models else difference_test(row)
+    return "", "", "", answered, backbone, action, acted, ratio, "", test, over_models
 
 
 def summarise_runs(all_rows: Sequence[RetentionRow]) -> list[RunSummary]:
-    """One per run and group of a table's rows and means, by the first view of each.
+    """Return a summary per run and group of a table's rows and means, of sides by the first view of each.
 
-    Policies have the answers of a VLM of their suite.
-    A VLM has a summary of its own only where no policy of its suite is in the table.
+    Policies have the answers of a VLM of their suite. A VLM has a summary of its own only where no policy of its
+    suite is in the table. Labels have one of all their rows, without a mean.
     """
-    rows = [row for row in all_rows if row.category != MEAN]
-    means = [row for row in all_rows if row.category == MEAN]
-    asked = [row for row in rows if is_vlm(row) and _asks_for_the_answer(row)]
-    asked_means = {row.run.location: row for row in means if is_vlm(row)}
+    labels = [
+        RunSummary(model_name(rows[0]), "", tuple(map(CategorySummary, rows)), None)
+        for rows in by_run([row for row in all_rows if not row.is_side])
+    ]
+    rows = [row for row in all_rows if row.is_side and row.category != MEAN]
+    means = [row for row in all_rows if row.is_side and row.category == MEAN]
+    answers = [row for row in rows if is_vlm(row) and _asks_for_the_answer(row)]
+    answer_means = {row.run.location: row for row in means if is_vlm(row)}
     policies = by_run([row for row in rows if not is_vlm(row)])
-    beside = {row.run.suite for row in rows if not is_vlm(row)}
-    alone = by_run([row for row in rows if is_vlm(row) and row.run.suite not in beside])
+    suites = {row.run.suite for row in rows if not is_vlm(row)}
+    alone = by_run([row for row in rows if is_vlm(row) and row.run.suite not in suites])
     mean_of = {(mean.key, mean.view): mean for mean in means}
-    found = []
+    summaries = []
     for of_run in (*policies, *alone):
-        own = [row for row in of_run if row.view == of_run[0].view]
-        same = [row for row in asked if not is_vlm(own[0]) and row.run.suite == own[0].run.suite]
-        first = {row.category: row for row in same if row.run.location == same[0].run.location}
-        categories = tuple(CategorySummary(row, first.get(row.category)) for row in own)
-        vlm_mean = asked_means.get(same[0].run.location) if same else None
-        name = model_name(same[0]) if same else ""
-        mean = CategorySummary(mean_of[own[0].key, own[0].view], vlm_mean)
-        found.append(RunSummary(model_name(own[0]), name, categories, mean))
-    return found
+        first_view = [row for row in of_run if row.view == of_run[0].view]
+        head = first_view[0]
+        same = [row for row in answers if not is_vlm(head) and row.run.suite == head.run.suite]
+        vlm_rows = {row.category: row for row in same if row.run.location == same[0].run.location}
+        categories = tuple(CategorySummary(row, vlm_rows.get(row.category)) for row in first_view)
+        vlm_mean = answer_means.get(same[0].run.location) if same else None
+        mean = CategorySummary(mean_of[head.key, head.view], vlm_mean)
+        summaries.append(RunSummary(model_name(head), model_name(same[0]) if same else "", categories, mean))
+    return [*summaries, *labels]
 
 
 def _asks_for_the_answer(row: RetentionRow) -> bool:

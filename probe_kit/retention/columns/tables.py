@@ -19,6 +19,7 @@ from probe_kit.retention.columns.text import (
     difference_name,
     is_vlm,
     model_name,
+    name_of,
     once_per_category,
     probed,
     title_of,
@@ -52,23 +53,23 @@ def retention_tables(
     differences; notes of the last table of behaviour. sections: groups of columns that are shown, all by default.
     """
     once = once_per_category(rows)
-    own = {
-        "Accuracy of answers": [row for row in once if is_vlm(row)],
-        "Success rate": [row for row in once if not is_vlm(row)],
+    rows_of = {
+        "Accuracy of answers": [row for row in once if row.is_side and is_vlm(row)],
+        "Success rate": [row for row in once if row.is_side and not is_vlm(row)],
         "Retention": probed(rows),
         "Controls": probed(rows) if controlled(rows) else [],
     }
-    last = next((title for title in reversed(BEHAVIOUR) if own[title]), None)
-    found = {}
-    for title, of_table in own.items():
+    last = next((title for title in reversed(BEHAVIOUR) if rows_of[title]), None)
+    tables = {}
+    for title, of_table in rows_of.items():
         groups = [group for group in _groups(title, of_table) if sections is None or group.section in sections]
         if of_table and groups:
             gaps = [] if title == "Controls" else _differences(of_table, differences, title in BEHAVIOUR)
-            further = unpaired if title == last else ()
-            made = _table(title, groups, of_table, gaps, further)
-            if len(made.headings) > made.names:
-                found[title] = made
-    return found
+            why_unpaired = unpaired if title == last else ()
+            table = _table(title, groups, of_table, gaps, why_unpaired)
+            if len(table.headings) > table.names:
+                tables[title] = table
+    return tables
 
 
 def _groups(title: str, rows: Sequence[RetentionRow]) -> list[ColumnGroup]:
@@ -94,7 +95,7 @@ def _table(
     groups: Sequence[ColumnGroup],
     rows: Sequence[RetentionRow],
     differences: Sequence[Difference],
-    further: Sequence[str],
+    why_unpaired: Sequence[str],
 ) -> Table:
     modes = modes_of(rows)
     lines = _ordered(rows, differences)
@@ -106,7 +107,7 @@ def _table(
     ]
     names = _name_columns(title, rows, differences)
     tested = any(column.key == "difference.p" for column, _ in columns)
-    notes = [*_legend(title, rows), _difference_legend(differences, tested), *further, *_sizes(rows)]
+    notes = [*_legend(title, rows), _difference_legend(differences, tested), *why_unpaired, *_sizes(rows)]
     return Table(
         title=_title(title, rows),
         headings=(
@@ -148,19 +149,25 @@ def _name_columns(
     title: str, rows: Sequence[RetentionRow], differences: Sequence[Difference]
 ) -> list[tuple[Heading, Callable[[TableRow], str]]]:
     """Return the columns that tell rows apart: the category, and of several runs, views or calls which one."""
-    found: list[tuple[Heading, Callable[[TableRow], str]]] = [
+    names: list[tuple[Heading, Callable[[TableRow], str]]] = [
         (Heading("category", "Kind of question."), lambda line: title_of(line.category))
+        if all(row.is_side for row in rows)
+        else (Heading("label", "What the probes decode, and in which category."), _label_name)
     ]
     if differences or len({row.key for row in rows}) > 1:
-        found.append((Heading("run", "A run, or two of which the second is subtracted."), _run_name))
+        names.append((Heading("run", "A run, or two of which the second is subtracted."), _run_name))
     if title in BEHAVIOUR:
-        return found
+        return names
     if len({row.view for row in rows}) > 1:
         help_ = "How the tokens of an episode became one vector."
-        found.append((Heading("view", help_), lambda line: line.view or "–"))
+        names.append((Heading("view", help_), lambda line: line.view or "–"))
     if len({row.run.call for row in rows}) > 1:
-        found.append((Heading("call", TERMS["call"]), _call))
-    return found
+        names.append((Heading("call", TERMS["call"]), _call))
+    return names
+
+
+def _label_name(line: TableRow) -> str:
+    return title_of(line.category) if isinstance(line, Difference) else name_of(line)
 
 
 def _run_name(line: TableRow) -> str:
@@ -177,7 +184,9 @@ def _title(title: str, rows: Sequence[RetentionRow]) -> str:
     views, runs = ({row.view for row in rows}, {model_name(row): None for row in rows})
     view = f", view {rows[0].view}" if title not in BEHAVIOUR and len(views) == 1 else ""
     model = f"{next(iter(runs))} on " if len(runs) == 1 else ""
-    return f"{title}{view}: {model}{', '.join(dict.fromkeys(row.run.suite for row in rows))}"
+    targets = list(dict.fromkeys(row.target for row in rows if not row.is_side))
+    of_label = f" of {targets[0]}" if len(targets) == 1 else " of labels" * bool(targets)
+    return f"{title}{of_label}{view}: {model}{', '.join(dict.fromkeys(row.run.suite for row in rows))}"
 
 
 def cell_text(column: Column, line: TableRow) -> str:
@@ -213,6 +222,11 @@ _SITES = (
     "layer: the first of the best, + as many others that tie; after @ the iteration (flow step or action token), "
     "of which the first sees no action yet; p family-wise"
 )
+_ABOVE = (
+    "above chance: score of the sites that the inner folds choose, on the outer folds, minus its mean score with "
+    "permuted labels; 95 % intervals over groups; layer: that of the largest score above its own chance; p "
+    "family-wise"
+)
 _ANSWER_SITES = "layer: the first of the best, + as many others that tie; p family-wise"
 
 
@@ -223,11 +237,13 @@ def _legend(title: str, rows: Sequence[RetentionRow]) -> list[str]:
     if title == "Success rate":
         return [_OUTCOMES, *dict.fromkeys(rule_sentence(row.rules) for row in rows if row.category == MEAN)]
     calls = sorted({row.run.call for row in rows if row.run.call is not None})
-    said = [call_words(calls[0])] if len(calls) == 1 else []
+    of_call = [call_words(calls[0])] if len(calls) == 1 else []
+    if not all(row.is_side for row in rows):
+        return [_ABOVE, *_undefined(rows)]
     if title == "Retention":
         sites = _ANSWER_SITES if modes_of(rows) == "answers" else _SITES
-        return [sites, *_undefined(rows), chance_only(rows), *said]
-    return [_controls(rows), *said]
+        return [sites, *_undefined(rows), chance_only(rows), *of_call]
+    return [_controls(rows), *of_call]
 
 
 def _undefined(rows: Sequence[RetentionRow]) -> list[str]:
@@ -235,10 +251,10 @@ def _undefined(rows: Sequence[RetentionRow]) -> list[str]:
     reasons: dict[str, list[str]] = {}
     for row in rows:
         if not row.retention.defined and row.category != MEAN:
-            reasons.setdefault(row.retention.note, []).append(row.category)
+            reasons.setdefault(row.retention.note, []).append(row.category if row.is_side else name_of(row))
     means = {row.retention.note for row in rows if row.retention.defined and row.retention.note}
-    found = [f"{reason}: {', '.join(dict.fromkeys(names))}" for reason, names in reasons.items()]
-    return [*found, *(f"mean {note}" for note in sorted(means))]
+    sentences = [f"{reason}: {', '.join(dict.fromkeys(names))}" for reason, names in reasons.items()]
+    return [*sentences, *(f"mean {note}" for note in sorted(means))]
 
 
 def _controls(rows: Sequence[RetentionRow]) -> str:
@@ -272,19 +288,19 @@ def _difference_legend(differences: Sequence[Difference], has_tests: bool) -> st
 def _sizes(rows: Sequence[RetentionRow]) -> list[str]:
     """Return per run its folder and the range of its sizes; one sentence where runs have the same."""
     sizes: dict[str, list[str]] = {}
-    for own in by_run([row for row in rows if row.category != MEAN]):
-        sizes.setdefault(_size(own), []).append(Path(own[0].run.location).name)
+    for of_run in by_run([row for row in rows if row.category != MEAN]):
+        sizes.setdefault(_size(of_run), []).append(Path(of_run[0].run.location).name)
     return [f"run{'s' * (len(names) > 1)} {', '.join(names)}: {size}" for size, names in sizes.items()]
 
 
 def _size(rows: Sequence[RetentionRow]) -> str:
-    parts = [
-        f"{_span([row.success.n_episodes for row in rows])} episodes",
-        f"{_span([row.success.n_items for row in rows])} items",
-    ]
+    is_of_sides = all(row.is_side for row in rows)
+    samples = [row.success.n_episodes if is_of_sides else row.controls.n_samples or 0 for row in rows]
+    parts = [f"{_span(samples)} {'episodes' if is_of_sides else 'samples'}"]
+    parts += [f"{_span([row.success.n_items for row in rows])} items"] * is_of_sides
     if groups := [row.controls.n_groups for row in rows if row.controls.n_groups is not None]:
         parts.append(f"{_span(groups)} groups")
-    return f"per category {', '.join(parts)}"
+    return f"per {'category' if is_of_sides else 'label'} {', '.join(parts)}"
 
 
 def _span(numbers: Sequence[int]) -> str:

@@ -1,4 +1,4 @@
-"""How single values of a retention row and of a difference read in a table for people."""
+"""The texts of single values of a retention row and of a difference in a table for people."""
 
 from collections.abc import Callable, Sequence
 
@@ -7,12 +7,9 @@ from probe_kit.retention.behaviour.success_rate import Regime
 from probe_kit.retention.compare.compare import Difference
 from probe_kit.retention.compare.model_test import ModelTest
 from probe_kit.retention.rows.parts import StreamPart
-from probe_kit.retention.rows.row import RetentionRow
+from probe_kit.retention.rows.row import EVERYWHERE, RetentionRow
 from probe_kit.suite.categories import category_of
-from probe_kit.suite.validation.sufficiency import GROUPS_FOR_PROBES
 
-ITEMS_PER_GROUP = 2
-"""Of a suite with counterparts: two items ask for either of two pictures."""
 NOT_ACTED = "n/a"
 """In place of a success rate, for a model that did not act."""
 ABOVE_CHANCE = "above chance"
@@ -27,8 +24,9 @@ _REGIMES = {
 
 
 def place(layer: int | None, iteration: int | None = None, ties: int | None = None) -> str:
-    """Where the best site is: its layer, after @ the iteration where the stream has several, and after + how many
-    other sites are as good.
+    """Return where the best site is: its layer, after @ the iteration where the stream has several.
+
+    After + stands how many other sites are as good.
     """
     if layer is None:
         return "–"
@@ -73,12 +71,12 @@ def published_value(row: RetentionRow) -> str:
 
 
 def backbone_place(row: RetentionRow) -> str:
-    """Where the backbone's best site is."""
+    """Return where the backbone's best site is."""
     return place(row.backbone.layer, None, row.backbone.ties)
 
 
 def action_place(row: RetentionRow) -> str:
-    """Where the best site of the action is."""
+    """Return where the best site of the action is."""
     return place(row.action.layer, row.action.iteration, row.action.ties)
 
 
@@ -88,7 +86,7 @@ def call_words(call: int) -> str:
 
 
 def verdict_text(part: StreamPart) -> str:
-    """What was found in a stream, and how much there could be where it is not shown."""
+    """Return the verdict of a stream, and how much there could be where it is not shown."""
     if part.verdict is None or part.at_most is None:
         return "–"
     most = f"{100 * part.at_most:.0f} %"
@@ -102,12 +100,12 @@ def verdict_text(part: StreamPart) -> str:
 
 def exceeds_text(part: StreamPart) -> str:
     """The controls that the best site is shown to exceed, and those that it is not shown to exceed."""
-    found = {name: better for name, better in part.exceeds.items() if better is not None}
-    if set(found) == {"chance"}:
-        return "chance (no control was run)" if found["chance"] else "not shown: chance"
-    shown = [name for name, better in found.items() if better]
-    open_ = [name for name, better in found.items() if not better]
-    return "; ".join(filter(None, [", ".join(shown), f"not shown: {', '.join(open_)}" if open_ else ""])) or "–"
+    outcomes = {name: better for name, better in part.exceeds.items() if better is not None}
+    if set(outcomes) == {"chance"}:
+        return "chance (no control was run)" if outcomes["chance"] else "not shown: chance"
+    exceeded = [name for name, better in outcomes.items() if better]
+    open_ = [name for name, better in outcomes.items() if not better]
+    return "; ".join(filter(None, [", ".join(exceeded), f"not shown: {', '.join(open_)}" if open_ else ""])) or "–"
 
 
 def baseline(name: str) -> Callable[[RetentionRow], str]:
@@ -130,7 +128,7 @@ def difference_name(row: Difference) -> str:
 
 
 def difference_items(row: Difference) -> str:
-    """How many items both sides have, or that they ran other ones; empty where all are in common."""
+    """Return how many items both sides have, or that they ran other ones; empty where all are in common."""
     if not row.paired:
         return "other items"
     if row.n_items is None or row.n_items == row.of_items:
@@ -164,8 +162,15 @@ def models_p(test: ModelTest) -> str:
 
 
 def title_of(category: str) -> str:
-    """The category as it is spelt in a table or at the beginning of a sentence."""
+    """Return a category as it is spelt in a table or at the beginning of a sentence."""
     return category_of(category).title
+
+
+def name_of(row: RetentionRow) -> str:
+    """Return what a row is about: its category, or its target where that is no side."""
+    if row.is_side:
+        return title_of(row.category)
+    return row.target if row.category == EVERYWHERE else f"{row.target}, {title_of(row.category)}"
 
 
 def once_per_category(rows: Sequence[RetentionRow]) -> list[RetentionRow]:
@@ -175,10 +180,10 @@ def once_per_category(rows: Sequence[RetentionRow]) -> list[RetentionRow]:
 
 def by_run(rows: Sequence[RetentionRow]) -> list[list[RetentionRow]]:
     """Return the rows of each run, and group, in the order of their first ones."""
-    found: dict[tuple[str | None, str], list[RetentionRow]] = {}
+    runs: dict[tuple[str | None, str], list[RetentionRow]] = {}
     for row in rows:
-        found.setdefault(row.key, []).append(row)
-    return list(found.values())
+        runs.setdefault(row.key, []).append(row)
+    return list(runs.values())
 
 
 def probed(rows: Sequence[RetentionRow]) -> list[RetentionRow]:
@@ -194,8 +199,3 @@ def controlled(rows: Sequence[RetentionRow]) -> bool:
 def is_vlm(row: RetentionRow) -> bool:
     """Whether a row is of a VLM run."""
     return row.run.mode == "answers"
-
-
-def can_be_probed(row: RetentionRow) -> bool:
-    """Whether the category has items of enough groups for probes; with fewer `probe-kit train` would refuse."""
-    return row.success.n_items >= ITEMS_PER_GROUP * GROUPS_FOR_PROBES

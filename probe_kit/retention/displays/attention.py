@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +35,7 @@ class AttentionDisplay(Panelled):
     iterations and inferences. Descriptive: attended tokens need not be used, and no verdict reads this.
     """
 
-    measure: ClassVar[str] = "% of attention (describes, no cause)"
+    measure = "% of attention (describes, no cause)"
     category: str
     blocks: NDArray[np.int64]
     roles: tuple[str, ...]

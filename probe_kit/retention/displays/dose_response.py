@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +36,7 @@ class DoseResponseDisplay(Panelled):
     significant: (K,) beyond the controls, family-wise.
     """
 
-    measure: ClassVar[str] = "% of episodes that turn"
+    measure = "% of episodes that turn"
     category: str
     position: str
     coefficients: NDArray[np.float64]

@@ -1,4 +1,4 @@
-"""Layer curves: accuracy by layer, the backbone beside where the action is made, a line per iteration."""
+"""Layer curves: score by layer, the backbone beside where the action is made, a line per iteration."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -7,7 +7,9 @@ from math import ceil
 from typing import TYPE_CHECKING, Literal, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
+from probe_kit.retention.choices import Iterations
 from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import (
@@ -15,9 +17,10 @@ from probe_kit.retention.displays.base.report_figure import (
     FigureSource,
     ReportFigure,
     in_view,
+    label_views,
     view_suffix,
 )
-from probe_kit.retention.displays.base.selection import curve_of, known_view, scores_of
+from probe_kit.retention.displays.base.selection import known_view, probed_curve, scores_of
 from probe_kit.retention.displays.base.style import (
     DPI,
     PARTS,
@@ -31,9 +34,10 @@ from probe_kit.retention.displays.base.style import (
     significance_handles,
 )
 from probe_kit.retention.displays.stream_curve import LayerLine, StreamCurve
-from probe_kit.retention.estimators.retention import Iterations
+from probe_kit.retention.rows.row import EVERYWHERE
 from probe_kit.retention.text import spell
-from probe_kit.statistics.estimates.balanced import CHANCE
+from probe_kit.train.choices import SIDES
+from probe_kit.train.crossval.task_scores import METRICS
 from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:
@@ -46,55 +50,132 @@ if TYPE_CHECKING:
 _SIDESTEP = 0.1  # of a layer, so that the bars of two streams on one axes do not hide each other
 _ENOUGH = 20  # label permutations, fewer than which have no 95 % band
 _PEAK = "best of its stream (all, where several tie)"
+PERCENT = 100.0
+
+
+@dataclass(frozen=True)
+class Ground:
+    """The chance, band and control that the scores of one stream are compared with; arrays (L,) by layer.
+
+    chance: one half for a side, else the mean score of the label permutations at the layer's best site; NaN
+    without any. null_band: ends of the range that holds 95 % of the scores under label permutation, of a side
+    those of all sites; None below 20 permutations. control: name and score of the best control of a label.
+    """
+
+    chance: NDArray[np.float64]
+    null_band: tuple[NDArray[np.float64], NDArray[np.float64]] | None
+    control: tuple[str, float] | None = None
+
+    @classmethod
+    def of(cls, results: ProbeResults, category: str, view: str, stream: StreamCurve) -> Self:
+        """Return the ground of a stream's best sites."""
+        curve = results.curves[category, view]
+        names = [str(site) for site in curve.sites]
+        rows = [names.index(site) for site in stream.sites]
+        every = np.broadcast_to(curve.null.ravel(), (len(rows), curve.null.size))
+        null = every if curve.is_side else curve.null[rows]
+        ends = np.percentile(null, [2.5, 97.5], axis=1) if curve.null.shape[1] >= _ENOUGH else None
+        controls = () if curve.is_side else results.controls.of_stream(category, view, stream.stream)
+        return cls(
+            curve.chance[rows],
+            None if ends is None else (ends[0], ends[1]),
+            (controls[0].name, controls[0].score) if controls else None,
+        )
+
+    def draw(self, axes: "Axes", layers: NDArray[np.int64], scale: float) -> None:
+        """Draw the band, chance and the best control; scale: 100 for percent."""
+        wide = layers if layers.size > 1 else layers + np.array([-0.3, 0.3])
+        if self.null_band is not None:
+            low, high = (scale * np.broadcast_to(end, wide.shape) for end in self.null_band)
+            name = "95 % of probes of permuted labels"
+            if np.ptp(low) == np.ptp(high) == 0:
+                axes.axhspan(low[0], high[0], color="0.92", lw=0, label=name)
+            else:
+                axes.fill_between(wide, low, high, color="0.92", lw=0, label=name)
+        chance = scale * np.broadcast_to(self.chance, wide.shape)
+        if np.ptp(chance) == 0:
+            axes.axhline(chance[0], color="0.45", lw=1, ls="--", label="chance")
+        elif not np.isnan(chance).any():
+            axes.plot(wide, chance, color="0.45", lw=1, ls="--", label="chance")
+        if self.control is not None:
+            name, score = self.control
+            axes.axhline(scale * score, color="black", lw=1, ls=":", label="best control")
+            axes.annotate(
+                f"control {name} {score:.2f}", (0.01, scale * score), xycoords=axes.get_yaxis_transform(),
+                ha="left", va="bottom", fontsize=6.5, color="0.2",
+            )  # fmt: skip
 
 
 @dataclass
 class LayerCurveDisplay(Display):
-    """Held-out accuracy by layer, for one category in one view.
+    """Held-out score by layer, for one category in one view: accuracy of a side, metric of a label.
 
-    Filled markers are above chance against the best site of their stream (family-wise p < 0.05), and above
-    random-features and untrained where those were run. Grey: chance, and `null_band`, which holds 95 % of the
-    accuracies under label permutation; None below 20 label permutations.
+    Filled markers are above chance against the best site of their stream (family-wise p < 0.05), and above every
+    control that was run. grounds: what the scores are compared with, one per stream.
     """
 
+    target: str
+    metric: str
     category: str
     view: str
-    chance: float
-    null_band: tuple[float, float] | None
     streams: tuple[StreamCurve, ...]
+    grounds: tuple[Ground, ...]
     certificate: ProvenanceLine
     ax_: "Axes | None" = field(default=None, init=False, repr=False)
 
     @classmethod
     def from_results(
-        cls, results: ProbeResults, category: str, view: str | None = None, iterations: Iterations = "all"
+        cls,
+        results: ProbeResults,
+        category: str | None = None,
+        view: str | None = None,
+        iterations: Iterations = "all",
     ) -> Self:
-        """Read stored probes; view: the first probed one by default.
+        """Read stored probes; category, view: the first probed one by default.
 
         iterations: a line for each of `all`, for the `best` of every layer, for the `last` one or one by number.
         Raises UnknownSiteError for a view, and UnknownCategoryError for a category, that was not probed, and
         UsageError for an iteration that no stream has.
         """
-        view = known_view(results, view)
-        curve = curve_of(results, category, view)
-        band = np.percentile(curve.null, [2.5, 97.5]) if curve.null.shape[1] >= _ENOUGH else None
-        scores = scores_of(results, category, view)
+        category, view, _ = probed_curve(results, view, category)
+        scores, settings = scores_of(results, category, view), results.settings
+        streams = tuple(StreamCurve.of(rows, iterations) for _, rows in scores.groupby("stream", sort=False))
+        of_label = ProvenanceLine.of_label(results, category, view)
         return cls(
+            target=settings.target,
+            metric=METRICS[settings.task],
             category=category,
             view=view,
-            chance=CHANCE,
-            null_band=None if band is None else (float(band[0]), float(band[1])),
-            streams=tuple(StreamCurve.of(rows, iterations) for _, rows in scores.groupby("stream", sort=False)),
-            certificate=ProvenanceLine.of_results(results, view),
+            streams=streams,
+            grounds=tuple(Ground.of(results, category, view, stream) for stream in streams),
+            certificate=ProvenanceLine.of_results(results, view) if settings.is_side else of_label,
         )
+
+    @property
+    def is_side(self) -> bool:
+        """Whether the target is a side, whose accuracies are drawn in percent on one scale."""
+        return self.target in SIDES
+
+    @property
+    def name(self) -> str:
+        """The category of a side, or the label."""
+        if self.is_side:
+            return spell(self.category)
+        return self.target if self.category == EVERYWHERE else f"{self.target}, {spell(self.category)}"
+
+    @property
+    def measure(self) -> str:
+        """The name of the upright axis."""
+        return "held-out accuracy (%)" if self.is_side else f"held-out {self.metric}"
 
     def plot(self, ax: "Axes | None" = None) -> Self:
         """Draw all streams on `ax`, or each beside the other on a figure of its own with legend and caption."""
         if ax is not None:
-            self._draw_ground(ax)
             for number, curve in enumerate(self.streams):
-                _draw_stream(ax, curve, _SIDESTEP * (number - (len(self.streams) - 1) / 2))
-            _finish(ax, max(curve.layers.max() for curve in self.streams) + 1, spell(self.category))
+                if number == 0:
+                    self.grounds[0].draw(ax, curve.layers, self._scale)
+                _draw_stream(ax, curve, _SIDESTEP * (number - (len(self.streams) - 1) / 2), self._scale)
+            self._finish(ax, max(curve.layers.max() for curve in self.streams) + 1, self.name)
             self.ax_ = ax
             return self
         figure, grid = _pairs([self], in_pyplot=True)
@@ -104,31 +185,46 @@ class LayerCurveDisplay(Display):
 
     def plot_beside(self, axes: "Sequence[Axes]") -> Self:
         """Draw each stream on axes of its own."""
-        for curve, ax in zip(self.streams, axes, strict=False):
-            self._draw_ground(ax)
-            _draw_stream(ax, curve)
-            _finish(ax, int(curve.layers.max()) + 1, f"{spell(self.category)}: {curve.label}")
+        for curve, ground, ax in zip(self.streams, self.grounds, axes, strict=False):
+            ground.draw(ax, curve.layers, self._scale)
+            _draw_stream(ax, curve, scale=self._scale)
+            self._finish(ax, int(curve.layers.max()) + 1, f"{self.name}: {curve.label}")
         self.ax_ = axes[0]
         return self
 
-    def _draw_ground(self, axes: "Axes") -> None:
-        if self.null_band is not None:
-            low, high = self.null_band
-            axes.axhspan(100 * low, 100 * high, color="0.92", lw=0, label="95 % of probes of permuted labels")
-        axes.axhline(100 * self.chance, color="0.45", lw=1, ls="--", label="chance")
+    @property
+    def _scale(self) -> float:
+        return PERCENT if self.is_side else 1.0
+
+    def _finish(self, axes: "Axes", layers: int, title: str) -> None:
+        plain(axes)
+        if self.is_side:
+            accuracy_axis(axes)
+        else:
+            low, high = axes.get_ylim()
+            axes.set_ylim(min(low, 0.0), max(high, 1.05))
+        layer_axis(axes, layers)
+        axes.tick_params(labelleft=True)
+        axes.set_title(title, fontsize=9, loc="left")
 
 
-def layer_curve(results: ProbeResults, view: str | None = None, iterations: Iterations = "all") -> "Figure":
-    """Held-out accuracy by layer for every category, as a matplotlib figure (`figure.savefig(…)`).
+def layer_curve(
+    results: ProbeResults,
+    view: str | None = None,
+    iterations: Iterations = "all",
+    categories: Sequence[str] | None = None,
+) -> "Figure":
+    """Return a figure of held-out score by layer for every category (`figure.savefig(…)`).
 
     Backbone beside action, which has a line per iteration on one scale of colours; iterations: `all`, or `best`
-    for the best of every layer, `last`, or one by number. Bars: each layer's 95 % interval,
-    where the stream runs once. Filled markers are above chance against the best site of their stream
-    (family-wise p < 0.05), and above random-features and untrained where those were run. Grey: chance, and the
-    band that holds 95 % of the accuracies under label permutation. view: the first probed one by default. Raises
-    UnknownSiteError for a view that was not probed, UsageError for an iteration.
+    for the best of every layer, `last`, or one by number. Bars: each layer's 95 % interval, where the stream runs
+    once. Filled markers are above chance against the best site of their stream (family-wise p < 0.05), and above
+    every control that was run. Grey: chance, and the band that holds 95 % of the scores under label permutation;
+    of a label at the best site of each layer, with the best control. view: the first probed one by default.
+    categories: all by default. Raises UnknownSiteError for a view that was not probed, UsageError for an
+    iteration.
     """
-    view, names = known_view(results, view), results.settings.categories
+    view, names = known_view(results, view), categories or results.settings.categories
     displays = [LayerCurveDisplay.from_results(results, name, view, iterations) for name in names]
     figure, grid = _pairs(displays)
     _complete(figure, grid, displays)
@@ -165,7 +261,10 @@ def _complete(figure: "Figure", grid: "list[list[Axes]]", displays: Sequence[Lay
         display.plot_beside(axes)
         for unused in axes[len(display.streams) :]:
             unused.set_visible(False)
-    figure.supylabel("held-out accuracy (%)", fontsize=9)
+    if not displays[0].is_side:
+        ranges = [ax.get_ylim() for axes in grid for ax in axes]
+        grid[0][0].set_ylim(min(low for low, _ in ranges), max(high for _, high in ranges))
+    figure.supylabel(displays[0].measure, fontsize=9)
     caption(figure, displays[0].certificate)
     handles: dict[str, Artist] = {}
     for ax in grid[0]:
@@ -204,25 +303,17 @@ def _colours() -> "Colormap":
     return LinearSegmentedColormap.from_list("iterations", ["#F7C79B", PARTS["action"].colour, "#3B1200"])
 
 
-def _finish(axes: "Axes", layers: int, title: str) -> None:
-    plain(axes)
-    accuracy_axis(axes)
-    layer_axis(axes, layers)
-    axes.tick_params(labelleft=True)
-    axes.set_title(title, fontsize=9, loc="left")
-
-
-def _draw_stream(axes: "Axes", curve: StreamCurve, sidestep: float = 0.0) -> None:
+def _draw_stream(axes: "Axes", curve: StreamCurve, sidestep: float = 0.0, scale: float = PERCENT) -> None:
     line = PARTS[curve.part]
     if len(curve.lines) == 1:
-        draw_line(axes, curve.lines[0], line, curve.label, sidestep, bars=_has_bars(curve))
+        draw_line(axes, curve.lines[0], line, curve.label, sidestep, bars=_has_bars(curve), scale=scale)
     else:
         colours = _colours()
         for number, layers in enumerate(curve.lines):
             shade = Line(colours(number / (len(curve.lines) - 1)), line.marker)  # type: ignore[arg-type]
-            draw_line(axes, layers, shade, f"iteration {layers.iteration}", sidestep, bars=False)
+            draw_line(axes, layers, shade, f"iteration {layers.iteration}", sidestep, bars=False, scale=scale)
         axes.plot([], [], color=line.colour, marker=line.marker, ms=4, lw=1.3, label=f"{curve.name}, by iteration")
-    mark_peaks(axes, curve, sidestep)
+    mark_peaks(axes, curve, sidestep, scale)
 
 
 def _has_bars(curve: StreamCurve) -> bool:
@@ -237,41 +328,45 @@ def draw_line(
     name: str,
     sidestep: float = 0.0,
     bars: bool = True,
+    scale: float = PERCENT,
 ) -> None:
-    """One line; filled markers where it is significant. bars: each layer's own 95 % interval.
+    """Draw one line; filled markers where it is significant. bars: each layer's own 95 % interval.
 
-    A layer that was chosen, such as the best iteration's, has no interval of its own.
+    A layer that was chosen, such as the best iteration's, has no interval of its own. scale: 100 for percent, on
+    whose fixed axis scores that lie below are marked at the edge.
     """
-    layers, accuracy = line.layers + sidestep, 100 * line.accuracy
+    layers, scores = line.layers + sidestep, scale * line.score
     if bars:
-        arms = np.array([accuracy - 100 * line.low, 100 * line.high - accuracy]).clip(min=0)
+        arms = np.array([scores - scale * line.low, scale * line.high - scores]).clip(min=0)
         axes.errorbar(
-            layers, accuracy, yerr=arms, fmt="none", ecolor=style.colour, elinewidth=0.8, alpha=0.7
+            layers, scores, yerr=arms, fmt="none", ecolor=style.colour, elinewidth=0.8, alpha=0.7
         )  # fmt: skip
     size = 4.5 if bars else 3.2
     axes.plot(
-        layers, accuracy, color=style.colour, lw=1.3, ls=style.dash, marker=style.marker, ms=size, mfc="white",
+        layers, scores, color=style.colour, lw=1.3, ls=style.dash, marker=style.marker, ms=size, mfc="white",
         label=name,
     )  # fmt: skip
     clear = line.significant
-    axes.plot(layers[clear], accuracy[clear], color=style.colour, ls="none", marker=style.marker, ms=size)
-    mark_below(axes, layers, accuracy, style.colour)
+    axes.plot(layers[clear], scores[clear], color=style.colour, ls="none", marker=style.marker, ms=size)
+    if scale == PERCENT:
+        mark_below(axes, layers, scores, style.colour)
 
 
-def mark_peaks(axes: "Axes", curve: StreamCurve, sidestep: float = 0.0) -> None:
-    """A mark above every site that no other one of its stream beats, and above its error bar where it has one."""
+def mark_peaks(axes: "Axes", curve: StreamCurve, sidestep: float = 0.0, scale: float = PERCENT) -> None:
+    """Mark every site that no other one of its stream beats, and above its error bar where it has one."""
     from matplotlib.transforms import ScaledTranslation
 
     figure = axes.figure
     layers = sorted({layer for layer, _ in curve.peaks})
     above = axes.transData + ScaledTranslation(0, 5 / 72, figure.dpi_scale_trans)
-    top = dict.fromkeys(layers, float(curve.accuracy.max()))
+    best = dict(zip(curve.layers.tolist(), curve.score.tolist(), strict=True))
+    top = {layer: best[layer] for layer in layers}
     if _has_bars(curve):
         line = curve.lines[0]
         high = dict(zip(line.layers.tolist(), line.high.tolist(), strict=True))
         top = {layer: np.fmax(value, high[layer]) for layer, value in top.items()}
     (mark,) = axes.plot(
-        [layer + sidestep for layer in layers], [100 * top[layer] for layer in layers], ls="none",
+        [layer + sidestep for layer in layers], [scale * top[layer] for layer in layers], ls="none",
         marker=_MARK, ms=5, color="black", transform=above, clip_on=False, zorder=4,
     )  # fmt: skip
     mark.set_gid("peak")
@@ -306,3 +401,17 @@ def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
                 drawn.position, partial(layer_curve, drawn.results, view, source.table.iterations),
                 is_detail=view != views[0],
             )  # fmt: skip
+
+
+def label_figures(source: FigureSource) -> Iterator[ReportFigure]:
+    """Yield the figures that a report of these labels shows."""
+    iterations = "best" if source.table.iterations == "all" else source.table.iterations
+    for view in label_views(source):
+        yield ReportFigure(
+            view.file_name("layer-curves"), view.title("Layer curves"), view.target,
+            "How well a linear probe decodes the label in groups it has not seen, layer by layer, with 95 % "
+            f"intervals over groups. {ONLY_FILLED}. Grey: what the same probes reach with labels exchanged "
+            "between groups. Dotted: the best control.",
+            view.position, partial(layer_curve, view.results, view.name, iterations, [view.category]),
+            is_detail=not view.is_first,
+        )  # fmt: skip

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import label_of
 from probe_kit.retention.behaviour.run_labels import full_name
+from probe_kit.retention.choices import Iterations
 from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure
@@ -24,7 +25,6 @@ from probe_kit.retention.displays.base.style import (
     plain,
     series,
 )
-from probe_kit.retention.estimators.retention import Iterations
 from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:

@@ -1,6 +1,7 @@
 """All figures that fit a table of runs: what `probe-kit retention --figures` saves and the report shows.
 
-Every module of this folder with a function `report_figures` takes part; its constant `PLACE` orders the figures.
+Every module of this folder with a function `report_figures` takes part in tables of sides, and with a function
+`label_figures` in tables of labels; its constant `PLACE` orders the figures.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -11,7 +12,12 @@ from typing import TYPE_CHECKING
 
 from probe_kit.errors import UsageError
 from probe_kit.retention.columns.text import model_name
-from probe_kit.retention.displays.base.report_figure import DrawnRun, FigureSource, ReportFigure
+from probe_kit.retention.displays.base.report_figure import (
+    DrawnRun,
+    FigureSource,
+    ReportFigure,
+    file_names,
+)
 from probe_kit.retention.table import RetentionTable
 from probe_kit.train.data.run_reader import RunReader
 
@@ -22,28 +28,45 @@ SUFFIXES = (".png", ".pdf")
 
 
 def collect_figures(runs: Sequence[RunReader], table: RetentionTable) -> list[ReportFigure]:
-    """Every figure that the runs and their table allow, those of all runs first. Nothing is drawn yet.
+    """Return every figure that the runs and their table allow, those of all runs first. Nothing is drawn yet.
 
-    Raises UsageError for a run that the table was not made of.
+    Of labels one after the other; `subject` is the label. Raises UsageError for a run that the table was not made
+    of.
     """
     called = {row.run.location: model_name(row) for row in table.rows}
     if strangers := [str(run.location) for run in runs if str(run.location) not in called]:
         raise UsageError(f"the table has no rows of {', '.join(strangers)}; make it of the runs that are drawn")
+    stems = run_names(runs)
+    if table.is_of_sides:
+        probes = [
+            (at, stem, table.results_of(run.location))
+            for at, (run, stem) in enumerate(zip(runs, stems, strict=True))
+        ]
+    else:
+        labels = dict(zip(table.targets, file_names(table.targets), strict=True))
+        probes = [
+            (at, f"{stem}-{label}", table.results[str(run.location), target])
+            for target, label in labels.items()
+            for at, (run, stem) in enumerate(zip(runs, stems, strict=True))
+        ]
     drawn = tuple(
-        DrawnRun(run, stem, called[str(run.location)], position, table.results.get(str(run.location)))
-        for position, (run, stem) in enumerate(zip(runs, run_names(runs), strict=True))
+        DrawnRun(runs[at], stem, called[str(runs[at].location)], at, results) for at, stem, results in probes
     )
     source = FigureSource(table, drawn)
-    figures = [figure for make in _makers() for figure in make(source)]
-    return sorted(figures, key=lambda figure: -1 if figure.run is None else figure.run)
+    figures = [figure for make in _makers(table.is_of_sides) for figure in make(source)]
+    order = {target: at for at, target in enumerate(table.targets)}
+    return sorted(
+        figures, key=lambda figure: (order.get(figure.subject, 0), -1 if figure.run is None else figure.run)
+    )
 
 
-def _makers() -> list[Callable[[FigureSource], Iterator[ReportFigure]]]:
-    """The functions `report_figures` of the modules of this folder, in the order of their `PLACE`."""
+def _makers(of_sides: bool) -> list[Callable[[FigureSource], Iterator[ReportFigure]]]:
+    """Return the functions of the modules of this folder that make figures, in the order of their `PLACE`."""
     names = [file.name for file in iter_modules(import_module(__package__).__path__) if not file.ispkg]
     modules = [import_module(f"{__package__}.{name}") for name in names]
-    places = [(module.PLACE, module.report_figures) for module in modules if hasattr(module, "PLACE")]
-    return [make for _, make in sorted(places, key=lambda placed: placed[0])]
+    name = "report_figures" if of_sides else "label_figures"
+    makers = [module for module in modules if hasattr(module, "PLACE") and hasattr(module, name)]
+    return [getattr(module, name) for module in sorted(makers, key=lambda module: module.PLACE)]
 
 
 def save_figures(exhibits: Sequence[ReportFigure], folder: Path) -> Iterator[Path]:

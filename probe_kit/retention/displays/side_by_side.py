@@ -7,6 +7,7 @@ from textwrap import fill
 from typing import TYPE_CHECKING
 
 from probe_kit.errors import UsageError
+from probe_kit.retention.choices import Iterations
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import (
     DOTS,
@@ -30,7 +31,6 @@ from probe_kit.retention.displays.base.style import (
 from probe_kit.retention.displays.iteration_maps import IterationMapDisplay, draw_legend, draw_map, draw_scale
 from probe_kit.retention.displays.layer_curves import draw_line
 from probe_kit.retention.displays.stream_curve import LayerLine, StreamCurve
-from probe_kit.retention.estimators.retention import Iterations
 from probe_kit.retention.text import spell
 from probe_kit.statistics.estimates.balanced import CHANCE
 from probe_kit.train.results.probe_results import ProbeResults
@@ -122,7 +122,7 @@ def _draw_panel(axes: "Axes", curves: Sequence[tuple[int, StreamCurve]], names: 
 def _at_depths(line: LayerLine, curve: StreamCurve) -> LayerLine:
     """The line along depth as a fraction."""
     depths = curve.depth
-    return LayerLine(line.iteration, depths, line.accuracy, line.low, line.high, line.significant)  # type: ignore[arg-type]
+    return LayerLine(line.iteration, depths, line.score, line.low, line.high, line.significant)  # type: ignore[arg-type]
 
 
 def maps_side_by_side(results: Sequence[ProbeResults], names: Sequence[str], view: str) -> "Figure":

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,7 +46,7 @@ class SiteEffectDisplay(Panelled):
     part reads of each block; None where it was not tested. Filled: significant, family-wise.
     """
 
-    measure: ClassVar[str] = "% of episodes"
+    measure = "% of episodes"
     category: str
     chance: float
     readable: Points

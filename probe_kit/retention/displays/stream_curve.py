@@ -1,4 +1,4 @@
-"""The numbers of a layer curve: one stream's accuracy by layer, as a line per iteration or the best of them."""
+"""The numbers of a layer curve: one stream's score by layer, as a line per iteration or the best of them."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Self
@@ -7,8 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.hooks.contract.sites import label_of
+from probe_kit.retention.choices import Iterations
 from probe_kit.retention.displays.base.selection import of_iterations
-from probe_kit.retention.estimators.retention import Iterations
+from probe_kit.train.choices import SIDES
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -18,7 +19,7 @@ Shares = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class LayerLine:
-    """Held-out accuracy by layer; arrays (L,), accuracies as shares with their 95 % interval over groups.
+    """Held-out score by layer; arrays (L,), accuracies as shares or R², with their 95 % interval over groups.
 
     iteration: of all values, None where the stream runs once or where every layer has its best one.
     significant: above chance, family-wise, and above the controls that were run.
@@ -26,7 +27,7 @@ class LayerLine:
 
     iteration: int | None
     layers: NDArray[np.int64]
-    accuracy: Shares
+    score: Shares
     low: Shares
     high: Shares
     significant: NDArray[np.bool_]
@@ -35,29 +36,30 @@ class LayerLine:
     def of(cls, rows: "pd.DataFrame", iteration: int | None = None) -> Self:
         """Read rows of `ProbeResults.scores`, one per layer."""
         rows = rows.sort_values("layer")
-        accuracy, low, high = (rows[name].to_numpy(dtype=float) for name in ("accuracy", "ci_low", "ci_high"))
+        score, low, high = (rows[name].to_numpy(dtype=float) for name in ("score", "ci_low", "ci_high"))
         significant = rows["signal"].to_numpy(dtype=bool)
-        return cls(iteration, rows["layer"].to_numpy(dtype=np.int64), accuracy, low, high, significant)
+        return cls(iteration, rows["layer"].to_numpy(dtype=np.int64), score, low, high, significant)
 
 
 @dataclass(frozen=True)
 class StreamCurve:
-    """One stream's held-out accuracy by layer; arrays (L,), accuracies as shares. depth: the layer as a fraction.
+    """One stream's held-out score by layer; arrays (L,), accuracies as shares or R².
 
-    part: of the model, see `Stream.part`.
+    part: of the model, see `Stream.part`. depth: the layer as a fraction.
 
-    accuracy: of the best of the iterations that are shown, with its 95 % interval `low`, `high` over groups.
-    least, most: over these iterations. significant: above chance, family-wise, and above the controls that were
-    run. iterations: how many are shown.
-    lines: what is drawn: one per iteration, or the best. peaks: (layer, iteration) of the most accurate sites, all
-    of them where several tie.
+    sites: L best ones of the iterations that are shown, of a label by the score above their own chance. score: of
+    these, with its 95 % interval `low`, `high` over groups. least, most: over these iterations. significant: above
+    chance, family-wise, and above the controls that were run. iterations: how many are shown.
+    lines: what is drawn: one per iteration, or the best. peaks: (layer, iteration) of the best sites, all of them
+    where several tie.
     """
 
     stream: str
     part: str
+    sites: tuple[str, ...]
     layers: NDArray[np.int64]
     depth: Shares
-    accuracy: Shares
+    score: Shares
     low: Shares
     high: Shares
     least: Shares
@@ -74,18 +76,20 @@ class StreamCurve:
         Raises UsageError if the stream has no such iteration.
         """
         scores = of_iterations(scores, iterations)
-        by_layer = scores.groupby("layer")["accuracy"]
-        best_rows = scores.loc[by_layer.idxmax()].sort_values("layer")
+        by_layer = scores.groupby("layer")["score"]
+        excess = scores["score"] - (0.0 if scores["target"].iloc[0] in SIDES else scores["chance"].fillna(0.0))
+        best_rows = scores.loc[excess.groupby(scores["layer"]).idxmax()].sort_values("layer")
         best = LayerLine.of(best_rows)
         steps = sorted(int(step) for step in scores["iteration"].dropna().unique())
         each = tuple(LayerLine.of(scores[scores["iteration"] == step], step) for step in steps)
-        tied = scores[scores["accuracy"] >= scores["accuracy"].max() - 1e-12]
+        tied = scores[excess >= excess.max() - 1e-12]
         return cls(
             stream=str(scores["stream"].iloc[0]),
             part=str(scores["part"].iloc[0]),
+            sites=tuple(best_rows["site"]),
             layers=best.layers,
             depth=best_rows["depth"].to_numpy(dtype=float),
-            accuracy=best.accuracy,
+            score=best.score,
             low=best.low,
             high=best.high,
             least=by_layer.min().to_numpy(dtype=float),

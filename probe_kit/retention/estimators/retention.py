@@ -6,13 +6,13 @@ That is the action expert or, in a policy without one, the positions that choose
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import nan
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import TooFewGroupsError, UnbalancedEpisodesError, UsageError
 from probe_kit.hooks.contract.sites import Site
+from probe_kit.retention.choices import Iterations
 from probe_kit.retention.estimators.stream_scores import ACTION, BACKBONE, StreamScores, score_streams
 from probe_kit.statistics.estimates.balanced import CHANCE
 from probe_kit.statistics.estimates.retention import Ratio, retention
@@ -21,30 +21,24 @@ from probe_kit.statistics.intervals import NO_LIMITS, Interval
 from probe_kit.train.results.control_scores import RANDOM_FEATURES, UNTRAINED, Controls, Exceeds, has_signal
 from probe_kit.train.results.probe_curve import ProbeCurve
 
-Iterations = Literal["all", "best", "last"] | int
-"""Which iterations of the expert, or which action tokens, take part: all, the last one, or one by number.
-
-Where one number is made of all of them it is the best one's, so that `best` is another word for `all`; a layer
-curve draws a line for each of `all`, and one line for the `best` of every layer.
-"""
-
-
 NO_SCORES = "n/a (too few groups of items, or a fold with one side only)"
 """In place of retention where no score is defined."""
 
 
 @dataclass(frozen=True)
 class Peak:
-    """The best site of a stream: its held-out accuracy and family-wise p.
+    """The best site of a stream: its held-out score and family-wise p.
 
-    The accuracy is too high by the luck of being chosen; `StreamScores` holds the score without it.
-    ties: how many other sites of the stream are as accurate; `site` is the first of them all.
+    score: of a side the accuracy, else the metric. It is too high by the luck of being chosen; `StreamScores`
+    holds the score without it. chance: one half, else the mean score of the label permutations at the site; NaN
+    without any. ties: how many other sites of the stream are as accurate; `site` is the first of them all.
     """
 
     site: Site
-    accuracy: float
+    score: float
     p_fwe: float
     ties: int = 0
+    chance: float = CHANCE
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,7 +61,7 @@ class RetentionEstimate:
 
 @dataclass(frozen=True, kw_only=True)
 class Retention(RetentionEstimate):
-    """Retention of one category in one view.
+    """Retention of one target in one category and view.
 
     backbone, action: the best sites. streams: the scores; None with too few groups of items.
     """
@@ -78,17 +72,21 @@ class Retention(RetentionEstimate):
 
 
 def best_site(curve: ProbeCurve, stream: str, iterations: Iterations = "all") -> Peak | None:
-    """The most accurate site of `stream`, the first one on ties; None if the curve has no such stream.
+    """Return the best site of `stream`, the first one on ties; None if the curve has no such stream.
 
-    Raises UsageError if the stream has no such iteration.
+    Of a side the most accurate one counts, else the largest score above the site's own chance. Raises UsageError
+    if the stream has no such iteration.
     """
     rows = stream_rows(curve, stream, iterations)
     if rows.size == 0:
         return None
-    right = curve.correct[rows].sum(axis=1)
-    best = rows[np.argmax(right)]
-    ties = int((right == right.max()).sum()) - 1
-    return Peak(curve.sites[best], float(curve.correct[best].mean()), float(curve.p_fwe()[best]), ties)
+    if curve.is_side:
+        right = curve.correct[rows].sum(axis=1)
+        best, ties = rows[np.argmax(right)], int((right == right.max()).sum()) - 1
+    else:
+        best, ties = curve.largest_excess(rows), 0
+    score, p = float(curve.metric[best]), float(curve.p_fwe()[best])
+    return Peak(curve.sites[best], score, p, ties, float(curve.chance[best]))
 
 
 def stream_peaks(curve: ProbeCurve, iterations: Iterations = "all") -> dict[str, Peak]:
@@ -96,7 +94,9 @@ def stream_peaks(curve: ProbeCurve, iterations: Iterations = "all") -> dict[str,
 
     Raises UsageError if the action's stream has no such iteration.
     """
-    peaks = {BACKBONE: best_site(curve, BACKBONE)}
+    peaks = {}
+    if curve.backbone_stream is not None:
+        peaks[BACKBONE] = best_site(curve, curve.backbone_stream)
     if curve.action_stream is not None:
         peaks[ACTION] = best_site(curve, curve.action_stream, iterations)
     return {name: peak for name, peak in peaks.items() if peak is not None}
@@ -107,7 +107,7 @@ def curve_scores(curve: ProbeCurve, iterations: Iterations = "all", seed_text: s
 
     None with too few groups, or where a fold was trained on one side only: then no score is defined.
     """
-    rows = {ACTION: _action_rows(curve, iterations), BACKBONE: curve.stream(BACKBONE)}
+    rows = {ACTION: _rows(curve, curve.action_stream, iterations), BACKBONE: _rows(curve, curve.backbone_stream)}
     try:
         return score_streams(
             curve, {name: of_stream for name, of_stream in rows.items() if of_stream.size}, seed_text
@@ -143,7 +143,7 @@ def estimate_retention(
     exceeds: what the backbone's best site is better than. absent_below: see `verdict`.
     """
     if streams is None:
-        published = _published(peaks[ACTION].accuracy, peaks[BACKBONE].accuracy)
+        published = _published(peaks[ACTION].score, peaks[BACKBONE].score)
         return RetentionEstimate(value=nan, interval=NO_LIMITS, published=published, defined=False, note=NO_SCORES)
     ratio: Ratio = retention(streams.scores)
     return RetentionEstimate(
@@ -151,7 +151,7 @@ def estimate_retention(
         interval=ratio.interval,
         published=_published(streams.peak(ACTION), streams.peak(BACKBONE)),
         defined=has_signal(exceeds),
-        note=_missing_signal(exceeds, streams, absent_below),
+        note=_missing_signal(exceeds, streams, absent_below) if streams.at_most else "",
     )
 
 
@@ -199,6 +199,5 @@ def known_iteration(stream: str, every: Sequence[int | None], iterations: Iterat
     return int(step)
 
 
-def _action_rows(curve: ProbeCurve, iterations: Iterations) -> NDArray[np.intp]:
-    stream = curve.action_stream
+def _rows(curve: ProbeCurve, stream: str | None, iterations: Iterations = "all") -> NDArray[np.intp]:
     return np.empty(0, np.intp) if stream is None else stream_rows(curve, stream, iterations)

@@ -2,13 +2,14 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from math import sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.statistics.estimates.balanced import CHANCE
 from probe_kit.statistics.estimates.crossfit import CrossFit, crossfit
-from probe_kit.statistics.estimates.scores import Scores, accuracy_interval
+from probe_kit.statistics.estimates.scores import Scores, accuracy_interval, t_quantile
 from probe_kit.statistics.estimates.shares import Share
 from probe_kit.statistics.estimates.verdict import at_most, findable, permuted_threshold
 from probe_kit.statistics.intervals import Interval, correlation_of, difference_interval, mean_interval, not_surer
@@ -30,7 +31,7 @@ class StreamScores:
     """Cross-fitted scores of K streams of one category and view.
 
     names: `action` and `backbone` in this order, as far as they were probed. fit: their scores, on the same
-    groups. at_most: by name, an upper limit of the best site's accuracy, see `verdict.at_most`.
+    groups. at_most: of a side, by name, an upper limit of the best site's accuracy, see `verdict.at_most`.
     """
 
     names: tuple[str, ...]
@@ -43,9 +44,19 @@ class StreamScores:
         """Scores above one half with their covariance."""
         return Scores.of(self.fit)
 
+    def above(self, name: str) -> float:
+        """Return the score above chance of the sites that the inner folds choose, on the outer folds."""
+        return float(self.fit.above[self.names.index(name)])
+
+    def above_interval(self, name: str) -> Interval:
+        """Return its 95 % interval, Student's."""
+        row, scores = self.names.index(name), self.scores
+        spread = t_quantile(scores.df) * sqrt(scores.covariance[row, row])
+        return Interval(self.above(name) - spread, self.above(name) + spread)
+
     def accuracy(self, name: str) -> float:
-        """Accuracy of the sites that the inner folds choose, on the outer folds."""
-        return CHANCE + float(self.fit.above[self.names.index(name)])
+        """Return the accuracy of the sites of a side that the inner folds choose, on the outer folds."""
+        return CHANCE + self.above(name)
 
     def interval(self, name: str) -> Interval:
         """Its 95 % interval (Wilson)."""
@@ -69,6 +80,10 @@ def score_streams(curve: ProbeCurve, rows: Mapping[str, NDArray[np.intp]], seed_
     if not rows:
         return None
     streams = {name: curve.fit_stream(of_stream) for name, of_stream in rows.items()}
+    if not curve.is_side:  # chance differs between sites and is subtracted from each
+        return StreamScores(
+            tuple(rows), crossfit(list(streams.values()), curve.group_names, seed_text, chance=0.0)
+        )
     fit = crossfit(list(streams.values()), curve.group_names, seed_text)
     return StreamScores(
         tuple(rows),

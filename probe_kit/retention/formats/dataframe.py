@@ -37,7 +37,7 @@ def peak_frame(rows: Sequence[RetentionRow]) -> "pd.DataFrame":
     """The best sites, one line per run, category, view and `stream`: `backbone` and `action`."""
     return _frame(
         [
-            _key(row, True) | {"stream": ("string", stream)} | _flat(getattr(row, stream))
+            _key(row, True) | _flat(getattr(row, stream)) | {"stream": ("string", stream)}
             for row in rows
             if row.view is not None
             for stream in ("backbone", "action")
@@ -72,7 +72,7 @@ def _defined(row: Any) -> Any:
     """The row without numbers of retention where it is not defined."""
     if not isinstance(row, RetentionRow) or row.retention.defined:
         return row
-    return replace(row, retention=RetentionPart(note=row.retention.note))
+    return replace(row, retention=RetentionPart(note=row.retention.note, reason=row.retention.reason))
 
 
 def _flat(part: Any, before: str = "") -> _Flat:

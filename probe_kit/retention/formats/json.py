@@ -6,6 +6,7 @@ from dataclasses import asdict
 from typing import Any
 
 from probe_kit.retention.columns.findings import finding
+from probe_kit.retention.columns.label_sentences import label_details
 from probe_kit.retention.columns.sentences import conclusion, verdict
 from probe_kit.retention.compare.compare import Difference
 from probe_kit.retention.rows.row import MEAN, RetentionRow
@@ -36,6 +37,9 @@ def _in_words(row: RetentionRow) -> dict[str, Any]:
     """The verdict and what follows from it, as tables and sentences have them; None of a mean."""
     if row.category == MEAN:
         return {"verdict": None, "finding": None, "conclusion": None}
+    if not row.is_side:
+        words = {"metric": row.metric, "verdict": None}
+        return words | {"finding": finding(row), "conclusion": label_details(row)}
     return {"verdict": verdict(row), "finding": finding(row), "conclusion": conclusion(row)}
 
 

@@ -4,15 +4,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from probe_kit._tables.table import Table
-from probe_kit.errors import NoProbesError
-from probe_kit.retention.displays.labels import label_figures
-from probe_kit.retention.labels.table import LabelRetentionTable, label_retention_table
+from probe_kit.retention.displays.base.report_figure import ReportFigure
+from probe_kit.retention.displays.report_figures import collect_figures
 from probe_kit.retention.report.pictures import Picture, arranged
+from probe_kit.retention.table import RetentionTable, retention_table
 from probe_kit.train.choices import Task
 from probe_kit.train.crossval.task_scores import METRICS
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.probe_results import ProbeResults
-from probe_kit.train.results.store import load_results, stored_targets
+from probe_kit.train.results.store import stored_targets
 from probe_kit.train.results.summary import best_sites_sentences, best_sites_table
 
 
@@ -21,14 +21,13 @@ class LabelSection:
     """One label. run: its name, empty where the section is of all runs. measured: task and metric.
 
     retention, sentences: its rows of the retention table, and what they say. pictures: by kind, see `arranged`.
-    probes: best sites and controls, a table per run. notes: what the probes say, and what was left out. Of a run
-    without backbone or action there is no retention, and a sentence says so.
+    probes: best sites and controls, a table per run. notes: what the probes say, and what was left out.
     """
 
     target: str
     run: str
     measured: str
-    retention: Table | None
+    retention: Table
     sentences: tuple[str, ...]
     pictures: list[list[Picture]]
     probes: tuple[Table, ...]
@@ -37,18 +36,21 @@ class LabelSection:
     @property
     def tables(self) -> tuple[Table, ...]:
         """All of them."""
-        return self.probes if self.retention is None else (self.retention, *self.probes)
+        return self.retention, *self.probes
 
 
 def label_sections(
     runs: Sequence[RunReader],
-    table: LabelRetentionTable,
+    table: RetentionTable,
+    exhibits: Sequence[ReportFigure],
     names: Sequence[str],
     places: tuple[str, ...],
     of_one: str = "",
 ) -> list[LabelSection]:
-    """A section per label of the table. names: of the runs. of_one: name of the run where sections are of one."""
-    exhibits = label_figures(runs, table)
+    """Return a section per label of the table.
+
+    exhibits: its figures. names: of the runs. of_one: name of the run where sections are of one.
+    """
     sections = []
     for target in table.targets:
         of_target = table.of_target(target)
@@ -59,8 +61,8 @@ def label_sections(
                 target,
                 of_one,
                 _measured(next(iter(probes.values()))),
-                of_target.text,
-                tuple(of_target.sentences),
+                of_target.tables()["Retention"],
+                tuple(category.details for run in of_target.summary for category in run.categories),
                 arranged(exhibits, target, names, places),
                 tuple(
                     _probes_table(results, f"Best sites and controls{f', {name}' if several else ''}")
@@ -84,20 +86,9 @@ def stored_label_sections(
     for run, name in zip(runs, names, strict=True):
         of_one = name if len(runs) > 1 else ""
         for target in stored_targets(run):
-            try:
-                table = label_retention_table([run], target)
-            except NoProbesError as error:
-                sections.append(_without_retention(load_results(run, target=target), of_one, str(error)))
-            else:
-                sections += label_sections([run], replace(table, tried={}), [name], places, of_one)
+            table = retention_table([run], target=target)
+            sections += label_sections([run], table, collect_figures([run], table), [name], places, of_one)
     return sections
-
-
-def _without_retention(results: ProbeResults, of_one: str, reason: str) -> LabelSection:
-    return LabelSection(
-        results.settings.target, of_one, _measured(results), None, (f"{reason}.",), [],
-        (_probes_table(results, "Best sites and controls"),), tuple(best_sites_sentences(results)),
-    )  # fmt: skip
 
 
 def _measured(results: ProbeResults) -> str:

@@ -53,7 +53,7 @@ def opening_row(table: RetentionTable) -> RetentionRow | None:
     Of runs with probes the first category with signal is next, and then the first at all; None without rows.
     """
     rows = [category.row for run in table.summary for category in run.categories]
-    probed = [row for row in rows if str(row.run.location) in table.results and row.backbone.score is not None]
+    probed = [row for row in rows if row.backbone.score is not None]
     lost = [row for row in probed if row.backbone.has_signal and not row.action.has_signal]
     encoded = [row for row in probed if row.backbone.has_signal]
     return next(iter((*lost, *encoded, *probed, *rows)), None)
@@ -70,7 +70,7 @@ def opening_question(row: RetentionRow, name: str, grid: EpisodeGrid) -> Questio
 
 def opening_curve(row: RetentionRow, table: RetentionTable, position: int) -> ReportFigure | None:
     """Accuracy by layer of the row's category; None where it was not probed. position: of the run."""
-    results = table.results.get(str(row.run.location))
+    results = table.results_of(row.run.location)
     if results is None or row.backbone.score is None:
         return None
     output = "answer" if modes_of([row]) == "answers" else "action"

@@ -24,16 +24,10 @@ class Provenance:
     documents: tuple[tuple[str, str], ...]
 
 
-def provenance(
-    name: str, run: RunReader, results: ProbeResults | None, labels: Sequence[ProbeResults] = ()
-) -> Provenance:
-    """Return what a run says about itself and its probes; runs that were not made by probe_kit say less.
-
-    labels: its probes of labels.
-    """
+def provenance(name: str, run: RunReader, results: Sequence[ProbeResults]) -> Provenance:
+    """Return what a run says about itself and its probes; runs that were not made by probe_kit say less."""
     settings = run.settings
     certificate = run.certificate
-    probes = _probe_settings(results)
     facts = {
         "run": run.label,
         "model": run.model,
@@ -48,13 +42,10 @@ def provenance(
             certificate.get("hooks_on_equals_hooks_off"), "no"
         ),
         "mixed": ", ".join(run.mixed),
-        "probes": str(probes.get("key", "none" * (not labels))),
-        **{f"probes of {probes_of.settings.target}": probes_of.key for probes_of in labels},
+        **({f"probes{_of_target(probes)}": probes.key for probes in results} or {"probes": "none"}),
     }
-    documents = {"run settings": settings, "certificate": certificate, "probe settings": probes}
-    documents |= {
-        f"probe settings of {probes_of.settings.target}": _probe_settings(probes_of) for probes_of in labels
-    }
+    documents = {"run settings": settings, "certificate": certificate}
+    documents |= {f"probe settings{_of_target(probes)}": _probe_settings(probes) for probes in results}
     return Provenance(
         name,
         ProvenanceLine.of_run(run).line,
@@ -113,7 +104,9 @@ def _stream(run: RunReader, name: str) -> str:
     return f"{name} {stream.layers} layers{steps}, width {stream.width}"
 
 
-def _probe_settings(results: ProbeResults | None) -> dict[str, Any]:
-    if results is None:
-        return {}
-    return {"key": results.key, "created": results.created, **asdict(results.settings)}
+def _of_target(probes: ProbeResults) -> str:
+    return "" if probes.settings.is_side else f" of {probes.settings.target}"
+
+
+def _probe_settings(probes: ProbeResults) -> dict[str, Any]:
+    return {"key": probes.key, "created": probes.created, **asdict(probes.settings)}

@@ -2,8 +2,9 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import isnan
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+import numpy as np
 
 from probe_kit.env.scoring.rules import DEFAULT_RULE
 from probe_kit.errors import UnknownSiteError
@@ -16,32 +17,19 @@ from probe_kit.retention.behaviour.success_rate import (
     sensitivity,
     success_rate,
     success_share,
+    units_of,
 )
 from probe_kit.retention.behaviour.vlm_answers import ask_of, read_by_clause
-from probe_kit.retention.estimators.retention import (
-    Iterations,
-    Peak,
-    best_site,
-    curve_scores,
-    estimate_retention,
-    stream_peaks,
-)
-from probe_kit.retention.estimators.stream_scores import ACTION, BACKBONE, RowEstimates, StreamScores, limits
+from probe_kit.retention.choices import Iterations
+from probe_kit.retention.estimators.stream_scores import RowEstimates
 from probe_kit.retention.rows.interventions import add_image_swap
 from probe_kit.retention.rows.outcome_rules import OutcomeRuleScores, RunUnderRule
-from probe_kit.retention.rows.parts import (
-    ActionPart,
-    AnswerStats,
-    BackbonePart,
-    ControlScores,
-    RetentionPart,
-    RunInfo,
-)
+from probe_kit.retention.rows.parts import AnswerStats, RunInfo
+from probe_kit.retention.rows.probe_parts import number_or_none, with_probes
 from probe_kit.retention.rows.row import RetentionRow
-from probe_kit.statistics.estimates.verdict import ABSENT_BELOW, Verdict, verdict
+from probe_kit.statistics.estimates.verdict import ABSENT_BELOW
+from probe_kit.train.choices import CORRECT
 from probe_kit.train.data.run_reader import RunReader
-from probe_kit.train.results.control_scores import Controls, Exceeds, UntrainedScore, has_signal
-from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:
@@ -136,47 +124,21 @@ def _row(
     row = RetentionRow(
         category=category,
         view=view,
+        target=CORRECT if results is None else results.settings.target,
         group=group,
-        run=_run_info(run, results, heard),
+        run=run_info(run, results),
         success=success,
         rules=rules,
         answers=_answers(run, episodes),
     )
     if results is not None and view is not None:
-        row, streams = _with_probes(row, run, results, settings)
+        row, streams = with_probes(row, results, settings.iterations, settings.absent_below, run.seed_text)
         estimates = replace(estimates, streams=streams)
     return RowWithEstimates(row, estimates, episodes if scored else None)
 
 
-def _with_probes(
-    row: RetentionRow, run: RunReader, results: ProbeResults, settings: RowSettings
-) -> tuple[RetentionRow, StreamScores | None]:
-    """The row with the parts of its category's probes, and their scores."""
-    curve = None if row.view is None else results.curves.get((row.category, row.view))
-    if row.view is None or curve is None:
-        note = f"n/a (probes {results.key} are of {', '.join(results.settings.categories)})"
-        return replace(row, retention=RetentionPart(note=note)), None
-    streams = curve_scores(curve, settings.iterations, run.seed_text)
-    peaks = stream_peaks(curve, settings.iterations)
-    exceeds = {
-        name: results.controls.exceeds(row.category, row.view, str(peak.site), peak.p_fwe)
-        for name, peak in peaks.items()
-    }
-    remedy = results.remedy(row.category, row.view)
-    probed = _ProbedCategory(
-        results.controls, row.category, row.view, curve, peaks, exceeds, streams, settings, remedy
-    )
-    row = replace(
-        row,
-        backbone=probed.backbone(),
-        action=probed.action(),
-        retention=probed.retention(),
-        controls=probed.controls_of(row.success),
-    )
-    return row, streams
-
-
-def _run_info(run: RunReader, results: ProbeResults | None, heard: bool) -> RunInfo:
+def run_info(run: RunReader, results: ProbeResults | None) -> RunInfo:
+    """Return the part of a row that names its run."""
     return RunInfo(
         location=str(run.location),
         model=run.model,
@@ -189,7 +151,7 @@ def _run_info(run: RunReader, results: ProbeResults | None, heard: bool) -> RunI
         settings=run.settings_sha256,
         probes=None if results is None else results.key,
         call=None if results is None else results.settings.call,
-        capture_only=heard,
+        capture_only=capture_only(run.episodes),
     )
 
 
@@ -213,7 +175,7 @@ def _answers(run: RunReader, episodes: "pd.DataFrame") -> AnswerStats:
         share_by_clause=by_clause,
         accuracy_strict=strict,
         option_mass=float(episodes["option_mass"].mean()),
-        letter_bias=_number(float(bias)),
+        letter_bias=number_or_none(float(bias)),
         share_near_tie=float(episodes["near_tie"].astype(bool).mean()),
     )
 
@@ -221,117 +183,5 @@ def _answers(run: RunReader, episodes: "pd.DataFrame") -> AnswerStats:
 def _no_success(episodes: "pd.DataFrame", heard: bool) -> SuccessRate:
     """Return an empty rate, of a model that did not act or a run that keeps nothing to judge by."""
     reason = "" if heard else "n/a: the run keeps no trajectories, which this outcome rule needs"
-    return SuccessRate(n_episodes=len(episodes), n_items=int(episodes["item_id"].nunique()), reason=reason)
-
-
-@dataclass(frozen=True)
-class _ProbedCategory:
-    """The probes of one category in one view.
-
-    By stream, `backbone` and `action`: the best sites, and what these are better than. streams: the scores.
-    """
-
-    controls_run: Controls
-    category: str
-    view: str
-    curve: ProbeCurve
-    peaks: dict[str, Peak]
-    exceeds: dict[str, Exceeds]
-    streams: StreamScores | None
-    settings: RowSettings
-    remedy: str
-
-    def backbone(self) -> BackbonePart:
-        """Return the part of the backbone's best site."""
-        peak = self.peaks.get(BACKBONE)
-        return BackbonePart() if peak is None else BackbonePart(**self._part(BACKBONE, peak))
-
-    def action(self) -> ActionPart:
-        """Return the part of the best site where the action is made."""
-        peak = self.peaks.get(ACTION)
-        if peak is None:
-            return ActionPart()
-        first = self._first_iteration(peak)
-        return ActionPart(
-            iteration=peak.site.iteration,
-            first_peak=None if first is None else first.accuracy,
-            first_layer=None if first is None else first.site.layer,
-            **self._part(ACTION, peak),
-        )
-
-    def _part(self, name: str, peak: Peak) -> dict[str, Any]:
-        untrained, scored = self._untrained(peak.site.stream), self.streams
-        exceeds = self.exceeds[name]
-        most = None if scored is None else scored.at_most[name]
-        return {
-            "score": None if scored is None else scored.accuracy(name),
-            "ci": None if scored is None else limits(scored.interval(name)),
-            "peak": peak.accuracy if scored is None else scored.peak(name),
-            "at_most": most,
-            "verdict": None if scored is None else self._verdict(name, exceeds, scored),
-            "site": str(peak.site),
-            "layer": peak.site.layer,
-            "depth": self.curve.depth(peak.site),
-            "ties": peak.ties,
-            "p_fwe": _number(peak.p_fwe),
-            "exceeds": exceeds,
-            "selectivity": self._selectivity(peak),
-            "minus_untrained": None if untrained is None else untrained.difference,
-            "minus_untrained_ci": None if untrained is None else untrained.ci,
-            "remedy": self.remedy,
-        }
-
-    def _verdict(self, name: str, exceeds: Exceeds, scored: StreamScores) -> Verdict:
-        bound = self.settings.absent_below
-        return verdict(has_signal(exceeds), scored.at_most[name], scored.findable[name], bound)
-
-    def retention(self) -> RetentionPart:
-        """Return the retention of both streams."""
-        if len(self.peaks) < 2:
-            return RetentionPart(note="n/a (one stream only)")
-        backbone = self.exceeds[BACKBONE]
-        estimate = estimate_retention(self.peaks, self.streams, backbone, self.settings.absent_below)
-        return RetentionPart(
-            value=_number(estimate.value),
-            ci=limits(estimate.interval),
-            published=_number(estimate.published),
-            defined=estimate.defined,
-            note=estimate.note,
-        )
-
-    def controls_of(self, success: SuccessRate) -> ControlScores:
-        """Return the scores that the best sites are compared with."""
-        baselines = self.controls_run.of_category(self.category)
-        untrained = [self._untrained(peak.site.stream) for peak in self.peaks.values()]
-        score = None if self.streams is None or BACKBONE not in self.peaks else self.streams.accuracy(BACKBONE)
-        return ControlScores(
-            n_groups=self.curve.n_groups,
-            missing=missing_episodes(self.curve),
-            probe_minus_sr=None if score is None or success.sr is None else score - success.sr,
-            baselines={name: score.score for name, score in baselines.items()},
-            leaks=tuple(name for name, score in baselines.items() if score.above_chance),
-            untrained=next((peak_score.untrained for peak_score in untrained if peak_score is not None), None),
-        )
-
-    def _untrained(self, stream: str) -> UntrainedScore | None:
-        return self.controls_run.untrained_peak(self.category, self.view, stream)
-
-    def _selectivity(self, peak: Peak) -> float | None:
-        return _number(peak.accuracy - float(self.curve.control_accuracy[self.curve.sites.index(peak.site)]))
-
-    def _first_iteration(self, peak: Peak) -> Peak | None:
-        """The best layer where the stream has seen nothing of the action yet; None for one that runs once."""
-        iterations = [site.iteration for site in self.curve.sites if site.stream == peak.site.stream]
-        steps = [step for step in iterations if step is not None]
-        return best_site(self.curve, peak.site.stream, min(steps)) if steps else None
-
-
-def missing_episodes(curve: ProbeCurve) -> dict[str, float]:
-    """Return by side the share of items that lack their episode of that side."""
-    items = len(set(curve.items.tolist()))
-    sides = {"left": curve.labels, "right": ~curve.labels}
-    return {side: 1 - len(set(curve.items[is_side].tolist())) / items for side, is_side in sides.items()}
-
-
-def _number(value: float) -> float | None:
-    return None if isnan(value) else value
+    items, groups = int(episodes["item_id"].nunique()), np.unique(units_of(episodes)).size
+    return SuccessRate(n_episodes=len(episodes), n_items=items, n_groups=groups, reason=reason)

@@ -123,11 +123,20 @@ class StreamPart:
     it is better than `chance` and each control; None for one that was not run. selectivity: its accuracy above
     that of the same probe on random labels of items. minus_untrained: how much more accurate it is than the
     untrained network's best. remedy: what to do where no p can be below 0.05; empty where one can.
+
+    Of a target that is no side, peak is the metric of the site with the largest score above its own chance, and
+    chance the mean score of the label permutations there. above: score above chance of the sites that the inner
+    folds choose, on the outer folds; above_ci: its 95 % interval, Student's. Score, verdict, at_most, selectivity
+    and minus_untrained are of sides alone.
     """
 
+    stream: str | None = None
     score: float | None = None
     ci: Limits | None = None
     peak: float | None = None
+    chance: float | None = None
+    above: float | None = None
+    above_ci: Limits | None = None
     at_most: float | None = None
     verdict: Verdict | None = None
     site: str | None = None
@@ -150,6 +159,13 @@ class StreamPart:
     def is_controlled(self) -> bool:
         """Whether its best site was compared with a control, and not with chance alone."""
         return any(better is not None for name, better in self.exceeds.items() if name != "chance")
+
+    @property
+    def missed(self) -> tuple[str, ...]:
+        """The names of chance and controls that its best site is not shown to exceed."""
+        return tuple(
+            name for name, better in self.exceeds.items() if not better and (better is False or name == "chance")
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,8 +193,9 @@ class RetentionPart:
     value: score of the action above one half over that of the backbone; in a mean the ratio of the mean scores of
     all probed categories. ci: its 95 % interval, (None, None) where the backbone is not known well enough to
     divide by. published: the ratio of the peaks; in a mean the mean of these ratios over the categories whose
-    backbone signal is shown. defined: whether the backbone's signal is shown, in a mean in any category; note: why
-    not.
+    backbone signal is shown; of sides alone. defined: whether the backbone's signal is shown, in a mean in any
+    category; note: why not, in few words. reason: of a target that is no side the same with what was found, what
+    was expected and what to do.
     """
 
     value: float | None = None
@@ -186,18 +203,21 @@ class RetentionPart:
     published: float | None = None
     defined: bool = False
     note: str = "n/a (no probes)"
+    reason: str = ""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ControlScores:
     """The scores that those of probes are compared with.
 
-    n_groups: independent groups of items. missing: by side, the share of items without their episode of that
-    side. probe_minus_sr: backbone score − success rate. baselines: accuracy of each control that never sees the
-    model; leaks: those above chance. untrained: name of the untrained network's run.
+    n_groups: independent groups of items. n_samples: episodes, or inferences of them, that were probed. missing:
+    by side, the share of items without their episode of that side. probe_minus_sr: backbone score − success rate.
+    baselines: accuracy of each control that never sees the model; leaks: those above chance. untrained: name of
+    the untrained network's run.
     """
 
     n_groups: int | None = None
+    n_samples: int | None = None
     missing: dict[str, float] = field(default_factory=dict)
     probe_minus_sr: float | None = None
     baselines: dict[str, float] = field(default_factory=dict)

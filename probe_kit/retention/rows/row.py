@@ -13,7 +13,11 @@ from probe_kit.retention.rows.parts import (
     RunInfo,
     SwapEffect,
 )
+from probe_kit.train.choices import CORRECT, SIDES, Task
+from probe_kit.train.crossval.task_scores import METRICS
 
+EVERYWHERE = "all"
+"""Category of rows over all episodes, which labels have by default."""
 MEAN = "mean"
 """Category of the rows that average over categories."""
 
@@ -22,12 +26,15 @@ MEAN = "mean"
 class RetentionRow:
     """One row of the retention table: its parts. A part with nothing to say holds defaults.
 
-    view: how tokens became one vector, None without probes. group: of several groups of runs, this run's. In a row
+    view: how tokens became one vector, None without probes. target: what the probes decode; task:
+    its kind. group: of several groups of runs, this run's. In a row
     of category `mean`, numbers are averages over `categories` and retention leaves out `left_out`.
     """
 
     category: str
     view: str | None
+    target: str = CORRECT
+    task: Task = "binary"
     group: str | None = None
     categories: tuple[str, ...] = ()
     left_out: tuple[str, ...] = ()
@@ -45,3 +52,13 @@ class RetentionRow:
     def key(self) -> tuple[str | None, str]:
         """Group and location of its run, which tell runs of a table apart."""
         return self.group, self.run.location
+
+    @property
+    def is_side(self) -> bool:
+        """Whether the target is a side of a picture; success and answers are numbers of these rows alone."""
+        return self.target in SIDES
+
+    @property
+    def metric(self) -> str:
+        """The name of the score: accuracy balanced between classes, or R²."""
+        return METRICS[self.task]

@@ -17,11 +17,12 @@ from probe_kit.statistics.sufficiency import (
     groups_for_not_used,
     groups_for_signal,
     least_probe_p,
+    probe_command,
 )
 from probe_kit.suite.items import LAYOUTS
 from probe_kit.suite.suite import Suite
 
-__all__ = ["GROUPS_FOR_PROBES", "MARGIN", "Smallest", "Sufficiency", "sufficiencies"]
+__all__ = ["GROUPS_FOR_PROBES", "MARGIN", "Smallest", "Sufficiency", "probe_command", "sufficiencies"]
 
 MARGIN = 0.1
 """Margin of a success rate that the plan gives a number of items for."""

@@ -31,7 +31,7 @@ from probe_kit.runs.results import (
     write_bundle,
 )
 from probe_kit.runs.store import Location, locate
-from probe_kit.statistics.sufficiency import GROUPS_FOR_PROBES
+from probe_kit.statistics.sufficiency import GROUPS_FOR_PROBES, probe_command
 from probe_kit.train.choices import CORRECT, SIDES
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.control_scores import Controls
@@ -201,15 +201,14 @@ def how_to_probe(run: RunReader) -> str:
     """Return a sentence that says how a run gets probes: the command, or that it has too few groups of items."""
     if run.recorded or run.in_own_environment:
         return f"`probe-kit targets {run.location}` lists what can be probed."
-    command, episodes = f"probe-kit train {run.location}", run.episodes
-    if not {"category", "group_id"} <= set(episodes):
-        return f"Run `{command}`."
-    counts = episodes.groupby("category", sort=False)["group_id"].nunique()
+    if not {"category", "group_id"} <= set(run.episodes):
+        return f"Run `probe-kit train {run.location}`."
+    counts = run.episodes.groupby("category", sort=False)["group_id"].nunique().to_dict()
+    command = probe_command(run.location, counts)
     few = [f"{name} has {count}" for name, count in counts.items() if count < GROUPS_FOR_PROBES]
-    enough = [str(name) for name, count in counts.items() if count >= GROUPS_FOR_PROBES]
     if not few:
         return f"Run `{command}`."
-    hint = f" `{command} --categories {','.join(enough)}` probes the others." if enough else ""
+    hint = f" `{command}` probes the others." if command else ""
     return (
         f"Probes need {GROUPS_FOR_PROBES} independent groups of items: {', '.join(few)}. Extract more items.{hint}"
     )

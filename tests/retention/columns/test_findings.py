@@ -59,7 +59,8 @@ def policy(backbone: str, action: str, use: str, rate: str) -> RetentionRow:
     plain = row("acts", "public-info", sr, capture_only=sr is None)
     swap = SwapEffect() if USES[use] is None else SwapEffect(use=USES[use])
     return replace(
-        plain, view=None if backbone == "not probed" else "mean", success=replace(plain.success, regime=regime),
+        plain, view=None if backbone == "not probed" else "mean",
+        success=replace(plain.success, regime=regime, n_groups=12),
         backbone=BackbonePart(**STREAMS[backbone]), action=ActionPart(**STREAMS[action]), image_swap=swap,
     )  # fmt: skip
 
@@ -122,6 +123,9 @@ def test_the_next_step_is_the_command_for_what_is_open() -> None:
         "next: probe-kit train acts", "next: probe-kit intervene acts", "next: probe-kit power",
         "next: probe-kit train acts --permutations 200", "next: probe-kit view acts",
     ]  # fmt: skip
+    few = replace(unprobed, category="shape", success=replace(unprobed.success, n_groups=4))
+    assert next_step([unprobed, few]).partition("  ")[0] == "next: probe-kit train acts --categories public-info"
+    assert "train" not in next_step([few]), "`train` would refuse it"
     assert next_step([answers("color")]) == ""
     scripted = replace(unprobed, run=replace(unprobed.run, action_stream=None, location="my run"))
     assert next_step([scripted]).startswith("next: probe-kit view 'my run'")

@@ -24,7 +24,7 @@ RUN = RunInfo(
 
 def rate(sr: float, low: float, high: float, regime: Regime, wrong: float = 0.0) -> SuccessRate:
     return SuccessRate(
-        n_episodes=48, n_items=24, sr=sr, ci=(low, high), regime=regime, chance_margin=0.2,
+        n_episodes=48, n_items=24, n_groups=12, sr=sr, ci=(low, high), regime=regime, chance_margin=0.2,
         share_wrong=wrong, share_outside=1 - sr - wrong,
     )  # fmt: skip
 
@@ -38,7 +38,7 @@ RATES = {
     "wide": rate(0.75, 0.45, 0.95, OPEN),
     "wrong": rate(0.1, 0.02, 0.25, Regime.FAILURE, wrong=0.8),
     "misses": rate(0.1, 0.02, 0.25, Regime.FAILURE, wrong=0.1),
-    "none": SuccessRate(n_episodes=48, n_items=24),
+    "none": SuccessRate(n_episodes=48, n_items=24, n_groups=12),
 }
 
 

@@ -82,7 +82,7 @@ BLIND = [answers(name, picture="none") for name in ("color", MEAN)]
 @pytest.mark.parametrize("rows", [ACTED, [*ACTED, *ELSEWHERE], [*ACTED, *BLIND]])
 def test_a_policy_stands_alone_where_no_vlm_was_asked_the_same(rows: list[RetentionRow]) -> None:
     found = next(one for one in summarise_runs(rows) if one.run == "pi0-tiny")
-    assert found.beside == ""
+    assert found.vlm == ""
     assert all("VLM" not in sentence for sentence in found.sentences)
 
 
@@ -98,7 +98,7 @@ def test_a_vlm_without_a_policy_is_described_as_answering() -> None:
 def test_every_number_has_its_interval_and_a_mark_where_it_exceeds_every_control() -> None:
     (found,) = summarise_runs([*ASKED, *ACTED])
     table = summary_table([found])
-    assert table.columns == ("category", *HEADINGS)
+    assert table.columns == ("category", *HEADINGS[3:])
     color, _, counting, mean = table.texts
     assert color == (
         "Color", f"100 [90, 100] {MARK}", f"100 [40, 100] {MARK}", f"100 [40, 100] {MARK}", f"94 [84, 100] {MARK}",

@@ -150,7 +150,7 @@ def test_the_last_or_one_iteration_can_be_asked_for(curve_of: CurveOf, episodes:
     for iterations, accuracy in (("all", 0.8), ("last", 0.7), (0, 0.8)):
         peak = best_site(curve, "expert", iterations)  # type: ignore[arg-type]
         assert peak is not None
-        assert peak.accuracy == accuracy
+        assert peak.score == accuracy
         streams = curve_scores(curve, iterations)  # type: ignore[arg-type]
         assert streams is not None
         assert streams.peak("action") == accuracy

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import TYPE_CHECKING, Self
 
 from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
@@ -10,17 +10,22 @@ from probe_kit.retention.displays.base.style import Line, axes_for, caption, leg
 
 if TYPE_CHECKING:
     import numpy as np
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
 
 class Panelled(Display, ABC):
-    """One panel. measure: what its upright axis counts. title: what it is of."""
+    """One panel, such as a stream of the model."""
 
-    measure: ClassVar[str]
     certificate: ProvenanceLine
     ax_: "Axes | None"
+
+    @property
+    @abstractmethod
+    def measure(self) -> str:
+        """Return the name of the upright axis."""
 
     @property
     @abstractmethod
@@ -29,31 +34,59 @@ class Panelled(Display, ABC):
 
     @abstractmethod
     def draw(self, axes: "Axes") -> None:
-        """Lines, with labels for the legend, and the axes' scales."""
+        """Draw marks with labels for the legend, and the axes' scales."""
+
+    def further_handles(self) -> "list[Artist]":
+        """Return handles of the legend, behind those of what is drawn."""
+        return []
 
     def plot(self, ax: "Axes | None" = None) -> Self:
         """Draw on `ax`, or on a figure of its own with legend and caption."""
         axes, figure = axes_for(ax, 6.2, 3.9)
         self.draw(axes)
         plain(axes)
-        axes.set_title(self.title, fontsize=10, loc="left")
+        axes.set_title(self.title, fontsize=9, loc="left")
         if figure is not None:
             axes.set_ylabel(self.measure, fontsize=9)
-            legend_above(figure, axes.get_legend_handles_labels()[0])
+            _draw_legend(figure, [axes], self)
         caption(figure, self.certificate)
         self.ax_ = axes
         return self
 
 
-def in_panels(displays: Sequence[Panelled], height: float = 2.5, *, share: bool = True) -> "Figure":
-    """All of them in one figure, under one legend. displays: at least one, all of a kind."""
-    figure, grid = panels(len(displays), height=height, share=share)
+def in_panels(
+    displays: Sequence[Panelled],
+    width: float = 3.1,
+    height: float = 2.5,
+    *,
+    share: bool = True,
+    level: bool = False,
+) -> "Figure":
+    """Return all of them in one figure, under one legend.
+
+    displays: at least one, all of a kind. width, height: of a panel in inches. share: whether panels share both
+    axes; level: whether they share the range of the upright one.
+    """
+    figure, grid = panels(len(displays), width, height, share=share)
     for display, axes in zip(displays, grid, strict=True):
         display.plot(axes)
+    if level:
+        ranges = [axes.get_ylim() for axes in grid]
+        for axes in grid:
+            axes.set_ylim(min(low for low, _ in ranges), max(high for _, high in ranges))
     figure.supylabel(displays[0].measure, fontsize=9)
     caption(figure, displays[0].certificate)
-    legend_above(figure, grid[0].get_legend_handles_labels()[0])
+    _draw_legend(figure, grid, displays[0])
     return figure
+
+
+def _draw_legend(figure: "Figure", grid: "Sequence[Axes]", display: Panelled) -> None:
+    """Draw a legend with every name once."""
+    handles: dict[str, Artist] = {}
+    for axes in grid:
+        handles |= {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    if every := [*handles.values(), *display.further_handles()]:
+        legend_above(figure, every)
 
 
 def draw_series(

@@ -1,5 +1,6 @@
 """The figures that a display contributes to reports and `--figures`, each with how to read it."""
 
+import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -7,8 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 from probe_kit.retention.displays.base.style import SIGNAL
 from probe_kit.retention.rows.outcome_rules import can_be_judged, under_rule
+from probe_kit.retention.rows.row import EVERYWHERE
 from probe_kit.retention.table import RetentionTable
 from probe_kit.train.data.run_reader import RunReader
+from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:
@@ -20,9 +23,9 @@ DOTS = f"Dots mark evidence: {SIGNAL}"
 
 @dataclass(frozen=True)
 class DrawnRun:
-    """A run of a table. stem: beginning of its files' names. name: in legends. position: among the runs.
+    """A run of a table, of labels each with one. stem: beginning of its files' names. name: in legends.
 
-    results: its probes, None without any.
+    position: among the runs. results: its probes, None without any.
     """
 
     run: RunReader
@@ -98,3 +101,61 @@ def in_view(title: str, view: str, views: Sequence[str]) -> str:
 def view_suffix(view: str, views: Sequence[str]) -> str:
     """Return the end of a file's name; the first view needs none."""
     return "" if view == views[0] else f"-{view.replace(':', '-')}"
+
+
+# -- labels ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class LabelView:
+    """One label of one run in one category and view, for a figure. name: of the view. stem: of its files."""
+
+    results: ProbeResults
+    category: str
+    name: str
+    stem: str
+    position: int
+
+    @property
+    def target(self) -> str:
+        """The label."""
+        return self.results.settings.target
+
+    @property
+    def curve(self) -> ProbeCurve:
+        """Its probes."""
+        return self.results.curves[self.category, self.name]
+
+    @property
+    def is_first(self) -> bool:
+        """Whether it is of the first view; figures of others are details."""
+        return self.name == self.results.settings.views[0]
+
+    def file_name(self, figure: str) -> str:
+        """Return the stem of a figure's files."""
+        of_category = "" if self.category == EVERYWHERE else f"-{file_names([self.category])[0]}"
+        return f"{self.stem}{of_category}-{figure}{view_suffix(self.name, self.results.settings.views)}"
+
+    def title(self, title: str) -> str:
+        """Return a title, which names the view where there are several."""
+        return in_view(title, self.name, self.results.settings.views)
+
+
+def label_views(source: FigureSource) -> Iterator[LabelView]:
+    """Yield the categories and views of the rows of a table of labels, label by label and run by run."""
+    for drawn in source.probed:
+        assert drawn.results is not None
+        for row in source.table.rows:
+            if (row.target, row.run.location) == (drawn.results.settings.target, str(drawn.run.location)):
+                yield LabelView(drawn.results, row.category, row.view or "", drawn.stem, drawn.position)
+
+
+def file_names(targets: Sequence[str]) -> list[str]:
+    """Return label columns as parts of file names, no two alike."""
+    names: list[str] = []
+    for target in targets:
+        name = re.sub(r"[^\w.-]+", "-", target).strip(".-") or "label"
+        tries = (name, *(f"{name}-{number}" for number in range(2, len(targets) + 1)))
+        used = {other.casefold() for other in names}
+        names.append(next(free for free in tries if free.casefold() not in used))
+    return names

@@ -2,8 +2,11 @@
 
 from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import NDArray
+
 from probe_kit.errors import UnknownCategoryError, UnknownSiteError, UsageError
-from probe_kit.retention.estimators.retention import Iterations
+from probe_kit.retention.choices import Iterations
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeResults
 
@@ -47,3 +50,24 @@ def of_iterations(scores: "pd.DataFrame", iterations: Iterations) -> "pd.DataFra
         stream = scores["stream"].iloc[0]
         raise UsageError(f"the stream {stream} has iterations {steps.min()} to {steps.max()}, not {step}")
     return scores[scores["iteration"] == step]
+
+
+def probed_curve(results: ProbeResults, view: str | None, category: str | None) -> tuple[str, str, ProbeCurve]:
+    """Return category, view and curve, by default the first. Raises as `known_view` and `curve_of`."""
+    view, category = known_view(results, view), category or results.settings.categories[0]
+    return category, view, curve_of(results, category, view)
+
+
+def rows_of(curve: ProbeCurve, stream: str) -> NDArray[np.intp]:
+    """Return the positions of the sites of a stream. Raises UnknownSiteError without any."""
+    rows = curve.stream(stream)
+    if not rows.size:
+        raise UnknownSiteError(
+            f"stream {stream!r} was not probed in this view; probed: {', '.join(curve.streams)}"
+        )
+    return rows
+
+
+def best_row(curve: ProbeCurve, stream: str) -> int:
+    """Return the position of the site of a stream that has the largest score above its own chance."""
+    return curve.largest_excess(rows_of(curve, stream))

@@ -114,7 +114,10 @@ def layer_axis(axes: "Axes", layers: int, label: bool = True) -> None:
     from matplotlib.ticker import MaxNLocator
 
     axes.set_xlim(-0.06 * layers - 0.2, 1.06 * (layers - 1) + 0.2)
-    axes.xaxis.set_major_locator(MaxNLocator(nbins=7, integer=True, min_n_ticks=2))
+    if layers == 1:  # a locator of whole numbers falls back on fractions where there is only one
+        axes.set_xticks([0])
+    else:
+        axes.xaxis.set_major_locator(MaxNLocator(nbins=7, integer=True, min_n_ticks=2))
     if label:
         axes.set_xlabel("layer", fontsize=8.5)
 

@@ -1,42 +1,14 @@
-"""`probe-kit retention --target COLUMN`: retention of labels of one's own."""
+"""The output of retention commands: a table in a format, figures in a folder, and where a report is."""
 
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from probe_kit._system.counting import counted
-from probe_kit._terminal.console import err, out, print_json_text, print_text, say
+from probe_kit._terminal.console import print_json_text, print_text, say
 
 if TYPE_CHECKING:
-    from probe_kit.retention.choices import TableFormat
     from probe_kit.retention.displays.base.report_figure import ReportFigure
-    from probe_kit.retention.labels.table import LabelRetentionTable
-    from probe_kit.train.data.run_reader import RunReader
-
-
-def show_label_retention(
-    runs: "Sequence[RunReader]",
-    table: "LabelRetentionTable",
-    style: "TableFormat",
-    html: Path | None,
-    figures: Path | None,
-    details: bool = False,
-) -> None:
-    """Print the retention table of labels, and write its report and figures where that was asked for."""
-    if figures is not None:
-        from probe_kit.retention.displays.labels import label_figures
-
-        save_all(label_figures(runs, table), figures, details)
-    if html is not None:
-        from probe_kit.retention.report import write_label_report
-
-        with err.status("drawing the report"):
-            written = write_label_report(runs, html, table)
-        say_report(written)
-    if style == "table":
-        out.print(table.to_rich())
-    else:
-        print_text_of(table, style)
 
 
 def print_text_of(table: Any, style: str) -> None:

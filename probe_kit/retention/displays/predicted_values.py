@@ -1,19 +1,18 @@
 """Predicted against true values of a continuous label."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, ClassVar, Self
+from functools import partial
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
+from probe_kit.retention.displays.base.panels import Panelled, in_panels
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
-from probe_kit.retention.displays.labels.label_panel import (
-    LabelPanel,
-    best_row,
-    label_curve_of,
-    label_panels,
-)
+from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure, label_views
+from probe_kit.retention.displays.base.selection import best_row, probed_curve
 from probe_kit.train.crossval.task_scores import METRICS
 from probe_kit.train.results.probe_results import ProbeResults
 
@@ -26,14 +25,12 @@ _PIXELS_FROM = 2000
 
 
 @dataclass
-class PredictedValuesDisplay(LabelPanel):
+class PredictedValuesDisplay(Panelled):
     """Held-out predictions of the best site of a stream; arrays (n,).
 
     true, predicted: values in the label's own unit. groups: (n,) number of each sample's group, which is its
     colour. site: of the largest score above its own chance. score: its R².
     """
-
-    size: ClassVar[tuple[float, float]] = (3.3, 3.0)
 
     target: str
     view: str
@@ -58,7 +55,7 @@ class PredictedValuesDisplay(LabelPanel):
 
         Raises UnknownSiteError for a view or stream that was not probed, UsageError for a label of classes.
         """
-        category, view, curve = label_curve_of(results, view, category)
+        category, view, curve = probed_curve(results, view, category)
         if results.settings.task != "continuous":
             raise UsageError(f"the label {results.settings.target!r} is of classes; expected a continuous one")
         row = best_row(curve, stream)
@@ -98,6 +95,23 @@ class PredictedValuesDisplay(LabelPanel):
 
 def predicted_values(results: ProbeResults, view: str | None = None, category: str | None = None) -> "Figure":
     """Predicted against true, a panel per stream; arguments and errors as of `PredictedValuesDisplay`."""
-    category, view, curve = label_curve_of(results, view, category)
+    category, view, curve = probed_curve(results, view, category)
     displays = [PredictedValuesDisplay.from_results(results, stream, view, category) for stream in curve.streams]
-    return label_panels(displays, level=True)
+    return in_panels(displays, 3.3, 3.0, share=False, level=True)
+
+
+PLACE = 18
+"""Of its figures in the report."""
+
+
+def label_figures(source: FigureSource) -> Iterator[ReportFigure]:
+    """Yield the figures that a report of these labels shows: of continuous ones."""
+    for view in label_views(source):
+        if not view.curve.classes:
+            yield ReportFigure(
+                view.file_name("predicted"), view.title("Predicted against true"), view.target,
+                "A point per sample, predicted by the best site of each part in groups it has not seen. Colours "
+                "are groups. Predictions are clipped to the range of the training labels.",
+                view.position, partial(predicted_values, view.results, view.name, view.category),
+                is_detail=not view.is_first,
+            )  # fmt: skip

@@ -13,19 +13,19 @@ from sklearn.metrics import balanced_accuracy_score
 from typer.testing import CliRunner
 
 from probe_kit.cli import app
-from probe_kit.errors import NoProbesError, UnknownSiteError, UsageError
-from probe_kit.retention import label_retention_table
-from probe_kit.retention.displays.base.style import PARTS
-from probe_kit.retention.displays.labels import (
+from probe_kit.errors import UnknownCategoryError, UnknownSiteError, UsageError
+from probe_kit.retention import retention_table
+from probe_kit.retention.displays import (
     ClassConfusionDisplay,
-    LabelCurveDisplay,
+    LayerCurveDisplay,
     PredictedValuesDisplay,
     StepScoresDisplay,
-    label_curves,
-    label_figures,
+    collect_figures,
+    layer_curve,
     step_scores,
 )
-from probe_kit.retention.displays.labels.figures import file_names
+from probe_kit.retention.displays.base.report_figure import file_names
+from probe_kit.retention.displays.base.style import PARTS
 from probe_kit.retention.report import report_html
 from probe_kit.runs import Run, open_run
 from probe_kit.train import ProbeResults, Target, load_results, train_probes
@@ -61,35 +61,35 @@ def kinds(run: Run) -> Target:
 def test_the_layer_curve_has_the_best_site_of_a_layer_its_own_null_and_the_best_control(run: Run) -> None:
     results = load_results(run, target="sim.tool_y")
     curve = results.curves["all", "mean"]
-    display = LabelCurveDisplay.from_results(results, "expert")
+    display = LayerCurveDisplay.from_results(results, iterations="best")
+    backbone, expert = display.streams
+    ground = display.grounds[1]
     excess = curve.metric - curve.null.mean(axis=1)
     rows = [row for row, site in enumerate(curve.sites) if site.stream == "expert"]
     best = max(rows, key=lambda row: excess[row])
-    assert display.layers.tolist() == [0]
-    assert display.iterations.tolist() == [curve.sites[best].iteration]
-    assert display.score == pytest.approx(curve.metric[best])
-    assert display.chance == pytest.approx(curve.null[best].mean())
-    assert [*display.null_low, *display.null_high] == pytest.approx(np.percentile(curve.null[best], [2.5, 97.5]))
-    assert np.isnan(display.low).all(), "a site that was chosen has no interval of its own"
+    assert (expert.layers.tolist(), expert.sites) == ([0], (str(curve.sites[best]),))
+    assert expert.score == pytest.approx(curve.metric[best])
+    assert ground.chance == pytest.approx(curve.null[best].mean())
+    assert ground.null_band is not None
+    assert [end[0] for end in ground.null_band] == pytest.approx(np.percentile(curve.null[best], [2.5, 97.5]))
     state = max(results.controls.scores, key=lambda one: one.score)
-    assert display.control == (state.name, state.score) == ("state", pytest.approx(1.0, abs=0.01))
-    backbone = LabelCurveDisplay.from_results(results, "backbone")
+    assert ground.control == (state.name, state.score) == ("state", pytest.approx(1.0, abs=0.01))
     table = results.scores.set_index("site")
     assert backbone.low[1] == table.loc["backbone.01.residual", "ci_low"]
-    assert not backbone.signal.any(), "the state has it too"
-    with pytest.raises(UnknownSiteError, match="probed: backbone, expert"):
-        LabelCurveDisplay.from_results(results, "vision")
+    assert not backbone.significant.any(), "the state has it too"
+    with pytest.raises(UnknownCategoryError, match="probed: all"):
+        LayerCurveDisplay.from_results(results, "color")
     with pytest.raises(UnknownSiteError, match="probed: mean"):
-        LabelCurveDisplay.from_results(results, "backbone", "last")
+        LayerCurveDisplay.from_results(results, view="last")
 
 
 def test_without_enough_permutations_there_is_no_band_and_without_any_no_chance(run: Run) -> None:
     for permutations, chance in ((9, True), (0, False)):
         train_probes(run, target=Target.of_run(run, "sim.tool_z"), permutations=permutations, controls=())
-        figure = label_curves(load_results(run, target="sim.tool_z"))
+        figure = layer_curve(load_results(run, target="sim.tool_z"))
         names = {name for axes in figure.axes for name in axes.get_legend_handles_labels()[1]}
-        assert "95 % of permuted labels" not in names
-        assert ("chance of the site" in names) == chance
+        assert "95 % of probes of permuted labels" not in names
+        assert ("chance" in names) == chance
         assert "best control" not in names
 
 
@@ -180,8 +180,8 @@ def test_predicted_values_are_held_out_and_coloured_by_group(run: Run) -> None:
 
 
 def test_every_figure_of_a_table_is_drawn_unclipped_and_says_what_it_is_of(run: Run) -> None:
-    table = label_retention_table([run], ["sim.tool_y", "sim.phase", "a/b: <i>"])
-    exhibits = label_figures([run], table)
+    table = retention_table([run], target=["sim.tool_y", "sim.phase", "a/b: <i>"])
+    exhibits = collect_figures([run], table)
     assert [one.name for one in exhibits] == [
         "run-sim.tool_y-layer-curves", "run-sim.tool_y-steps", "run-sim.tool_y-predicted",
         "run-sim.phase-layer-curves", "run-sim.phase-steps", "run-sim.phase-confusion",
@@ -196,7 +196,7 @@ def test_every_figure_of_a_table_is_drawn_unclipped_and_says_what_it_is_of(run: 
             assert inked.y1 < figure.get_figheight() + 0.02, exhibit.name
             assert f"target {exhibit.subject}" in figure.caption  # type: ignore[attr-defined]
     with pytest.raises(UsageError, match="has no rows of"):
-        label_figures([run], label_retention_table([run], "sim.phase").of_target("nothing"))
+        collect_figures([run], retention_table([run], target="sim.phase").of_target("nothing"))
 
 
 def test_names_of_files_differ_where_columns_do() -> None:
@@ -220,7 +220,7 @@ def test_the_command_writes_figures_and_a_page_of_several_labels(run: Run, tmp_p
     assert "http://" not in text.replace("http://www.w3.org", ""), "needs no network"
     assert text.count("data:image/svg+xml,") + text.count("data:image/webp") == 5
     assert "control state" in text
-    shown = label_retention_table([run], ["sim.tool_y", "a/b: <i>"]).summary
+    shown = retention_table([run], target=["sim.tool_y", "a/b: <i>"]).summary_table
     assert shown.columns == ("label", "metric", "backbone above chance", "action above chance", "retention")
     assert [cells[-1] for cells in shown.texts] == ["n/a", "n/a"]
     for wrong, message in (
@@ -245,20 +245,12 @@ def results(run: Run) -> ProbeResults:
     return load_results(run, target="sim.tool_y")
 
 
-def test_a_label_of_a_run_without_an_action_has_a_section_that_says_so(
-    run: Run, monkeypatch: pytest.MonkeyPatch
+def test_a_run_without_an_action_stream_shows_what_its_backbone_holds_and_says_what_is_missing(
+    tmp_path: Path,
 ) -> None:
-    def refuse(*_: object) -> None:
-        raise NoProbesError("no site of the action was probed, so there is no retention")
-
-    monkeypatch.setattr("probe_kit.retention.report.label_sections.label_retention_table", refuse)
-    text = report_html([run])
-    assert "no site of the action was probed" in text
-    assert "sim.tool_y" in text
-
-
-def test_a_run_of_recordings_without_an_action_stream_is_refused_by_name(tmp_path: Path) -> None:
     run = write_recorded_run(tmp_path / "run")
     train_probes(run, target=Target.of_run(run, "dataset.state.y"), permutations=0, controls=())
-    with pytest.raises(NoProbesError, match="no site of the action"):
-        label_retention_table([run], "dataset.state.y")
+    table = retention_table([run], target="dataset.state.y")
+    assert table.rows[0].retention.note == "n/a (one stream only)"
+    assert "no site of the action was probed" in table.rows[0].retention.reason
+    assert "no site of the action was probed" in report_html([run], table)

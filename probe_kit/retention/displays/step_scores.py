@@ -1,21 +1,19 @@
 """Score of a label at every step of the window, with those of its controls."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
+from probe_kit.retention.displays.base.panels import Panelled, in_panels
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
-from probe_kit.retention.displays.base.selection import scores_of
+from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure, label_views
+from probe_kit.retention.displays.base.selection import best_row, probed_curve, scores_of
 from probe_kit.retention.displays.base.style import GREEN, PARTS, Line, significance_handles
-from probe_kit.retention.displays.labels.label_panel import (
-    LabelPanel,
-    best_row,
-    label_curve_of,
-    label_panels,
-)
 from probe_kit.train.crossval.task_scores import METRICS, score_interval
 from probe_kit.train.results.control_scores import ControlScore
 from probe_kit.train.results.probe_results import ProbeResults
@@ -30,7 +28,7 @@ _CONTROLS = (Line("black", "", ":"), Line(GREEN, "", (0, (5, 1))))  # type: igno
 
 
 @dataclass
-class StepScoresDisplay(LabelPanel):
+class StepScoresDisplay(Panelled):
     """The metric at each step, of the best site of a stream; arrays (W,).
 
     R² is that of the label's spread over all steps. Balanced accuracy is that of the classes at the
@@ -67,7 +65,7 @@ class StepScoresDisplay(LabelPanel):
 
         Raises UnknownSiteError for a view or stream that was not probed, UsageError for labels of a single step.
         """
-        category, view, curve = label_curve_of(results, view, category)
+        category, view, curve = probed_curve(results, view, category)
         if curve.steps.size < 2:
             raise UsageError(f"the label {results.settings.target!r} has one step; expected several to show")
         row = best_row(curve, stream)
@@ -158,6 +156,23 @@ def _whole_numbers(axes: "Axes", label: str) -> None:
 
 def step_scores(results: ProbeResults, view: str | None = None, category: str | None = None) -> "Figure":
     """Score of a label by step, a panel per stream; arguments and errors as of `StepScoresDisplay`."""
-    category, view, curve = label_curve_of(results, view, category)
+    category, view, curve = probed_curve(results, view, category)
     displays = [StepScoresDisplay.from_results(results, stream, view, category) for stream in curve.streams]
-    return label_panels(displays, level=True)
+    return in_panels(displays, 3.1, 2.6, share=False, level=True)
+
+
+PLACE = 16
+"""Of its figures in the report."""
+
+
+def label_figures(source: FigureSource) -> Iterator[ReportFigure]:
+    """Yield the figures that a report of these labels shows: of those with several steps."""
+    for view in label_views(source):
+        if view.curve.steps.size > 1:
+            yield ReportFigure(
+                view.file_name("steps"), view.title("Score by step"), view.target,
+                "The same by inference, at the best site of each part, beside controls. Classes are balanced "
+                "among those of the step. A step of one class is easy, so compare with the controls at that step.",
+                view.position, partial(step_scores, view.results, view.name, view.category),
+                is_detail=not view.is_first,
+            )  # fmt: skip

@@ -5,6 +5,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pandas as pd
@@ -13,19 +14,44 @@ from scipy import stats
 from typer.testing import CliRunner
 
 from probe_kit.cli import app
-from probe_kit.errors import NoProbesError, UnknownSiteError, UsageError
+from probe_kit.errors import UnknownSiteError, UsageError
 from probe_kit.hooks import Site
-from probe_kit.retention import label_retention_table, measure_label_retention, measure_retention
-from probe_kit.retention.behaviour.success_rate import capture_only
-from probe_kit.retention.labels.estimate import with_corrected_p
+from probe_kit.retention import measure_retention, retention_table
+from probe_kit.retention.behaviour.success_rate import SuccessRate, capture_only
+from probe_kit.retention.rows.parts import RunInfo
+from probe_kit.retention.rows.probe_parts import with_corrected_p, with_probes
+from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.runs import Run, open_run
-from probe_kit.train import ControlComparison, Controls, ControlScore, ProbeCurve, Target, train_probes
+from probe_kit.statistics.estimates.retention import OTHER_TRAINING
+from probe_kit.train import (
+    ControlComparison,
+    Controls,
+    ControlScore,
+    ProbeCurve,
+    ProbeResults,
+    Target,
+    train_probes,
+)
 from probe_kit.train.results.inventory import stored_probes
 from tests.support.label_results import label_results
 from tests.support.recorded_run import write_recorded_run
 
 GROUPS, EACH = 20, 4
 BACKBONE, ACTION = (Site("backbone", 0), Site("backbone", 1)), (Site("expert", 0),)
+
+
+RUN = RunInfo(
+    location="runs/made", model="made", random_weights=False, weights_sha256=None, suite="some@1",
+    settings="0" * 64, probes=None,
+)  # fmt: skip
+
+
+def measured(results: ProbeResults, view: str = "mean", iterations: int | Literal["all"] = "all") -> RetentionRow:
+    """The row of a label."""
+    own = results.settings
+    success = SuccessRate(n_episodes=GROUPS, n_items=GROUPS)
+    row = RetentionRow(category="all", view=view, target=own.target, task=own.task, run=RUN, success=success)
+    return with_probes(row, results, iterations, seed_text=own.seed_text)[0]
 
 
 def controls(name: str, score: float, p: float, view: str = "mean") -> Controls:
@@ -39,13 +65,13 @@ def controls(name: str, score: float, p: float, view: str = "mean") -> Controls:
 
 def test_of_one_site_each_it_is_the_ratio_of_scores_minus_the_chance_of_that_site() -> None:
     results = label_results({BACKBONE[0]: (0.8, 0.3), ACTION[0]: (0.5, 0.4)}, GROUPS, EACH)
-    found = measure_label_retention(results)
-    assert found.defined
+    found = measured(results)
+    assert found.retention.defined
     assert found.backbone.above == pytest.approx(0.8 - 0.3)
     assert found.action.above == pytest.approx(0.5 - 0.4)
-    assert found.value == pytest.approx((0.5 - 0.4) / (0.8 - 0.3))
-    assert (found.backbone.score, found.backbone.chance) == pytest.approx((0.8, 0.3))
-    low, high = found.backbone.ci
+    assert found.retention.value == pytest.approx((0.5 - 0.4) / (0.8 - 0.3))
+    assert (found.backbone.peak, found.backbone.chance) == pytest.approx((0.8, 0.3))
+    low, high = found.backbone.above_ci
     assert low is not None
     assert high is not None
     assert low < 0.5 < high
@@ -54,26 +80,26 @@ def test_of_one_site_each_it_is_the_ratio_of_scores_minus_the_chance_of_that_sit
 def test_its_variance_is_that_of_group_means_and_its_limits_are_fiellers() -> None:
     """With one site per stream nothing is chosen: the variance is that of a mean over groups."""
     results = label_results({BACKBONE[0]: (0.8, 0.3), ACTION[0]: (0.5, 0.4)}, 60, EACH, noise=0.3)
-    found = measure_label_retention(results)
+    found = measured(results)
     each = results.curves["all", "mean"].scores.reshape(2, 60, EACH).mean(axis=2)
     errors = each.std(axis=1, ddof=1) / np.sqrt(60)
     quantile = stats.t.ppf(0.975, 59)
     for peak, error in zip((found.backbone, found.action), errors, strict=True):
-        assert peak.ci[1] is not None
-        assert (peak.ci[1] - peak.above) / quantile == pytest.approx(error)
+        assert peak.above_ci[1] is not None
+        assert (peak.above_ci[1] - peak.above) / quantile == pytest.approx(error)
     # Fieller: ratios r at which |a - r b| is t standard errors, from the variances above and their covariance
     covariance = np.cov(each) / 60
     a, b = found.action.above, found.backbone.above
-    V, square = covariance[::-1, ::-1], quantile**2
+    V, square = covariance[::-1, ::-1], (quantile * OTHER_TRAINING) ** 2
     limits = np.sort(np.roots([b**2 - square * V[1, 1], -2 * (a * b - square * V[0, 1]), a**2 - square * V[0, 0]]))
-    assert found.ci == pytest.approx(tuple(limits))
+    assert found.retention.ci == pytest.approx(tuple(limits))
 
 
 def test_a_site_is_chosen_by_what_it_has_above_its_own_chance() -> None:
     results = label_results(
         {BACKBONE[0]: (0.95, 0.9), BACKBONE[1]: (0.6, 0.1), ACTION[0]: (0.5, 0.4)}, GROUPS, EACH
     )
-    found = measure_label_retention(results)
+    found = measured(results)
     assert found.backbone.site == str(BACKBONE[1])
     assert found.backbone.above == pytest.approx(0.5)
 
@@ -93,9 +119,9 @@ def test_with_chance_one_half_it_is_retention_of_sides(
         fold_of=curve.fold_of,
     )  # fmt: skip
     settings = replace(results.settings, seed_text="")
-    found = measure_label_retention(replace(results, curves={("all", "mean"): own}, settings=settings))
-    assert found.value == pytest.approx(sides.value)
-    assert found.ci == pytest.approx((sides.interval.low, sides.interval.high))
+    found = measured(replace(results, curves={("all", "mean"): own}, settings=settings))
+    assert found.retention.value == pytest.approx(sides.value)
+    assert found.retention.ci == pytest.approx((sides.interval.low, sides.interval.high))
     assert found.backbone.above == pytest.approx(0.4)
 
 
@@ -114,38 +140,37 @@ def test_without_signal_in_the_backbone_it_is_refused_by_what_is_missing(
     results = label_results(
         {BACKBONE[0]: (planted, 0.3), ACTION[0]: (0.5, 0.4)}, GROUPS, EACH, task=task, null_spread=spread
     )  # fmt: skip
-    found = measure_label_retention(replace(results, controls=given))
-    assert not found.defined
-    assert note in found.note
-    assert reason in found.reason
-    assert str(BACKBONE[0]) in found.reason
-    assert "abel" in found.reason, "what to do"
+    found = measured(replace(results, controls=given))
+    assert not found.retention.defined
+    assert note in found.retention.note
+    assert reason in found.retention.reason
+    assert str(BACKBONE[0]) in found.retention.reason
+    assert "abel" in found.retention.reason, "what to do"
 
 
 def test_labels_that_change_within_episodes_need_the_control_step() -> None:
     results = label_results({BACKBONE[0]: (0.8, 0.3), ACTION[0]: (0.5, 0.4)}, GROUPS, EACH, window=EACH)
-    without = measure_label_retention(replace(results, controls=controls("state", 0.1, 0.001)))
-    assert without.note == "n/a (control step was not run)"
-    assert "--controls step,state" in without.reason
-    assert measure_label_retention(replace(results, controls=controls("step", 0.1, 0.001))).defined
+    without = measured(replace(results, controls=controls("state", 0.1, 0.001)))
+    assert without.retention.note == "n/a (control step was not run)"
+    assert "--controls step,state" in without.retention.reason
+    assert measured(replace(results, controls=controls("step", 0.1, 0.001))).retention.defined
 
 
 def test_without_permutations_there_is_no_chance_and_no_retention() -> None:
     results = label_results({BACKBONE[0]: (0.8, 0.3), ACTION[0]: (0.5, 0.4)}, GROUPS, EACH, permutations=0)
-    found = measure_label_retention(results)
-    assert found.note == "n/a (no permutations)"
-    assert "--permutations 200" in found.reason
+    found = measured(results)
+    assert found.retention.note == "n/a (no permutations)"
+    assert "--permutations 200" in found.retention.reason
 
 
-def test_a_run_without_an_action_stream_and_an_unknown_view_or_iteration_are_refused() -> None:
-    results = label_results({BACKBONE[0]: (0.8, 0.3)}, GROUPS, EACH)
-    with pytest.raises(NoProbesError, match="no site of the action"):
-        measure_label_retention(results)
+def test_a_run_without_an_action_stream_has_no_retention_and_an_unknown_iteration_is_refused() -> None:
+    found = measured(label_results({BACKBONE[0]: (0.8, 0.3)}, GROUPS, EACH))
+    assert not found.retention.defined
+    assert "no site of the action was probed" in found.retention.reason
+    assert found.backbone.peak == pytest.approx(0.8), "what the backbone holds is shown all the same"
     both = label_results({BACKBONE[0]: (0.8, 0.3), Site("expert", 0, iteration=1): (0.5, 0.4)}, GROUPS, EACH)
-    with pytest.raises(UnknownSiteError, match="probed: mean"):
-        measure_label_retention(both, "last")
     with pytest.raises(UsageError, match="iterations"):
-        measure_label_retention(both, iterations=7)
+        measured(both, iterations=7)
 
 
 @pytest.fixture
@@ -159,20 +184,23 @@ def trained(labelled_run: Path, tmp_path: Path) -> Run:
 
 
 def test_what_was_planted_in_the_backbone_alone_does_not_reach_the_action(trained: Run) -> None:
-    table = label_retention_table([trained], "sim.tool_y")
-    found = table.rows[0].retention
-    assert found.defined
+    table = retention_table([trained], target="sim.tool_y")
+    (found,) = table.rows
+    assert found.retention.defined
     assert found.backbone.site == "backbone.01.residual"
     assert found.backbone.has_signal
     assert not found.action.has_signal
-    assert abs(found.value) < 0.2
-    assert found.ci[0] is not None
-    assert found.ci[1] is not None
-    assert found.ci[0] < found.value < found.ci[1]
+    assert abs(found.retention.value) < 0.2
+    assert found.retention.ci[0] is not None
+    assert found.retention.ci[1] is not None
+    assert found.retention.ci[0] < found.retention.value < found.retention.ci[1]
     frame = table.to_frame()
-    assert frame.loc[0, "retention"] == found.value
+    assert frame.loc[0, "retention.value"] == found.retention.value
     stored = json.loads(table.to_json())
-    assert stored[0]["retention"]["backbone"]["site"] == "backbone.01.residual"
+    assert stored[0]["backbone"]["site"] == "backbone.01.residual"
+    assert "%" in stored[0]["finding"] or "not beyond" in stored[0]["finding"]
+    with pytest.raises(UnknownSiteError, match="probed: mean"):
+        retention_table([trained], ["last"], target="sim.tool_y")
 
 
 def test_the_command_prints_it_in_every_format_and_names_what_a_label_does_not_have(trained: Run) -> None:
@@ -199,7 +227,7 @@ def test_runs_whose_labels_differ_are_not_put_into_one_table(trained: Run, tmp_p
     for run, values in ((trained, frame), (other, frame.assign(y=frame["y"] + 1))):
         train_probes(run, target=Target.read(values, "y", task="continuous"), permutations=9, controls=())
     with pytest.raises(UsageError, match=r"the labels .y. of .*other and .* differ \(sha256"):
-        label_retention_table([trained, other], "y")
+        retention_table([trained, other], target="y")
 
 
 # -- several labels in one table ---------------------------------------------------------------------------------
@@ -223,18 +251,18 @@ def test_one_table_has_a_binary_label_one_of_classes_and_a_continuous_one_and_no
     command = ["retention", str(three.path), *(part for name in NAMES for part in ("--target", name))]
     done = CliRunner().invoke(app, [*command, "--format", "json"])
     assert done.exit_code == 0, done.output
-    rows = [row["retention"] for row in json.loads(done.stdout)]
-    assert [(row["target"], row["task"], row["metric"]) for row in rows] == [
-        ("even", "binary", "balanced accuracy"),
-        ("kind", "classes", "balanced accuracy"),
-        ("sim.tool_y", "continuous", "R²"),
-    ]
+    rows = json.loads(done.stdout)
+    assert [(row["target"], row["task"]) for row in rows] == [
+        ("even", "binary"), ("kind", "classes"), ("sim.tool_y", "continuous"),
+    ]  # fmt: skip
     for row, name in zip(rows, NAMES, strict=True):
-        alone = label_retention_table([three], name).rows[0].retention
-        assert row["value"] == alone.value, "the same as by itself"
-    text = label_retention_table([three], NAMES).text
-    assert text.columns[:4] == ("label", "metric", "run", "view")
-    assert len(text.rows) == len(NAMES), "no row is a mean over tasks"
+        alone = retention_table([three], target=name).rows[0].retention
+        assert row["retention"]["value"] == alone.value, "the same as by itself"
+    table = retention_table([three], target=NAMES)
+    for text in (table.summary_table, table.tables()["Retention"]):
+        assert text.columns[:2] == ("label", "metric")
+        assert [cells[1] for cells in text.texts] == ["balanced accuracy", "balanced accuracy", "R²"]
+        assert len(text.rows) == len(NAMES), "no row is a mean over tasks"
     for style in ("table", "csv", "markdown", "latex"):
         done = CliRunner().invoke(app, [*command, "--format", style], env={"COLUMNS": "250"})
         assert done.exit_code == 0, done.output
@@ -242,26 +270,24 @@ def test_one_table_has_a_binary_label_one_of_classes_and_a_continuous_one_and_no
 
 
 def test_trap_9_the_table_says_how_many_labels_were_tried_and_corrects_them_by_holm(three: Run) -> None:
-    alone = label_retention_table([three], NAMES)
+    alone = retention_table([three], target=NAMES)
     assert (
-        alone.sentences[-1]
+        alone.notes[-1]
         == "labelled (random weights) has probes of 3 labels (even, kind, sim.tool_y); p is of each label alone."
     )
-    family = label_retention_table([three], NAMES, family="table")
-    assert family.sentences[-1].endswith("p is corrected for the 3 labels of this table (Holm).")
+    family = retention_table([three], target=NAMES, family="table")
+    assert family.notes[-1].endswith("p is corrected for the 3 labels of this table (Holm).")
     for part in ("backbone", "action"):
-        before = [getattr(row.retention, part).p_fwe for row in alone.rows]
-        after = [getattr(row.retention, part).p_fwe for row in family.rows]
+        before = [getattr(row, part).p_fwe for row in alone.rows]
+        after = [getattr(row, part).p_fwe for row in family.rows]
         assert after == pytest.approx([holm_by_hand(before, p) for p in before])
     assert (
-        label_retention_table([three], "kind")
-        .sentences[-1]
-        .startswith("labelled (random weights) has probes of 3")
+        retention_table([three], target="kind").notes[-1].startswith("labelled (random weights) has probes of 3")
     )
     table = pd.DataFrame({"episode_id": three.episodes["episode_id"]})
     table["even"] = np.arange(len(table)) // 2 % 2
     train_probes(three, target=Target.read(table, "even"), permutations=0, controls=())
-    tried = label_retention_table([three], "kind").sentences[-1]
+    tried = retention_table([three], target="kind").notes[-1]
     assert "has probes of 4 labels (even in 2 versions, kind, sim.tool_y)" in tried
 
 
@@ -272,21 +298,21 @@ def holm_by_hand(family: list[float], p: float) -> float:
 
 def test_a_site_that_is_above_chance_alone_may_not_be_among_several_labels() -> None:
     results = label_results({BACKBONE[0]: (0.8, 0.3), ACTION[0]: (0.5, 0.4)}, GROUPS, EACH)
-    found = measure_label_retention(results)
-    assert found.defined
+    found = measured(results)
+    assert found.retention.defined
     corrected = with_corrected_p(found, results, 0.06, None, 2)
-    assert not corrected.defined
-    assert corrected.note == "n/a (backbone not shown to exceed chance)"
-    assert "p 0.060" in corrected.reason
+    assert not corrected.retention.defined
+    assert corrected.retention.note == "n/a (backbone not shown to exceed chance)"
+    assert "p 0.060" in corrected.retention.reason
     assert corrected.action.p_fwe == found.action.p_fwe
-    assert corrected.value == found.value
+    assert corrected.retention.value == found.retention.value
 
 
 def test_stored_probes_are_chosen_by_key_for_one_target_that_they_are_of(three: Run) -> None:
     labels = Target.of_run(three, "sim.tool_y")
     other = train_probes(three, target=labels, permutations=19, controls=("step",))
-    newest = label_retention_table([three], "sim.tool_y")
-    assert newest.rows[0].settings == other.key
+    newest = retention_table([three], target="sim.tool_y")
+    assert newest.rows[0].run.probes == other.key
     first = next(one for one in stored_probes(three) if one.permutations == 39 and "tool_y" in str(one.target))
     place = str(three.path)
 
@@ -307,7 +333,7 @@ def test_stored_probes_are_chosen_by_key_for_one_target_that_they_are_of(three: 
     assert code == 2, "without --target a key of a label is none of sides"
     assert first.key in error
     with pytest.raises(UsageError, match="'kind' is given twice"):
-        label_retention_table([three], ["kind", "kind"])
+        retention_table([three], target=["kind", "kind"])
     code, _, error = asked(place, "--target", "kind")
     assert code == 2
     assert "is given twice" in error
@@ -321,8 +347,8 @@ def test_recordings_have_a_table_and_a_page_though_they_have_no_success_rate(tmp
     train_probes(
         run, target=Target.of_run(run, "dataset.state.x"), permutations=39, controls=("step", "instruction")
     )
-    found = label_retention_table([run], "dataset.state.x")
-    assert found.rows[0].run == "shown (capture only)"
+    found = retention_table([run], target="dataset.state.x")
+    assert found.rows[0].run.name == "shown (capture only)"
     assert found.rows[0].retention.defined
     page = tmp_path / "report.html"
     done = CliRunner().invoke(

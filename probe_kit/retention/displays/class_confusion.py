@@ -1,20 +1,19 @@
 """Confusion matrix of a label of classes: which class the best site predicts for which."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, ClassVar, Self
+from functools import partial
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
+from probe_kit.retention.displays.base.panels import Panelled, in_panels
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
+from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure, label_views
+from probe_kit.retention.displays.base.selection import best_row, probed_curve
 from probe_kit.retention.displays.base.style import BLUE
-from probe_kit.retention.displays.labels.label_panel import (
-    LabelPanel,
-    best_row,
-    label_curve_of,
-    label_panels,
-)
 from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:
@@ -28,14 +27,12 @@ _LONGEST = 14
 
 
 @dataclass
-class ClassConfusionDisplay(LabelPanel):
+class ClassConfusionDisplay(Panelled):
     """Held-out predictions of the best site of a stream.
 
     counts: (K, K) samples by true class, down, and predicted class, across. site: of the largest score above its
     own chance.
     """
-
-    size: ClassVar[tuple[float, float]] = (3.3, 3.1)
 
     target: str
     view: str
@@ -60,7 +57,7 @@ class ClassConfusionDisplay(LabelPanel):
         """
         from sklearn.metrics import confusion_matrix
 
-        category, view, curve = label_curve_of(results, view, category)
+        category, view, curve = probed_curve(results, view, category)
         if not curve.classes:
             raise UsageError(f"the label {results.settings.target!r} is continuous; expected classes to confuse")
         row = best_row(curve, stream)
@@ -125,6 +122,23 @@ class ClassConfusionDisplay(LabelPanel):
 
 def class_confusions(results: ProbeResults, view: str | None = None, category: str | None = None) -> "Figure":
     """Confusion matrices, a panel per stream; arguments and errors as of `ClassConfusionDisplay`."""
-    category, view, curve = label_curve_of(results, view, category)
+    category, view, curve = probed_curve(results, view, category)
     displays = [ClassConfusionDisplay.from_results(results, stream, view, category) for stream in curve.streams]
-    return label_panels(displays)
+    return in_panels(displays, 3.3, 3.1, share=False)
+
+
+PLACE = 17
+"""Of its figures in the report."""
+
+
+def label_figures(source: FigureSource) -> Iterator[ReportFigure]:
+    """Yield the figures that a report of these labels shows: of those with classes."""
+    for view in label_views(source):
+        if view.curve.classes:
+            yield ReportFigure(
+                view.file_name("confusion"), view.title("Confusion matrix"), view.target,
+                "Which class the best site of each part predicts for which, in groups it has not seen. Each row "
+                "sums to 100 %; the mean of the diagonal is the balanced accuracy.",
+                view.position, partial(class_confusions, view.results, view.name, view.category),
+                is_detail=not view.is_first,
+            )  # fmt: skip

@@ -1,1 +1,0 @@
-"""Retention of labels of your own: estimates, and the table that shows them."""

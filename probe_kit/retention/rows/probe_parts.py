@@ -1,0 +1,259 @@
+"""The parts of a row that probes give, for every target: both streams, retention and controls."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from math import isnan
+from typing import Any
+
+from probe_kit._system.counting import enumerated
+from probe_kit._tables.numbers import p_text
+from probe_kit.retention.choices import Iterations
+from probe_kit.retention.estimators.retention import (
+    Peak,
+    best_site,
+    curve_scores,
+    estimate_retention,
+    stream_peaks,
+)
+from probe_kit.retention.estimators.stream_scores import ACTION, BACKBONE, StreamScores, limits
+from probe_kit.retention.rows.parts import ActionPart, BackbonePart, ControlScores, RetentionPart
+from probe_kit.retention.rows.row import RetentionRow
+from probe_kit.statistics.estimates.verdict import ABSENT_BELOW, verdict
+from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.train.results.control_scores import Controls, Exceeds, has_signal
+from probe_kit.train.results.probe_curve import ProbeCurve
+from probe_kit.train.results.probe_results import ProbeResults
+
+LEAST_EXCESS = 0.05
+"""R² above chance that the backbone must have; a ratio of less is the ratio of two errors."""
+STEP = "step"
+"""The control that labels of several inferences need: the number of the inference alone may say as much."""
+NO_STEP = "n/a (control step was not run)"
+
+
+def with_probes(
+    row: RetentionRow,
+    results: ProbeResults,
+    iterations: Iterations = "all",
+    absent_below: float = ABSENT_BELOW,
+    seed_text: str = "",
+) -> tuple[RetentionRow, StreamScores | None]:
+    """Return the row with the parts of its category's probes, and their scores; None where there are none.
+
+    seed_text: of the run; scores on equal groups of one are paired. absent_below: see `verdict`.
+    """
+    curve = None if row.view is None else results.curves.get((row.category, row.view))
+    if row.view is None or curve is None:
+        note = f"n/a (probes {results.key} are of {', '.join(results.settings.categories)})"
+        return replace(row, retention=RetentionPart(note=note)), None
+    streams, peaks = curve_scores(curve, iterations, seed_text), stream_peaks(curve, iterations)
+    exceeds = {
+        name: results.controls.exceeds(row.category, row.view, str(peak.site), peak.p_fwe)
+        for name, peak in peaks.items()
+    }
+    parts = {name: _stream_part(curve, peak, exceeds[name]) for name, peak in peaks.items()}
+    for part in parts.values():
+        part["remedy"] = results.remedy(row.category, row.view)
+    if streams is not None:
+        scored = _of_side(exceeds, streams, absent_below) if curve.is_side else _above_chance(streams)
+        parts = {name: part | scored.get(name, {}) for name, part in parts.items()}
+    for name, peak in peaks.items() if curve.is_side else ():
+        parts[name] |= _selectivity(row, results.controls, curve, peak)
+    row = replace(
+        row,
+        backbone=BackbonePart(**parts.get(BACKBONE, {})),
+        action=ActionPart(**parts.get(ACTION, {}), **_iterations(curve, peaks.get(ACTION))),
+        retention=_retention(peaks, streams, exceeds.get(BACKBONE), absent_below),
+    )
+    row = replace(row, controls=_controls(row, results, curve, peaks))
+    return row if curve.is_side else with_reason(row, results), streams
+
+
+# -- streams -------------------------------------------------------------------------------------------------
+
+
+def _stream_part(curve: ProbeCurve, peak: Peak, exceeds: Exceeds) -> dict[str, Any]:
+    return {
+        "stream": peak.site.stream,
+        "peak": peak.score,
+        "chance": None if curve.is_side else number_or_none(peak.chance),
+        "site": str(peak.site),
+        "layer": peak.site.layer,
+        "depth": curve.depth(peak.site),
+        "ties": peak.ties,
+        "p_fwe": number_or_none(peak.p_fwe),
+        "exceeds": exceeds,
+    }
+
+
+def _of_side(exceeds: Mapping[str, Exceeds], streams: StreamScores, bound: float) -> dict[str, dict[str, Any]]:
+    """Return by stream the accuracy of a side; peaks are balanced between the sides too."""
+    return {
+        name: {
+            "score": streams.accuracy(name),
+            "ci": limits(streams.interval(name)),
+            "peak": streams.peak(name),
+            "at_most": streams.at_most[name],
+            "verdict": verdict(has_signal(exceeds[name]), streams.at_most[name], streams.findable[name], bound),
+        }
+        for name in streams.names
+    }
+
+
+def _above_chance(streams: StreamScores) -> dict[str, dict[str, Any]]:
+    return {
+        name: {"above": streams.above(name), "above_ci": limits(streams.above_interval(name))}
+        for name in streams.names
+    }
+
+
+def _selectivity(row: RetentionRow, controls: Controls, curve: ProbeCurve, peak: Peak) -> dict[str, Any]:
+    """Return how much more accurate the best site of a side is than on random labels, and untrained."""
+    untrained = controls.untrained_peak(row.category, row.view or "", peak.site.stream)
+    control = float(curve.control_accuracy[curve.sites.index(peak.site)])
+    return {
+        "selectivity": number_or_none(peak.score - control),
+        "minus_untrained": None if untrained is None else untrained.difference,
+        "minus_untrained_ci": None if untrained is None else untrained.ci,
+    }
+
+
+def _iterations(curve: ProbeCurve, peak: Peak | None) -> dict[str, Any]:
+    """Return the iteration of the action's best site, and of a side the best layer of the first iteration.
+
+    The first iteration has seen nothing of the action yet. A stream that runs once has neither.
+    """
+    if peak is None:
+        return {}
+    iterations = [site.iteration for site in curve.sites if site.stream == peak.site.stream]
+    steps = [step for step in iterations if step is not None]
+    first = best_site(curve, peak.site.stream, min(steps)) if steps and curve.is_side else None
+    return {
+        "iteration": peak.site.iteration,
+        "first_peak": None if first is None else first.score,
+        "first_layer": None if first is None else first.site.layer,
+    }
+
+
+# -- retention and controls ----------------------------------------------------------------------------------
+
+
+def _retention(
+    peaks: Mapping[str, Peak], streams: StreamScores | None, backbone: Exceeds | None, bound: float
+) -> RetentionPart:
+    if len(peaks) < 2 or backbone is None:
+        return RetentionPart(note="n/a (one stream only)")
+    estimate = estimate_retention(peaks, streams, backbone, bound)
+    return RetentionPart(
+        value=number_or_none(estimate.value),
+        ci=limits(estimate.interval),
+        published=number_or_none(estimate.published),
+        defined=estimate.defined,
+        note=estimate.note,
+    )
+
+
+def _controls(
+    row: RetentionRow, results: ProbeResults, curve: ProbeCurve, peaks: Mapping[str, Peak]
+) -> ControlScores:
+    """Return the scores that the best sites are compared with."""
+    sizes = ControlScores(n_groups=curve.n_groups, n_samples=int(curve.labels.size))
+    if not curve.is_side:
+        return sizes
+    baselines = results.controls.of_category(row.category)
+    untrained = [
+        results.controls.untrained_peak(row.category, row.view or "", peak.site.stream) for peak in peaks.values()
+    ]
+    accuracy, success = row.backbone.score, row.success.sr
+    return replace(
+        sizes,
+        missing=missing_episodes(curve),
+        probe_minus_sr=None if accuracy is None or success is None else accuracy - success,
+        baselines={name: score.score for name, score in baselines.items()},
+        leaks=tuple(name for name, score in baselines.items() if score.above_chance),
+        untrained=next((peak.untrained for peak in untrained if peak is not None), None),
+    )
+
+
+def missing_episodes(curve: ProbeCurve) -> dict[str, float]:
+    """Return by side the share of items that lack their episode of that side."""
+    items = len(set(curve.items.tolist()))
+    sides = {"left": curve.labels, "right": ~curve.labels}
+    return {side: 1 - len(set(curve.items[is_side].tolist())) / items for side, is_side in sides.items()}
+
+
+def number_or_none(value: float) -> float | None:
+    """Return None in place of NaN, as rows hold a number that there is not."""
+    return None if isnan(value) else value
+
+
+# -- targets that are no side --------------------------------------------------------------------------------
+
+
+def with_reason(row: RetentionRow, results: ProbeResults, tests: int = 1) -> RetentionRow:
+    """Return a row of a label that says whether there is something to retain, and else what is missing.
+
+    tests: the number that p is corrected for.
+    """
+    note, reason = _missing(row, results, tests)
+    return replace(row, retention=replace(row.retention, defined=not note, note=note, reason=reason))
+
+
+def with_corrected_p(
+    row: RetentionRow, results: ProbeResults, backbone: float | None, action: float | None, tests: int
+) -> RetentionRow:
+    """Return a row of a label with p of both streams corrected for so many tests; None for no p."""
+    parts: dict[str, Any] = {
+        name: replace(part, p_fwe=p, exceeds=part.exceeds | {"chance": p < SIGNIFICANCE})
+        for name, part, p in ((BACKBONE, row.backbone, backbone), (ACTION, row.action, action))
+        if p is not None
+    }
+    return with_reason(replace(row, **parts), results, tests)
+
+
+def _missing(row: RetentionRow, results: ProbeResults, tests: int) -> tuple[str, str]:
+    """Return why there is nothing to retain, in few words and in full; two empty texts where there is."""
+    settings, backbone = results.settings, row.backbone
+    if backbone.peak is None or row.action.peak is None:
+        part = "backbone" if backbone.peak is None else "action"
+        probed = ", ".join(
+            dict.fromkeys(site.stream for site in results.curves[row.category, row.view or ""].sites)
+        )
+        return "n/a (one stream only)", (
+            f"no site of the {part} was probed, so there is no retention; probed: {probed}. Extract a policy "
+            "whose backbone and action stream are captured"
+        )
+    best = f"the backbone's best site {backbone.site} has {row.metric} {backbone.peak:.2f}"
+    if backbone.p_fwe is None or backbone.chance is None:
+        return "n/a (no permutations)", (
+            f"{best}, and no permuted labels say what chance is. Train with --permutations 200, on groups that "
+            "can exchange labels"
+        )
+    if settings.window > 1 and STEP not in results.controls.names:
+        return NO_STEP, (
+            f"{best}, and labels change within episodes, so their step may say as much. Train with the control "
+            f"step: `--controls {','.join([STEP, *results.controls.names])}`"
+        )
+    if missed := backbone.missed:
+        scores = {
+            control.name: control.score
+            for control in results.controls.scores
+            if control.category == row.category and control.stream in ("", backbone.stream)
+        }
+        facts = [f"chance {backbone.chance:.2f}, p {p_text(backbone.p_fwe)}"]
+        facts += [f"{name} {scores[name]:.2f}" for name in missed if name in scores]
+        advice = "Label more groups, or choose a label that these controls do not decode"
+        if remedy := results.remedy(row.category, row.view or "", tests):
+            advice = f"No p can be below it: {remedy}"
+        return f"n/a (backbone not shown to exceed {enumerated(missed)})", (
+            f"{best} ({'; '.join(facts)}). Expected p < {SIGNIFICANCE} and more than every control that was run. "
+            f"{advice}"
+        )
+    if row.backbone.above is None:
+        return row.retention.note, f"{best}, and too few groups to choose a site on others. Label more groups"
+    if row.task == "continuous" and row.backbone.above < LEAST_EXCESS:
+        return f"n/a (backbone {row.backbone.above:.2f} above chance)", (
+            f"{best}, {row.backbone.above:.2f} above chance where a site is chosen on other groups; expected "
+            f"{LEAST_EXCESS} or more to divide by. Label more groups"
+        )
+    return "", ""
