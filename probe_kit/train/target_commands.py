@@ -27,10 +27,13 @@ def targets(run: common.RunFolder, wording: common.Wording = None, partial: comm
     from rich.text import Text
 
     opened = _open(run, partial, wording)
-    table, listed = Table("target", "task", "per", "values"), list(listed_targets(opened))
+    table, constant = Table("target", "task", "per", "values"), constant_columns(opened)
+    listed = [row for row in listed_targets(opened) if row[0] not in constant]
     for row in listed:
         table.add_row(*map(Text, row))
     out.print(table)
+    if constant:
+        say(marked("one value only, so that there is nothing to decode: {}", ", ".join(constant)))
     # Those that need no further option come first, and what is not possible is never the next step.
     possible = sorted((row for row in listed if row[1] != "–"), key=lambda row: row[1] == DOUBTFUL)
     if not possible:
@@ -45,18 +48,37 @@ DOUBTFUL = "classes or continuous"
 """The task of a few integers, which `--task` decides."""
 
 
+def constant_columns(run: "RunReader") -> list[str]:
+    """Return the built-in columns of a run that hold one value, such as the parts of a state that never move."""
+    from probe_kit.train.columns.builtin import builtin_column
+
+    constant = []
+    for name in _names(run):
+        try:
+            cells = () if name in SIDES else builtin_column(run, name).cells
+        except ProbeKitError:
+            continue
+        if len({cell for cell in cells if cell is not None}) == 1:
+            constant.append(name)
+    return constant
+
+
+def _names(run: "RunReader") -> list[str]:
+    from probe_kit.train.columns.builtin import builtin_names, outcome_column, prefix_of, recorded_columns
+
+    if run.inputs is None:
+        return [*SIDES, *builtin_names()]
+    return [*(prefix_of(run) + name for name in recorded_columns(run)), *outcome_column(run)]
+
+
 def listed_targets(run: "RunReader") -> Iterator[tuple[str, str, str, str]]:
     """Yield name, task, `episode` or `inference`, and classes with counts or range of every target of a run.
 
-    One that the run cannot give has the reason in the last place, such as a column with a single value.
+    One that the run cannot give has the reason in the last place.
     """
-    from probe_kit.train.columns.builtin import builtin_names, outcome_column, prefix_of, recorded_columns
     from probe_kit.train.target import Target
 
-    names = [*SIDES, *builtin_names()]
-    if run.inputs is not None:
-        names = [*(prefix_of(run) + name for name in recorded_columns(run)), *outcome_column(run)]
-    for name in names:
+    for name in _names(run):
         try:
             target = Target.of_run(run, name)
         except ProbeKitError as error:
