@@ -9,7 +9,7 @@ from probe_kit.hooks.contract.options import check_options
 from probe_kit.hooks.contract.views import resolve_view, view_names
 from probe_kit.hooks.registry import find_family, get_family
 from probe_kit.runs.store import SCHEMES
-from probe_kit.statistics.label_permutations import permutations_for, shortage, smallest_p
+from probe_kit.statistics.label_permutations import permutations_for, smallest_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.study.expansion import SCRIPTED, Member, acts, answers, excludes, members
 from probe_kit.study.failures import FOLDER
@@ -191,7 +191,7 @@ def _probes(study: Study, suite: PlannedSuite) -> Iterator[Mistake]:
             yield from _few_items(study, block, suite, (*path, "runs"))
             for model in block.models:
                 yield from _views((*path, "views"), table.views, study.models[model])
-        if table.permutations and shortage(smallest_p(table.permutations), table.permutations):
+        if table.permutations and smallest_p(table.permutations) > SIGNIFICANCE:  # tables say what equality leaves
             text = f"{table.permutations} are too few: no p can be below {SIGNIFICANCE}"
             yield Mistake((*path, "permutations"), f"{text}. Give at least {permutations_for()}")
         if "untrained" in table.controls:

@@ -254,7 +254,7 @@ MISTAKES: list[tuple[str, str, str]] = [
     ('prompt = "p2"', 'prompt = "p9"  # here', "asks.p2"),
     ('runs = ["main"]\npermutations', 'runs = ["mane"]  # here\npermutations', "unknown block 'mane'"),
     ('runs = ["main"]\npermutations', 'runs = ["main", "vlms"]  # here\npermutations', "asks with tokens none"),
-    ("permutations = 100", "permutations = 19  # here", "19 are too few: no p can be below 0.05"),
+    ("permutations = 100", "permutations = 18  # here", "18 are too few: no p can be below 0.05"),
     ('untrained = "random"\n', "", "'base' names no untrained network"),
     ("items = 24", "items = 8", "fewer than 10 items of color, shape"),
     ('chain = ["base", "state"]', 'chain = ["base", "stats"]  # here', "unknown model 'stats'"),
