@@ -1,7 +1,7 @@
 """Cells: one model in one condition, or asked in one way, with one seed. Known without loading a model."""
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from math import ceil
@@ -73,6 +73,11 @@ class Cell:
     def selection(self) -> Selection:
         """The selection that all blocks together need."""
         return joined(self.selections.values())
+
+    def selected(self, blocks: Collection[str]) -> Selection | None:
+        """Return the selection that these blocks need together, None if none of them uses the run."""
+        selections = [selection for name, selection in self.selections.items() if name in blocks]
+        return joined(selections) if selections else None
 
     @property
     def n_items(self) -> int:

@@ -19,7 +19,7 @@ from probe_kit._terminal.options import (
     one_of,
     speed_option,
 )
-from probe_kit.errors import ProbeKitError, UsageError
+from probe_kit.errors import UsageError
 from probe_kit.train.command_options import Jobs
 
 if TYPE_CHECKING:
@@ -241,6 +241,7 @@ def table(
     With --partial the command exits with 1 if anything is missing that the study would play.
     """
     from probe_kit.study import load_study, make_table
+    from probe_kit.study.tables import make_each
 
     study = load_study(file)
     if html is not None:
@@ -252,14 +253,11 @@ def table(
         raise UsageError(
             f"--format csv prints one table, and {file} has {', '.join(study.study.tables)}; give the name of one"
         )
-    tables: dict[str, NamedTable] = {}
-    for table_name in [name] if name else study.study.tables:
-        try:
-            tables[table_name] = make_table(study, table_name, partial)
-        except ProbeKitError as error:
-            if name or not partial:
-                raise
-            say(marked("[red]no table {}: {}[/]", table_name, error))
+    names = [name] if name else list(study.study.tables)
+    accepts_missing = partial and name is None
+    tables, missing = make_each(names, lambda each: make_table(study, each, partial), accepts_missing)
+    for table_name, why in missing.items():
+        say(marked("[red]no table {}: {}[/]", table_name, why))
     _print_tables(tables, style, single=name is not None)
     if not name and style not in ("json", "csv"):
         tests = sum(printed.n_tests for printed in tables.values())
@@ -267,8 +265,7 @@ def table(
             f"{counted(len(tables), 'table')} with {counted(tests, 'test')}; "
             "each is corrected within its own comparison."
         )
-    expected = 1 if name else len(study.study.tables)
-    if len(tables) < expected or any(printed.is_partial for printed in tables.values()):
+    if missing or any(printed.is_partial for printed in tables.values()):
         raise typer.Exit(UNFINISHED)
 
 

@@ -17,7 +17,7 @@ from probe_kit.study.planned_suite import slugs
 from probe_kit.study.rates import domain_scores
 from probe_kit.study.reading import LoadedStudy
 from probe_kit.study.schema import FigureKind, FigureTable
-from probe_kit.study.stored import StoredRuns, of_blocks, stored_runs, study_probes
+from probe_kit.study.stored import StoredRuns, stored_runs, study_probes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -34,11 +34,8 @@ def make_figures(study: LoadedStudy, name: str, partial_runs: bool = False) -> l
         raise UsageError(unknown("figure", name, list(study.study.figures)))
     figure = study.study.figures[name]
     categories = None if figure.categories is None else slugs(figure.categories)
-    runs = stored_runs(study, of_blocks(figure.runs), partial_runs, categories)
-    if not runs.runs:
-        raise UsageError(
-            f"no run of the figure {name!r} is stored. Play them with `probe-kit study run {study.file}`"
-        )
+    subject = f"the figure {name!r}"
+    runs = stored_runs(study, lambda cell: cell.selected(figure.runs), subject, partial_runs, categories)
     return _MAKERS[figure.kind](_Source(study, name, figure, runs, categories, runs.labels(study), partial_runs))
 
 

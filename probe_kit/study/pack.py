@@ -30,7 +30,7 @@ from probe_kit.study.archive import (
 from probe_kit.study.named_table import table_record
 from probe_kit.study.reading import LoadedStudy
 from probe_kit.study.stored import open_stored
-from probe_kit.study.tables import make_table
+from probe_kit.study.tables import make_each, make_table
 
 Extra = Literal["pictures", "trajectories", "directions"]
 EXTRAS: tuple[Extra, ...] = get_args(Extra)
@@ -95,19 +95,12 @@ def _pack(study: LoadedStudy, folder: Path, partial: bool, extras: Collection[Ex
 
 
 def _write_tables(study: LoadedStudy, folder: Path, partial: bool) -> dict[str, str]:
-    """Every table in three formats; returns why others are missing."""
+    """Write every table in three formats; return why others are missing."""
     folder.mkdir(parents=True)
-    missing = {}
-    for name in study.study.tables:
-        try:
-            table = make_table(study, name, partial)
-        except ProbeKitError as error:
-            if not partial:
-                raise
-            missing[f"table {name}"] = str(error)
-            continue
+    tables, missing = make_each(study.study.tables, lambda name: make_table(study, name, partial), partial)
+    for name, table in tables.items():
         record = json.dumps(table_record(table), indent=1, ensure_ascii=False)
         (folder / f"{name}.json").write_text(record, encoding="utf-8")
         (folder / f"{name}.md").write_text(table.to_markdown() + "\n", encoding="utf-8")
         (folder / f"{name}.tex").write_text(table.to_latex(), encoding="utf-8")
-    return missing
+    return {f"table {name}": why for name, why in missing.items()}

@@ -30,14 +30,13 @@ from probe_kit.extract.rollout.controllers import SCRIPTED
 from probe_kit.extract.settings import AskSettings, ExtractSettings, Settings
 from probe_kit.runs import seal
 from probe_kit.runs.store import locate
-from probe_kit.study.cells import Cell
-from probe_kit.study.expansion import control_of
+from probe_kit.study.cells import Cell, Selection
 from probe_kit.study.failures import NOT_TRIED_AGAIN, Failure, Failures
 from probe_kit.study.plan import PlannedCell, StudyPlan, cells_by_model
-from probe_kit.study.probes import controls_of, probes_of
+from probe_kit.study.probes import probes_of, untrained_cell
 from probe_kit.study.reading import LoadedStudy
 from probe_kit.study.schema import ProbesTable
-from probe_kit.study.stored import StoredRun, of_blocks, open_cell
+from probe_kit.study.stored import open_cell
 from probe_kit.train import train_probes
 
 if TYPE_CHECKING:
@@ -320,11 +319,11 @@ def fit_probes(plan: StudyPlan, progress: ProbeProgress | None = None, jobs: int
     fitted = {(planned.cell.name, probes.name) for planned in plan.cells for probes in planned.probes}
     fitted -= {(planned.cell.name, probes.name) for planned in plan.cells for probes in planned.unprobed}
     for cell in (planned.cell for planned in plan.cells):
-        for name, table in probes_of(plan.study, cell):
+        for name, table, selection in probes_of(plan.study, cell):
             if (cell.name, name) in fitted:
                 continue
             try:
-                _fit(plan.study, table, cell, progress, jobs)
+                _fit(plan.study, table, cell, selection, progress, jobs)
             except (RunNotFoundError, RunIncompleteError) as error:
                 failures.append(Failure.of("waiting", cell.model, cell.name, error))
             except ProbeKitError as error:
@@ -336,12 +335,15 @@ def fit_probes(plan: StudyPlan, progress: ProbeProgress | None = None, jobs: int
 
 
 def _fit(
-    study: LoadedStudy, table: ProbesTable, cell: Cell, progress: ProbeProgress | None, jobs: int | None
+    study: LoadedStudy,
+    table: ProbesTable,
+    cell: Cell,
+    selection: Selection,
+    progress: ProbeProgress | None,
+    jobs: int | None,
 ) -> None:
-    probed = _opened(study, table, cell)
-    with_untrained = "untrained" in controls_of(study, table, cell)
-    control = control_of(study.study, study.cells, cell) if with_untrained else None
-    untrained = None if control is None else _opened(study, table, control, of=cell)
+    probed, network = open_cell(study, cell, selection), untrained_cell(study, table, cell)
+    untrained = None if network is None else open_cell(study, network, selection)
     baselines = tuple(name for name in table.controls if name != "untrained")
 
     def report(sites_done: int, sites: int, last: str) -> None:
@@ -360,10 +362,3 @@ def _fit(
         jobs=jobs,
         progress=report,
     )
-
-
-def _opened(study: LoadedStudy, table: ProbesTable, cell: Cell, of: Cell | None = None) -> StoredRun:
-    """Open the run of a cell, restricted to what is probed of it, or of another cell."""
-    selection = of_blocks(table.runs)(of or cell)
-    assert selection is not None, "the table is one of `probes_of`"
-    return open_cell(study, cell, selection)

@@ -2,16 +2,18 @@
 
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
+from math import isclose
 from typing import TYPE_CHECKING, Literal
 
 from probe_kit.errors import ProbeKitError
-from probe_kit.study.cells import Cell
+from probe_kit.study.cells import Cell, Selection
 from probe_kit.study.expansion import control_of
 from probe_kit.study.failures import Failures
 from probe_kit.study.reading import LoadedStudy
 from probe_kit.study.schema import ProbesTable
-from probe_kit.study.stored import of_blocks, part_of, probe_key_of
-from probe_kit.train.results.store import read_controls, read_probes, settings_of
+from probe_kit.study.stored import open_matching, part_of, probe_key_of
+from probe_kit.train.results.control_scores import Controls
+from probe_kit.train.results.store import load_results, read_controls, read_probes, settings_of
 
 if TYPE_CHECKING:
     from probe_kit.runs import Run
@@ -29,18 +31,19 @@ class PlannedProbes:
     why: str = ""
 
 
-def probes_of(study: LoadedStudy, cell: Cell) -> Iterator[tuple[str, ProbesTable]]:
-    """Yield the tables of probes that a cell belongs to, by name."""
+def probes_of(study: LoadedStudy, cell: Cell) -> Iterator[tuple[str, ProbesTable, Selection]]:
+    """Yield the tables of probes that a cell belongs to, by name, each with what of the run is probed."""
     for name, table in study.study.probes.items():
-        if not cell.unavailable and of_blocks(table.runs)(cell) is not None:
-            yield name, table
+        selection = cell.selected(table.runs)
+        if not cell.unavailable and selection is not None:
+            yield name, table, selection
 
 
 def planned_probes(study: LoadedStudy, cell: Cell, run: "Run") -> Iterator[PlannedProbes]:
     """Yield the state of the probes of a whole run."""
     failures = Failures(study.study.folder)
-    for name, table in probes_of(study, cell):
-        why = _why_missing(study, table, cell, run)
+    for name, table, selection in probes_of(study, cell):
+        why = _why_missing(study, table, cell, run, selection)
         failure = failures.of(cell, name) if why else None
         if failure is not None:
             yield PlannedProbes(name, "failed", failure.reason)
@@ -48,10 +51,8 @@ def planned_probes(study: LoadedStudy, cell: Cell, run: "Run") -> Iterator[Plann
             yield PlannedProbes(name, "missing" if why else "stored", why)
 
 
-def _why_missing(study: LoadedStudy, table: ProbesTable, cell: Cell, run: "Run") -> str:
+def _why_missing(study: LoadedStudy, table: ProbesTable, cell: Cell, run: "Run", selection: Selection) -> str:
     """Return why the probes of a table are to be fitted, empty if they and all of their controls are stored."""
-    selection = of_blocks(table.runs)(cell)
-    assert selection is not None, "the table is one of `probes_of`"
     if not run.streams:
         return "the run has no activations"
     stored = read_probes(run.location)
@@ -60,8 +61,11 @@ def _why_missing(study: LoadedStudy, table: ProbesTable, cell: Cell, run: "Run")
     except ProbeKitError:  # such as too few groups, which fitting says at length
         return "not fitted"
     if bundle is not None:
-        absent = [name for name in controls_of(study, table, cell) if name not in read_controls(bundle).names]
-        return f"without the control {', '.join(absent)}" if absent else ""
+        controls, names = read_controls(bundle), [name for name in table.controls if name != "untrained"]
+        if absent := [name for name in names if name not in controls.names]:
+            return f"without the control {', '.join(absent)}"
+        network = untrained_cell(study, table, cell)
+        return "" if network is None else _why_other_network(study, table, network, selection, controls)
     of_target = [bundle for bundle in stored.values() if settings_of(bundle).target == table.target]
     if not of_target:
         return "not fitted"
@@ -74,11 +78,30 @@ def _why_missing(study: LoadedStudy, table: ProbesTable, cell: Cell, run: "Run")
     return "; ".join(changes) or "of other episodes"
 
 
+def _why_other_network(
+    study: LoadedStudy, table: ProbesTable, network: Cell, selection: Selection, controls: Controls
+) -> str:
+    """Return why probes are to be compared with their untrained network again, empty if they are.
+
+    Stored comparisons do not name the run of the network: they are of it if accuracies are those of its probes.
+    """
+    try:
+        run = part_of(open_matching(study, network, partial=True), network, selection).in_wording()
+        curves = load_results(run, probe_key_of(table, run)).curves
+    except ProbeKitError:
+        return "not compared with its untrained network"
+    for score in controls.untrained:
+        curve = curves.get((score.category, score.view))
+        row = -1 if curve is None else [str(site) for site in curve.sites].index(score.untrained_site)
+        if curve is None or not isclose(curve.correct[row].astype(float).mean(), score.untrained_accuracy):
+            return "compared with another untrained network"
+    return "" if controls.untrained else "without the control untrained"
+
+
 def _text(value: object) -> str:
     return ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
 
 
-def controls_of(study: LoadedStudy, table: ProbesTable, cell: Cell) -> list[str]:
-    """Return the controls that the probes of a cell have; an untrained network has no untrained network."""
-    has_untrained = control_of(study.study, study.cells, cell) is not None
-    return [name for name in table.controls if name != "untrained" or has_untrained]
+def untrained_cell(study: LoadedStudy, table: ProbesTable, cell: Cell) -> Cell | None:
+    """Return the run of the untrained network that probes are compared with, None without such a control."""
+    return control_of(study.study, study.cells, cell) if "untrained" in table.controls else None

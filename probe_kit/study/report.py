@@ -1,13 +1,11 @@
 """The report of a study: one HTML file with its state, every table and figure, and the settings of its runs."""
 
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
 from probe_kit._system.bounded_files import read_regular
 from probe_kit._system.drafts import write_whole
 from probe_kit._tables.table import Table
-from probe_kit.errors import ProbeKitError, UsageError
 from probe_kit.retention.displays.base.report_figure import ReportFigure
 from probe_kit.retention.report.pictures import Picture, data_uri
 from probe_kit.retention.report.provenance import citation, provenance
@@ -16,8 +14,8 @@ from probe_kit.retention.report.words import words_of
 from probe_kit.study.figures import make_figures
 from probe_kit.study.plan import StudyPlan, plan_study
 from probe_kit.study.reading import LoadedStudy
-from probe_kit.study.stored import of_blocks, stored_runs
-from probe_kit.study.tables import make_table
+from probe_kit.study.stored import stored_runs
+from probe_kit.study.tables import make_each, make_table
 from probe_kit.version import __version__
 
 
@@ -43,13 +41,12 @@ def write_study_report(study: LoadedStudy, path: Path | str, partial: bool = Fal
 
 def study_report(study: LoadedStudy, partial: bool = False) -> StudyReport:
     """The page as text, from stored runs alone. It needs no network, and holds no path of this machine."""
-    file, missing = study.study, dict[str, str]()
-    tables = _made("table", file.tables, lambda name: make_table(study, name, partial), missing, partial)
-    figures = _made("figure", file.figures, lambda name: make_figures(study, name, partial), missing, partial)
-    used = of_blocks([block.name for block in file.runs])
-    runs = stored_runs(study, used, partial=True)
-    if not runs.runs:
-        raise UsageError(f"no run of {study.file} is stored. Play it with `probe-kit study run {study.file}`")
+    file = study.study
+    tables, no_table = make_each(file.tables, lambda name: make_table(study, name, partial), partial)
+    figures, no_figure = make_each(file.figures, lambda name: make_figures(study, name, partial), partial)
+    missing = {f"table {name}": why for name, why in no_table.items()}
+    missing |= {f"figure {name}": why for name, why in no_figure.items()}
+    runs = stored_runs(study, lambda cell: cell.selection, str(study.file), partial=True)
     labels, plan = runs.labels(study), plan_study(study)
     places = tuple(name for stored in runs.runs for name in (stored.run.location.address, stored.location))
     state = _state(plan)
@@ -76,21 +73,6 @@ def study_report(study: LoadedStudy, partial: bool = False) -> StudyReport:
     )
     partly = bool(missing) or bool(runs.unfinished) or any(of_name.is_partial for of_name in tables.values())
     return StudyReport(html, missing, partly)
-
-
-def _made[Made](
-    kind: str, names: Iterable[str], make: Callable[[str], Made], missing: dict[str, str], partial: bool
-) -> dict[str, Made]:
-    """Make what can be made, by name; `missing` gets the reason of all else."""
-    parts = {}
-    for name in names:
-        try:
-            parts[name] = make(name)
-        except ProbeKitError as error:
-            if not partial:
-                raise
-            missing[f"{kind} {name}"] = str(error)
-    return parts
 
 
 def _state(plan: StudyPlan) -> Table:

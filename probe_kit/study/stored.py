@@ -15,7 +15,7 @@ from probe_kit.errors import (
 )
 from probe_kit.runs import open_run
 from probe_kit.runs.store import locate
-from probe_kit.study.cells import Cell, Selection, joined
+from probe_kit.study.cells import Cell, Selection
 from probe_kit.study.failures import Failures
 from probe_kit.study.matching import check_run_of_cell, check_same_items, check_same_weights
 from probe_kit.study.reading import LoadedStudy, load_study, shipped_studies
@@ -70,14 +70,16 @@ class StoredRuns:
 def stored_runs(
     study: LoadedStudy,
     select: Callable[[Cell], Selection | None],
+    subject: str,
     partial: bool = False,
     categories: Sequence[str] | None = None,
 ) -> StoredRuns:
-    """Open the stored runs of a study. select: returns what of a cell a table prints; None leaves it out.
+    """Open the stored runs of a study.
 
+    select: returns what of a cell is printed; None leaves it out. subject: what is made of them, for messages.
     partial: accept runs that are missing or unfinished; they are named. categories: slugs, all by default.
-    Raises RunIncompleteError for a run that is missing, unfinished or damaged, unless `partial`, and
-    SettingsMismatchError for a run that is not its cell's.
+    Raises RunIncompleteError for a run that is missing, unfinished or damaged, unless `partial`, UsageError for
+    no stored run, SettingsMismatchError for a run of another cell.
     """
     runs, missing, unfinished, models = list[StoredRun](), list[str](), list[str](), list[str]()
     for cell in study.cells:
@@ -104,6 +106,8 @@ def stored_runs(
             runs.append(stored)
             if len(stored.run.episodes) < stored.run.planned:
                 unfinished.append(f"{label} has {len(stored.run.episodes)} of {stored.run.planned} episodes")
+    if not runs:
+        raise UsageError(f"no run of {subject} is stored. Play it with `probe-kit study run {study.file}`")
     check_same_items([stored.run for stored in runs])
     check_same_weights([(stored.cell, stored.run) for stored in runs])
     return StoredRuns(tuple(runs), tuple(missing), tuple(unfinished), tuple(models))
@@ -158,7 +162,7 @@ def open_cell(
 ) -> StoredRun:
     """Open the stored run of a cell, restricted to a selection. Raises what `open_stored` raises."""
     run = open_stored(study, cell, partial)
-    of_probes = (of_blocks(table.runs)(cell) for table in study.study.probes.values())
+    of_probes = (cell.selected(table.runs) for table in study.study.probes.values())
     fitted = next((of_table for of_table in of_probes if of_table is not None), None)
     part = part_of(run, cell, selection, categories)
     return StoredRun(cell, part, part if fitted is None else part_of(run, cell, fitted))
@@ -196,7 +200,7 @@ def _probe_key(study: LoadedStudy, stored: StoredRun, run: "Run", partial: bool)
     tables = {
         name: table
         for name, table in study.study.probes.items()
-        if table.target == CORRECT and of_blocks(table.runs)(stored.cell) is not None
+        if table.target == CORRECT and stored.cell.selected(table.runs) is not None
     }
     if not tables or not run.streams:
         return ""
@@ -234,16 +238,6 @@ def _label(study: LoadedStudy, cell: Cell, several: bool) -> str:
     return f"{label} · {cell.way}{seed}" if several or seed else label
 
 
-def of_blocks(names: Sequence[str]) -> Callable[[Cell], Selection | None]:
-    """Return a function that gives what cells hold for some blocks."""
-
-    def select(cell: Cell) -> Selection | None:
-        selections = [selection for name, selection in cell.selections.items() if name in names]
-        return joined(selections) if selections else None
-
-    return select
-
-
 def stored_runs_by_name(name: str) -> "list[Run] | None":
     """Return the stored runs of a study file, or of a study of the package; None for a name of neither.
 
@@ -252,10 +246,7 @@ def stored_runs_by_name(name: str) -> "list[Run] | None":
     if not (name.endswith(".toml") or (name in shipped_studies() and not Path(name).exists())):
         return None
     study = load_study(name)
-    blocks = [block for cell in study.cells for block in cell.selections]
-    stored = stored_runs(study, of_blocks(blocks), partial=True)
+    stored = stored_runs(study, lambda cell: cell.selection, str(study.file), partial=True)
     for remark in (*stored.missing, *stored.unfinished):
         say(remark)
-    if not stored.runs:
-        raise UsageError(f"no run of {study.file} is stored. Play it with `probe-kit study run {name}`")
     return [run.probed for run in stored.runs]

@@ -1,6 +1,6 @@
 """Making of a study's named tables."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 from math import isfinite
@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from probe_kit._system.bounded_json import load_json
-from probe_kit.errors import RunDamagedError, UsageError
+from probe_kit.errors import ProbeKitError, RunDamagedError, UsageError
 from probe_kit.retention import retention_table
 from probe_kit.retention.behaviour.vlm_answers import scored
 from probe_kit.retention.compare.known_used import KnownUsedTable, correct_joins, match_runs
@@ -35,7 +35,6 @@ from probe_kit.study.schema import ComparisonTable, DriftTable, TableTable
 from probe_kit.study.stored import (
     StoredRun,
     StoredRuns,
-    of_blocks,
     probe_keys,
     stored_runs,
     study_probes,
@@ -63,14 +62,29 @@ def make_table(study: LoadedStudy, name: str, partial: bool = False) -> NamedTab
     table = study.study.tables[name]
     if study.pack is not None and table.kind == "drift":
         return _packed(study.file.parent, study.pack, name)
-    stored = stored_runs(study, _selection(study, table), partial, _categories(table))
-    if not stored.runs:
-        raise UsageError(
-            f"no run of the table {name!r} is stored. Play them with `probe-kit study run {study.file}`"
-        )
+    subject = f"the table {name!r}"
+    stored = stored_runs(study, _selection(study, table), subject, partial, _categories(table))
     printed = _of_kind(study, table, stored, name, partial)
     printed = printed.with_note([*stored.missing, *stored.unfinished, *_versions(stored)])
     return replace(printed, is_partial=bool(stored.unfinished), numbers=_numbers(printed.numbers, stored))
+
+
+def make_each[Made](
+    names: Iterable[str], make: Callable[[str], Made], partial: bool
+) -> tuple[dict[str, Made], dict[str, str]]:
+    """Make a table or figure of every name; return also why others are missing.
+
+    Raises what `make` raises, unless `partial`.
+    """
+    by_name, missing = dict[str, Made](), dict[str, str]()
+    for name in names:
+        try:
+            by_name[name] = make(name)
+        except ProbeKitError as error:
+            if not partial:
+                raise
+            missing[name] = str(error)
+    return by_name, missing
 
 
 def _numbers(numbers: Sequence[Number], stored: StoredRuns) -> tuple[Number, ...]:
@@ -168,12 +182,12 @@ def _selection(study: LoadedStudy, table: TableTable) -> Callable[[Cell], Select
         return lambda cell: cell.selection if cell.name in names else None
     comparison = study.study.comparisons.get(table.comparison or "")
     if comparison is None:
-        return of_blocks(table.runs or ())
+        return lambda cell: cell.selected(table.runs or ())
     models, ways = _compared(study, comparison)
     asks = comparison.pairs is not None  # a chain and groups are of policies
 
     def select(cell: Cell) -> Selection | None:
-        blocks = table.runs is None or of_blocks(table.runs)(cell) is not None
+        blocks = table.runs is None or cell.selected(table.runs) is not None
         is_compared = cell.model in models and cell.way in ways and (asks or not cell.asks) and blocks
         return cell.selection if is_compared else None
 

@@ -268,3 +268,28 @@ def test_probes_of_the_file_are_fitted_once_and_shown(small_suite: Suite, tmp_pa
     assert len(stored) == 2
     fit_probes(plan_study(study))
     assert {path: path.stat().st_mtime_ns for path in stored} == stored
+
+
+@pytest.mark.slow
+def test_probes_are_compared_again_where_the_file_names_another_untrained_network(
+    small_suite: Suite, tmp_path: Path
+) -> None:
+    file = small_study(tmp_path, small_suite)
+    text = file.read_text(encoding="utf-8")
+
+    def words() -> str:
+        cells = plan_study(load_study(file), only="main").cells
+        return next(planned.words for planned in cells if planned.cell.name == "first/still")
+
+    def play_and_fit() -> None:
+        assert conduct_study(plan_study(load_study(file), only="main"), env_workers=0) == []
+        assert fit_probes(plan_study(load_study(file), only="main")) == []
+
+    play_and_fit()
+    assert words() == "whole; probed"
+    file.write_text(text.replace("weights_seed = 1", "weights_seed = 2"), encoding="utf-8")
+    assert words() == "whole; probes main: not compared with its untrained network"
+    play_and_fit()
+    assert words() == "whole; probed"
+    file.write_text(text, encoding="utf-8")
+    assert words() == "whole; probes main: compared with another untrained network"
