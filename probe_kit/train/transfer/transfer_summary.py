@@ -7,6 +7,7 @@ from probe_kit._tables.table import Table
 from probe_kit.hooks.contract.sites import label_of
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.crossval.task_scores import METRICS
+from probe_kit.train.results.best_sites import p_text, score_text
 from probe_kit.train.transfer.transfer_results import TransferResults
 
 if TYPE_CHECKING:
@@ -64,9 +65,9 @@ def _cells(row: "pd.Series") -> tuple[str, ...]:
     return (
         str(row["site"]),
         f"{row['score']:.3f} [{row['ci_low']:.3f}, {row['ci_high']:.3f}]",
-        _number(row["chance"]),
-        _number(row["p_fwe"]),
-        f"{row['recentred']:.3f}",
+        score_text(row["chance"], is_side=False),
+        p_text(row["p_fwe"]),
+        score_text(row["recentred"], is_side=False),
         f"{row['refitted']:.3f} [{row['refitted_ci_low']:.3f}, {row['refitted_ci_high']:.3f}]",
     )
 
@@ -81,7 +82,3 @@ def _verdict(row: "pd.Series") -> str:
     if row["p_fwe"] < SIGNIFICANCE:
         return f"transfers {where} at {row['site']} {numbers}"
     return f"is not shown to transfer {where} {numbers}"
-
-
-def _number(value: float) -> str:
-    return "–" if value != value else f"{value:.3f}"
