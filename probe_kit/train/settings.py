@@ -6,7 +6,7 @@ from probe_kit.hashing import sha256_json
 from probe_kit.statistics.folds import FoldUnit
 from probe_kit.train.choices import SIDES, Incomplete, Task
 
-FORMAT = 7  # raise when settings have other fields or would give other numbers
+FORMAT = 8  # raise when settings have other fields or would give other numbers
 
 
 @dataclass(frozen=True)
