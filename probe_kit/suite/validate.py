@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from probe_kit._system.counting import counted
 from probe_kit.suite.categories import category_of
 from probe_kit.suite.leakage import Baseline, run_baselines, save_baselines
 from probe_kit.suite.manifest import read_suite
@@ -59,7 +60,8 @@ class Report:
         if self.missing:
             lines.append(f"Not in this suite: {', '.join(category_of(slug).title for slug in self.missing)}.")
         verdict = "valid" if self.ok else "not valid"
-        lines.append(f"{self.suite}: {verdict}, {len(self.errors)} errors, {len(self.warnings)} warnings")
+        counts = f"{counted(len(self.errors), 'error')}, {counted(len(self.warnings), 'warning')}"
+        lines.append(f"{self.suite}: {verdict}, {counts}")
         return "\n".join(line for line in lines if line)
 
 
