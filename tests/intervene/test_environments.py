@@ -1,0 +1,125 @@
+"""Interventions on runs of an environment: pairs of first observations that differ in one input."""
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+
+from probe_kit.errors import OtherFramesError, SettingsMismatchError
+from probe_kit.extract import EnvSource, ExtractSettings, prepare
+from probe_kit.hooks import Observation
+from probe_kit.intervene import AttentionReadout, ImageSwap, InstructionSwap, Interchange, run_intervention
+from probe_kit.intervene.sessions.observed import ObservedSession
+from probe_kit.intervene.sessions.opening import open_session
+from probe_kit.intervene.sessions.session import ReplaySource
+from probe_kit.runs import Run, open_run
+
+if TYPE_CHECKING:
+    from probe_kit.hooks.families.pi0.adapter import Pi0
+
+EPISODES = 12
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _own_modules() -> Iterator[None]:
+    """The module `reach_env` can be imported by its name, as a user's own module can."""
+    folder = str(Path(__file__).parents[1] / "support")
+    sys.path.append(folder)
+    yield
+    sys.path.remove(folder)
+
+
+@pytest.fixture(scope="module")
+def played(_own_modules: None, pi0_tiny: "Pi0", tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """Twelve episodes in six groups, whose block and colour differ by the seed."""
+    source = EnvSource("reach_env:ReachEnv", max_steps=6)
+    settings = ExtractSettings("pi0-tiny", source=source, captured_calls=2, execute=3, env_workers=0, batch=1)
+    folder = tmp_path_factory.mktemp("played") / "run"
+    prepare(settings, policy=pi0_tiny).run(folder)
+    return open_run(folder)
+
+
+@pytest.fixture
+def session(played: Run, pi0_tiny: "Pi0") -> Iterator[ObservedSession]:
+    with open_session(played, ReplaySource(), lambda *_: pi0_tiny, ImageSwap()) as opened, opened.ready():
+        assert isinstance(opened, ObservedSession)
+        yield opened
+
+
+def test_a_pair_has_the_picture_of_another_group_and_all_else_of_its_own(session: ObservedSession) -> None:
+    for item in session.items:
+        for pair in session.pairs(item):
+            clean, source, donor = pair.clean, pair.source, pair.donor
+            assert isinstance(clean, Observation)
+            assert isinstance(source, Observation)
+            assert isinstance(donor, Observation)
+            np.testing.assert_array_equal(source.image, donor.image)
+            assert not np.array_equal(source.image, clean.image)
+            np.testing.assert_array_equal(source.state, clean.state)
+            assert source.instruction == clean.instruction
+
+
+def test_the_first_action_of_every_episode_is_inferred_again_bit_for_bit(
+    played: Run, session: ObservedSession
+) -> None:
+    assert played.inputs is not None
+    actions = played.inputs.read("action")
+    for item in session.items:
+        for pair in session.pairs(item):
+            chunk = session.act(pair.clean, pair.seed)
+            assert session.replay_error(pair, chunk) == 0
+            np.testing.assert_array_equal(chunk[:3], actions[pair.row, 0])
+
+
+@pytest.mark.parametrize(
+    ("intervention", "rows"),
+    [
+        (ImageSwap(), 1),
+        (InstructionSwap(), 1),
+        (ImageSwap(vary="state"), 1),
+        (Interchange(sites=("backbone.01", "kv.*"), roles=("image",)), 4),
+        (AttentionReadout(roles=("image",)), None),
+    ],
+)
+def test_kinds_work_in_an_environment_and_are_read_again(
+    played: Run, pi0_tiny: "Pi0", intervention: ImageSwap, rows: int | None
+) -> None:
+    result = run_intervention(played, intervention, load=lambda *_: pi0_tiny)
+    assert result.certificate["replay"]["equal"] == EPISODES
+    assert len(result.effects) == rows or rows is None
+    assert result.verdicts == {}
+    assert run_intervention(played, intervention, load=not_loaded).to_csv() == result.to_csv()
+
+
+def not_loaded(*_: object) -> "Pi0":
+    raise AssertionError("it is stored")
+
+
+def test_an_input_of_the_environment_moves_the_action_and_patches_are_shares_of_its_exchange(
+    played: Run, pi0_tiny: "Pi0"
+) -> None:
+    """All that the acting stream reads of the picture carries no more than the exchange of the picture."""
+    (swap,) = run_intervention(played, ImageSwap(), load=lambda *_: pi0_tiny).effects
+    assert swap.changed == 1
+    assert swap.size > swap.control_size
+    first = Interchange(sites=("backbone.00",), roles=("image",))
+    (row,) = run_intervention(played, first, load=lambda *_: pi0_tiny).effects
+    assert row.action_share == pytest.approx(1.0, abs=1e-3), "only the picture differs, and all of it is patched"
+
+
+def test_another_version_of_the_environment_is_refused(
+    played: Run, pi0_tiny: "Pi0", monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import reach_env  # type: ignore[import-not-found]
+
+    monkeypatch.setattr(reach_env.ReachEnv, "revision", "reach 2")
+    with pytest.raises((OtherFramesError, SettingsMismatchError), match="reach 2"):
+        open_session(played, ReplaySource(), lambda *_: pi0_tiny)
+
+
+def test_fewer_episodes_than_the_run_has_are_refused(played: Run, pi0_tiny: "Pi0") -> None:
+    with pytest.raises(OtherFramesError, match="has no episode 'reach-04' any more"):
+        open_session(played, ReplaySource(environment_options={"count": "4"}), lambda *_: pi0_tiny)
