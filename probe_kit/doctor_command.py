@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from probe_kit._terminal.console import err, marked, out, print_json
+from probe_kit._terminal.console import err, marked, out, print_json, say
 from probe_kit._terminal.options import AsJson
 
 if TYPE_CHECKING:
@@ -23,7 +23,10 @@ def doctor(
         print_json([finding.to_json() for finding in findings])
     else:
         _print_findings(findings)
-    raise typer.Exit(1 if any(finding.state == "missing" for finding in findings) else 0)
+    missing = any(finding.state == "missing" for finding in findings)
+    if not missing:
+        say("next: [bold]probe-kit demo[/]; [bold]probe-kit diagnose MODEL[/] says which inputs a policy uses")
+    raise typer.Exit(1 if missing else 0)
 
 
 def _print_findings(findings: "list[Finding]") -> None:
