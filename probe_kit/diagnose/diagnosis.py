@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from copy import copy
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -14,7 +15,7 @@ from probe_kit.diagnose.frames import frames_of
 from probe_kit.diagnose.measure import Actions, Infer, InputExchange
 from probe_kit.diagnose.passage import measure_passage
 from probe_kit.diagnose.results import Diagnosis, InputDiagnosis
-from probe_kit.errors import UnsupportedInterventionError, UsageError
+from probe_kit.errors import ObservationError, UnsupportedInterventionError, UsageError
 from probe_kit.extract.sources.inputs import STATE, with_input
 from probe_kit.hashing import sha256_json
 from probe_kit.intervene.pairs import Pair
@@ -83,7 +84,7 @@ def diagnose_run(
         return replace(load_diagnosis(run, key), knowledge=knowledge)
     with open_session(run, source, load) as session, session.ready():
         if base_policy is not None:
-            _check_base(session.policy, base_policy)
+            base_policy = with_inputs_of(session.policy, base_policy)
         progress("frames")
         drawn = frames_of(session, frames, dict(paraphrases or {}))
         exchange = InputExchange(_inference(session), drawn, seed)
@@ -109,12 +110,14 @@ def load_diagnosis(run: "Run", key: str) -> Diagnosis:
 def _load_base(run: "Run", source: "ReplaySource", checkpoint: str, load: "LoadPolicy | None") -> "Policy":
     from probe_kit.intervene.sessions.session import load_policy_of
 
-    cameras = run.certificate["policy"]["cameras"]
-    return (load or load_policy_of)(run, replace(source, checkpoint=checkpoint)).with_cameras(cameras)
+    return (load or load_policy_of)(run, replace(source, checkpoint=checkpoint))
 
 
-def _check_base(tuned: "Policy", base: "Policy") -> None:
-    """Raise UsageError for a base that reads other inputs than the checkpoint that was tuned from it."""
+def with_inputs_of(tuned: "Policy", base: "Policy") -> "Policy":
+    """The base with the cameras of the checkpoint that was tuned from it. Raises UsageError for other inputs."""
+    if base.card.cameras != tuned.card.cameras:
+        with suppress(ObservationError):
+            base = base.with_cameras(tuned.card.cameras)
     for what, now, before in (
         ("cameras", tuned.card.cameras, base.card.cameras),
         ("numbers of the state", tuned.state_numbers, base.state_numbers),
@@ -126,6 +129,7 @@ def _check_base(tuned: "Policy", base: "Policy") -> None:
                 f"the base {base.card.checkpoint} has other inputs: its {what} are {_plain(before)}, those of "
                 f"{tuned.card.checkpoint} {_plain(now)}. Give the checkpoint that this one was tuned from"
             )
+    return base
 
 
 def _plain(inputs: object) -> object:

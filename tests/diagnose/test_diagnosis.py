@@ -4,33 +4,30 @@ The policy decides Color by what block 2 hands over (`kv.02`), and nothing reads
 """
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
 
 import probe_kit as pk
 from probe_kit.cli import app
-from probe_kit.diagnose.diagnosis import diagnose_run, load_diagnosis
+from probe_kit.diagnose.diagnosis import diagnose_run, load_diagnosis, with_inputs_of
 from probe_kit.diagnose.frames import frames_of
 from probe_kit.diagnose.paraphrases import read_paraphrases
 from probe_kit.diagnose.results import Diagnosis
 from probe_kit.errors import UsageError
 from probe_kit.extract import ExtractSettings, LeRobotSource, extract_run
 from probe_kit.hashing import derive_seed
+from probe_kit.hooks import Policy
 from probe_kit.hooks.families.pi0.adapter import load_pi0_tiny
 from probe_kit.intervene.sessions.opening import open_session
-from probe_kit.intervene.sessions.session import ReplaySource, load_policy_of
+from probe_kit.intervene.sessions.session import LoadPolicy, ReplaySource, load_policy_of
 from probe_kit.runs import Run, verify_run
 from tests.support.lerobot_recordings import CAMERA, write_recording
 from tests.support.made_once import made_once
 from tests.support.pi0_organisms import ORGANISMS, edited, make_deaf
-
-if TYPE_CHECKING:
-    from probe_kit.hooks import Policy
 
 FRAMES = ("--frames", "12")
 
@@ -183,10 +180,10 @@ def test_a_table_without_a_target_is_refused(folder: Path) -> None:
     assert (answer.exit_code, "name the column" in answer.output) == (2, True)
 
 
-def deaf_since(checkpoint: str | None) -> "Callable[[Run, ReplaySource], Policy]":
+def deaf_since(checkpoint: str | None) -> LoadPolicy:
     """The run's policy as it is, deaf where it is loaded from this checkpoint."""
 
-    def load(run: Run, source: ReplaySource) -> "Policy":
+    def load(run: Run, source: ReplaySource) -> Policy:
         sound = replace(source, checkpoint=None)
         deaf = source.checkpoint == checkpoint
         return edited(make_deaf)(run, sound) if deaf else load_policy_of(run, sound)
@@ -205,18 +202,21 @@ def test_what_fine_tuning_lost_is_found_in_the_same_pairs_of_the_base(run: Run) 
     assert compared.exit_code() == 1
 
 
-def test_a_base_with_another_state_is_refused(run: Run) -> None:
-    class Other(type(load_pi0_tiny())):  # type: ignore[misc]
+def test_a_base_with_another_state_or_camera_is_refused() -> None:
+    tuned, base = load_pi0_tiny(), load_pi0_tiny()
+    assert with_inputs_of(tuned, base) is base
+
+    class Wide(type(base)):  # type: ignore[misc]
         state_numbers = 32
 
-    def load(run: Run, source: ReplaySource) -> "Policy":
-        policy = load_policy_of(run, replace(source, checkpoint=None))
-        if source.checkpoint is not None:
-            policy.__class__ = Other
-        return policy
-
-    with pytest.raises(UsageError, match="its numbers of the state are 32"):
-        diagnose_run(run, frames=12, base="before", load=load)
+    base.__class__ = Wide
+    with pytest.raises(UsageError, match="its numbers of the state are 32, those of embedded 8"):
+        with_inputs_of(tuned, base)
+    base.__class__ = type(tuned)
+    base.card = replace(base.card, cameras=("wrist",))
+    base.with_cameras = lambda cameras: Policy.with_cameras(base, cameras)  # type: ignore[method-assign]
+    with pytest.raises(UsageError, match=r"its cameras are .'wrist',"):
+        with_inputs_of(tuned, base)
 
 
 # -- organisms ----------------------------------------------------------------------------------------------
