@@ -34,10 +34,10 @@ def run_of(folder: Path, category: str, draw: int, frames: int) -> Run:
 
 
 def judged(verdict: str, truth: tuple[str, ...]) -> str:
-    """Return whether a verdict is the truth; an open one is neither right nor wrong."""
+    """Return whether a verdict is the truth; one that shows less is open, neither right nor wrong."""
     if verdict in truth:
         return "right"
-    return "open" if verdict == "open" else "wrong"
+    return "open" if verdict == "open" or (verdict, *truth) == ("moves", "decides") else "wrong"
 
 
 def diagnose(organism: Organism, folder: Path, draw: int, frames: int, inside: bool) -> dict[str, str]:

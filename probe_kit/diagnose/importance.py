@@ -62,12 +62,13 @@ class Exchanges:
     """The changes of the action by exchanges of one input, pair by pair.
 
     exchanged, control, every: (P,) shares of the variance, see `ActionScale.shares`: with the donor's input, with
-    the control of the input, and with all inputs of the donor. groups: (P,). largest: (P,) the largest change of
-    any number of the action under the donor's input. blanked: (F,) the same of every frame under the blank.
+    the control of the input (None where the model takes none), and with all inputs of the donor. groups: (P,).
+    first: (P,) the first donor of its frame. largest: (P,) the largest change of any number of the action under the
+    donor's input. blanked: (F,) the same of every frame under the blank.
     """
 
     exchanged: NDArray[np.float64]
-    control: NDArray[np.float64]
+    control: NDArray[np.float64] | None
     every: NDArray[np.float64]
     groups: NDArray[np.str_]
     first: NDArray[np.bool_]
@@ -78,7 +79,7 @@ class Exchanges:
 def importance_of(name: str, exchanges: Exchanges) -> InputDiagnosis:
     """The verdict on one input that was exchanged."""
     groups = exchanges.groups
-    above = exchanges.exchanged - exchanges.control
+    above = exchanges.exchanged - (0.0 if exchanges.control is None else exchanges.control)
     # One donor per frame, as there is one control: only then are both exchangeable, and the test exact.
     first = exchanges.first
     seed = derive_seed(name, "sign flips", *np.unique(groups).tolist())
@@ -88,7 +89,7 @@ def importance_of(name: str, exchanges: Exchanges) -> InputDiagnosis:
     measured: dict[str, Any] = {
         "share": float(exchanges.exchanged.mean()),
         "share_ci": (max(0.0, share_ci[0]), share_ci[1]),
-        "control": float(exchanges.control.mean()),
+        "control": np.nan if exchanges.control is None else float(exchanges.control.mean()),
         "every": float(exchanges.every.mean()),
         "p": p,
         "n_pairs": groups.size,
@@ -148,6 +149,8 @@ def _verdict(exchanges: Exchanges, above: NDArray[np.float64], p: float) -> tupl
     inputs, _ = unbounded_student_interval(exchanges.every, groups)
     if over_half >= 0 and inputs >= INPUTS_DECIDE:
         return "decides", "it changes at least half of what all inputs change together"
+    if exchanges.control is None:
+        return "open", "the model takes no other spelling of it as a control; give --paraphrases"
     if float(exchanges.every.mean()) < INPUTS_DECIDE:
         return "moves", "the seed decides the action, and all inputs together hardly do"
     return "moves", "it changes less than half of what all inputs change together, or that was not shown"

@@ -35,13 +35,17 @@ def differing(frames: Sequence[Frame], name: str) -> bool:
     return any(not same_input(first, frame.observation, name) for frame in frames[1:])
 
 
-def control_of(frame: Frame, name: str, spread: NDArray[np.float64]) -> Observation:
-    """The frame's observation after a change of one input that means nothing, see `hardly_changed`.
+def controls_of(frame: Frame, name: str, spread: NDArray[np.float64]) -> list[Observation]:
+    """The frame's observation after changes of one input that mean nothing, the best first; see `hardly_changed`.
 
-    Without other words of the frame, the first letter's case and the full stop change. spread: (D,) of the state.
+    Without other words of the frame, the first letter's case and the full stop change, or one of them: a tokenizer
+    of words may know only one spelling. spread: (D,) of the state.
     """
-    words = frame.other_words or _retyped(frame.observation.instruction)
-    return hardly_changed(frame.observation, name, spread, words)
+    texts = [frame.other_words] if frame.other_words else _retyped(frame.observation.instruction)
+    return [
+        hardly_changed(frame.observation, name, spread, words)
+        for words in (texts if name == INSTRUCTION else texts[:1])
+    ]
 
 
 def spread_of_states(frames: Sequence[Frame]) -> NDArray[np.float64]:
@@ -50,7 +54,7 @@ def spread_of_states(frames: Sequence[Frame]) -> NDArray[np.float64]:
     return np.asarray(states.std(axis=0), np.float64)
 
 
-def _retyped(words: str) -> str:
-    """Without its full stop if it has one, else with one; the first letter in the other case."""
+def _retyped(words: str) -> list[str]:
+    """The full stop added or removed, and the first letter in the other case; then one of both alone."""
     stopped = words.removesuffix(".") if words.endswith(".") else f"{words}."
-    return stopped[:1].swapcase() + stopped[1:]
+    return [text[:1].swapcase() + text[1:] for text in (stopped, words)] + [stopped]

@@ -1,6 +1,7 @@
 """The inferences of a diagnosis: clean, with every input exchanged, blanked and hardly changed."""
 
 from collections.abc import Callable, Collection, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -9,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.diagnose.importance import ActionScale, Exchanges, compare_with_base, importance_of
-from probe_kit.diagnose.inputs import control_of, differing, inputs_of, spread_of_states
+from probe_kit.diagnose.inputs import controls_of, differing, inputs_of, spread_of_states
 from probe_kit.diagnose.results import InputDiagnosis
 from probe_kit.errors import InstructionError, UsageError
 from probe_kit.extract.sources.donors import Frame, draw_donors
@@ -141,11 +142,11 @@ class InputExchange:
         donors = [observations[donor] for _, donor in pairs]
         varied = [with_input(observations[index], name, donor) for index, donor in zip(rows, donors, strict=True)]
         exchanged, every = self.infer(varied, seeds), self.infer(donors, seeds)
-        control = self.infer([control_of(frame, name, self._spread) for frame in frames], self._seeds)
+        control = self._controlled(name)
         blanked = self._blanked(name)
         self._exchanges[name] = Exchanges(
             exchanged=scale.shares(exchanged, clean[rows]),
-            control=scale.shares(control, clean)[rows],
+            control=None if control is None else scale.shares(control, clean)[rows],
             every=scale.shares(every, clean[rows]),
             groups=np.array([frames[index].group for index in rows]),
             first=np.concatenate([[True], np.diff(rows) != 0]),
@@ -153,6 +154,18 @@ class InputExchange:
             blanked=np.abs(blanked - clean[: len(blanked)]).max(axis=(1, 2), initial=0.0),
         )
         return importance_of(name, self._exchanges[name])
+
+    def _controlled(self, name: str) -> Actions | None:
+        """Actions of all frames after a change without meaning; None where the model takes none of some frame."""
+        chunks = []
+        for frame in self.frames:
+            for control in controls_of(frame, name, self._spread):
+                with suppress(InstructionError):
+                    chunks.append(self.infer([control], [frame.seed])[0])
+                    break
+            else:
+                return None
+        return np.stack(chunks)
 
     def _blanked(self, name: str) -> Actions:
         """Actions of all frames without one input; of none where the family refuses text without words."""

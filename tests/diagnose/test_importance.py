@@ -1,7 +1,9 @@
 """How much an input decides, against policies whose shares of the variance are known by construction."""
 
+import re
 from collections.abc import Sequence
 from hashlib import sha256
+from typing import Any
 
 import numpy as np
 import pytest
@@ -228,3 +230,24 @@ def test_an_input_that_is_declared_absent_is_none_unless_it_moves_the_action() -
     inputs = {diagnosed.name: diagnosed for diagnosed in exchange.measure(absent={"state", "picture"})}
     assert inputs["state"].verdict == "not an input"
     assert inputs["picture"].matters, "a declaration does not outweigh what was measured"
+
+
+def test_a_tokenizer_of_one_spelling_is_given_another_control_and_without_any_only_a_decision_is_shown() -> None:
+    def knowing(refused: str, weights: Sequence[float]) -> Any:
+        policy = linear_policy(weights)
+
+        def infer(observations: Sequence[Observation], seeds: Sequence[int]) -> Actions:
+            if any(re.search(refused, observation.instruction) for observation in observations):
+                raise InstructionError("a word that this tokenizer does not know")
+            return policy(observations, seeds)  # type: ignore[no-any-return]
+
+        return infer
+
+    (stopped,) = InputExchange(knowing("^[A-Z]|^$", [1.0, 1.0, 1.0]), frames()).measure(["instruction"])
+    assert stopped.control == 0
+    other_spelling = "[.]|^[A-Z]|^$"
+    (decides,) = InputExchange(knowing(other_spelling, [1.0, 0.2, 0.0]), frames()).measure(["instruction"])
+    assert (decides.verdict, np.isnan(decides.control)) == ("decides", True)
+    (moves,) = InputExchange(knowing(other_spelling, [0.5, 1.0, 0.0]), frames()).measure(["instruction"])
+    assert moves.verdict == "open"
+    assert "--paraphrases" in moves.reason
