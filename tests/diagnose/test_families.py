@@ -12,7 +12,10 @@ from probe_kit.extract import ExtractSettings, extract_run
 from probe_kit.suite import Suite
 from tests.support.acting_checkpoints import FAMILIES
 
-pytestmark = pytest.mark.slow
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.filterwarnings("ignore:the model put out tokens that name no action"),  # random weights do
+]
 
 
 @pytest.mark.parametrize("family", FAMILIES)
