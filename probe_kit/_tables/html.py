@@ -33,14 +33,14 @@ def environment(*folders: Path, places: tuple[str, ...] = ()) -> "Environment":
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
     from markupsafe import Markup
 
-    def shown(value: Any) -> Any:
+    def escaped(value: Any) -> Any:
         if not isinstance(value, str) or isinstance(value, Markup) or value.startswith("data:"):
             return value
         return without_places(value, places)
 
     templates = Environment(
         loader=FileSystemLoader([*folders, _FOLDER]), autoescape=True, undefined=StrictUndefined, trim_blocks=True,
-        lstrip_blocks=True, finalize=shown,
+        lstrip_blocks=True, finalize=escaped,
     )  # fmt: skip
     templates.filters |= {"heat": heat_colour, "sort_key": sort_key, "unbroken": unbroken}
     return templates

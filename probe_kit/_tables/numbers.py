@@ -15,7 +15,7 @@ def percent(value: float | None, digits: int = 1) -> str:
     return number(None if value is None else 100 * value, digits)
 
 
-def whole(value: float | None) -> str:
+def whole_percent(value: float | None) -> str:
     """Return a share as a percentage without decimals."""
     return percent(value, 0)
 

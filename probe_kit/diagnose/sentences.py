@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from probe_kit._tables.numbers import p_text, whole, with_limits
+from probe_kit._tables.numbers import p_text, whole_percent, with_limits
 from probe_kit._tables.table import Cell, Heading, Table
 
 if TYPE_CHECKING:
@@ -62,13 +62,18 @@ def _row(diagnosed: "InputDiagnosis", headings: Sequence[Heading]) -> Sequence[C
         diagnosed.name,
         ("yes" if diagnosed.arrives else "no") if tested else "–",
         diagnosed.verdict,
-        with_limits(diagnosed.share, diagnosed.share_ci, whole),
-        whole(diagnosed.control),
-        whole(diagnosed.every),
+        with_limits(diagnosed.share, diagnosed.share_ci, whole_percent),
+        whole_percent(diagnosed.control),
+        whole_percent(diagnosed.every),
         p_text(diagnosed.p),
     ]
     if (base := diagnosed.base) is not None:
-        texts += [whole(base.share), with_limits(base.difference, base.ci, whole), p_text(base.p), base.change]
+        texts += [
+            whole_percent(base.share),
+            with_limits(base.difference, base.ci, whole_percent),
+            p_text(base.p),
+            base.change,
+        ]
     texts += ["–"] * (len(headings) - len(texts))
     alarms = {"arrives", "verdict"} if diagnosed.matters is False else set()
     if base is not None and base.change == "lost in fine-tuning":

@@ -97,7 +97,7 @@ class Scene:
             for side in SIDES:
                 self._put(self.tiles[side], self._tile_start(side), self.spec.tile_yaw)
         self._put(self.cube, cube_position, cube_yaw)
-        self.arm.place(self.home_q, self.spec.home_opening)
+        self.arm.set_joints(self.home_q, self.spec.home_opening)
         self.arm.command_gripper(self.spec.home_opening)
 
     @contextmanager
@@ -128,7 +128,7 @@ class Scene:
         client, model = self.client, self.arm.model
         x, y, z = self.spec.home
         around_cube = model.pads + self.spec.cube_side / 2 + GRASP_GAP
-        self.arm.place(self.home_q, (around_cube - model.closed) / (model.opened - model.closed))
+        self.arm.set_joints(self.home_q, (around_cube - model.closed) / (model.opened - model.closed))
         client.resetBasePositionAndOrientation(self.cube, (x, y, z - model.hand_drop), yaw_quaternion(0.0))
         self.close_hand(2)
 
@@ -253,7 +253,7 @@ class Scene:
         self._drawn = 0
         self._frames = 0
         self.home_q = self._find_home()
-        self.arm.place(self.home_q, spec.home_opening)
+        self.arm.set_joints(self.home_q, spec.home_opening)
         if spec.tile_mass > 0:
             # Contacts of tiles survive restoreState: without this an episode depends on the one before.
             for side in SIDES:

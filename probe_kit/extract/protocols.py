@@ -114,15 +114,15 @@ def _family(model: str) -> "Family | None":
 
 def _used(model: ModelSettings, task: ActTask, scene: "SceneSpec") -> dict[str, str]:
     """The values that the run is made with, under the names of `ProtocolRow.settings`."""
-    used = {f"-M {name}": _told(as_text(value)) for name, value in model.options.items()}
+    used = {f"-M {name}": _portable_value(as_text(value)) for name, value in model.options.items()}
     plain = {
         "checkpoint": model.checkpoint, "execute": task.execute, "rotation": task.rotation, "dtype": model.dtype,
     }  # fmt: skip
-    used |= {name: _told(str(value)) for name, value in plain.items() if value is not None}
+    used |= {name: _portable_value(str(value)) for name, value in plain.items() if value is not None}
     return {**used, **({"acts": "capture only"} if task.capture_only else {}), **_scene(scene)}
 
 
-def _told(value: str) -> str:
+def _portable_value(value: str) -> str:
     """Files and folders by their last name: where they lie on this machine is no part of a run."""
     return Path(value).name if Path(value).expanduser().exists() else value
 

@@ -107,7 +107,7 @@ def export(
     from probe_kit.runs.store import locate
 
     location = locate(run)
-    target = out_file or location.beside(f"{location.name}.{DIRECTION_FILES.get(style, style)}")
+    target = out_file or location.path_of_export(f"{location.name}.{DIRECTION_FILES.get(style, style)}")
     with err.status("exporting"):
         written = export_run(location, style, target, partial, sites=sites, view=view, dtype=dtype, seed=seed)
     out.print(str(written), soft_wrap=True)

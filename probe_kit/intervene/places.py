@@ -172,7 +172,7 @@ def resolve_sites(pattern: str, policy: "Model") -> list[SiteGroup]:
     first, last = match["first"], match["last"]
     iterations = None if first is None else (int(first), int(last or first))
     return [
-        _place(stream, PlaceName(stream.name, layer, quantity, number, iterations))
+        _site_group(stream, PlaceName(stream.name, layer, quantity, number, iterations))
         for layer in layers
         for number in heads
     ]
@@ -201,7 +201,7 @@ def _check_kv(model: "Model") -> None:
         interventions.check("kv", model.card.family)
 
 
-def _place(stream: "Stream", name: PlaceName) -> SiteGroup:
+def _site_group(stream: "Stream", name: PlaceName) -> SiteGroup:
     quantities = (name.quantity,) if name.quantity else KV if stream.name == KV_STREAM else (RESIDUAL,)
     low, high = name.iterations or (0, 0)
     sites = tuple(

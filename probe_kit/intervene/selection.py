@@ -60,7 +60,7 @@ class StoredResult:
         return not self.wrong_readout, self.outcomes.episodes.size, self.own_readout
 
     @property
-    def made(self) -> tuple[str, str]:
+    def newest(self) -> tuple[str, str]:
         """Return the time, which decides between what says as much."""
         return self.stored.created, self.stored.key
 
@@ -74,7 +74,7 @@ def stored_results(run: RunReader, kind: str) -> list[StoredResult]:
     every = [result for stored in stored_interventions(run, kind) for result in StoredResult.all_of(stored)]
     return sorted(
         every,
-        key=lambda result: (order.get(result.category, len(order)), result.category, result.rank, result.made),
+        key=lambda result: (order.get(result.category, len(order)), result.category, result.rank, result.newest),
     )
 
 

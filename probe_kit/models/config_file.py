@@ -74,7 +74,7 @@ def part(make: Callable[[dict[str, Any]], Any], model_type: str = "") -> BeforeV
     model_type: what it has to be; empty for any.
     """
 
-    def made(values: Any) -> Any:
+    def checked(values: Any) -> Any:
         if not isinstance(values, Mapping):
             return values
         if model_type and values.get("model_type", model_type) != model_type:
@@ -84,7 +84,7 @@ def part(make: Callable[[dict[str, Any]], Any], model_type: str = "") -> BeforeV
         except (TypeError, AttributeError, KeyError, ArithmeticError) as error:
             raise ValueError(f"cannot be read by transformers ({type(error).__name__}: {error})") from error
 
-    return BeforeValidator(made)
+    return BeforeValidator(checked)
 
 
 def in_words(error: ValidationError) -> str:

@@ -216,8 +216,8 @@ def _keys(paths: list[str], texts: list[str]) -> list[str | None]:
         name, separator, key = text.rpartition("=")
         if not (separator and name and key):
             raise UsageError(f"--probes {text!r} is not RUN=KEY; `probe-kit run show RUN` lists the keys")
-        matches = [at for at, path in enumerate(paths) if _place(path) == _place(name)]
-        matches = matches or [at for at, path in enumerate(paths) if _place(path).rpartition("/")[2] == name]
+        matches = [at for at, path in enumerate(paths) if _stripped(path) == _stripped(name)]
+        matches = matches or [at for at, path in enumerate(paths) if _stripped(path).rpartition("/")[2] == name]
         if len(matches) != 1:
             raise UsageError(
                 f"--probes {text!r}: {name} is {'several' if matches else 'none'} of the runs {', '.join(paths)}"
@@ -228,14 +228,14 @@ def _keys(paths: list[str], texts: list[str]) -> list[str | None]:
     return keys
 
 
-def _place(path: str) -> str:
+def _stripped(path: str) -> str:
     return path.rstrip("/") if "://" in path else str(Path(path).resolve())
 
 
 def _check_doubles(paths: Sequence[str]) -> None:
     """Said before anything is opened; `retention` also knows copies of a run."""
     for at, path in enumerate(paths):
-        if _place(path) in map(_place, paths[:at]):
+        if _stripped(path) in map(_stripped, paths[:at]):
             raise UsageError(f"{path} is given twice; its episodes would count twice. Leave one out")
 
 

@@ -56,7 +56,7 @@ class ActionErrors:
         """A line per shown frame: keys, `first` and `chunk`, root mean squares over all numbers that change."""
         import pandas as pd
 
-        rows, calls = np.nonzero(self._shown)
+        rows, calls = np.nonzero(self._has_recorded_action)
         steps = self.run.control_steps
         first, chunk = self.of_frames
         return pd.DataFrame(
@@ -93,7 +93,7 @@ class ActionErrors:
         return np.asarray(self.errors / np.where(self.deviations > 0, self.deviations, np.nan))
 
     @property
-    def _shown(self) -> NDArray[np.bool_]:
+    def _has_recorded_action(self) -> NDArray[np.bool_]:
         """(E, C) whether an inference has a recorded action."""
         return np.asarray(np.isfinite(self.errors[:, :, 0]).any(axis=2))
 

@@ -84,7 +84,7 @@ class Bucket(Location):
         """The URL."""
         return self._url
 
-    def beside(self, name: str) -> Path:
+    def path_of_export(self, name: str) -> Path:
         """Return a path in the working directory."""
         return Path(name)
 
@@ -278,7 +278,7 @@ class Bucket(Location):
 
     # -- runs ------------------------------------------------------------------------------------------
 
-    def found(self, objects: Mapping[str, bytes], last: str) -> None:
+    def begin(self, objects: Mapping[str, bytes], last: str) -> None:
         """One after another, none over another's."""
         strange = sorted(set(self.keys("")) - set(objects))
         if strange and not self.exists(last):
@@ -293,7 +293,7 @@ class Bucket(Location):
         self.create(last, objects[last])
 
     @contextmanager
-    def held(self, clear: Callable[[], None]) -> Iterator[None]:
+    def locked(self, clear: Callable[[], None]) -> Iterator[None]:
         """Nothing is locked."""
         clear()
         yield

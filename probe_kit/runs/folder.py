@@ -56,7 +56,7 @@ class Folder(Location):
         """Absolute."""
         return str(self._path.resolve())
 
-    def beside(self, name: str) -> Path:
+    def path_of_export(self, name: str) -> Path:
         """Next to the folder."""
         return self._path.resolve().parent / name if self._path.name in ("", "..") else self._path.with_name(name)
 
@@ -186,7 +186,7 @@ class Folder(Location):
 
     # -- runs ------------------------------------------------------------------------------------------
 
-    def found(self, objects: Mapping[str, bytes], last: str) -> None:
+    def begin(self, objects: Mapping[str, bytes], last: str) -> None:
         """Made as a draft and renamed, so that the folder appears with all objects or not at all."""
         with draft_of(self._path) as draft:
             try:
@@ -202,7 +202,7 @@ class Folder(Location):
                     raise SettingsMismatchError(f"{self} exists and is not a run; choose another --out") from error
 
     @contextmanager
-    def held(self, clear: Callable[[], None]) -> Iterator[None]:
+    def locked(self, clear: Callable[[], None]) -> Iterator[None]:
         """Every process that works holds a shared lock, so only one that finds itself alone may clear.
 
         An apparent leftover may be another process's work. The last process to finish removes what

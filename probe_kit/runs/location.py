@@ -48,7 +48,7 @@ class Location(ABC):
         """The text by which `locate` finds the same location in another process, in any working directory."""
 
     @abstractmethod
-    def beside(self, name: str) -> Path:
+    def path_of_export(self, name: str) -> Path:
         """Default path of a file that is made from the run."""
 
     @abstractmethod
@@ -130,14 +130,14 @@ class Location(ABC):
     # -- runs ------------------------------------------------------------------------------------------
 
     @abstractmethod
-    def found(self, objects: Mapping[str, bytes], last: str) -> None:
+    def begin(self, objects: Mapping[str, bytes], last: str) -> None:
         """Begin with these objects; `last`, one of them, never appears without all others.
 
         If another process is first, its objects stay. Raises SettingsMismatchError if something else is there.
         """
 
     @abstractmethod
-    def held(self, clear: Callable[[], None]) -> AbstractContextManager[None]:
+    def locked(self, clear: Callable[[], None]) -> AbstractContextManager[None]:
         """Lock the run while the body runs. A process that is alone first calls `clear` to remove leftovers."""
 
     @abstractmethod

@@ -224,7 +224,7 @@ class RunReader(Protocol):
         """The wordings that items were asked in; empty for their own words alone."""
 
     @property
-    def whole(self) -> Self:
+    def all_wordings(self) -> Self:
         """The same run with the episodes of all wordings."""
 
     @property

@@ -92,7 +92,7 @@ class Bundle:
     def read(self, name: str) -> bytes:
         """One file. Raises RunDamagedError if it is missing or was changed."""
         try:
-            content = self.location.read(self._place(name))
+            content = self.location.read(self._location_of(name))
         except FileNotFoundError:
             raise self.damaged(name, "is missing") from None
         if problem := self.files[name][1].problem(content):
@@ -102,20 +102,20 @@ class Bundle:
     def open(self, name: str) -> BinaryIO:
         """One file to be read here and there; see `check`."""
         try:
-            return self.location.open(self._place(name))
+            return self.location.open(self._location_of(name))
         except FileNotFoundError:
             raise self.damaged(name, "is missing") from None
 
     def check(self, name: str) -> None:
         """Read one file to its end, a piece at a time. Raises RunDamagedError if it was changed."""
         try:
-            _, digest = digest_of(self.location.pieces(self._place(name)))
+            _, digest = digest_of(self.location.pieces(self._location_of(name)))
         except FileNotFoundError:
             raise self.damaged(name, "is missing") from None
         if digest != self.files[name][1].digest:
             raise self.damaged(name, "has other bytes than were written")
 
-    def _place(self, name: str) -> str:
+    def _location_of(self, name: str) -> str:
         if name not in self.files:
             raise self.head_damaged(f"names no file {name}")
         return f"{self.folder}/{self.files[name][0]}"
@@ -143,7 +143,7 @@ class Bundle:
 
     def damaged(self, name: str, problem: str) -> RunDamagedError:
         """Return the error about one file."""
-        return RunDamagedError(f"{self.location}/{self._place(name)} {problem}. {advice_for(self.folder)}")
+        return RunDamagedError(f"{self.location}/{self._location_of(name)} {problem}. {advice_for(self.folder)}")
 
 
 def write_bundle(

@@ -324,7 +324,7 @@ class Run:
         return self._showing(name, self.item_ids)
 
     @property
-    def whole(self) -> "Run":
+    def all_wordings(self) -> "Run":
         """The same run with the episodes of all wordings."""
         return self if self.wording is None else self._showing(None, self.item_ids)
 
@@ -621,9 +621,9 @@ class Run:
         at = stored.at(site)
         index: tuple[Any, ...] = (slice(None), call - 1, *at)
         if self._keeps_mean_of(call):
-            return decode_bfloat16(self._kept(site.stream, "later")[index])
+            return decode_bfloat16(self._committed_rows(site.stream, "later")[index])
         index = (slice(None), call, *at, stored.views.index(view))
-        return np.asarray(self._kept(site.stream, "pooled")[index])
+        return np.asarray(self._committed_rows(site.stream, "pooled")[index])
 
     @property
     def sealed(self) -> bool:
@@ -667,7 +667,7 @@ class Run:
         of = next((number for number, commit in self._commits.items() if key in commit.objects), None)
         return RESTORE if of is None else redo(of)
 
-    def _kept(self, stream: str, kind: VectorKind) -> NDArray[Any]:
+    def _committed_rows(self, stream: str, kind: VectorKind) -> NDArray[Any]:
         """(E, S, [I,] L, [V,] D) rows of the committed episodes, read once per array."""
         if (stream, kind) not in self._kept_rows:
             rows = self.rows(stream, kind)
@@ -691,7 +691,7 @@ class Run:
         for name, stored in self._streams.items():
             if self.columns is None:
                 dimensions = ["episode", "call", *stored.dimensions, "view", "feature"]
-                array = xr.DataArray(self._kept(name, "pooled"), dims=dimensions)
+                array = xr.DataArray(self._committed_rows(name, "pooled"), dims=dimensions)
             else:
                 array = self.columns.xarray(name).isel(episode=self._columns_rows)
             renamed = {dimension: f"{name}_{dimension}" for dimension in (*stored.dimensions, "view", "feature")}

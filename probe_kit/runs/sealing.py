@@ -30,7 +30,7 @@ def seal(path: Path | str | Location) -> bool:
     once take turns, and all but the first find it done.
     """
     location = Run(locate(path)).location
-    with location.held(lambda: None), location.tended(DATA):  # a folder that is never exchanged
+    with location.locked(lambda: None), location.tended(DATA):  # a folder that is never exchanged
         return _seal(read_run(location))
 
 

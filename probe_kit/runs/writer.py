@@ -135,7 +135,7 @@ class RunWriter[PlanT: WrittenPlan]:
         self.settings = json.loads(canonical_json(settings))
         self._label = label or str(self.settings["model"])
         if not location.exists(RUN_FILE):
-            location.found(self._beginning(), last=RUN_FILE)
+            location.begin(self._beginning(), last=RUN_FILE)
         self.root = while_growing(location, self._continued)
         self.plan = plan.numbered({row["episode_id"]: row["episode"] for row in self.root.plan})
 
@@ -179,7 +179,7 @@ class RunWriter[PlanT: WrittenPlan]:
         check_other_settings(root.own_settings, self.settings, str(self.location))
         self._check_lengths(root)
         if self._lacks(root):
-            with self.location.held(lambda: None), self.location.tended(PLANS):
+            with self.location.locked(lambda: None), self.location.tended(PLANS):
                 root = self._grown()
         root.check()
         return root
@@ -225,7 +225,7 @@ class RunWriter[PlanT: WrittenPlan]:
     @contextmanager
     def owned(self) -> Iterator[None]:
         """Work on the run while the body runs; failures of earlier attempts are forgotten."""
-        with self.location.held(lambda: self.location.remove(FAILED)):
+        with self.location.locked(lambda: self.location.remove(FAILED)):
             yield
 
     @contextmanager
@@ -234,7 +234,7 @@ class RunWriter[PlanT: WrittenPlan]:
 
         No process then removes its drafts as leftovers. Failures that the owner recorded stay.
         """
-        with self.location.held(lambda: None):
+        with self.location.locked(lambda: None):
             yield
 
     def begin(self, allow_mixed: bool = False) -> None:

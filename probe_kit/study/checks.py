@@ -53,7 +53,7 @@ def _categories(study: Study, block: BlockTable, suite: PlannedSuite) -> tuple[s
 
 
 def _out(study: Study, _: PlannedSuite) -> Iterator[Mistake]:
-    scheme, is_url, _rest = study.folder.partition("://")
+    scheme, is_url, _path = study.folder.partition("://")
     if is_url and scheme not in SCHEMES:
         yield Mistake(("out",), f"runs lie in folders or at {', '.join(f'{name}://' for name in SCHEMES)}")
 

@@ -115,7 +115,7 @@ def run(
     plan = plan_study(study, only)
     if dry_run:
         changed = _look(plan, verify, orphans, as_json)
-        if changed or (exit_code and not plan.whole):
+        if changed or (exit_code and not plan.complete):
             raise typer.Exit(UNFINISHED)
         return
     failed = _played(plan, slots=slots, ray=ray, env_workers=env_workers, retry_failed=retry_failed)

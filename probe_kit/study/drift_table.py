@@ -59,8 +59,8 @@ def drift_table(pairs: Mapping[tuple[str, str], Sequence[CategoryDrift]], title:
 def _cells(drift: CategoryDrift) -> tuple[str, ...]:
     gap = drift.difference
     accuracies = (
-        _own(drift.before),
-        _own(drift.after),
+        _row_key(drift.before),
+        _row_key(drift.after),
         "–" if gap is None else with_limits(gap.backbone, gap.backbone_ci, points),
     )
     if not drift.sites:
@@ -84,7 +84,7 @@ def _lens(drift: CategoryDrift) -> tuple[str, str]:
     return ("–", "–") if lens is None else (percent(lens[0]), percent(lens[1]))
 
 
-def _own(row: RetentionRow) -> str:
+def _row_key(row: RetentionRow) -> str:
     return with_limits(row.backbone.score, row.backbone.ci, percent)
 
 

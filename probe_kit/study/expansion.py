@@ -127,7 +127,7 @@ def _settings(study: Study, member: Member) -> Settings:
     if member.block.asks:
         ask = study.asks[member.way]
         tokens = member.block.tokens or "none"
-        return _asked(study, member.model, ask).changed(tokens=tokens, seed=member.seed)
+        return _ask_settings(study, member.model, ask).changed(tokens=tokens, seed=member.seed)
     settings = _settings_of(study, member.model, study.conditions[member.way], member.block.tokens)
     return settings.changed(seed=member.seed)
 
@@ -153,7 +153,7 @@ def _settings_of(study: Study, name: str, condition: ConditionTable, tokens: str
     ).followed()
 
 
-def _asked(study: Study, name: str, ask: AskTable) -> AskSettings:
+def _ask_settings(study: Study, name: str, ask: AskTable) -> AskSettings:
     return AskSettings(**_common(study, name), **ask.model_dump())
 
 

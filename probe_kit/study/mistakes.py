@@ -23,7 +23,7 @@ class Mistake:
     text: str
 
     @property
-    def place(self) -> str:
+    def field(self) -> str:
         """The path as it would be written, such as `runs[0].models`."""
         parts = [f"[{part}]" if isinstance(part, int) else f".{_key(part)}" for part in self.path]
         return "".join(parts).removeprefix(".") or "the file"
@@ -44,7 +44,7 @@ class StudyFileError(UsageError):
 
     def __init__(self, file: str, content: dict[str, Any], mistakes: Sequence[Mistake]) -> None:
         self.mistakes = tuple(sorted(mistakes, key=lambda mistake: _order(content, mistake.path)))
-        super().__init__("\n".join(f"{file}: {mistake.place}: {mistake.text}" for mistake in self.mistakes))
+        super().__init__("\n".join(f"{file}: {mistake.field}: {mistake.text}" for mistake in self.mistakes))
 
 
 def part_in_file(path: Place, content: Any) -> Place:

@@ -98,7 +98,7 @@ class StudyPlan:
         return [planned for planned in self.cells if planned.state != "skipped"]
 
     @property
-    def whole(self) -> bool:
+    def complete(self) -> bool:
         """Whether no episode and no probes are missing."""
         return not any(planned.missing or planned.unprobed for planned in self.played)
 
@@ -171,13 +171,13 @@ class StudyPlan:
             f"{counted(totals['inferences'], 'inference')} of policies (given by shape: no model was loaded)",
             f"missing: {counted(totals['missing'], 'episode')}{unprobed}",
         ]
-        hours, unmeasured = _known(self.hours())
+        hours, unmeasured = _known_sums(self.hours())
         if hours:
             each = ", ".join(f"{model} {value:.2g}" for model, value in hours.items())
             lines.append(f"hours, measured in stored episodes: {sum(hours.values()):.2g} ({each})")
         if unmeasured:
             lines.append(f"hours unknown before a first episode is stored: {', '.join(unmeasured)}")
-        sizes, unsized = _known(self.bytes())
+        sizes, unsized = _known_sums(self.bytes())
         if sizes:
             lines.append(f"bytes: up to {in_units(round(sum(sizes.values())))} before compression")
         if unsized:
@@ -352,7 +352,7 @@ def _by_model(amounts: Iterable[tuple[str, float | None]]) -> dict[str, float | 
     return sums
 
 
-def _known(sums: Mapping[str, float | None]) -> tuple[dict[str, float], list[str]]:
+def _known_sums(sums: Mapping[str, float | None]) -> tuple[dict[str, float], list[str]]:
     """Return the sums that are known, and the models of the others."""
     return {model: value for model, value in sums.items() if value is not None}, [
         model for model, value in sums.items() if value is None

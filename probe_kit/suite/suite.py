@@ -114,9 +114,9 @@ class Suite:
         return self.card.get("parent")
 
     @property
-    def whole(self) -> "Suite":
+    def complete(self) -> "Suite":
         """The suite that this one was selected from, itself for a whole suite."""
-        return self if self.selected_from is None else self.selected_from.whole
+        return self if self.selected_from is None else self.selected_from.complete
 
     @property
     def categories(self) -> tuple[str, ...]:

@@ -71,7 +71,7 @@ def power(
         raise UsageError("--power and --width are two questions; ask them one after the other")
     if items is not None and (width is not None or goal is not None):
         raise UsageError("--power and --width look for the number of items themselves; leave --items out")
-    counts = [_whole(part) for part in split(items or ITEMS) or ()]
+    counts = [_whole_number_argument(part) for part in split(items or ITEMS) or ()]
     signals = [_points(part) for part in split(signal) or ()]
     if width is not None:
         count = items_for_width(width / 100)
@@ -155,7 +155,7 @@ def _print(estimates: "list[Power]") -> None:
     out.print(Table.of("Power: how often a signal is seen", headings, rows, notes=notes))
 
 
-def _whole(text: str) -> int:
+def _whole_number_argument(text: str) -> int:
     number = whole_number(text)
     if number is None or not 1 <= number <= MOST_ITEMS:
         raise UsageError(f"{text!r} is not a number of items; expected 1 to {MOST_ITEMS}")

@@ -135,7 +135,7 @@ class Target:
                 f"{self.table.source} has the key {SOURCE!r} of recordings, and {run.location} is of scenes; "
                 f"expected {EPISODE!r}. `probe-kit labels RUN` writes the ids"
             )
-        run_keys = _shown(run, self.inferences is not None)
+        run_keys = _source_frames(run, self.inferences is not None)
         frames: Sequence[int] = self.inferences or (-1,) * len(self.episodes)
         _check_recorded(run, self.table, self.episodes, self.inferences)
         keys = [run_keys.get((episode, frame), ()) for episode, frame in zip(self.episodes, frames, strict=True)]
@@ -297,7 +297,7 @@ def side_labels(episodes: "pd.DataFrame", name: str, seed: int) -> NDArray[np.in
     return flipped[:, 0].astype(np.int8)
 
 
-def _shown(run: RunReader, by_frame: bool) -> dict[tuple[str, int], list[tuple[str, int]]]:
+def _source_frames(run: RunReader, by_frame: bool) -> dict[tuple[str, int], list[tuple[str, int]]]:
     """Episode ids and inferences of a run by source episode and frame; of whole episodes the frame is -1."""
     keys_of: dict[tuple[str, int], list[tuple[str, int]]] = {}
     steps = run.control_steps

@@ -172,9 +172,9 @@ class ViewedRun:
         stored = read_sheet(self.run.location, number)
         if stored is not None or inputs is None or "pixels" not in inputs.kinds:
             return stored
-        shown = inputs.row("pixels", position)[: len(self.inference_steps(position))]
+        pixels = inputs.row("pixels", position)[: len(self.inference_steps(position))]
         # The pictures of all cameras stand side by side.
-        frames = tuple(np.hstack(list(cameras)) for cameras in shown)
+        frames = tuple(np.hstack(list(cameras)) for cameras in pixels)
         return FrameSheet(as_thumbnail(frames, "all"), len(frames)) if frames else None
 
     @cached_property

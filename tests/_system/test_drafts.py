@@ -49,7 +49,7 @@ def draw_suite(path: Path) -> None:
 
 
 def begin_run(path: Path) -> None:
-    locate(path).found({"run.json": b"{}", "data.zarr/zarr.json": b"{}"}, last="run.json")
+    locate(path).begin({"run.json": b"{}", "data.zarr/zarr.json": b"{}"}, last="run.json")
 
 
 @pytest.mark.parametrize("make", [write_text, draw_suite, begin_run])

@@ -306,7 +306,7 @@ def test_a_plan_of_a_few_items_draws_these_and_one_category(
     whole = default_suite(("color", "shape"))
     again = prepare(settings, fetch=False)
     assert isinstance(again.plan, Plan)
-    assert again.source.suite.whole.content_sha256 == whole.content_sha256
+    assert again.source.suite.complete.content_sha256 == whole.content_sha256
     assert first.source.suite.items == again.source.suite.items
     assert first.source.suite.identity == again.source.suite.identity
     enough = [list(sufficiencies(own.source.suite, True, True)) for own in (first, again)]

@@ -84,7 +84,7 @@ def test_one_wording_of_a_run_is_read_like_a_run(ladder):
         assert one.planned == 4
         np.testing.assert_array_equal(one.column(site), whole[mine])
         assert one.xarray()["backbone_pooled"].sizes["episode"] == 4
-        assert one.whole.episodes.equals(ladder.episodes)
+        assert one.all_wordings.episodes.equals(ladder.episodes)
     assert ladder.in_wording().wording == "knowledge"
     assert (ladder.in_wording("named").column(site) != ladder.in_wording("knowledge").column(site)).any()
 

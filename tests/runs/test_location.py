@@ -24,7 +24,7 @@ class LocationContract:
         raise AssertionError("a subclass gives the location")
 
     def test_the_first_object_of_a_key_stays(self, location: Location) -> None:
-        location.found(BEGINNING, "run.json")
+        location.begin(BEGINNING, "run.json")
         assert location.create("commits/1.json", b"first")
         assert not location.create("commits/1.json", b"second")
         assert location.read("commits/1.json") == b"first"
@@ -72,18 +72,18 @@ class LocationContract:
         assert location.exists("failed-not/1.json")
 
     def test_a_run_begins_with_all_its_objects_once(self, location: Location) -> None:
-        location.found(BEGINNING, "run.json")
-        location.found({**BEGINNING, "run.json": b"of another process, which was second"}, "run.json")
+        location.begin(BEGINNING, "run.json")
+        location.begin({**BEGINNING, "run.json": b"of another process, which was second"}, "run.json")
         assert {key: location.read(key) for key in location.keys("")} == BEGINNING
 
     def test_a_location_that_holds_something_else_is_left_alone(self, location: Location) -> None:
         location.write("thesis.txt", b"do not touch")
         with pytest.raises(SettingsMismatchError, match="choose another --out"):
-            location.found(BEGINNING, "run.json")
+            location.begin(BEGINNING, "run.json")
         assert location.keys("") == ["thesis.txt"]
 
     def test_a_derived_group_replaces_the_former_one_when_it_is_complete(self, location: Location) -> None:
-        location.found(BEGINNING, "run.json")
+        location.begin(BEGINNING, "run.json")
         for stamp in ("a" * 64, "b" * 64):
             with location.rebuilding("columns.zarr", stamp) as store:
                 zarr.open_group(store, mode="w", zarr_format=3, attributes={"stamp": stamp})
@@ -130,7 +130,7 @@ class TestBucket(LocationContract):
     def test_the_beginning_of_another_run_is_refused(self, location: Location) -> None:
         location.write("plan.json", b"another plan")
         with pytest.raises(SettingsMismatchError, match=r"another plan\.json"):
-            location.found(BEGINNING, "run.json")
+            location.begin(BEGINNING, "run.json")
         assert not location.exists("run.json")
 
     def test_a_bucket_that_does_not_exist_is_named_in_words(self, location: Location) -> None:  # noqa: ARG002
@@ -142,7 +142,7 @@ class TestBucket(LocationContract):
 
     def test_it_has_neither_a_folder_nor_a_full_disk(self, location: Location) -> None:
         assert location.free_bytes() is None
-        assert location.beside("run.h5") == Path("run.h5")
+        assert location.path_of_export("run.h5") == Path("run.h5")
         with pytest.raises(UsageError, match="object store"):
             _ = location.path
 

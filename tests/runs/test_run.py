@@ -138,7 +138,7 @@ def test_a_run_shows_the_first_items_of_some_categories(recorded_run: Run) -> No
         np.testing.assert_array_equal(part.tokens(site)[1], recorded_run.tokens(site)[1][mine])
     assert part.control_steps.tolist() == recorded_run.control_steps[mine].tolist()
     assert (part.judged("disc")["correct"].to_numpy() == recorded_run.judged("disc")["correct"][mine]).all()
-    assert part.whole is part
+    assert part.all_wordings is part
     assert part.only(items=2).episodes["item_id"].unique().tolist() == first[:2]
     assert recorded_run.only() is recorded_run
 

@@ -58,9 +58,9 @@ def test_a_mistake_is_named_with_its_path_and_nothing_else_is_raised(
         load_study(file)
     (field,) = fields_at(text, "# here") or fields_at(text, ELSEWHERE[said])[:1]
     mistakes = dict(zip(str(caught.value).splitlines(), caught.value.mistakes, strict=True))
-    paths = [mistake.place for line, mistake in mistakes.items() if said in line]
+    paths = [mistake.field for line, mistake in mistakes.items() if said in line]
     assert any(is_in(path, field) for path in paths), (field, str(caught.value))
-    assert all(line == f"{file}: {mistake.place}: {mistake.text}" for line, mistake in mistakes.items())
+    assert all(line == f"{file}: {mistake.field}: {mistake.text}" for line, mistake in mistakes.items())
     assert caught.value.exit_code == 2
 
 
@@ -73,7 +73,7 @@ def test_wrong_names_are_said_together_in_the_order_of_the_file(tmp_path: Path) 
     )
     with pytest.raises(StudyFileError) as caught:
         load_study(written(tmp_path, text))
-    assert [mistake.place for mistake in caught.value.mistakes] == fields_at(text, "# here")
+    assert [mistake.field for mistake in caught.value.mistakes] == fields_at(text, "# here")
 
 
 def test_what_does_not_fit_together_is_said_together_in_the_order_of_the_file(tmp_path: Path) -> None:
@@ -86,7 +86,7 @@ def test_what_does_not_fit_together_is_said_together_in_the_order_of_the_file(tm
     )
     with pytest.raises(StudyFileError) as caught:
         load_study(written(tmp_path, text))
-    assert [mistake.place for mistake in caught.value.mistakes] == fields_at(text, "# here")
+    assert [mistake.field for mistake in caught.value.mistakes] == fields_at(text, "# here")
 
 
 def test_wrong_values_are_said_together_before_names_are_looked_at(tmp_path: Path) -> None:
@@ -101,7 +101,7 @@ def test_wrong_values_are_said_together_before_names_are_looked_at(tmp_path: Pat
     )
     with pytest.raises(StudyFileError) as caught:
         load_study(written(tmp_path, text))
-    paths = [mistake.place for mistake in caught.value.mistakes]
+    paths = [mistake.field for mistake in caught.value.mistakes]
     assert paths == fields_at(text, "# here")
 
 

@@ -33,7 +33,7 @@ class Arm:
         self._couple_fingers()
         self.chain = self._measure_chain()
 
-    def place(self, q: Array, opening: float) -> None:
+    def set_joints(self, q: Array, opening: float) -> None:
         """Put the joints there at rest, without moving through the space between."""
         for joint, angle in zip(self.model.joints, q, strict=True):
             self._client.resetJointState(self.body, joint, angle)
@@ -120,7 +120,7 @@ class Arm:
     def _measure_chain(self) -> SerialChain:
         """Read the screws off the loaded robot at q = 0."""
         client, model = self._client, self.model
-        self.place(np.zeros(len(model.joints)), 0.0)
+        self.set_joints(np.zeros(len(model.joints)), 0.0)
         info = [client.getJointInfo(self.body, joint) for joint in model.joints]
         states = [client.getLinkState(self.body, joint, computeForwardKinematics=True) for joint in model.joints]
         tool = client.getLinkState(self.body, model.tool, computeForwardKinematics=True)

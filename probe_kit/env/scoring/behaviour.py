@@ -71,7 +71,7 @@ def behaviour_of(trajectory: Trajectory, side_correct: Side, box_half: float, mo
     start, least = [float(away[0]) for away in distances], [_least(away) for away in distances]
     furthest = _furthest(trajectory)
     released_at = _first_release(trajectory.held)
-    towards_correct = _beside(trajectory, side_correct)
+    towards_correct = _offset_to_correct_side(trajectory, side_correct)
     return Behaviour(
         grasped=bool(trajectory.held.any()),
         released=released_at is not None,
@@ -136,7 +136,7 @@ def _furthest(trajectory: Trajectory) -> float:
     return float(np.nanmax(np.hypot(*(trajectory.cube[:, :2] - trajectory.cube[0, :2]).T)))
 
 
-def _beside(trajectory: Trajectory, side_correct: Side) -> NDArray[np.float32]:
+def _offset_to_correct_side(trajectory: Trajectory, side_correct: Side) -> NDArray[np.float32]:
     """(T + 1,) how far the hand is on the correct side of the line midway between where the pictures began."""
     correct, wrong = trajectory.tile(side_correct)[0, :2], trajectory.tile(other_side(side_correct))[0, :2]
     middle, towards = (correct + wrong) / 2, (correct - wrong) / np.linalg.norm(correct - wrong)

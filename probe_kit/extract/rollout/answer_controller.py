@@ -91,11 +91,11 @@ class AnswerController(ModelController["AnswerModel", "Prompt"]):
     def infer(self, turns: Sequence[Turn]) -> list[Inference]:
         """Per turn the columns of its outcome; nothing is executed."""
         with self._acting():
-            return [Inference(None, columns=columns) for columns in self._asked(turns)]
+            return [Inference(None, columns=columns) for columns in self._answer_turns(turns)]
 
-    def _asked(self, turns: Sequence[Turn]) -> list[dict[str, Any]]:
+    def _answer_turns(self, turns: Sequence[Turn]) -> list[dict[str, Any]]:
         self._choose_positions()
-        observations = [self._shown(turn) for turn in turns]
+        observations = [self._question_observation(turn) for turn in turns]
         phrases_asked = [self._phrases.get(turn.row.columns["item_id"], NO_OBJECT) for turn in turns]
         buffers = {row: turn.buffers for row, turn in enumerate(turns)} if self.streams else {}
         spoken: list[list[str]] = []
@@ -139,7 +139,7 @@ class AnswerController(ModelController["AnswerModel", "Prompt"]):
 
     # -- what is asked -----------------------------------------------------------------------------------
 
-    def _shown(self, turn: Turn) -> Observation:
+    def _question_observation(self, turn: Turn) -> Observation:
         (observation,) = copied([turn.observation])
         if self._settings.task.picture != "side-by-side":
             return observation
@@ -259,8 +259,8 @@ class AnswerController(ModelController["AnswerModel", "Prompt"]):
         return columns | {
             "content": choice.content,
             "letter_bias": choice.letter_bias,
-            "side_logits": side_said(choice.said),
-            "outcome_logits": outcome_of(choice.said, expected),
+            "side_logits": side_said(choice.likeliest),
+            "outcome_logits": outcome_of(choice.likeliest, expected),
             "side_debiased": side_said(choice.debiased),
             "outcome_debiased": outcome_of(choice.debiased, expected),
             "question": question,

@@ -60,7 +60,7 @@ class _Trial:
         self.episodes = [episode for _, episode in first[:EPISODES]]
 
     def play(self) -> None:
-        self.shown = [self._play(self._opened, episode) for episode in self._chosen]
+        self.shown = [self._play(self._opened, episode) for episode in self._selected_episodes]
 
     def facts_are_constant(self) -> None:
         after = [step for steps in self._played for step in steps[1:]]
@@ -72,14 +72,14 @@ class _Trial:
 
     def repeats(self) -> None:
         """The first episode again, behind the other one."""
-        again = self._play(self._opened, self._chosen[0])
+        again = self._play(self._opened, self._selected_episodes[0])
         _check_equal(self._played[0], again, "the same episode, played again behind another one")
 
     def repeats_elsewhere(self) -> None:
         """Repeat the first episode in a new environment, as each process opens its own."""
         other = open_environment(self.source)
         try:
-            again = self._play(other, self._chosen[0])
+            again = self._play(other, self._selected_episodes[0])
         finally:
             self._close(other)
         _check_equal(self._played[0], again, "the same episode in a second environment")
@@ -99,7 +99,7 @@ class _Trial:
         return self.environment
 
     @property
-    def _chosen(self) -> list[EnvEpisode]:
+    def _selected_episodes(self) -> list[EnvEpisode]:
         if not self.episodes:
             raise _BrokenError("there are no episodes, see above")
         return self.episodes

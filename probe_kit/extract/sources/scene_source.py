@@ -114,7 +114,7 @@ class SceneSource(Source[SceneSettings]):
 
     def name_parts(self) -> list[Any]:
         """The whole suite, the selected categories, and the wordings."""
-        return [self.suite.whole.content_sha256, self.suite.categories, self.settings.wordings]
+        return [self.suite.complete.content_sha256, self.suite.categories, self.settings.wordings]
 
     @property
     def suite_parent(self) -> Any:

@@ -49,7 +49,7 @@ def phrases(suite: Suite, query: Query, seed: int = 0) -> dict[str, Phrase]:
     if query == "target":
         return {item.item_id: Phrase.of(item) for item in suite.items}
     by_category: dict[str, list[Item]] = {}
-    for item in suite.whole.items:
+    for item in suite.complete.items:
         by_category.setdefault(item.category, []).append(item)
     choose = _distractor if query == "distractor" else _absent
     by_item = {item.item_id: choose(item, by_category[item.category], seed) for item in suite.items}

@@ -77,7 +77,7 @@ class Choice:
         return (first - second) / 2
 
     @property
-    def said(self) -> Said:
+    def likeliest(self) -> Said:
         """The likeliest answer of the first pass."""
         return likeliest(self.passes[0])
 

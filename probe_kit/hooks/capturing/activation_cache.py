@@ -27,7 +27,7 @@ class ActivationCache(Mapping[Site, Tensor]):
         """Raises UnknownSiteError for a site that was not captured or a name that is none."""
         activation = self._kept.get(Site.parse(site) if isinstance(site, str) else site)
         if activation is None:
-            raise UnknownSiteError(f"{site} was not captured; the tape holds {self._held() or 'nothing yet'}")
+            raise UnknownSiteError(f"{site} was not captured; the tape holds {self._contents() or 'nothing yet'}")
         return activation
 
     def __iter__(self) -> Iterator[Site]:
@@ -63,7 +63,7 @@ class ActivationCache(Mapping[Site, Tensor]):
         )
         if not sites:
             raise UnknownSiteError(
-                f"no site {stream}.….{quantity} was captured; the tape holds {self._held() or 'nothing yet'}"
+                f"no site {stream}.….{quantity} was captured; the tape holds {self._contents() or 'nothing yet'}"
             )
         layers = [list(of_layer) for _, of_layer in groupby(sites, key=lambda site: site.layer)]
         iterations = {site.iteration for site in sites}
@@ -93,14 +93,14 @@ class ActivationCache(Mapping[Site, Tensor]):
             for (stream, quantity), sites in by_stream.items()
         ]  # fmt: skip
 
-    def _held(self) -> str:
+    def _contents(self) -> str:
         return "; ".join(
             f"{stream}.{quantity}: {layers} layers" + (f" x {iterations} iterations" if iterations else "")
             for stream, quantity, layers, iterations, _, _ in self._streams()
         )
 
     def __repr__(self) -> str:
-        return f"<ActivationCache of {len(self)} sites{': ' if self._kept else ''}{self._held()}>"
+        return f"<ActivationCache of {len(self)} sites{': ' if self._kept else ''}{self._contents()}>"
 
     def _repr_html_(self) -> str:
         rows = [

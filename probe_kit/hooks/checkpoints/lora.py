@@ -49,7 +49,7 @@ class Adapter:
         factors, copies = self._sorted()
         merged = dict(tensors)
         for name, tensor in copies.items():
-            target = self._place(name, merged, name_in_module)
+            target = self._target(name, merged, name_in_module)
             if merged[target].shape != tensor.shape:
                 raise WeightsError(
                     f"the LoRA adapter in {self.folder} replaces {name} of shape {tuple(merged[target].shape)} by "
@@ -57,7 +57,7 @@ class Adapter:
                 )
             merged[target] = tensor.to(merged[target].dtype)
         for path, layer_factors in factors.items():
-            weight = self._place(f"{path}.weight", merged, name_in_module)
+            weight = self._target(f"{path}.weight", merged, name_in_module)
             layer = module.get_submodule(weight.removesuffix(".weight"))
             bias = f"{weight.removesuffix('.weight')}.bias"
             parts = {"weight": merged[weight], **({"bias": merged[bias]} if bias in merged else {})}
@@ -93,7 +93,7 @@ class Adapter:
             )
         return factors, copies
 
-    def _place(self, name: str, tensors: Mapping[str, Tensor], name_in_module: Callable[[str], str]) -> str:
+    def _target(self, name: str, tensors: Mapping[str, Tensor], name_in_module: Callable[[str], str]) -> str:
         """The network's name of a weight that the adapter changes."""
         for candidate in (name, name_in_module(name)):
             if candidate in tensors:

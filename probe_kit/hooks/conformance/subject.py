@@ -65,7 +65,7 @@ class Subject:
     ) -> None:
         self.name, self.given_checkpoint = family, None if checkpoint is None else str(checkpoint)
         self.options = check_options(family, self.family.options, options) if family else dict(options)
-        self._others, self.instructions, self.tolerance = other_options, tuple(instructions), tolerance
+        self._other_values, self.instructions, self.tolerance = other_options, tuple(instructions), tolerance
         self.device, self.dtype, self._model = device, dtype, model
         self._scratch: Path | None = None
 
@@ -127,9 +127,9 @@ class Subject:
         """The values of every option that are not in use, as far as they are known."""
         declared = [option for option in self.family.options if option.name != SIZE]
         declared_values = {
-            option.name: _others(option, self.options.get(option.name, option.default)) for option in declared
+            option.name: _others_of(option, self.options.get(option.name, option.default)) for option in declared
         }
-        passed_values = {name: (value,) for name, value in self._others.items()}
+        passed_values = {name: (value,) for name, value in self._other_values.items()}
         return {name: values for name, values in declared_values.items() if values} | passed_values
 
     def load(self, checkpoint: Path, **options: Any) -> Model:
@@ -196,7 +196,7 @@ class Subject:
         return self.model.roles(observations)
 
 
-def _others(option: Option, used: Any) -> tuple[Any, ...]:
+def _others_of(option: Option, used: Any) -> tuple[Any, ...]:
     """Return the values besides `used` that the declaration names."""
     if option.kind is bool:
         return (not (used is True or str(used).lower() in ("true", "yes", "on", "1")),)

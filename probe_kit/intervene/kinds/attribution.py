@@ -150,7 +150,7 @@ class AttributionPatching(Intervention):
         anchors = complete_cuts(session.policy, places)
         every = [*anchors, *cells]
         rows, shares = self._estimates(session, every)
-        top, drawn = self._chosen(cells, [values[len(anchors) :] for values in shares])
+        top, drawn = self._select(cells, [values[len(anchors) :] for values in shares])
         patched = {*anchors, *top, *drawn}
         sites = sites_of_cells(every)
         exact = [patch_of(cell, sites, f"{EXACT}|") for cell in every if cell in patched]
@@ -196,7 +196,7 @@ class AttributionPatching(Intervention):
             shares.append(np.array([pooled_share(moved, swap) for moved in by_cell.T]))
         return rows, shares
 
-    def _chosen(self, cells: Sequence[Cell], shares: Sequence[NDArray[np.float64]]) -> tuple[set[Cell], set[Cell]]:
+    def _select(self, cells: Sequence[Cell], shares: Sequence[NDArray[np.float64]]) -> tuple[set[Cell], set[Cell]]:
         """Return those with the largest estimates of any category, by kind, and those drawn from the rest."""
         top: set[Cell] = set()
         drawn: set[Cell] = set()

@@ -216,5 +216,5 @@ def _finding(rows: Sequence[PatchEffect]) -> str:
     verb = "have" if any(row.is_dose for row in edits) else "carry"
     apart = len(edits) - len(open_)
     by_construction = f"; {apart} more {verb} it by construction and locate nothing (*)" * (apart > 0)
-    found = count_edits(names, len(open_))
-    return f"edits that {verb} half of the image swap's effect: {found}{by_construction}"
+    count = count_edits(names, len(open_))
+    return f"edits that {verb} half of the image swap's effect: {count}{by_construction}"

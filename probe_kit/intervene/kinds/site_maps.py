@@ -287,31 +287,31 @@ def _maps(run: RunReader) -> list[_Selection]:
     results = [
         result for result in stored_results(run, "interchange") if _direction(result.stored.settings) == WHOLE
     ]
-    return _chosen(pool_conditions(results), ())
+    return _selections(pool_conditions(results), ())
 
 
 def _along(run: RunReader) -> list[_Selection]:
     results = [
         result for result in stored_results(run, "interchange") if _direction(result.stored.settings) != WHOLE
     ]
-    return _chosen(pool_conditions(results, ("direction", "seed")), ("direction",))
+    return _selections(pool_conditions(results, ("direction", "seed")), ("direction",))
 
 
 def _steering(run: RunReader) -> list[_Selection]:
-    return _chosen(
+    return _selections(
         pool_conditions(stored_results(run, "steer"), ("direction", "seed", "target_side")),
         ("direction", "target_side"),
     )
 
 
-def _chosen(groups: Sequence[PooledConditions], setting: Sequence[str]) -> list[_Selection]:
+def _selections(groups: Sequence[PooledConditions], setting: Sequence[str]) -> list[_Selection]:
     """One per category, place, role and values of these settings, by depth within a category."""
     selected: dict[str, dict[tuple[str, ...], _Selection]] = {}
     for group in groups:
         values = [str(group.like.stored.settings.get(name)) for name in setting]
         by_subject = selected.setdefault(group.like.category, {})
         for subject, conditions in _by_place(group).items():
-            created = max(group.sources[name].made for name in conditions)
+            created = max(group.sources[name].newest for name in conditions)
             candidate = _Selection(group, conditions, (group.like.rank, len(conditions), created))
             before = by_subject.setdefault((*subject, *values), candidate)
             if before.merit < candidate.merit:

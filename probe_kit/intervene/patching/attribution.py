@@ -363,7 +363,7 @@ def _row(cell: Cell, moved: NDArray[np.float64], exact: Sweep, anchors: Sequence
     is_anchor = cell in anchors
     at = anchors.index(cell) if is_anchor else 0
     is_significant = exact.source_p < SIGNIFICANCE
-    estimate = share_of_whole(moved, exact.whole, exact.groups, DRAWS) if is_significant else None
+    estimate = share_of_whole(moved, exact.full_effect, exact.groups, DRAWS) if is_significant else None
     return AttributionEffect(
         category="",
         place=cell.site_group.name,

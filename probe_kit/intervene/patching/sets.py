@@ -151,7 +151,7 @@ def compare_alone_and_without(
     rows = []
     for at, cell in enumerate(distinct):
         lost = swept.patched[0] - swept.patched[1 + len(distinct) + at]
-        needed = share_of_whole(lost, swept.whole, swept.groups, DRAWS) if alone.shares[at] else None
+        needed = share_of_whole(lost, swept.full_effect, swept.groups, DRAWS) if alone.shares[at] else None
         p = float(alone.table["p_fwe"][at])
         rows.append(
             {
@@ -189,7 +189,7 @@ def find_minimal_cells(
 
     def effects(sets: Sequence[tuple[Cell, ...]]) -> list[float]:
         swept = sweep_cells(model, searched, sets, metric)
-        return [pooled_share(values - swept.clean, swept.whole) for values in swept.patched]
+        return [pooled_share(values - swept.clean, swept.full_effect) for values in swept.patched]
 
     smallest = find_minimal_set(distinct, effects, keep)
     scored = sweep_cells(model, held_out, [smallest.cells], metric)

@@ -86,7 +86,7 @@ class Sweep:
         return tuple(" + ".join(map(str, cells)) for cells in self.cells)
 
     @property
-    def whole(self) -> NDArray[np.float64]:
+    def full_effect(self) -> NDArray[np.float64]:
         """(E,) by how much the source differs from the clean inference."""
         return self.source - self.clean
 
@@ -98,7 +98,7 @@ class Sweep:
     @cached_property
     def _source_p_values(self) -> tuple[float, float]:
         """Toward where the source should move the metric, and away from it."""
-        moved = self.toward * self.whole
+        moved = self.toward * self.full_effect
         toward, away = (paired_greater_p(sign * moved, self.items, self.groups) for sign in (1.0, -1.0))
         return toward, away
 
@@ -108,7 +108,7 @@ class Sweep:
         if self.source_p >= SIGNIFICANCE:
             return (None,) * len(self.cells)
         return tuple(
-            share_of_whole(values - self.clean, self.whole, self.groups, DRAWS) for values in self.patched
+            share_of_whole(values - self.clean, self.full_effect, self.groups, DRAWS) for values in self.patched
         )
 
     @cached_property

@@ -31,17 +31,17 @@ class Frames:
         from probe_kit.extract.sources.kinds import kind_of
         from probe_kit.extract.sources.source import Played
 
-        self.run, shown = run, stored_inputs_of(run.settings)
+        self.run, inputs = run, stored_inputs_of(run.settings)
         replaced = {} if source.dataset is None else {"folder": str(source.dataset)}
         values = source_of_run(run, replaced, {"folder": "--dataset"} if run.recorded else {}) | replaced
         if source.environment_options:
             values["options"] = {**values["options"], **source.environment_options}
         opened = kind_of(values)(**values).open()
         opened.check_same(run.settings)
-        opened.columns = tuple(shown["columns"])
+        opened.columns = tuple(inputs["columns"])
         self._name, self._rows = opened.name, {row.episode_id: row for row in opened.rows(run.settings["seed"])}
         self._player = opened.play(Played())()
-        self.cameras = tuple(camera if isinstance(camera, str) else camera[0] for camera in shown["cameras"])
+        self.cameras = tuple(camera if isinstance(camera, str) else camera[0] for camera in inputs["cameras"])
         self._cached = lru_cache(maxsize=CACHED)(self.observe)
         self.index = list(self._listed())
 

@@ -96,14 +96,14 @@ class InternVLAConfig(ConfigFile):
             )
         data = (values.get("datasets") or {}).get("vla_data") or {}
         dino, head = framework.get("dino") or {}, framework.get("action_model") or {}
-        dit = values.get("dit") or _named(
+        dit = values.get("dit") or _sizes_of(
             head.get("action_model_type", "DiT-B"), _DIT, "action_model_type", source
         )
         return cls.read(
             {
                 "vlm": vlm,
                 "dino": values.get("dino")
-                or _named(dino.get("dino_backbone", "dinov2_vits14"), _DINO, "dino_backbone", source),
+                or _sizes_of(dino.get("dino_backbone", "dinov2_vits14"), _DINO, "dino_backbone", source),
                 "layer_qformer": {**values, **(framework.get("layer_qformer") or {})},
                 "action_model": {**values, **head, **dit},
                 "base": (framework.get("qwenvl") or {}).get("base_vlm"),
@@ -167,7 +167,7 @@ def _read(file: Path) -> dict[str, Any]:
     return values
 
 
-def _named(name: str, table: Mapping[str, tuple[int, int, int]], field: str, source: str) -> dict[str, int]:
+def _sizes_of(name: str, table: Mapping[str, tuple[int, int, int]], field: str, source: str) -> dict[str, int]:
     """The sizes of a released part, under the names that `dims.json` has."""
     if name not in table:
         raise CheckpointError(

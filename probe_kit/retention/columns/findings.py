@@ -8,7 +8,7 @@ import re
 import shlex
 from collections.abc import Sequence
 
-from probe_kit._tables.numbers import whole
+from probe_kit._tables.numbers import whole_percent
 from probe_kit.intervene.results.verdict import UseVerdict
 from probe_kit.retention.behaviour.success_rate import Regime
 from probe_kit.retention.columns.label_sentences import label_finding
@@ -52,12 +52,14 @@ def count_words(sentence: str) -> int:
 
 
 def _of_vlm(row: RetentionRow) -> str:
-    rate = f"{whole(row.success.sr)} %"
+    rate = f"{whole_percent(row.success.sr)} %"
     if knows(row):
         inside = ", and probes read it in the backbone" if _is_encoded(row) else ""
         return f"known: the VLM answers right in {rate}{inside}."
     if (row.success.share_outside or 0) > 0.5:
-        return f"not shown: no answer could be read in {whole(row.success.share_outside)} % of the episodes."
+        return (
+            f"not shown: no answer could be read in {whole_percent(row.success.share_outside)} % of the episodes."
+        )
     inside = ", yet probes read the answer in the backbone" if _is_encoded(row) else ""
     return f"not shown: the VLM answers right in {rate}, {_against_guessing(row)}{inside}."
 
@@ -168,7 +170,7 @@ def _success(row: RetentionRow) -> str:
     """Return how a policy does."""
     if row.success.sr is None:
         return "the model did not act" if row.run.capture_only else "success is not known"
-    return f"success {whole(row.success.sr)} %"
+    return f"success {whole_percent(row.success.sr)} %"
 
 
 def _without_signal(row: RetentionRow, vlm: RetentionRow | None) -> str:
@@ -188,7 +190,7 @@ def _without_swap(row: RetentionRow, vlm: RetentionRow | None) -> str:
     words = {Regime.KNOWLEDGE: "success", Regime.FAILURE: "failure"}
     head = words.get(row.success.regime or Regime.NO_RELIABLE_KNOWLEDGE, "success not shown")
     against_guessing = "" if head == "success" else f", {_against_guessing(row)}"
-    return f"{head}: the cube ends right in {whole(row.success.sr)} %{against_guessing}; {unprobed(row)}."
+    return f"{head}: the cube ends right in {whole_percent(row.success.sr)} %{against_guessing}; {unprobed(row)}."
 
 
 # -- what to do next ----------------------------------------------------------------------------------------------

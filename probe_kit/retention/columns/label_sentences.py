@@ -1,7 +1,7 @@
 """The sentences about a row whose target is no side: a short one for the end of a command, and one in full."""
 
 from probe_kit._system.counting import counted, enumerated
-from probe_kit._tables.numbers import number, whole, with_limits
+from probe_kit._tables.numbers import number, whole_percent, with_limits
 from probe_kit.hooks.contract.sites import label_of
 from probe_kit.retention.rows.probe_parts import NO_STEP
 from probe_kit.retention.rows.row import RetentionRow
@@ -20,7 +20,7 @@ def label_finding(row: RetentionRow) -> str:
     share_left = (
         ""
         if row.retention.value is None
-        else f"; {whole(row.retention.value)} % of its score above chance is left"
+        else f"; {whole_percent(row.retention.value)} % of its score above chance is left"
     )
     return f"encoded and passed on: probes read it in the backbone and the {action}{share_left}."
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Literal, cast
 
 from probe_kit._system.counting import counted
-from probe_kit._tables.numbers import Limits, whole
+from probe_kit._tables.numbers import Limits, whole_percent
 from probe_kit.intervene.results.verdict import UNTESTED, UseVerdict, describe_swap
 from probe_kit.retention.behaviour.success_rate import Regime
 from probe_kit.retention.columns.label_sentences import label_details
@@ -242,7 +242,7 @@ def _answered(row: RetentionRow) -> str:
 
 def _rate(row: RetentionRow) -> str:
     """A success rate with its interval and, where these alone would mislead, why it is in its regime."""
-    return f"{whole(row.success.sr)} %{_range(row.success.ci)}{_regime_reason(row)}"
+    return f"{whole_percent(row.success.sr)} %{_range(row.success.ci)}{_regime_reason(row)}"
 
 
 def _regime_reason(row: RetentionRow) -> str:
@@ -266,8 +266,8 @@ def _regime_reason(row: RetentionRow) -> str:
 def _failure(row: RetentionRow) -> str:
     wrong, outside = row.success.share_wrong or 0.0, row.success.share_outside or 0.0
     if outside >= wrong:
-        return f"{whole(outside)} % {'unread' if is_vlm(row) else 'on neither picture'}"
-    return f"{whole(wrong)} % {'name' if is_vlm(row) else 'on'} the other picture"
+        return f"{whole_percent(outside)} % {'unread' if is_vlm(row) else 'on neither picture'}"
+    return f"{whole_percent(wrong)} % {'name' if is_vlm(row) else 'on'} the other picture"
 
 
 # -- streams -------------------------------------------------------------------------------------------------
@@ -292,7 +292,7 @@ def _streams(row: RetentionRow) -> list[str]:
 
 def _in_stream(name: str, part: StreamPart, what: str) -> str:
     """One stream. what: how the answer is called there."""
-    score, most = f"{whole(part.score)} %", f"{whole(part.at_most)} %"
+    score, most = f"{whole_percent(part.score)} %", f"{whole_percent(part.at_most)} %"
     open_to = f"{score}; its best site could have up to {most}"
     if part.verdict == "shown":
         return f"{name} holds {what} ({_accuracy(part)})"
@@ -308,7 +308,7 @@ def _in_stream(name: str, part: StreamPart, what: str) -> str:
 def _accuracy(part: StreamPart) -> str:
     """Return the score of a stream with signal; one without a control may be in the pictures themselves."""
     against = "" if part.is_controlled else "; against chance only"
-    return f"{whole(part.score)} %{_range(part.ci)}{against}"
+    return f"{whole_percent(part.score)} %{_range(part.ci)}{against}"
 
 
 def chance_only(rows: Sequence[RetentionRow]) -> str:
@@ -349,4 +349,4 @@ def _range(limits: Limits | None) -> str:
     """Limits of a share in words, with a comma before them."""
     if limits is None or None in limits:
         return ""
-    return f", {whole(limits[0])} to {whole(limits[1])}"
+    return f", {whole_percent(limits[0])} to {whole_percent(limits[1])}"

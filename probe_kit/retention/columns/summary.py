@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from probe_kit._tables.numbers import Limits, number, points, signed, whole, with_limits
+from probe_kit._tables.numbers import Limits, number, points, signed, whole_percent, with_limits
 from probe_kit._tables.table import Cell, Heading, Row, Table
 from probe_kit.intervene.results.verdict import describe_readouts
 from probe_kit.retention.columns.findings import finding
@@ -102,7 +102,7 @@ def _is_marked(part: StreamPart) -> bool:
 
 
 def _share(value: float | None, limits: Limits | None, marked: bool) -> str:
-    text = with_limits(value, limits, whole)
+    text = with_limits(value, limits, whole_percent)
     return f"{text} {MARK}" if marked and value is not None else text
 
 

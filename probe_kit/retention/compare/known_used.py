@@ -334,7 +334,7 @@ def _joined(category: str, items: "pd.DataFrame", clear: bool | None) -> Categor
         episodes={code: singles.count(code) for code in every},
         has_signal=clear if probed else None,
         comparisons=tuple(_comparisons(answered, encoded, used, items["group"].to_numpy(str))),
-        **({} if clear is False else _kept(sets, encoded)),
+        **({} if clear is False else _readable_sites(sets, encoded)),
     )
 
 
@@ -358,7 +358,7 @@ def _comparisons(
     return comparisons
 
 
-def _kept(sets: Sequence[Bools], encoded: Bools | None) -> dict[str, Any]:
+def _readable_sites(sets: Sequence[Bools], encoded: Bools | None) -> dict[str, Any]:
     """Return counts of items that are answered right and encoded, by what the action does with them."""
     if encoded is None:
         return {}
@@ -387,7 +387,7 @@ def _over_all(items: "pd.DataFrame", rows: Sequence[CategoryCounts], seed: int) 
         if encoded.any()
         else None
     )
-    return replace(overall, **{**_kept([answered, encoded, used], encoded), "p_linked": p})
+    return replace(overall, **{**_readable_sites([answered, encoded, used], encoded), "p_linked": p})
 
 
 # -- what a reader must know -----------------------------------------------------------------------------

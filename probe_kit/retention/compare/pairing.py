@@ -55,17 +55,17 @@ def compare_runs(
     """
     if against is not None and len(runs) < 2:
         raise UsageError(f"--compare {against} needs a second run to compare with it")
-    names = dict(zip(map(_place, runs), full_names(runs, labels), strict=True))
+    names = dict(zip(map(_location_of, runs), full_names(runs, labels), strict=True))
     differences: list[Difference] = []
     unpaired: list[str] = []
     for minuend, subtrahend in _pairs(runs, names, against, pairs):
-        both = f"{names[_place(minuend)]} and {names[_place(subtrahend)]}"
+        both = f"{names[_location_of(minuend)]} and {names[_location_of(subtrahend)]}"
         items = common_items([minuend, subtrahend])
         if why := _why_not(minuend, subtrahend, items):
             unpaired.append(f"{both} are not compared: {why}.")
             continue
         unpaired += _left_out(both, items)
-        first, second = (Side.of(names[_place(run)], run, drawn) for run in (minuend, subtrahend))
+        first, second = (Side.of(names[_location_of(run)], run, drawn) for run in (minuend, subtrahend))
         differences += compare(first, second, items=items)
     if not vlm_vla and pairs is None and len({ask_of(run) is None for run in runs}) == 2:
         unpaired.append("VLM runs and policy runs are not compared with each other; --compare vlm-vla does that.")
@@ -127,20 +127,20 @@ def compare_with_vlms(
     A policy whose network grew from weights that were asked is not compared with VLMs of other weights. names:
     what runs are called, by location. chosen: locations of the VLM runs and policy runs that are compared instead.
     """
-    vlms, policies = ([run for run in runs if _asked(run) == kind] for kind in (True, False))
+    vlms, policies = ([run for run in runs if _answers(run) == kind] for kind in (True, False))
     related = [(vlm, policy, grew_from(policy, vlm)) for vlm, policy in product(vlms, policies)]
-    grown = {_place(policy) for _, policy, source in related if source == "yes"}
+    grown = {_location_of(policy) for _, policy, source in related if source == "yes"}
     differences: list[Difference] = []
     for vlm, policy, source in related:
         if (
-            (_place(vlm), _place(policy)) not in pairs
+            (_location_of(vlm), _location_of(policy)) not in pairs
             if pairs is not None
-            else (source == "no" and _place(policy) in grown)
+            else (source == "no" and _location_of(policy) in grown)
         ):
             continue
         items = common_items([vlm, policy]) if wording_of(vlm) == wording_of(policy) else {}
         items = {name: in_common for name, in_common in items.items() if in_common.n_items}
-        first, second = (Side.of(names[_place(run)], run, drawn) for run in (vlm, policy))
+        first, second = (Side.of(names[_location_of(run)], run, drawn) for run in (vlm, policy))
         rows = compare(first, second, "success", items=items, others_too=True)
         differences += [
             replace(
@@ -199,13 +199,13 @@ def compare_wordings(runs: Sequence[RunReader]) -> list[Difference]:
     settings = RowSettings(None, "all", (), DEFAULT_RULE, with_behaviour=False)
     differences: list[Difference] = []
     for run in runs:
-        every_wording = run.whole
+        every_wording = run.all_wordings
         sides = {}
         for wording in run.wordings:
             in_wording: RunReader = _InWording(every_wording, wording)
             if len(in_wording.episodes):
                 sides[wording] = Side(
-                    wording, (in_wording,), tuple(run_rows(in_wording, None, settings)), _place(run)
+                    wording, (in_wording,), tuple(run_rows(in_wording, None, settings)), _location_of(run)
                 )
         for first, second in combinations(sides.values(), 2):
             differences += compare(first, second, "success")
@@ -228,7 +228,7 @@ def _left_out(both: str, items: Mapping[str, CommonItems]) -> list[str]:
     return sentences
 
 
-def _place(run: RunReader) -> str:
+def _location_of(run: RunReader) -> str:
     return str(run.location)
 
 
@@ -239,30 +239,35 @@ def _pairs(
     pairs: Sequence[tuple[str, str]] | None,
 ) -> list[tuple[RunReader, RunReader]]:
     if pairs is not None:
-        by_location = {_place(run): run for run in runs}
+        by_location = {_location_of(run): run for run in runs}
         if strange := [location for pair in pairs for location in pair if location not in by_location]:
             raise UsageError(f"{strange[0]} is none of the runs {', '.join(by_location)}")
         return [(by_location[minuend], by_location[subtrahend]) for minuend, subtrahend in pairs]
     against = None if name is None else _run_called(name, runs, names)
     if against is not None:
-        return [(run, against) for run in runs if run is not against and _asked(run) == _asked(against)]
+        return [(run, against) for run in runs if run is not against and _answers(run) == _answers(against)]
     with_first = []
     for are_vlms in (True, False):
-        alike = [run for run in runs if _asked(run) == are_vlms]
+        alike = [run for run in runs if _answers(run) == are_vlms]
         with_first += [(subtrahend, alike[0]) for subtrahend in alike[1:]]
     return with_first
 
 
-def _asked(run: RunReader) -> bool:
+def _answers(run: RunReader) -> bool:
     return ask_of(run) is not None
 
 
 def _run_called(name: str, runs: Sequence[RunReader], names: Mapping[str, str]) -> RunReader:
-    for called in (_place, lambda run: names[_place(run)], lambda run: run.location.name, lambda run: run.label):
+    for called in (
+        _location_of,
+        lambda run: names[_location_of(run)],
+        lambda run: run.location.name,
+        lambda run: run.label,
+    ):
         matches = [run for run in runs if called(run) == name.rstrip("/")]
         if len(matches) == 1:
             return matches[0]
-    candidates = ", ".join(f"{run.location.name} ({names[_place(run)]})" for run in runs)
+    candidates = ", ".join(f"{run.location.name} ({names[_location_of(run)]})" for run in runs)
     raise UsageError(f"--compare {name!r} is {'several' if matches else 'none'} of the runs {candidates}")
 
 

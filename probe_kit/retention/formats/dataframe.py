@@ -56,10 +56,10 @@ def _frame(lines: Sequence[_Flat]) -> "pd.DataFrame":
     dtypes = {name: dtype for line in lines for name, (dtype, _) in line.items()}
     values = [{name: value for name, (_, value) in line.items()} for line in lines]
     frame = pd.DataFrame(values, columns=list(dtypes))
-    return frame.astype({name: _known(dtype, bool(frame[name].isna().any())) for name, dtype in dtypes.items()})
+    return frame.astype({name: _nullable(dtype, bool(frame[name].isna().any())) for name, dtype in dtypes.items()})
 
 
-def _known(dtype: str, has_gaps: bool) -> str:
+def _nullable(dtype: str, has_gaps: bool) -> str:
     return "boolean" if dtype == "bool" and has_gaps else dtype
 
 
@@ -87,7 +87,7 @@ def _flat(part: Any, before: str = "") -> _Flat:
         elif _is_interval(declared.name):
             flat |= _limits(name, value)
         elif isinstance(value, dict):
-            flat |= {f"{name}.{key}": _named(number) for key, number in value.items()}
+            flat |= {f"{name}.{key}": _heading_and_value(number) for key, number in value.items()}
         elif isinstance(value, tuple):
             flat[name] = ("string", " ".join(value))
         else:
@@ -114,7 +114,7 @@ def _limits(name: str, value: Any) -> _Flat:
     return {f"{name}_low": ("float64", low), f"{name}_high": ("float64", high)}
 
 
-def _named(value: Any) -> tuple[str, Any]:
+def _heading_and_value(value: Any) -> tuple[str, Any]:
     return ("boolean" if isinstance(value, bool) or value is None else "float64"), value
 
 

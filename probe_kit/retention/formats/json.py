@@ -22,7 +22,7 @@ def table_json(
     between_runs = [difference for difference in differences if difference.run is not None]
     between_groups = [difference for difference in differences if difference.run is None]
     several = len({row.run.location for row in rows}) > 1 and not any(row.group for row in rows)
-    lines = [asdict(row) | _in_words(row) | (_own(row, between_runs) if several else {}) for row in rows]
+    lines = [asdict(row) | _in_words(row) | (_json_of_row(row, between_runs) if several else {}) for row in rows]
     records = {
         "differences": [asdict(row) for row in between_groups],
         "wordings": list(map(_of_wordings, wordings)),
@@ -43,7 +43,7 @@ def _in_words(row: RetentionRow) -> dict[str, Any]:
     return {"verdict": verdict(row), "finding": finding(row), "conclusion": conclusion(row)}
 
 
-def _own(row: RetentionRow, differences: Sequence[Difference]) -> dict[str, Any]:
+def _json_of_row(row: RetentionRow, differences: Sequence[Difference]) -> dict[str, Any]:
     """Return the differences of a row's run from the others; a difference of behaviour stands in every view."""
     differences_of = [
         asdict(difference)

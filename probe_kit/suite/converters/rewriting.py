@@ -155,7 +155,7 @@ def _bare(text: str) -> str:
     return _ARTICLE.sub("", _TAIL.sub("", text.strip()))
 
 
-def _thing(text: str) -> str:
+def _noun_of(text: str) -> str:
     """The noun of a question; "picture" for a mere "image"."""
     noun = _bare(text)
     return "picture" if noun.lower() in _GENERIC or noun.startswith("of ") else noun
@@ -167,7 +167,7 @@ def _is_comparative(word: str) -> bool:
 
 def _graded(match: re.Match[str]) -> tuple[str, str] | None:
     """ "more ADJ X" and "less ADJ X" (R1, R3, R6)."""
-    noun, degree, adjective = _thing(match["x"]), match["degree"], _bare(match["adj"])
+    noun, degree, adjective = _noun_of(match["x"]), match["degree"], _bare(match["adj"])
     return f"{degree} {adjective} {noun}", f"{opposite_of(degree)} {adjective} {noun}"
 
 
@@ -176,14 +176,14 @@ def _comparative(match: re.Match[str]) -> tuple[str, str] | None:
     word = match["er"].lower()
     if not _is_comparative(word) or word in ("more", "less", "fewer"):
         return None
-    noun = _thing(match["x"])
+    noun = _noun_of(match["x"])
     return f"{word} {noun}", f"{opposite_of(word)} {noun}"
 
 
 def _doing(match: re.Match[str]) -> tuple[str, str]:
     verb = match["verb"].removesuffix("s")
     doing = f"{verb[:-1] if verb.endswith('e') else verb}ing"
-    noun = _thing(match["x"])
+    noun = _noun_of(match["x"])
     return f"more {doing} {noun}", f"less {doing} {noun}"
 
 
@@ -192,7 +192,7 @@ def _having(match: re.Match[str]) -> tuple[str, str] | None:
     word = match["er"].lower()
     if not _is_comparative(word):
         return None
-    noun, owned = _thing(match["x"]), _bare(match["y"])
+    noun, owned = _noun_of(match["x"]), _bare(match["y"])
     follows = owned if word == "more" and " " not in owned else owned.split()[-1] if word == "more" else ""
     return f"{noun} with {word} {owned}", f"{noun} with {opposite_of(word, follows)} {owned}"
 

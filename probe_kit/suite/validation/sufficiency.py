@@ -57,7 +57,7 @@ class Smallest:
             name: (len({item.group_id for item in items}), len(items)) for name, items in of_category.items()
         }
         name = min(counts, key=lambda category: counts[category])
-        return cls(name, counts[name][1], counts[name][0], suite.whole)
+        return cls(name, counts[name][1], counts[name][0], suite.complete)
 
     @property
     def words(self) -> str:

@@ -63,19 +63,19 @@ class Instant:
     @property
     def steps_to_grasp(self) -> float | None:
         """Control steps to the first grasp, negative behind it; None if there is none."""
-        held_frames = self._held
+        held_frames = self._frames_of_grasp
         return float(held_frames[0] - self.frame) if held_frames.size else None
 
     @property
     def phase(self) -> str:
         """One of PHASES; the release is the last one of the episode."""
-        held_frames = self._held
+        held_frames = self._frames_of_grasp
         if not held_frames.size or self.frame < held_frames[0]:
             return PHASES[0]
         return PHASES[1] if self.frame <= held_frames[-1] else PHASES[2]
 
     @property
-    def _held(self) -> NDArray[np.intp]:
+    def _frames_of_grasp(self) -> NDArray[np.intp]:
         """Frames in which both fingers touch the cube."""
         return np.flatnonzero(self.trajectory.held)
 

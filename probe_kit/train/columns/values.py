@@ -50,7 +50,7 @@ def code_labels(cells: Sequence[Cell], task: Task | None, target: str) -> LabelV
     """
     if task is not None and task not in TASKS:
         raise UsageError(f"task {task!r}; expected one of {', '.join(TASKS)}")
-    present = [_whole(cell) for cell in cells if cell is not None]
+    present = [_integer_if_whole(cell) for cell in cells if cell is not None]
     distinct = sorted(set(present))  # type: ignore[type-var]  # of one kind, so that they can be ordered
     if len(distinct) < 2:
         contents = f"one value, {distinct[0]!r}" if distinct else "no value"
@@ -62,11 +62,11 @@ def code_labels(cells: Sequence[Cell], task: Task | None, target: str) -> LabelV
         _check_squares(numbers, target)
         return LabelValues(fitting_task, (), numbers)
     code = {value: number for number, value in enumerate(distinct)}
-    codes = [np.nan if cell is None else code[_whole(cell)] for cell in cells]
+    codes = [np.nan if cell is None else code[_integer_if_whole(cell)] for cell in cells]
     return LabelValues(fitting_task, tuple(map(str, distinct)), np.array(codes, np.float64))
 
 
-def _whole(cell: Cell) -> Cell:
+def _integer_if_whole(cell: Cell) -> Cell:
     """A number without decimals as an integer: tables with empty cells store integers as decimals."""
     return int(cell) if isinstance(cell, float) and cell.is_integer() else cell
 

@@ -118,12 +118,12 @@ def add_controls(
         for category, problem in problems.items():
             if features is None:
                 references = {
-                    stream: problem.curve(_named(_layer_probes(prepared.inputs, problem, width, seed)))
+                    stream: problem.curve(_by_site(_layer_probes(prepared.inputs, problem, width, seed)))
                     for stream, width in widths.items()
                 }
                 scores = _layer_scores(category, references, problem.is_side)
             else:
-                reference = problem.curve(_named([problem.probe(features)]))
+                reference = problem.curve(_by_site([problem.probe(features)]))
                 references = dict.fromkeys(widths, reference)
                 scores = [control_score(name, category, reference)]
             compared = name == RANDOM_FEATURES or not problem.is_side
@@ -132,7 +132,7 @@ def add_controls(
     return replace(results, controls=controls)
 
 
-def _named(probes: Sequence[SiteProbe]) -> dict[Site, SiteProbe]:
+def _by_site(probes: Sequence[SiteProbe]) -> dict[Site, SiteProbe]:
     """Probes of controls by sites that stand for none."""
     return {Site("control", number): probe for number, probe in enumerate(probes)}
 

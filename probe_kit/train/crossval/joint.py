@@ -88,7 +88,7 @@ class _Columns:
     folds: Sequence[NestedFold]
 
     def fitted(self) -> list[FittedFold]:
-        best, starts, quality = self._chosen()
+        best, starts, quality = self._select_strengths()
         inner = len(self.site.sets.outer) - len(best)
         fold, column = (part.ravel() for part in np.indices(best.shape))
         problems = self._problems(inner + fold, column, STRENGTHS[best].ravel())
@@ -105,7 +105,7 @@ class _Columns:
             for number, nested in enumerate(self.folds)
         ]
 
-    def _chosen(self) -> tuple[NDArray[np.intp], Array, list[InnerQuality]]:
+    def _select_strengths(self) -> tuple[NDArray[np.intp], Array, list[InnerQuality]]:
         """(F, L) position of the chosen C by outer fold and column; (C, F, L, D + 1) weights to start from.
 
         The weights are the mean of the inner folds'. Returns also the inner quality of every outer fold.

@@ -102,7 +102,7 @@ class ArrayRun(NotPlayed):
         return self.suite
 
     @property
-    def whole(self) -> Self:
+    def all_wordings(self) -> Self:
         """The run itself: it has no wordings."""
         return self
 

@@ -137,20 +137,20 @@ class StackedDesign:
         return self
 
     @cached_property
-    def _own(self) -> Array:
+    def _samples_by_label(self) -> Array:
         """(K, N, R) the samples of every label column."""
         return self.samples[self.fold_of]
 
     def __matmul__(self, weights: Array) -> Array:
-        return (self._own @ weights.T[..., None])[..., 0].T
+        return (self._samples_by_label @ weights.T[..., None])[..., 0].T
 
     def gather(self, values: Array) -> Array:
         """Zᵀ · values, (R, K) for (N, K)."""
-        return (values.T[:, None] @ self._own)[:, 0].T
+        return (values.T[:, None] @ self._samples_by_label)[:, 0].T
 
     def moments(self, weights: Array) -> Array:
         """Zᵀ · diag(column) · Z per column of weights, (K, R, R) for (N, K)."""
-        return (self._own * weights.T[..., None]).swapaxes(1, 2) @ self._own
+        return (self._samples_by_label * weights.T[..., None]).swapaxes(1, 2) @ self._samples_by_label
 
 
 @dataclass(frozen=True)

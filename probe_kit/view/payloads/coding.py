@@ -56,12 +56,12 @@ def payload_script(name: str, value: Any, places: tuple[str, ...] = ()) -> bytes
     Text of `value` has visible signs in place of control and direction characters, and the last part alone of
     `places` and other absolute paths. No `<` is left, so that no text can end the script.
     """
-    return _script("put", name, _shown(value, places))
+    return _script("put", name, _encode(value, places))
 
 
 def failure_script(name: str, words: str, places: tuple[str, ...] = ()) -> bytes:
     """The script `refuse(name, words)`: why there is no payload of this name, for the page to show."""
-    return _script("refuse", name, _shown(words, places))
+    return _script("refuse", name, _encode(words, places))
 
 
 def _script(function: str, name: str, value: Any) -> bytes:
@@ -69,13 +69,13 @@ def _script(function: str, name: str, value: Any) -> bytes:
     return f"{function}({json.dumps(name)},{text})\n".replace("<", "\\u003c").encode("ascii")
 
 
-def _shown(value: Any, places: tuple[str, ...]) -> Any:
+def _encode(value: Any, places: tuple[str, ...]) -> Any:
     if isinstance(value, Packed):
         return value
     if isinstance(value, str):
         return without_places(terminal_safe(value), places)
     if isinstance(value, dict):
-        return {_shown(key, places): _shown(entry, places) for key, entry in value.items()}
+        return {_encode(key, places): _encode(entry, places) for key, entry in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_shown(entry, places) for entry in value]
+        return [_encode(entry, places) for entry in value]
     return value

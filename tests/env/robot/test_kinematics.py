@@ -34,7 +34,7 @@ def test_a_planar_arm_of_two_links_agrees_with_trigonometry():
 def test_forward_kinematics_equal_those_of_pybullet(arm, postures, arm_env):
     client = arm_env.scene.client
     for q in postures:
-        arm.place(q, 1.0)
+        arm.set_joints(q, 1.0)
         state = client.getLinkState(arm.body, arm.model.tool, computeForwardKinematics=True)
         pose = arm.chain.pose(q)
         np.testing.assert_allclose(pose.position, state[4], atol=1e-6)

@@ -38,7 +38,7 @@ def test_letter_bias_and_content_are_separated(content: float, bias: float) -> N
     assert choice.margins == [content + bias, content - bias]
     assert (choice.content, choice.letter_bias) == (content, bias)
     assert choice.debiased == ("none" if content == 0 else "left" if content > 0 else "right")
-    assert choice.said == ("left" if content + bias > 0 else "right")
+    assert choice.likeliest == ("left" if content + bias > 0 else "right")
 
 
 def test_one_order_cannot_tell_a_bias() -> None:

@@ -86,7 +86,7 @@ def read_steps(
 def _nvidias_steps(folder: Path, config: GrootConfig, settings: Mapping[str, Any]) -> Steps:
     fields = read_state_fields(folder, settings, str(config.embodiment_tag))
     before, behind = make_groot_pre_post_processors(config)
-    read = _chosen([*before.steps, *behind.steps], "processor_config.json and statistics.json")
+    read = _select_steps([*before.steps, *behind.steps], "processor_config.json and statistics.json")
     return replace(read, fields=fields)
 
 
@@ -100,7 +100,7 @@ def _lerobots_steps(folder: Path, config: GrootConfig) -> Steps:
         steps += [step for entry in content.get("steps", []) if (step := _saved(folder, path, entry)) is not None]
     # What the configuration says of the gripper counts, as in lerobot, not what the step was saved with.
     _apply_groot_action_decode_transform(SimpleNamespace(steps=steps), config.action_decode_transform)
-    return _chosen(steps, "policy_preprocessor.json and policy_postprocessor.json")
+    return _select_steps(steps, "policy_preprocessor.json and policy_postprocessor.json")
 
 
 def _saved(folder: Path, path: Path, entry: Mapping[str, Any]) -> Any:
@@ -128,7 +128,7 @@ def _saved(folder: Path, path: Path, entry: Mapping[str, Any]) -> Any:
     return step
 
 
-def _chosen(steps: Sequence[Any], source: str) -> Steps:
+def _select_steps(steps: Sequence[Any], source: str) -> Steps:
     kinds = (
         GrootN17PackInputsStep,
         GrootN17VLMEncodeStep,

@@ -97,14 +97,14 @@ def _weights(folder: Path, file_name: str | None, hub: str | None) -> Path:
         if file_name is None and ((candidate / SINGLE_FILE).is_file() or (candidate / INDEX_FILE).is_file()):
             return candidate
     if hub is not None:
-        name = _chosen([name for name in hub_files(hub) if name.endswith(".pt")], file_name, hub)
+        name = _select_file([name for name in hub_files(hub) if name.endswith(".pt")], file_name, hub)
         return checkpoint_folder(hub, (name,)) / name
     inside = folder.glob(f"{WEIGHTS_FOLDER}/*.pt")
     files = sorted(path.relative_to(folder).as_posix() for path in (*folder.glob("*.pt"), *inside))
-    return folder / _chosen(files, file_name, str(folder))
+    return folder / _select_file(files, file_name, str(folder))
 
 
-def _chosen(files: Sequence[str], name: str | None, location: str) -> str:
+def _select_file(files: Sequence[str], name: str | None, location: str) -> str:
     """The path of one .pt file among `files`, by its name. Raises CheckpointError for none and for several."""
     by_name = {Path(file).name: file for file in files}
     listed = ", ".join(sorted(by_name))

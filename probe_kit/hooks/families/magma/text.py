@@ -115,12 +115,12 @@ class ChatText:
         before = picture_question("", self.config.image_start_end) if pictured else ""
         turn = before + question
         frames = chat_text(conversation(turn, self.user_first), self._template, **self._beginning)
-        start, stop = self._place(turn, frames)
+        start, stop = self._question_span(turn, frames)
         start += len(before)
         encoding = self._tokenizer.encode(frames + begun)
         return TokenPrompt(tuple(encoding.ids), positions_of(encoding, start, stop))
 
-    def _place(self, turn: str, frames: str) -> tuple[int, int]:
+    def _question_span(self, turn: str, frames: str) -> tuple[int, int]:
         """The beginning and end of the user's words in `frames`."""
         words = turn.strip()  # as templates do
         start = frames.find(words)

@@ -77,11 +77,11 @@ class Pi0(PaliGemmaPolicy, EvaluatedPi0):
         """lerobot's expert attends eagerly, and returns its weights."""
         acting = [label == "action" for label in self.suffix_labels()]
 
-        def own(block: int, iteration: int, weights: Tensor) -> None:
+        def note_acting(block: int, iteration: int, weights: Tensor) -> None:
             note(block, iteration, weights[:, :, acting, : weights.shape[-1] - len(acting)])
 
         return recording_weights(
-            [layer.self_attn for layer in self._joint.gemma_expert.model.layers], own, returned
+            [layer.self_attn for layer in self._joint.gemma_expert.model.layers], note_acting, returned
         )
 
 

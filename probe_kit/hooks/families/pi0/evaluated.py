@@ -49,7 +49,11 @@ class EvaluatedPi0(LerobotFlow):
     def units_of(self, feature: str, kind: str) -> Units:
         """The checkpoint's own; where it has none, those of its evaluation. Raises CheckpointError for both."""
         requested = self.evaluation.statistics
-        if requested is not None and (units := self._own(feature, kind)) is not None and units.mode != "IDENTITY":
+        if (
+            requested is not None
+            and (units := self._stored(feature, kind)) is not None
+            and units.mode != "IDENTITY"
+        ):
             raise CheckpointError(
                 f"{self.checkpoint} holds the statistics of its {feature} itself ({units.source}), and "
                 f"{requested} were given too; leave -M statistics out"
@@ -69,7 +73,7 @@ class EvaluatedPi0(LerobotFlow):
             "proprio, or none if its numbers are metres and radians"
         )
 
-    def _own(self, feature: str, kind: str) -> Units | None:
+    def _stored(self, feature: str, kind: str) -> Units | None:
         try:
             return self.own_units(feature, kind)
         except CheckpointError:
@@ -79,7 +83,7 @@ class EvaluatedPi0(LerobotFlow):
     def _statistics(self) -> StatisticsFile | None:
         """The chosen statistics; for a checkpoint without own ones, its folder's or evaluation's. Else None."""
         source = self.evaluation.statistics
-        if source is None and self._own(STATE, "STATE") is None and self._own("action", "ACTION") is None:
+        if source is None and self._stored(STATE, "STATE") is None and self._stored("action", "ACTION") is None:
             source = statistics_in(self.folder) or EVALUATED_WITH.get(str(without_revision(self.checkpoint)))
         return None if source in (None, NO_STATISTICS) else StatisticsFile.read(str(source))
 

@@ -232,7 +232,7 @@ class Prismatic(PrismaticModel, AnswerModel):
             raise UsageError(
                 f"a question is one prefill; this model takes {self.steps} steps. Load it with steps=1"
             )
-        texts = [self._asked(question) for question in questions]
+        texts = [self._framed(question) for question in questions]
         options = [
             [id_behind(self.tokenizer, text, option) for option in question.options]
             for text, question in zip(texts, questions, strict=True)
@@ -246,12 +246,12 @@ class Prismatic(PrismaticModel, AnswerModel):
         pixels = None
         if self.shows_pictures(questions):
             pixels = self.pixel_values(question.observation.image for question in questions)
-        decoded = self.generate(pixels, [self.tokenizer.encode(self._asked(question)) for question in questions])
+        decoded = self.generate(pixels, [self.tokenizer.encode(self._framed(question)) for question in questions])
         return Prefill(
             self.network.language_model, decoded.mask.long(), decoded.last, decoded.logits[:, 0], decoded.cache
         )
 
-    def _asked(self, question: Prompt) -> str:
+    def _framed(self, question: Prompt) -> str:
         return self.frame.around(question.text) + question.begun
 
     def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
@@ -264,7 +264,7 @@ class Prismatic(PrismaticModel, AnswerModel):
         image = [f"image.{CAMERA}"] * patches
         rows = []
         for question in questions:
-            inside = self.tokenizer.inside(self._asked(question), *self.frame.place(question.text))
+            inside = self.tokenizer.inside(self._framed(question), *self.frame.question_span(question.text))
             labels = ["language" if is_question else "special" for is_question in inside]
             rows.append([*labels[:1], *image, *labels[1:-1]])
         longest = max(map(len, rows))

@@ -26,7 +26,7 @@ class TextFrame:
         """The whole text; the original strips white space from both ends of a question."""
         return f"{self.before}{question.strip()}{self.behind}"
 
-    def place(self, question: str) -> tuple[int, int]:
+    def question_span(self, question: str) -> tuple[int, int]:
         """The beginning and end of the question in the text."""
         return len(self.before), len(self.before) + len(question.strip())
 

@@ -63,7 +63,7 @@ def read_tile(path: Path, yaw: int = RELEASE_YAW) -> Tile:
     low, high = every.min(axis=0), every.max(axis=0)
     top = _top(meshes, float(low[2]), float(high[2]), path)
     width, depth, height = (float(extent) for extent in high - low)
-    return Tile(_seen(top, yaw, path), (width, depth, height))
+    return Tile(_render_top(top, yaw, path), (width, depth, height))
 
 
 def _meshes(scene: Any) -> Iterator[tuple[NDArray[np.float64], Any]]:
@@ -97,7 +97,7 @@ def _top(meshes: list[tuple[NDArray[np.float64], Any]], low: float, high: float,
     return _Top(xy, np.asarray(uv, np.float64)[vertices] * (1, -1) + (0, 1), mesh.visual.material)
 
 
-def _seen(top: _Top, yaw: int, path: Path) -> Image.Image:
+def _render_top(top: _Top, yaw: int, path: Path) -> Image.Image:
     texture = _texture(top.material, path)
     slope = _slope(top, path)
     pixels = np.asarray(_cut(texture, top.uv, path))

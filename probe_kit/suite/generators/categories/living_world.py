@@ -122,7 +122,7 @@ def _tiles(left: Depicted, right: Depicted, rng: np.random.Generator) -> tuple[P
     return _portrait(left, rng), _portrait(right, rng)
 
 
-def _named() -> tuple[tuple[Depicted, Depicted], ...]:
+def _animal_pairs() -> tuple[tuple[Depicted, Depicted], ...]:
     """Half of the pairs inside one family; never a whole animal beside a mere face."""
     creature_of = {creature.name: creature for creature in CREATURES}
     unlike = none_alike(LOOK_ALIKES)
@@ -144,7 +144,7 @@ def _alive_or_not(count: int) -> tuple[tuple[Depicted, Depicted], ...]:
     return spread_pairs(living + dead, lambda a, b: a.name != b.name, most=count)
 
 
-_NAMED = _named()
+_NAMED = _animal_pairs()
 LIVING_WORLD = Generator(
     category="living-world",
     pairs=_NAMED + _alive_or_not(len(_NAMED) // (_ALIVE_SHARE - 1)),

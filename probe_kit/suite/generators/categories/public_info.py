@@ -173,9 +173,9 @@ def _pairs() -> tuple[tuple[Concept, Concept], ...]:
     return among_services + among_forbidden + mixed
 
 
-def _shown(board: Board) -> str:
+def _contents_of_board(board: Board) -> str:
     shows = _SHOWS[board.icon]
     return f"picture of the {shows}" if shows else ""
 
 
-PUBLIC_INFO = Generator(category="public-info", pairs=_pairs(), tiles=_tiles, name_of=_shown)
+PUBLIC_INFO = Generator(category="public-info", pairs=_pairs(), tiles=_tiles, name_of=_contents_of_board)

@@ -81,7 +81,7 @@ def test_roles_name_what_every_position_is(model: Prismatic, observation: Observ
 def test_a_question_stands_in_the_frame_of_the_language_model(language: str, text: str) -> None:
     frame = frame_of(language)
     assert frame.around(" Why? ") == text
-    start, stop = frame.place(" Why? ")
+    start, stop = frame.question_span(" Why? ")
     assert text[start:stop] == "Why?"
 
 

@@ -1,0 +1,137 @@
+"""Names and docstrings of the package use the field's words.
+
+A name says what it holds; a docstring begins with a verb or a noun.
+"""
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[1] / "probe_kit"
+
+FILLERS = frozenset(
+    [
+        "found",
+        "one",
+        "own",
+        "place",
+        "seen",
+        "said",
+        "shown",
+        "given",
+        "there",
+        "here",
+        "beside",
+        "whole",
+        "rest",
+        "kept",
+        "asked",
+        "known",
+        "wanted",
+        "named",
+        "told",
+        "chosen",
+        "meant",
+        "taken",
+        "made",
+        "further",
+        "others",
+        "another",
+        "something",
+        "thing",
+        "things",
+        "it",
+        "them",
+        "these",
+        "those",
+        "such",
+    ]
+)
+"""Words that say nothing about the value; `episode`, `row`, `site`, `scores` do."""
+STORED = {
+    ("probe_kit/intervene/kinds/base.py", "place"),
+    ("probe_kit/intervene/kinds/erase.py", "kept"),
+    ("probe_kit/intervene/patching/attribution.py", "place"),
+    ("probe_kit/intervene/results/verdict.py", "place"),
+}
+"""Keys of stored results of interventions, which tables and the fence name so."""
+PRONOUNS = re.compile(
+    r"(what|whose|which|as|of|by|with|who|where|how|that|those|these|it|this|so|if|when|from|to|in|for|whether)\b",
+    re.IGNORECASE,
+)
+FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
+
+
+def fillers(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Lines and names of assigned variables, parameters, fields and definitions that are fillers."""
+    for node in ast.walk(tree):
+        match node:
+            case ast.Name(id=name, ctx=ast.Store()) | ast.arg(arg=name) | ast.ExceptHandler(name=str(name)):
+                pass
+            case ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name) | ast.ClassDef(name=name):
+                pass
+            case _:
+                continue
+        if name.lstrip("_") in FILLERS:
+            yield node.lineno, name
+
+
+def first_words(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Lines and first lines of docstrings that begin with a pronoun or a preposition.
+
+    The docstring of a function that returns a Boolean may begin with "Whether".
+    """
+    for node in ast.walk(tree):
+        if not isinstance(node, (ast.Module, ast.ClassDef, *FUNCTIONS)):
+            continue
+        docstring = (ast.get_docstring(node) or "").strip()
+        word = PRONOUNS.match(docstring)
+        boolean = isinstance(node, FUNCTIONS) and node.returns is not None and ast.unparse(node.returns) == "bool"
+        if word and not (boolean and word.group().lower() == "whether"):
+            yield getattr(node, "lineno", 1), docstring.splitlines()[0]
+
+
+CHECKS = {"names": fillers, "docstrings": first_words}
+
+
+@pytest.mark.parametrize("check", CHECKS)
+def test_the_package_is_written_in_the_words_of_the_field(check: str) -> None:
+    files = sorted(file.relative_to(PACKAGE.parent).as_posix() for file in PACKAGE.rglob("*.py"))
+    wrong = [
+        f"{file}:{line}: {text}"
+        for file in files
+        for line, text in CHECKS[check](ast.parse((PACKAGE.parent / file).read_text(encoding="utf-8")))
+        if (file, text) not in STORED
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "found = 1",
+        "def f(*, own): ...",
+        "for one in x: ...",
+        "[seen for seen in x]",
+        "class C:\n    kept: int",
+        "def _rest(): ...",
+        "try: ...\nexcept E as said: ...",
+    ],
+)
+def test_a_filler_is_found_wherever_a_name_is_given(line: str) -> None:
+    assert list(fillers(ast.parse(line)))
+
+
+@pytest.mark.parametrize(
+    ("first", "allowed"), [("What it is.", False), ("Of a run.", False), ("The run.", True), ("Return it.", True)]
+)
+def test_a_docstring_begins_with_a_verb_or_a_noun(first: str, allowed: bool) -> None:
+    assert list(first_words(ast.parse(f"def f():\n    '{first}'"))) == ([] if allowed else [(1, first)])
+
+
+def test_whether_is_for_booleans_alone() -> None:
+    assert not list(first_words(ast.parse("def f() -> bool:\n    'Whether it is.'")))
+    assert list(first_words(ast.parse("def f() -> int:\n    'Whether it is.'")))
