@@ -56,8 +56,10 @@ STORED = {
     ("probe_kit/intervene/kinds/erase.py", "kept"),
     ("probe_kit/intervene/patching/attribution.py", "place"),
     ("probe_kit/intervene/results/verdict.py", "place"),
+    ("probe_kit/retention/behaviour/success_rate.py", "one"),
+    ("probe_kit/retention/compare/known_used.py", "asked"),
 }
-"""Keys of stored results of interventions, which tables and the fence name so."""
+"""Keys of tables and of stored results of interventions, which the fence holds."""
 PRONOUNS = re.compile(
     r"(what|whose|which|as|of|by|with|who|where|how|that|those|these|it|this|so|if|when|from|to|in|for|whether)\b",
     re.IGNORECASE,

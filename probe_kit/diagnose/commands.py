@@ -172,7 +172,7 @@ Planned = tuple[str, Sequence[Any], list[str]]
 
 
 def _planned(name: str, typed: Mapping[str, Any], frames: int, out_folder: str | None) -> Planned:
-    """What a diagnosis of this run, or of a run that is only planned, would exchange and patch."""
+    """Return what a diagnosis of this run, or of a planned one, would exchange and patch."""
     from probe_kit.intervene.settings import has_sides
     from probe_kit.runs import open_run
 

@@ -178,7 +178,7 @@ def open_checked(
     if location is not None:
         _check_writable(location)
     source = settings.source.open(not fetch and _selects_only(settings, location))
-    source = source.asked() if isinstance(settings, AskSettings) else source
+    source = source.for_questions() if isinstance(settings, AskSettings) else source
     if decided := {name: value for name, value in source.decided().items() if name in settings.names()}:
         settings = settings.changed(**decided)
     if not loaded:

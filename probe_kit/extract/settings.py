@@ -224,7 +224,7 @@ class Settings(Part):
         calls = {"captured_calls": self.capture.captured_calls}
         return {**model, "seed": self.seed, **self.capture.model_dump(mode="json"), **calls}
 
-    def chosen(self) -> dict[str, Any]:
+    def changed_fields(self) -> dict[str, Any]:
         """The fields of all parts but the source that differ from their defaults, by name."""
         parts = [getattr(self, part) for part in _PARTS]
         values = {
@@ -429,7 +429,7 @@ def refuse(settings: Settings, names: Iterable[str], why: str) -> None:
 
     names: of fields, or NAME=VALUE where only that value has none. why: the rest of the sentence.
     """
-    changed, wrong = settings.chosen(), []
+    changed, wrong = settings.changed_fields(), []
     offered = (option for part in _PARTS for option in options_of(type(getattr(settings, part))))
     flags = {option.field: option.flag for option in offered}
     for name, _, value in (text.partition("=") for text in names):

@@ -163,8 +163,8 @@ def token_boxes(policy: "Policy", observation: Observation) -> NDArray[np.float3
         most = moved.max(axis=0)
         looks = most > ENOUGH * most.max()
         # Shares of each token's own largest change: filters blur a band into the neighbours of its token.
-        own = np.where(looks, moved / np.where(looks, most, 1.0), 0.0)
-        sees = (own > HALF) & (own >= NEARLY * own.max(axis=1, keepdims=True))
+        relative = np.where(looks, moved / np.where(looks, most, 1.0), 0.0)
+        sees = (relative > HALF) & (relative >= NEARLY * relative.max(axis=1, keepdims=True))
         first, last = sees.argmax(axis=0) / bands, 1 - sees[::-1].argmax(axis=0) / bands
         ends.append(np.where(sees.any(axis=0), [first, last], np.nan))
     (left, right), (top, bottom) = ends

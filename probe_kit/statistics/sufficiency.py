@@ -34,8 +34,8 @@ def probe_command(run: object, groups: Mapping[Any, int]) -> str:
     enough = [name for name, count in groups.items() if count >= GROUPS_FOR_PROBES]
     if not enough:
         return ""
-    chosen = "" if len(enough) == len(groups) else f" --categories {','.join(enough)}"
-    return f"probe-kit train {run}{chosen}"
+    option = "" if len(enough) == len(groups) else f" --categories {','.join(enough)}"
+    return f"probe-kit train {run}{option}"
 
 
 def least_probe_p(groups: int) -> float:

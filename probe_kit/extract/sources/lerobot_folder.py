@@ -126,7 +126,7 @@ class LeRobotFolder:
 
     # -- checks ----------------------------------------------------------------------------------------
 
-    def chosen(self, episodes: Sequence[int] | None) -> list[int]:
+    def select_episodes(self, episodes: Sequence[int] | None) -> list[int]:
         """The episodes that were asked for, all for None. Raises RecordingError for one that is not there."""
         count = len(self.lengths)
         if outside := [number for number in episodes or () if number >= count]:

@@ -67,7 +67,7 @@ class RecordingSource(Source[LeRobotSource]):
     def __init__(self, settings: LeRobotSource, folder: LeRobotFolder, stretch: int = MOST_FRAMES) -> None:
         """Raises RecordingError for an episode that is not there."""
         self.settings, self.folder, self.stretch = settings, folder, stretch
-        self.episodes = tuple(folder.chosen(settings.episodes))
+        self.episodes = tuple(folder.select_episodes(settings.episodes))
         self.reader = LeRobotFrames(folder)
         self.prediction: tuple[int, int] = (0, 0)
         self.other_actions: str | None = None
@@ -86,7 +86,7 @@ class RecordingSource(Source[LeRobotSource]):
         opened.folder.check_files(opened.episodes, ())
         return opened
 
-    def asked(self) -> Self:
+    def for_questions(self) -> Self:
         """Return the same recordings with a row per chosen frame."""
         return type(self)(self.settings, self.folder, 1)
 

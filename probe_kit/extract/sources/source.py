@@ -115,7 +115,7 @@ class Source[Chosen: SourceSettings](ABC):
     def open(cls, settings: Chosen, selects_only: bool) -> Self:
         """Open the source that settings choose; see `SourceSettings.open`."""
 
-    def asked(self) -> Self:
+    def for_questions(self) -> Self:
         """Return the source of which questions are asked: one row is one question, about its first observation."""
         return self
 

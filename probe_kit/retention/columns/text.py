@@ -23,7 +23,7 @@ _REGIMES = {
 }
 
 
-def place(layer: int | None, iteration: int | None = None, ties: int | None = None) -> str:
+def site_text(layer: int | None, iteration: int | None = None, ties: int | None = None) -> str:
     """Return where the best site is: its layer, after @ the iteration where the stream has several.
 
     After + stands how many other sites are as good.
@@ -72,12 +72,12 @@ def published_value(row: RetentionRow) -> str:
 
 def backbone_place(row: RetentionRow) -> str:
     """Return where the backbone's best site is."""
-    return place(row.backbone.layer, None, row.backbone.ties)
+    return site_text(row.backbone.layer, None, row.backbone.ties)
 
 
 def action_place(row: RetentionRow) -> str:
     """Return where the best site of the action is."""
-    return place(row.action.layer, row.action.iteration, row.action.ties)
+    return site_text(row.action.layer, row.action.iteration, row.action.ties)
 
 
 def call_words(call: int) -> str:
