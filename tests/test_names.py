@@ -58,8 +58,9 @@ STORED = {
     ("probe_kit/intervene/results/verdict.py", "place"),
     ("probe_kit/retention/behaviour/success_rate.py", "one"),
     ("probe_kit/retention/compare/known_used.py", "asked"),
+    ("probe_kit/suite/generators/categories/attribute.py", "thing"),
 }
-"""Keys of tables and of stored results of interventions, which the fence holds."""
+"""Keys of tables and of stored results, which the fence holds, and a field that is hashed into items."""
 PRONOUNS = re.compile(
     r"(what|whose|which|as|of|by|with|who|where|how|that|those|these|it|this|so|if|when|from|to|in|for|whether)\b",
     re.IGNORECASE,

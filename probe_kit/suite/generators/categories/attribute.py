@@ -251,12 +251,12 @@ _THINGS = {name: gradable for gradable in GRADABLES for name in (gradable.more, 
 class Sample(Tile):
     """Everything the picture is drawn from: a thing, named by its more, with this much of its property."""
 
-    noun: str
+    thing: str
     level: float
     placement: Placement
 
     def _paint(self, canvas: Canvas) -> None:
-        _THINGS[self.noun].draw(canvas.pen(self.placement), self.level, self.ink)
+        _THINGS[self.thing].draw(canvas.pen(self.placement), self.level, self.ink)
 
 
 def _sample(gradable: Gradable, level: float, rng: np.random.Generator) -> Sample:
