@@ -9,10 +9,10 @@ from probe_kit._tables.numbers import number, percent, points, with_limits
 from probe_kit._tables.table import Table
 from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour.vlm_answers import ask_of
+from probe_kit.retention.columns.text import spell
 from probe_kit.retention.compare.origins import checkpoint_of, split_checkpoint
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.retention.table import RetentionTable
-from probe_kit.retention.text import spell
 from probe_kit.train.data.run_reader import RunReader
 
 _COLUMNS = {

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from probe_kit.errors import NoInterventionsError
 from probe_kit.intervene.kinds.attention import ACTION, CORRECT, OTHER, AttentionShares, Axis, stored_attention
 from probe_kit.intervene.places import ALL, TILE_ROLES
+from probe_kit.retention.columns.text import spell
 from probe_kit.retention.displays.base.panels import Panelled, in_panels
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure
 from probe_kit.retention.displays.base.style import layer_axis, series
-from probe_kit.retention.text import spell
 from probe_kit.train.data.run_reader import RunReader
 
 if TYPE_CHECKING:

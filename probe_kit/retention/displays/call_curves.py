@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Self
 from probe_kit.env.scoring.events import EVENTS
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import label_of
+from probe_kit.retention.columns.text import spell
 from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import (
@@ -37,7 +38,6 @@ from probe_kit.retention.estimators.by_call import (
     EventTimes,
     event_calls,
 )
-from probe_kit.retention.text import spell
 from probe_kit.statistics.estimates.balanced import CHANCE
 from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.probe_results import ProbeResults

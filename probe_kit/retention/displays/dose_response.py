@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import NoInterventionsError
 from probe_kit.intervene.kinds.site_maps import PatchEffect, stored_steering
+from probe_kit.retention.columns.text import spell
 from probe_kit.retention.displays.base.panels import Panelled, draw_series, in_panels
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure
 from probe_kit.retention.displays.base.style import GREY, series
-from probe_kit.retention.text import spell
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.data.run_reader import RunReader
 

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from probe_kit.env.scoring.rules import DEFAULT_RULE, Box, Disc, OutcomeRule, ReleasedOnTile, rule_of
 from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour.success_rate import capture_only
+from probe_kit.retention.columns.text import spell
 from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure
 from probe_kit.retention.displays.base.style import GREEN, VERMILION, axes_for, caption, legend_above, panels
-from probe_kit.retention.text import spell
 from probe_kit.train.data.run_reader import RunReader
 
 if TYPE_CHECKING:

@@ -10,14 +10,13 @@ from probe_kit._tables.heat import HEAT, heat_colour
 from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour.success_rate import Regime
 from probe_kit.retention.columns.modes import RATE, Modes, modes_of
-from probe_kit.retention.columns.text import model_name, once_per_category
+from probe_kit.retention.columns.text import model_name, once_per_category, spell
 from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure, figure_of
 from probe_kit.retention.displays.base.style import axes_for, caption, legend_above
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.retention.table import RetentionTable
-from probe_kit.retention.text import spell
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

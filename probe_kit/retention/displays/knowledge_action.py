@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Literal, Self
 
 from probe_kit.errors import UsageError
 from probe_kit.retention.columns.modes import RATE, Modes, modes_of
-from probe_kit.retention.columns.text import model_name
+from probe_kit.retention.columns.text import model_name, spell
 from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.label_placement import place_labels
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
@@ -22,7 +22,6 @@ from probe_kit.retention.displays.base.style import (
 )
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.retention.table import RetentionTable
-from probe_kit.retention.text import spell
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

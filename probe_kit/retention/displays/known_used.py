@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Self
 
+from probe_kit.retention.columns.text import spell
 from probe_kit.retention.compare.known_used import KnownUsedTable
 from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure, figure_of
@@ -22,7 +23,6 @@ from probe_kit.retention.displays.base.style import (
     plain,
 )
 from probe_kit.retention.joins import joins_of
-from probe_kit.retention.text import spell
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

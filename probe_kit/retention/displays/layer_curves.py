@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.retention.choices import Iterations
+from probe_kit.retention.columns.text import spell
 from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import (
@@ -35,7 +36,6 @@ from probe_kit.retention.displays.base.style import (
 )
 from probe_kit.retention.displays.stream_curve import LayerLine, StreamCurve
 from probe_kit.retention.rows.row import EVERYWHERE
-from probe_kit.retention.text import spell
 from probe_kit.train.choices import SIDES
 from probe_kit.train.crossval.task_scores import METRICS
 from probe_kit.train.results.probe_results import ProbeResults

@@ -6,11 +6,11 @@ from functools import partial
 from typing import TYPE_CHECKING, Self
 
 from probe_kit.retention.behaviour.success_rate import PairedItems, capture_only, paired_items
+from probe_kit.retention.columns.text import spell
 from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure, figure_of
 from probe_kit.retention.displays.base.style import GREEN, SKY, VERMILION, axes_for, caption, legend_above, plain
-from probe_kit.retention.text import spell
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.data.run_reader import RunReader
 

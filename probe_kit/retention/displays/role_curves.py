@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Self
 from probe_kit.errors import UnknownSiteError
 from probe_kit.hooks.contract.sites import label_of
 from probe_kit.retention.choices import Iterations
+from probe_kit.retention.columns.text import spell
 from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure
@@ -25,7 +26,6 @@ from probe_kit.retention.displays.base.style import (
 )
 from probe_kit.retention.displays.layer_curves import draw_line
 from probe_kit.retention.displays.stream_curve import StreamCurve
-from probe_kit.retention.text import spell
 from probe_kit.statistics.estimates.balanced import CHANCE
 from probe_kit.train.results.probe_results import ProbeResults
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from probe_kit.errors import UsageError
 from probe_kit.retention.choices import Iterations
+from probe_kit.retention.columns.text import spell
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import (
     DOTS,
@@ -31,7 +32,6 @@ from probe_kit.retention.displays.base.style import (
 from probe_kit.retention.displays.iteration_maps import IterationMapDisplay, draw_legend, draw_map, draw_scale
 from probe_kit.retention.displays.layer_curves import draw_line
 from probe_kit.retention.displays.stream_curve import LayerLine, StreamCurve
-from probe_kit.retention.text import spell
 from probe_kit.statistics.estimates.balanced import CHANCE
 from probe_kit.train.results.probe_results import ProbeResults
 

@@ -12,12 +12,12 @@ from probe_kit.errors import NoInterventionsError
 from probe_kit.hooks.contract.sites import KV_STREAM
 from probe_kit.intervene.kinds.site_maps import BACKBONE, PatchEffect, stored_site_effects
 from probe_kit.intervene.places import ALL, PlaceName
+from probe_kit.retention.columns.text import spell
 from probe_kit.retention.displays.base.panels import Panelled, draw_series, in_panels
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure
 from probe_kit.retention.displays.base.selection import scores_of
 from probe_kit.retention.displays.base.style import layer_axis, series
-from probe_kit.retention.text import spell
 from probe_kit.statistics.estimates.balanced import CHANCE
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.data.run_reader import RunReader

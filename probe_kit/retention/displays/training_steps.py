@@ -5,11 +5,11 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from probe_kit._tables.table import Table
+from probe_kit.retention.columns.text import spell
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import ReportFigure
 from probe_kit.retention.displays.base.style import caption, legend_above, panels, plain, series
 from probe_kit.retention.rows.row import MEAN
-from probe_kit.retention.text import spell
 from probe_kit.statistics.estimates.balanced import CHANCE
 
 if TYPE_CHECKING:

@@ -6,13 +6,13 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from probe_kit.retention.columns.modes import modes_of
+from probe_kit.retention.columns.text import spell
 from probe_kit.retention.displays.base.report_figure import ONLY_FILLED, ReportFigure
 from probe_kit.retention.displays.base.style import axes_for, legend_above
 from probe_kit.retention.displays.layer_curves import LayerCurveDisplay
 from probe_kit.retention.report.episodes import EpisodeGrid
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.retention.table import RetentionTable
-from probe_kit.retention.text import spell
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -4,12 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from probe_kit._system.counting import counted
-from probe_kit._tables.numbers import percent
+from probe_kit._tables.numbers import p_text, percent
 from probe_kit.retention.columns.modes import RATE, modes_of
 from probe_kit.retention.columns.sentences import chance_only
-from probe_kit.retention.columns.text import is_vlm, model_name
+from probe_kit.retention.columns.text import is_vlm, model_name, spell
 from probe_kit.retention.rows.row import MEAN, RetentionRow
-from probe_kit.retention.text import spell
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.results.control_scores import Exceeds
 
@@ -149,7 +148,8 @@ def _clear_words(p: float | None, exceeds: Exceeds) -> str:
     unshown = " or ".join(missed if clear else ["chance", *missed])
     words = ["above chance"] if clear else []
     words += [f"not shown to beat {unshown}"] if unshown else []
-    return f"{' but '.join(words)}, p = {p:.3f}"
+    equals = "" if p < 0.001 else "= "
+    return f"{' but '.join(words)}, p {equals}{p_text(p)}"
 
 
 def _names(part: Sequence[RetentionRow], rows: Sequence[RetentionRow]) -> str:

@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING
 
+from probe_kit._tables.numbers import p_text
 from probe_kit._terminal.notebook import rows_html
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.crossval.task_scores import METRICS
@@ -43,11 +44,6 @@ def score_text(value: float | None, is_side: bool) -> str:
     if value is None or value != value:
         return "–"
     return f"{100 * value:.1f}" if is_side else f"{value:.3f}"
-
-
-def p_text(value: float) -> str:
-    """Return a p-value; a dash for none."""
-    return "–" if value != value else f"{value:.3f}"
 
 
 def results_html(settings: ProbeSettings, label: str, scores: "pd.DataFrame") -> str:

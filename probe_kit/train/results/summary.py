@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from probe_kit._system.counting import counted, enumerated
+from probe_kit._tables.numbers import p_text
 from probe_kit._tables.table import Table
 from probe_kit.hooks.contract.sites import label_of
 from probe_kit.suite.categories import category_of
@@ -104,7 +105,7 @@ def _control_cells(control: ControlScore, is_side: bool) -> tuple[str, ...]:
     score, low, high, chance = (
         score_text(value, is_side) for value in (control.score, *control.ci, control.chance)
     )
-    p = "–" if control.p is None else f"{control.p:.3f} (this control alone)"
+    p = "–" if control.p is None else f"{p_text(control.p)} (this control alone)"
     return "", f"{score} [{low}, {high}]", chance, p, "", str(control.n), ""
 
 
