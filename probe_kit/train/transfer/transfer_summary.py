@@ -3,11 +3,12 @@
 from typing import TYPE_CHECKING
 
 from probe_kit._system.counting import counted
+from probe_kit._tables.numbers import p_text
 from probe_kit._tables.table import Table
 from probe_kit.hooks.contract.sites import label_of
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.crossval.task_scores import METRICS
-from probe_kit.train.results.best_sites import p_text, score_text
+from probe_kit.train.results.best_sites import score_text
 from probe_kit.train.transfer.transfer_results import TransferResults
 
 if TYPE_CHECKING:
