@@ -129,7 +129,11 @@ class Content:
     def sentences(self) -> tuple[str, ...]:
         """The notes as sentences, without the terms of marks such as `*` that no cell has."""
         text = " ".join(cell for row in self.texts for cell in row)
-        notes = (_without_terms(note, lambda term: not term.isalnum() and term not in text) for note in self.notes)
+
+        def is_unused_mark(term: str) -> bool:
+            return not any(map(str.isalnum, term)) and term not in text
+
+        notes = (_without_terms(note, is_unused_mark) for note in self.notes)
         return tuple(map(_sentence, filter(None, notes)))
 
     @property

@@ -278,5 +278,6 @@ def test_a_legend_explains_only_the_columns_that_are_there() -> None:
 
 def test_a_mark_that_no_cell_has_is_not_explained() -> None:
     for cell, notes in (("0.9*", ("*: by construction.",)), ("0.9", ())):
-        table = Table.of("Edits", ("edit", "effect"), [("a", cell)], notes=["*: by construction"])
-        assert table.sentences == notes
+        legend = ["*: by construction", "net rate: flips"]
+        table = Table.of("Edits", ("edit", "net rate"), [("a", cell)], notes=legend)
+        assert table.sentences == (*notes, "Net rate: flips.")
