@@ -210,7 +210,7 @@ def intervene(
     """
     from probe_kit.hooks.contract.options import read_pairs as read_options
     from probe_kit.intervene import ReplaySource
-    from probe_kit.intervene.sessions.pair_table import read_pairs
+    from probe_kit.intervene.pairs import read_pairs
     from probe_kit.runs import open_run
 
     opened = open_run(run, allow_partial=partial).in_wording(wording)

@@ -2,13 +2,17 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Union
 
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._system.text_tables import open_table
+from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.observation import Observation
+from probe_kit.intervene.settings import PairRow
 from probe_kit.suite.items import Side
 
 if TYPE_CHECKING:
@@ -56,3 +60,35 @@ def groups_and_items(pairs: Sequence[Pair]) -> tuple[list[str], list[str]]:
     """The group and the item of every pair; a pair without one is alone in its own."""
     groups = [pair.group or f"pair {at}" for at, pair in enumerate(pairs)]
     return groups, [pair.item or f"{groups[at]}, pair {at}" for at, pair in enumerate(pairs)]
+
+
+# -- tables of the user's own --------------------------------------------------------------------------------
+
+PAIR_COLUMNS = ("episode", "frame", "donor_episode", "donor_frame")
+
+
+def read_pairs(path: Path) -> tuple[PairRow, ...]:
+    """Return the rows of a table with the columns episode, frame, donor_episode, donor_frame.
+
+    Raises UsageError.
+    """
+    table = open_table(path, PAIR_COLUMNS)
+    if missing := [name for name in PAIR_COLUMNS if name not in table.names]:
+        raise UsageError(f"{path} has no column {missing[0]!r}; expected {', '.join(PAIR_COLUMNS)}")
+    rows = []
+    for line, cells in table.rows(PAIR_COLUMNS):
+        texts = [cells[name] or "" for name in PAIR_COLUMNS]
+        for column, text in zip(PAIR_COLUMNS[1::2], texts[1::2], strict=True):
+            if not text.isdecimal():
+                raise UsageError(
+                    f"{table.where(line, column)} is {text!r}; expected the number of a frame, from 0"
+                )
+        rows.append((_episode(texts[0]), int(texts[1]), _episode(texts[2]), int(texts[3])))
+    if not rows:
+        raise UsageError(f"{path} names no pair; expected a line per pair")
+    return tuple(rows)
+
+
+def _episode(text: str) -> str:
+    """Return the id of a recorded episode that is named by its number."""
+    return f"episode-{int(text):06d}" if text.isdecimal() else text

@@ -16,12 +16,11 @@ from probe_kit.extract import ExtractSettings, LeRobotSource, extract_run
 from probe_kit.hooks import Observation
 from probe_kit.intervene import ImageSwap, Interchange, ReplaySource, run_intervention
 from probe_kit.intervene.kinds.site_maps import patch_effects
-from probe_kit.intervene.pairs import Pair
+from probe_kit.intervene.pairs import Pair, read_pairs
 from probe_kit.intervene.replay import replay
 from probe_kit.intervene.runner import outcomes_of
 from probe_kit.intervene.sessions.observed import ObservedSession
 from probe_kit.intervene.sessions.opening import open_session
-from probe_kit.intervene.sessions.pair_table import read_pairs
 from probe_kit.intervene.sessions.scene import SceneSession
 from probe_kit.intervene.spread import displacements_toward, sizes, spread_of
 from probe_kit.runs import Run, open_run
