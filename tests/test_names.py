@@ -50,7 +50,7 @@ FILLERS = frozenset(
         "such",
     ]
 )
-"""Words that say nothing about the value; `episode`, `row`, `site`, `scores` do."""
+"""Words that do not describe the value; `episode`, `row`, `site`, `scores` do."""
 STORED = {
     ("probe_kit/intervene/kinds/base.py", "place"),
     ("probe_kit/intervene/kinds/erase.py", "kept"),
