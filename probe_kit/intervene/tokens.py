@@ -167,8 +167,8 @@ def token_boxes(policy: "Policy", observation: Observation) -> NDArray[np.float3
         sees = (relative > HALF) & (relative >= NEARLY * relative.max(axis=1, keepdims=True))
         first, last = sees.argmax(axis=0) / bands, 1 - sees[::-1].argmax(axis=0) / bands
         ends.append(np.where(sees.any(axis=0), [first, last], np.nan))
-    (left, right), (top, bottom) = ends
-    return np.stack([left, top, right, bottom], axis=1).astype(np.float32)
+    (x_first, x_last), (y_first, y_last) = ends
+    return np.stack([x_first, y_first, x_last, y_last], axis=1).astype(np.float32)
 
 
 def patch_embeddings(policy: "Policy", observation: Observation) -> NDArray[np.float32]:
