@@ -154,7 +154,7 @@ def test_paraphrases_are_read_by_the_rules_of_all_tables_and_do_not_contradict(t
 
 
 def test_a_target_is_probed_at_the_sites_that_are_patched(folder: Path, run: Run) -> None:
-    answer = run_command(folder / "run", *FRAMES, "--target", "correct", "--format", "json")
+    answer = run_command(folder / "run", *FRAMES, "--target", "side.correct", "--format", "json")
     knowledge = json.loads(answer.stdout)["knowledge"]
     sites = {site["name"]: site for site in knowledge["sites"]}
     assert sites["backbone.00"]["score"] < sites["backbone.03"]["score"]
