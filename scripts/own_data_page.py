@@ -7,6 +7,7 @@ the report of these labels go to FOLDER too.
 
 import argparse
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 import probe_kit as pk
 from probe_kit._tables.numbers import number, with_limits
-from probe_kit.extract.rollout.controllers import PolicyController, Turn
+from probe_kit.extract.rollout.controllers import Inference, PolicyController, Turn
 from probe_kit.hooks import Observation
 from probe_kit.hooks.contract.sites import label_of
 from probe_kit.retention import RetentionTable, retention_table
@@ -65,22 +66,21 @@ def main() -> None:
 def play(where: Path) -> tuple[pk.Run, list[list[Observation]]]:
     """A run in scenes, and what the policy was shown at every inference of its episodes."""
     shown: dict[int, list[Observation]] = {}
-    act = PolicyController.act
+    infer = PolicyController.infer
 
-    def watched(controller: PolicyController, turns: Any) -> Any:
+    def watched(self: PolicyController, turns: Sequence[Turn]) -> list[Inference]:
         for turn in turns:
-            assert isinstance(turn, Turn)
-            shown.setdefault(turn.seed, []).append(turn.observation)
-        return act(controller, turns)
+            shown.setdefault(turn.row.policy_seed, []).append(turn.observation)
+        return infer(self, turns)
 
-    PolicyController.act = watched  # type: ignore[method-assign]
+    PolicyController.infer = watched  # type: ignore[method-assign]
     try:
-        settings = pk.ExtractSettings.from_options(
+        settings = pk.ExtractSettings(
             model="pi0-tiny", categories=("color",), items=ITEMS, captured_calls="all", picture_size=(320, 240)
         )
         run = pk.extract_run(settings, where)
     finally:
-        PolicyController.act = act  # type: ignore[method-assign]
+        PolicyController.infer = infer  # type: ignore[method-assign]
     return run, [shown[int(seed)] for seed in run.episodes["policy_seed"]]
 
 
