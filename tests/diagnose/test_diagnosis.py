@@ -29,7 +29,7 @@ from tests.support.lerobot_recordings import CAMERA, write_recording
 from tests.support.made_once import made_once
 from tests.support.pi0_organisms import ORGANISMS, edited, make_deaf
 
-FRAMES = ("--frames", "12")
+FRAMES = ("--frames", "8")
 
 
 def run_command(*arguments: object) -> Any:
@@ -39,7 +39,7 @@ def run_command(*arguments: object) -> Any:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     def make(made: Path) -> None:
-        new = ("--categories", "color", "--items", 24, "--env-workers", 0, "--out", made / "run")
+        new = ("--categories", "color", "--items", 16, "--env-workers", 0, "--out", made / "run")
         answer = run_command("pi0-tiny", *new, *FRAMES, "--html", made / "why.html", "--format", "json")
         assert answer.exit_code == 0, answer.output
         (made / "first.json").write_text(answer.stdout, encoding="utf-8")
@@ -62,7 +62,7 @@ def test_words_and_pictures_decide_color_and_pass_by_one_block(diagnosis: dict[s
     inputs = {one["name"]: one for one in diagnosis["inputs"]}
     assert inputs["state"]["verdict"] == "not varied"
     for name in ("instruction", "picture"):
-        assert inputs[name]["verdict"] in ("decides", "moves"), "12 frames do not always tell them apart"
+        assert inputs[name]["verdict"] in ("decides", "moves"), "8 frames do not always tell them apart"
         assert inputs[name]["share"] > 0.5
     carried = {site["name"]: site["carried"] for site in inputs["instruction"]["passage"]}
     assert carried["kv.02"] > 0.9
@@ -123,18 +123,19 @@ def test_paraphrases_must_differ(tmp_path: Path, folder: Path) -> None:
     assert "line 2" in answer.output
 
 
+@pytest.mark.slow
 def test_recordings_of_the_same_frames_have_the_same_diagnosis(run: Run, tmp_path: Path) -> None:
     pytest.importorskip("lerobot.datasets.lerobot_dataset", reason="the extra `datasets` is not installed")
     with open_session(run, ReplaySource()) as session, session.ready():
-        frames = frames_of(session, 12)
+        frames = frames_of(session, 8)
     write_recording(tmp_path / "frames", [[frame.observation] for frame in frames])
     source = LeRobotSource(str(tmp_path / "frames"), cameras={"base": CAMERA})
     recorded = extract_run(ExtractSettings("pi0-tiny", source=source), tmp_path / "run")
-    diagnosis = diagnose_run(recorded, frames=12)
+    diagnosis = diagnose_run(recorded, frames=8)
     carried = {site.name: site.carried for site in diagnosis.inputs[0].passage}
     assert carried["kv.02"] > 0.9
     assert carried["backbone.03"] == 0
-    assert (diagnosis.n_frames, diagnosis.n_groups) == (12, 12)
+    assert (diagnosis.n_frames, diagnosis.n_groups) == (8, 8)
     shares = {diagnosed.name: diagnosed.share for diagnosed in diagnosis.inputs}
     assert shares["instruction"] > 0.5
     assert shares["picture"] > 0.5
@@ -153,6 +154,7 @@ def test_paraphrases_are_read_by_the_rules_of_all_tables_and_do_not_contradict(t
 # -- knowledge and the base -----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_target_is_probed_at_the_sites_that_are_patched(folder: Path, run: Run) -> None:
     answer = run_command(folder / "run", *FRAMES, "--target", "side.correct", "--format", "json")
     knowledge = json.loads(answer.stdout)["knowledge"]
@@ -163,6 +165,7 @@ def test_a_target_is_probed_at_the_sites_that_are_patched(folder: Path, run: Run
     assert pk.load_results(run).key == knowledge["key"]
 
 
+@pytest.mark.slow
 def test_what_no_site_knows_is_told_from_what_is_lost(folder: Path, tmp_path: Path) -> None:
     episodes = pk.open_run(folder / "run").episodes
     groups = {group: number for number, group in enumerate(sorted(set(episodes["group_id"])))}
@@ -191,9 +194,10 @@ def deaf_since(checkpoint: str | None) -> LoadPolicy:
     return load
 
 
+@pytest.mark.slow
 def test_what_fine_tuning_lost_is_found_in_the_same_pairs_of_the_base(run: Run) -> None:
     compared = diagnose_run(
-        run, frames=12, inputs=["instruction"], inside=False, base="before", load=deaf_since(None), seed=3
+        run, frames=8, inputs=["instruction"], inside=False, base="before", load=deaf_since(None), seed=3
     )
     (words,) = compared.inputs
     assert words.base is not None
@@ -228,13 +232,13 @@ def verdicts(diagnosis: Diagnosis) -> dict[str, str]:
 
 @pytest.mark.parametrize(
     "name",
-    ["blind", "deaf inside", *(pytest.param(name, marks=pytest.mark.slow) for name in ("deaf", "state only"))],
+    ["blind", *(pytest.param(name, marks=pytest.mark.slow) for name in ("deaf", "deaf inside", "state only"))],
 )
 def test_the_loss_in_an_organism_is_found_and_where_it_is(run: Run, name: str) -> None:
     organism = ORGANISMS[name]
     diagnosis = diagnose_run(
         run,
-        frames=12,
+        frames=8,
         inputs=tuple(organism.where),
         load=edited(organism.edit),
         # The weights that a diagnosis is stored under are those before the edit: the seed keeps organisms apart.

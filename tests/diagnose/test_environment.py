@@ -32,6 +32,7 @@ def played(name: str, folder: Path) -> Run:
     return extract_run(ExtractSettings("pi0-tiny", source=source, env_workers=0, execute=1), folder / "run")
 
 
+@pytest.mark.slow
 def test_words_pictures_and_state_of_an_environment_are_told_apart(tmp_path: Path) -> None:
     diagnosis = diagnose_run(played("ReachEnv", tmp_path), frames=12, inside=False)
     assert [diagnosed.name for diagnosed in diagnosis.inputs] == ["instruction", "picture", "state"]
