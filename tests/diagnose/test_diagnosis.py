@@ -53,6 +53,13 @@ def run(folder: Path) -> Run:
 
 
 @pytest.fixture(scope="module")
+def run_of_many(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """A run of enough groups for probes, and for a difference of two checkpoints."""
+    settings = ExtractSettings("pi0-tiny", categories=("color",), items=24, capture_only=True, env_workers=0)
+    return extract_run(settings, tmp_path_factory.mktemp("many") / "run")
+
+
+@pytest.fixture(scope="module")
 def diagnosis(folder: Path) -> dict[str, Any]:
     answer: dict[str, Any] = json.loads((folder / "first.json").read_text(encoding="utf-8"))
     return answer
@@ -155,25 +162,25 @@ def test_paraphrases_are_read_by_the_rules_of_all_tables_and_do_not_contradict(t
 
 
 @pytest.mark.slow
-def test_a_target_is_probed_at_the_sites_that_are_patched(folder: Path, run: Run) -> None:
-    answer = run_command(folder / "run", *FRAMES, "--target", "side.correct", "--format", "json")
+def test_a_target_is_probed_at_the_sites_that_are_patched(run_of_many: Run) -> None:
+    answer = run_command(run_of_many.location, *FRAMES, "--target", "side.correct", "--format", "json")
     knowledge = json.loads(answer.stdout)["knowledge"]
     sites = {site["name"]: site for site in knowledge["sites"]}
     assert sites["backbone.00"]["score"] < sites["backbone.03"]["score"]
     assert sites["expert.03"]["signal"], "the side decides the action"
     assert set(sites) < {site["name"] for site in json.loads(answer.stdout)["inputs"][0]["passage"]}, "and kv"
-    assert pk.load_results(run).key == knowledge["key"]
+    assert pk.load_results(run_of_many).key == knowledge["key"]
 
 
 @pytest.mark.slow
-def test_what_no_site_knows_is_told_from_what_is_lost(folder: Path, tmp_path: Path) -> None:
-    episodes = pk.open_run(folder / "run").episodes
+def test_what_no_site_knows_is_told_from_what_is_lost(run_of_many: Run, tmp_path: Path) -> None:
+    episodes = run_of_many.episodes
     groups = {group: number for number, group in enumerate(sorted(set(episodes["group_id"])))}
     coin = ["heads" if derive_seed("coin", groups[group]) % 2 else "tails" for group in episodes["group_id"]]
     table = tmp_path / "coin.csv"
     episodes[["episode_id"]].assign(coin=coin).to_csv(table, index=False)
     new = ("--target", "coin", "--labels", table, "--no-inside")
-    answer = run_command(folder / "run", *FRAMES, *new)
+    answer = run_command(run_of_many.location, *FRAMES, *new)
     assert answer.exit_code == 0, answer.output
     assert "coin is never known" in " ".join(answer.output.split())
 
@@ -195,9 +202,9 @@ def deaf_since(checkpoint: str | None) -> LoadPolicy:
 
 
 @pytest.mark.slow
-def test_what_fine_tuning_lost_is_found_in_the_same_pairs_of_the_base(run: Run) -> None:
+def test_what_fine_tuning_lost_is_found_in_the_same_pairs_of_the_base(run_of_many: Run) -> None:
     compared = diagnose_run(
-        run, frames=8, inputs=["instruction"], inside=False, base="before", load=deaf_since(None), seed=3
+        run_of_many, frames=12, inputs=["instruction"], inside=False, base="before", load=deaf_since(None), seed=3
     )
     (words,) = compared.inputs
     assert words.base is not None
