@@ -17,7 +17,7 @@ _HALF = re.compile(r"\\u[dD][89a-fA-F]")
 
 
 def parse_json(content: bytes | str, **options: Any) -> Any:
-    """The value. further: hooks of `json.loads`.
+    """The value. options: hooks of `json.loads`.
 
     Raises ValueError for text that is not UTF-8 or JSON, nests too deeply, has half characters, repeats a key, or
     may hold more than `MOST_VALUES` values.

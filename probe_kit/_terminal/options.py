@@ -51,7 +51,7 @@ NAMED: Any = LISTED | {"parser": read_categories}
 
 
 def check_no_others(typed: Mapping[str, object], what: str = "labels of your own") -> None:
-    """Raise UsageError for an option that does not go with `what`. given: options, with whether they are given."""
+    """Raise UsageError for an option that does not go with `what`. typed: whether each option was typed."""
     if wrong := [name for name, value in typed.items() if value]:
         raise UsageError(f"{wrong[0]} is not for {what}; leave it out")
 

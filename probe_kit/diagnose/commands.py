@@ -90,7 +90,7 @@ def diagnose(
     probe-kit diagnose pi0-tiny --categories color
     probe-kit diagnose pi0 --checkpoint DIR --dataset FOLDER --require instruction
     probe-kit diagnose pi0 --checkpoint DIR --dataset FOLDER --base lerobot/pi0_base
-    probe-kit diagnose runs/mine --target correct
+    probe-kit diagnose runs/mine --target side.correct
     """
     from probe_kit.diagnose.diagnosis import diagnose_run
     from probe_kit.diagnose.paraphrases import read_paraphrases

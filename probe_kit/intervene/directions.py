@@ -323,7 +323,7 @@ def _direction(training: NDArray[np.float64], is_left: NDArray[np.bool_], direct
 def _control(
     training: NDArray[np.float64], directions: list[NDArray[np.float64]], draw: np.random.Generator
 ) -> NDArray[np.float64]:
-    """(D,) of length 1, drawn from the training data's covariance and orthogonal to `others`."""
+    """(D,) of length 1, drawn from the training data's covariance and orthogonal to `directions`."""
     centred = training - training.mean(axis=0)
     drawn = centred.T @ draw.normal(size=len(centred))
     basis, _ = np.linalg.qr(np.stack(directions, axis=1))

@@ -98,7 +98,7 @@ class ConditionOutcomes:
         return self.of_episodes(self.categories == category)
 
     def of_episodes(self, selected: NDArray[np.bool_]) -> "ConditionOutcomes":
-        """Some of the episodes. chosen: (E,)."""
+        """Some of the episodes. selected: (E,)."""
         axes = dict.fromkeys(BY_CONDITION, 1)
         cut: dict[str, Any] = {
             name: np.compress(selected, value, axes.get(name, 0))
@@ -178,7 +178,7 @@ def save(
     certificate: Mapping[str, Any],
     extra_files: Mapping[str, bytes] = MappingProxyType({}),
 ) -> None:
-    """Write `interventions/<key>/`, all or nothing; what is there is kept. further: other files, by name."""
+    """Write `interventions/<key>/`, all or nothing; what is there is kept. extra_files: by name."""
     if is_stored(run, key):
         tidy_bundle(run, INTERVENTIONS, key)
         return

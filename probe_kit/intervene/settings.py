@@ -10,6 +10,7 @@ from probe_kit.runs.reader import SIDE
 from probe_kit.runs.run import Run
 
 FORMAT = 2  # raise when stored numbers would be others
+DONORS = 2  # the rule of `draw_donors`; raise when it gives other donors
 FIRST_CHUNK: Readout = "first-chunk"
 PER_STEP: Readout = "per-step"
 
@@ -100,7 +101,8 @@ def settings_of(intervention: Asked, run: Run) -> dict[str, Any]:
 
 
 def _pairs_of(choice: PairChoice) -> dict[str, Any]:
-    return {"vary": choice.varied, "frames": choice.frames, "pairs": [list(row) for row in choice.pairs]}
+    drawn = {} if choice.pairs else {"donors": DONORS}
+    return {"vary": choice.varied, "frames": choice.frames, "pairs": [list(row) for row in choice.pairs], **drawn}
 
 
 def has_sides(run: Run) -> bool:

@@ -69,7 +69,7 @@ def _why_missing(study: LoadedStudy, table: ProbesTable, cell: Cell, run: "Run",
     of_target = [bundle for bundle in stored.values() if settings_of(bundle).target == table.target]
     if not of_target:
         return "not fitted"
-    former = asdict(settings_of(max(of_target, key=lambda bundle: bundle.times.get("asked", ""))))
+    former = asdict(settings_of(max(of_target, key=lambda bundle: bundle.times.get("requested", ""))))
     changes = [
         f"{name} {_text(former[name])} → {_text(value)}"
         for name, value in table.model_dump(include=set(_FITTED)).items()

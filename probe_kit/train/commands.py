@@ -202,7 +202,7 @@ def _transfer(
 
 
 def facts_table(inventory: "Inventory", more_lines: Mapping[str, str]) -> "Table":
-    """A run and what is stored with it. further: lines below, by name."""
+    """A run and what is stored with it. more_lines: those below, by name."""
     from rich.table import Table
 
     missing = inventory.planned - inventory.episodes

@@ -1,4 +1,4 @@
-"""Promises of the pool behind `extract --workers`, `train --jobs` and `study run --workers`."""
+"""Promises of the pool behind `extract --workers`, `train --jobs` and `study run --slots`."""
 
 import os
 import signal

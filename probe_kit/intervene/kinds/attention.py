@@ -322,7 +322,7 @@ class AttentionShares:
         return cls.from_bytes(measurement.read(ATTENTION_FILE))
 
     def only(self, selected: NDArray[np.bool_]) -> Self:
-        """Some of the inferences. chosen: (N,)."""
+        """Some of the inferences. selected: (N,)."""
         return type(self)(
             self.roles, *(getattr(self, field.name)[selected] for field in fields(self) if field.name != "roles")
         )

@@ -87,9 +87,9 @@ def patch_cells(
 ) -> Output:
     """Return the output of the clean inference with the cells' activations from the source.
 
-    along: patch only the component within the span of its rows (K, D), at every cell. rest: patch all but that
-    component. Two inferences. Raises EmptyRoleError for a role that no token has now, UsageError for a basis that
-    is not orthonormal, CaptureError for a source with another number of tokens.
+    along: patch only the component within the span of its rows (K, D), at every cell. complement: patch all but
+    that component. Two inferences. Raises EmptyRoleError for a role that no token has now, UsageError for a basis
+    that is not orthonormal, CaptureError for a source with another number of tokens.
     """
     together = as_tuple(cells)
     _, source = run_with_cache(model, pair.source, pair.seed, [cell.site_group.name for cell in together])

@@ -181,7 +181,7 @@ def sweep_cells(
     """Patch every cell, or every set of cells, of `cells` in every pair; one inference each, and two per pair.
 
     metric: of an output and what was given, such as `session.lateral_displacement`; of the same inference as the
-    patch. along, rest: see `patch_cells`. Raises UsageError without pairs, and what `patch_cells` raises.
+    patch. along, complement: see `patch_cells`. Raises UsageError without pairs, and what `patch_cells` raises.
     """
     sets = tuple(as_tuple(together) for together in cells)
     if not pairs or not sets:

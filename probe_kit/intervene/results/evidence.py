@@ -115,7 +115,7 @@ Sites = Mapping[tuple[str, str], TieAtSite]
 def tie_at_site(
     full: PatchEffect | None, along: Sequence[PatchEffect], layer: Sequence[PatchEffect] = ()
 ) -> TieAtSite:
-    """The tie at one place and role. whole: its tokens patched in full. along: within subspaces, no controls.
+    """The tie at one place and role. full: its tokens patched in full. along: within subspaces, no controls.
 
     Weights of a probe point away from what else varies, and may carry nothing of a copy that is read. That it is
     another code is said only where a direction of the class means carries nothing either.

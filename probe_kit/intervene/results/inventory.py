@@ -16,7 +16,7 @@ from probe_kit.runs.run import Run
 from probe_kit.train.data.run_reader import RunReader
 
 COMMON = frozenset(
-    {"format", "kind", "run_settings", "stamp", "weights", "wording", "categories", "items", "readout"}
+    {"format", "kind", "run_settings", "stamp", "weights", "wording", "categories", "items", "readout", "donors"}
 )
 """Settings of every intervention; the rest of its settings is its kind's own."""
 

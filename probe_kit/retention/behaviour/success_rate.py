@@ -89,7 +89,7 @@ class SuccessRate:
 def regime(
     sr: float, margin: float, share_wrong: float, share_outside: float, answers: bool = False
 ) -> tuple[Regime, str]:
-    """The regime of a success rate, and why in a few words. asked: it is one of answers, `oob` one not read."""
+    """The regime of a success rate, and why in a few words. answers: it is one of answers, `oob` one not read."""
     share = "accuracy" if answers else "SR"
     if sr > 0.5 + margin:
         return Regime.KNOWLEDGE, f"{share} {sr:.3f} is above 0.5 + Δ = {0.5 + margin:.3f}"

@@ -11,7 +11,8 @@ from probe_kit.statistics.significance import SIGNIFICANCE
 def label_finding(row: RetentionRow) -> str:
     """Return whether probes decode the label in the backbone and how much of that is left in the action."""
     if not row.retention.defined:
-        return f"{'open' if row.backbone.p_fwe is None else 'not shown'}: {_missing(row)}."
+        is_open = row.backbone.p_fwe is None or row.action.peak is None
+        return f"{'open' if is_open else 'not shown'}: {_missing(row)}."
     action = label_of(row.action.stream or "action")
     if row.action.missed:
         missed = enumerated(row.action.missed)

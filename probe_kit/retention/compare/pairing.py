@@ -48,7 +48,7 @@ def compare_runs(
 
     runs: in the order in which they were named. drawn: their rows. labels: what runs are called, by location.
     against: a run's name in tables, its folder's name or its location. vlm_vla: whether VLM runs are compared with
-    policy runs elsewhere. chosen: by location, the pairs that are compared instead, each the first minus the
+    policy runs elsewhere. pairs: by location, those that are compared instead, each the first minus the
     second. Runs of one seed and wording are compared, on the items that both have: success rates on these alone,
     probes where no run has other items.
     Raises UsageError for a name that is none of the runs, or several.
@@ -125,7 +125,7 @@ def compare_with_vlms(
     """Return every VLM run minus every acting one that it can be compared with, in answers and success alone.
 
     A policy whose network grew from weights that were asked is not compared with VLMs of other weights. names:
-    what runs are called, by location. chosen: locations of the VLM runs and policy runs that are compared instead.
+    what runs are called, by location. pairs: locations of the VLM runs and policy runs that are compared instead.
     """
     vlms, policies = ([run for run in runs if _answers(run) == kind] for kind in (True, False))
     related = [(vlm, policy, grew_from(policy, vlm)) for vlm, policy in product(vlms, policies)]

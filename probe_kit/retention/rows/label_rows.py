@@ -131,7 +131,7 @@ def label_notes(
 
     names: of the runs, by location.
     """
-    bare = [row for row in rows if not row.backbone.is_controlled]
+    bare = [row for row in rows if row.backbone.peak is not None and not row.backbone.is_controlled]
     if bare:
         of_runs = ", ".join(dict.fromkeys(f"{row.target} of {names[row.run.location]}" for row in bare))
         yield f"No control was run for {of_runs}: a signal there is judged against chance only."

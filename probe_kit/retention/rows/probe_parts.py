@@ -63,7 +63,7 @@ def with_probes(
         row,
         backbone=BackbonePart(**parts.get(BACKBONE, {})),
         action=ActionPart(**parts.get(ACTION, {}), **_iterations(curve, peaks.get(ACTION))),
-        retention=_retention(peaks, streams, exceeds.get(BACKBONE), absent_below),
+        retention=_retention(curve.is_side, peaks, streams, exceeds.get(BACKBONE), absent_below),
     )
     row = replace(row, controls=_controls(row, results, curve, peaks))
     return row if curve.is_side else with_reason(row, results), streams
@@ -139,7 +139,11 @@ def _iterations(curve: ProbeCurve, peak: Peak | None) -> dict[str, Any]:
 
 
 def _retention(
-    peaks: Mapping[str, Peak], streams: StreamScores | None, backbone: Exceeds | None, bound: float
+    is_side: bool,
+    peaks: Mapping[str, Peak],
+    streams: StreamScores | None,
+    backbone: Exceeds | None,
+    bound: float,
 ) -> RetentionPart:
     if len(peaks) < 2 or backbone is None:
         return RetentionPart(note="n/a (one stream only)")
@@ -147,7 +151,8 @@ def _retention(
     return RetentionPart(
         value=number_or_none(estimate.value),
         ci=limits(estimate.interval),
-        published=number_or_none(estimate.published),
+        # The paper's ratio is of accuracies above one half, which the metric of a label is not.
+        published=number_or_none(estimate.published) if is_side else None,
         defined=estimate.defined,
         note=estimate.note,
     )

@@ -53,8 +53,8 @@ def check_untrained(
 ) -> None:
     """Raise UsageError unless `untrained` is another run of the same episodes, instructions, frames and labels.
 
-    samples, others: of the two runs. Of a target that is no side also for inferences after the first of a network
-    that acted: the frames it was shown then follow from its own actions.
+    samples, untrained_samples: of the two runs. Of a target that is no side also for inferences after the first of
+    a network that acted: the frames it was shown then follow from its own actions.
     """
     identities, untrained_identities = (
         _identities(*pair) for pair in ((run, samples), (untrained, untrained_samples))

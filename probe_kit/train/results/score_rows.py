@@ -18,7 +18,7 @@ from probe_kit.train.settings import ProbeSettings
 def score_rows(
     settings: ProbeSettings, controls: Controls, key: tuple[str, str], curve: ProbeCurve
 ) -> Iterator[dict[str, Any]]:
-    """Yield the row of every site of a curve. place: its category and view. See `ProbeResults.scores`."""
+    """Yield the row of every site of a curve. key: its category and view. See `ProbeResults.scores`."""
     category, view = key
     score, low, high = _estimates(curve)
     p, p_fwe, chance = pointwise_p(curve.metric, curve.null), curve.p_fwe(), curve.chance

@@ -140,7 +140,7 @@ def _vlm(values: Mapping[str, Any], run: Path, vlm: str | None) -> tuple[Path, M
 
 
 def _vlm_folder(values: Mapping[str, Any], run: Path, vlm: str | None) -> Path:
-    """`chosen`, or what config.yaml names: a folder, which may be relative to the run, or a model of the hub."""
+    """`vlm`, or what config.yaml names: a folder, which may be relative to the run, or a model of the hub."""
     base = vlm or str(((values.get("framework") or {}).get("qwenvl") or {}).get("base_vlm", ""))
     if not base:
         raise CheckpointError(f"{run} names no vision-language model; pass its folder with -M vlm=DIR")

@@ -138,7 +138,7 @@ class ByteTokenizer:
 def find_tokenizer(
     folders: Sequence[Path], tokenizer: str | None, beginning: int | None, vocabulary: int
 ) -> TextTokenizer:
-    """The checkpoint's tokenizer, or the one in the folder `chosen`, or bytes if that is asked for.
+    """The checkpoint's tokenizer, or the one in the folder `tokenizer`, or bytes if that is asked for.
 
     vocabulary: the number of text ids the model has. Raises CheckpointError naming the missing files.
     """
