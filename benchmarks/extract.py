@@ -12,7 +12,6 @@ import os
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -173,7 +172,7 @@ def bench_loop(suite: Suite, folder: Path, items: int, repeats: int) -> None:
         "pi0-tiny", str(folder / "checkpoint"), suite=suite.folder, items=items, codec="fast",
         scene=SceneSpec(max_steps=4),
     )  # fmt: skip
-    pooled, every = prepare(base), prepare(replace(base, tokens="all"))
+    pooled, every = prepare(base), prepare(base.changed(tokens="all"))
     modes = [("off", pooled, 0), ("pooled", pooled, 1), ("all", every, 1)]
     megabytes = {"off": 0.0, "pooled": pooled.plan.bytes / 1e6, "all": every.plan.bytes / 1e6}
     print(f"\nreal loop, {2 * items} episodes of one inference each ({inference_cpu(pooled):.2f} CPU-s)")

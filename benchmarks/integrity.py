@@ -24,10 +24,12 @@ from unittest.mock import patch
 import google_crc32c
 import numpy as np
 
+from probe_kit.env import SceneSpec
 from probe_kit.extract.plan import Plan, Row
 from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
 from probe_kit.extract.rollout.episode_loop import Rollout
-from probe_kit.extract.sources.scene_source import scene_row
+from probe_kit.extract.sources.scene import SceneSettings
+from probe_kit.extract.sources.scene_source import SceneSource, scene_row
 from probe_kit.runs import open_run, seal, verify_run
 from probe_kit.runs.commits import Commit, commit_key, write_commit
 from probe_kit.runs.layout import DATA, StoredStream
@@ -144,7 +146,7 @@ def bench_verifying(suite: Suite, run: Path, gigabytes: float, repeats: int) -> 
     episodes = max(1, round(gigabytes * 1e9 / stream.raw_bytes(True)))
     plan = make_plan(suite, [stream], 0, 1, True)
     many = tuple(_numbered(plan.episodes[0], number) for number in range(episodes))
-    writer = RunWriter(locate(run), _of_many(plan, many), settings("none"))
+    writer = RunWriter(locate(run), _of_many(suite, plan, many), settings("none"))
     record = episode(plan, 0).record
     with writer.owned():
         for planned in many:
@@ -175,7 +177,7 @@ def large_run(suite: Suite, run: Path, episodes: int) -> None:
     plan = make_plan(suite, [replace(BACKBONE, width=2), replace(EXPERT, width=2)], 0, 1, True)
     first = plan.episodes[0]
     many = tuple(_numbered(first, number) for number in range(episodes))
-    writer = RunWriter(locate(run), _of_many(plan, many), settings("zstd"))
+    writer = RunWriter(locate(run), _of_many(suite, plan, many), settings("zstd"))
     writer.write(episode(writer.plan, 0).record)
     model = writer.root.location.read(commit_key(0))
     commit = json.loads(model)
@@ -192,15 +194,16 @@ def large_run(suite: Suite, run: Path, episodes: int) -> None:
         write_commit(writer.location, Commit.model_validate(one))
 
 
-def _of_many(plan: Plan, episodes: tuple[Row, ...]) -> Plan:
+def _of_many(suite: Suite, plan: Plan, episodes: tuple[Row, ...]) -> Plan:
     """The plan with these episodes, whose items its suite then holds."""
     items = tuple(planned.content.item for planned in episodes)
-    return replace(plan, suite=replace(plan.suite, items=items), episodes=episodes)
+    source = SceneSource(SceneSettings(scene=SceneSpec()), replace(suite, items=items))
+    return replace(plan, episodes=episodes, selection=source.selection(episodes))
 
 
 def _numbered(planned: Row, number: int) -> Row:
     item = replace(planned.content.item, item_id=f"color-{number:05d}")
-    return scene_row(number, replace(planned.content, item=item), 0, 0)
+    return scene_row(number, replace(planned.content, item=item), 0, 0, item.content_sha256)
 
 
 def parse_commits(run: Path) -> None:

@@ -18,7 +18,7 @@ import os
 import tempfile
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -113,8 +113,8 @@ def main() -> None:
             settings = base
             if subject == "large":
                 checkpoint = str(written("pi0", folder / "large"))
-                settings = replace(
-                    base, model="pi0", checkpoint=checkpoint, random_weights=True, options={"statistics": "bridge"}
+                settings = base.changed(
+                    model="pi0", checkpoint=checkpoint, random_weights=True, options={"statistics": "bridge"}
                 )
             chosen = prepare(settings.changed(batch="auto"))
             print(f"{subject}: {chosen.calibration.words}", flush=True)

@@ -18,6 +18,7 @@ from probe_kit.errors import UnknownSiteError, UsageError
 from probe_kit.hooks import Site
 from probe_kit.retention import measure_retention, retention_table
 from probe_kit.retention.behaviour.success_rate import SuccessRate, capture_only
+from probe_kit.retention.columns.label_sentences import label_finding
 from probe_kit.retention.rows.parts import RunInfo
 from probe_kit.retention.rows.probe_parts import with_corrected_p, with_probes
 from probe_kit.retention.rows.row import RetentionRow
@@ -70,6 +71,7 @@ def test_of_one_site_each_it_is_the_ratio_of_scores_minus_the_chance_of_that_sit
     assert found.backbone.above == pytest.approx(0.8 - 0.3)
     assert found.action.above == pytest.approx(0.5 - 0.4)
     assert found.retention.value == pytest.approx((0.5 - 0.4) / (0.8 - 0.3))
+    assert found.retention.published is None, "the paper's ratio is of accuracies above one half"
     assert (found.backbone.peak, found.backbone.chance) == pytest.approx((0.8, 0.3))
     low, high = found.backbone.above_ci
     assert low is not None
@@ -168,6 +170,7 @@ def test_a_run_without_an_action_stream_has_no_retention_and_an_unknown_iteratio
     assert not found.retention.defined
     assert "no site of the action was probed" in found.retention.reason
     assert found.backbone.peak == pytest.approx(0.8), "what the backbone holds is shown all the same"
+    assert label_finding(found) == "open: no site of the action was probed."
     both = label_results({BACKBONE[0]: (0.8, 0.3), Site("expert", 0, iteration=1): (0.5, 0.4)}, GROUPS, EACH)
     with pytest.raises(UsageError, match="iterations"):
         measured(both, iterations=7)
