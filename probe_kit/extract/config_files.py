@@ -9,6 +9,7 @@ from probe_kit._terminal.field_options import options_of
 from probe_kit.errors import UsageError
 from probe_kit.extract.settings import Settings
 from probe_kit.extract.sources.kinds import kind_of
+from probe_kit.extract.sources.scene import SceneOptions, SceneSettings
 from probe_kit.runs.layout import RUN_FILE
 from probe_kit.runs.origin import Origin, is_here
 
@@ -65,9 +66,12 @@ def _of_run(folder: Path, typed: Collection[str], asks: bool) -> Mapping[str, An
     model = {**config["model"], "options": dict(origin.options)}
     if model["checkpoint"] is None and is_here(origin.checkpoint):
         model["checkpoint"] = origin.checkpoint
-    options = list(options_of(kind_of(config["source"])))
-    replaced = [option.field for option in options if option.parameter in typed]
-    source = source_of_run(run, replaced, {option.field: option.flag for option in options})
+    kind = kind_of(config["source"])
+    options = {option.field: option for option in options_of(kind)}
+    if kind is SceneSettings:
+        options |= {f"scene.{option.field}": option for option in options_of(SceneOptions)}
+    replaced = [field for field, option in options.items() if option.parameter in typed]
+    source = source_of_run(run, replaced, {field: option.flag for field, option in options.items()})
     return {**config, "model": model, "source": source}
 
 

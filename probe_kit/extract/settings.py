@@ -40,8 +40,18 @@ SCENE = SceneSettings.model_fields["kind"].default
 
 
 def _read_source(value: Any) -> Any:
-    """Settings of a source from the part of a file, by its kind."""
-    return kind_of(value)(**value) if isinstance(value, Mapping) else value
+    """Settings of a source from the part of a file, by its kind. Raises UsageError for what is no part."""
+    if value is None or isinstance(value, SourceSettings):
+        return value
+    fields = _fields_of("source", value)
+    return kind_of(fields)(**fields)
+
+
+def _fields_of(part: str, values: Any) -> dict[str, Any]:
+    """The fields of a part. Raises UsageError for what is no part, such as a text in a file."""
+    if not isinstance(values, Mapping | Part):
+        raise UsageError(f"{part} is {values!r}; expected its settings by name, as --print-config writes them")
+    return dict(values)
 
 
 def _checked_label(label: str | None) -> str | None:
@@ -123,7 +133,7 @@ class Settings(Part):
         parts, scene = by_part.pop(""), by_part.pop("source")
         parts |= {} if model is None or isinstance(model, str) else {"model": model}
         for part, fields in by_part.items():
-            parts[part] = dict(parts.get(part, {})) | fields
+            parts[part] = _fields_of(part, parts.get(part, {})) | fields
         if "family" not in parts["model"]:
             raise UsageError("no model is named; give --model NAME, which `probe-kit models` lists")
         parts["source"] = _with_scene(parts, scene)
@@ -163,7 +173,10 @@ class Settings(Part):
         source_options = {
             name: value for name, value in typed.items() if name not in {option.parameter for option in parts}
         }
-        before = None if file is None else cls(**{"model": values.pop("family", None), **file})
+        try:
+            before = None if file is None else cls(**{"model": values.get("family"), **file})
+        except TypeError as error:  # a name in the file that is no part
+            raise UsageError(f"--config: {error}") from error
         kind, fields = cls._typed_source(source_options, None if before is None else before.source)
         if kind is SceneSettings:
             values |= fields
@@ -370,7 +383,7 @@ class AskSettings(Settings):
         """
         parameters = {option.parameter for kind in SOURCES for option in options_of(kind)}
         options = {name: value for name, value in typed.items() if name in parameters}
-        kind, _ = cls._typed_source(options, None if file is None else _read_source(file["source"]))
+        kind, _ = cls._typed_source(options, None if file is None else _read_source(file.get("source")))
         if kind.command and picture_sizes is not None:
             _refuse(["picture_size"], kind)
         sizes: list[dict[str, Any]] = [{"picture_size": size} for size in picture_sizes or [DEFAULT_SIZE]]
@@ -452,7 +465,7 @@ def _with_scene(parts: Mapping[str, Any], fields: dict[str, Any]) -> Any:
 
     Raises UsageError for such fields with another source.
     """
-    former = dict(parts.get("source") or {})
+    former = _fields_of("source", parts.get("source") or {})
     if former.get("kind", SCENE) != SCENE:
         settings = _read_source(parts["source"])
         if refused := [name for name, value in fields.items() if value not in (None, False)]:

@@ -69,10 +69,10 @@ FRAME_COLUMNS = 8
 MOST_FRAMES = FRAME_COLUMNS * 68
 """In one picture: a WebP may not exceed 16,383 pixels a side, and a frame of a film is 240 high."""
 ExportFormat = Literal["h5", "safetensors", "lerobot", "parquet", "sae", "directions"]
-SaeDtype = Literal["bfloat16", "float16"]
 DIRECTION_FILES: dict[ExportFormat, str] = {"directions": "directions.safetensors"}
 """Endings of exports that are not called as their format."""
-"""What a memory map to train sparse autoencoders on holds."""
+SaeDtype = Literal["bfloat16", "float16"]
+"""The numbers in a memory map to train sparse autoencoders on."""
 ONCE, AT_END = "success_once", "success_at_end"
 """Columns of episodes: whether `success` was true after any action, and after the last one."""
 CAPTURE_ONLY = "capture_only"

@@ -121,6 +121,31 @@ def test_typed_options_replace_those_of_a_file(tmp_path: Path) -> None:
         assert again.scene.max_steps == 7 if "items" in words else again.source == source.changed(episodes=(0, 1))
 
 
+def test_a_typed_model_replaces_that_of_a_file() -> None:
+    file = ExtractSettings("idle", items=4).config()
+    assert ExtractSettings.of_command({"model": "expert"}, file).model.family == "expert"
+    assert ExtractSettings.of_command({"model": "expert"}, {"seed": 3}).model.family == "expert"
+
+
+@pytest.mark.parametrize("command", ["extract", "ask"])
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"source": "kitchen"}, "source is 'kitchen'; expected its settings by name"),
+        ({"capture": 3}, "capture is 3; expected its settings by name"),
+        ({"captured": {}}, "has no setting 'captured'; is it capture?"),
+    ],
+)
+def test_a_file_of_settings_that_holds_no_parts_is_refused_in_words(
+    tmp_path: Path, command: str, wrong: dict[str, Any], message: str
+) -> None:
+    (tmp_path / "settings.json").write_text(json.dumps({"model": {"family": "vlm-tiny"}, **wrong}))
+    line = [command, "--config", str(tmp_path / "settings.json"), "--dry-run"]
+    ended = CliRunner().invoke(app, line)
+    assert ended.exit_code == 2
+    assert message in " ".join(ended.output.split())
+
+
 def test_printed_settings_are_those_that_a_command_reads(tmp_path: Path) -> None:
     line = ["extract", "--model", "pi0-tiny", "--items", "2", "--print-config"]
     printed = CliRunner().invoke(app, line)

@@ -252,8 +252,7 @@ class AnswerController(ModelController["AnswerModel", "Prompt"]):
             columns |= {f"logit_{statement}{mark}": logit for statement, logit in forced_choice.logits.items()}
             columns |= {f"option_mass{mark}": forced_choice.mass, f"near_tie{mark}": forced_choice.near_tie}
         columns |= {
-            f"margin{mark}": forced_choice
-            for mark, forced_choice in zip(("", "_swapped"), choice.margins, strict=False)
+            f"margin{mark}": margin for mark, margin in zip(("", "_swapped"), choice.margins, strict=False)
         }
         phrase = self._phrases[episode.item.item_id]
         return columns | {

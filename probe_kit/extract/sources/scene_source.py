@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 
 EPISODES = 3
 """If the scene of one episode cannot be built, so many are tried: a single one costs no run."""
-"""The input of a pair whose donor has the two pictures in each other's place."""
 
 
 class SceneSource(Source[SceneSettings]):

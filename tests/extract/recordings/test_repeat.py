@@ -90,3 +90,15 @@ def test_a_file_that_is_gone_is_named_before_anything_is_made(
     message = extract("--config", str(first), "--out", str(tmp_path / "again"), code=2)
     assert ("reach_env" if source == "environment" else str(gone)) in message.replace("\n", "")
     assert not (tmp_path / "again").exists()
+
+
+def test_a_photo_that_is_gone_is_named_with_its_option_which_gives_another(tmp_path: Path) -> None:
+    for name in ("first.png", "second.png"):
+        Image.new("RGB", (640, 480), (90, 90, 90)).save(tmp_path / name)
+    photo = ["--rendering", "visual-matching", "--background", str(tmp_path / "first.png")]
+    shape = ["--model", "idle", "--categories", "color", "--items", "2", "--max-steps", "2"]
+    extract(*shape, *photo, "--out", str(tmp_path / "run"))
+    (tmp_path / "first.png").unlink()
+    again = ["--config", str(tmp_path / "run"), "--print-config"]
+    assert "Give it with --background" in " ".join(extract(*again, code=2).split())
+    assert "second.png" in extract(*again, "--background", str(tmp_path / "second.png"))
