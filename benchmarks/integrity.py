@@ -87,8 +87,8 @@ def bench_writing(suite: Suite, folder: Path, width: int, repeats: int) -> None:
     records = [episode(plan, number).record for number in range(2)]
     raw = 2 * stream.raw_bytes(True) / 1e6
     ways: dict[str, Callable[[bytes], str] | None] = {
-        "blake2b": None, "crc32c": lambda content: f"{google_crc32c.value(content):08x}",
-        "nothing": lambda _content: "0" * 8,
+        "blake2b": None, "crc32c": lambda content: f"{google_crc32c.value(content):064x}",
+        "nothing": lambda _content: "0" * 64,
     }  # fmt: skip
     for codec in ("zstd", "fast", "none"):
         found: dict[str, list[Seconds]] = {name: [] for name in ways}
@@ -98,7 +98,10 @@ def bench_writing(suite: Suite, folder: Path, width: int, repeats: int) -> None:
                 if digest is None:
                     found[name].append(seconds(partial(write, writer, records)))
                     continue
-                with patch(f"{RECORDING}.digest", digest), patch(f"{RECORDING}.block_digest", lambda _part: "0"):
+                with (
+                    patch(f"{RECORDING}.digest", digest),
+                    patch(f"{RECORDING}.block_digest", lambda _part: "0" * 16),
+                ):
                     found[name].append(seconds(partial(write, writer, records)))
         for name, turns in found.items():
             wall, cpu = medians(turns)
