@@ -80,7 +80,7 @@ class InputDiagnosis:
 
     share: the total-effect index, 1 where nothing else matters, with its 95 % interval by groups (Student).
     control: the index of a change that should not matter. every: of all inputs together. p: exact, one-sided, by
-    sign flips of whole groups: the input changes more than its control. unchanged: inferences, of `n_inferences`
+    permutation in whole groups: the input changes more than its control. unchanged: inferences, of `n_inferences`
     with another value or a blank, in which no number of the action changed. reason: of the verdict. passage: the
     sites in the order of the network; note: why there are none. base: the same in the base checkpoint.
     """

@@ -16,7 +16,7 @@ _HEADINGS = (
     Heading("decides %", "share of the action's variance that is due to it: total-effect index, 95 % by groups"),
     Heading("control %", "the same of a change that should not matter"),
     Heading("all inputs %", "the same of all inputs together; the seed decides the rest"),
-    Heading("p", "that it changes more than its control, by sign flips of whole groups"),
+    Heading("p", "that it changes more than its control, by permutation in whole groups"),
 )
 _FINDINGS = {
     "decides": "decides the action",

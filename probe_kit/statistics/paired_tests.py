@@ -191,6 +191,24 @@ def max_t(
     return observed, np.asarray(p), np.asarray(p_fwe)
 
 
+def least_column_p(values: NDArray[np.float64], groups: ArrayLike, seed: int) -> float:
+    """Chance that the first of K exchangeable columns lies so far below the others in the mean, one-sided.
+
+    values: (E, K), K at least 2. groups: (E,). The place of the first column is drawn anew, the same in all rows
+    of a group: any column may be the first where none differs. With two columns it is a test by signs. seed: of
+    the draws. The level is exact, because the observed places are one of them.
+    """
+    names, group_of = np.unique(np.asarray(groups), return_inverse=True)
+    columns = values.shape[1]
+    others = (values.sum(axis=1, keepdims=True) - values) / (columns - 1)
+    gains = np.zeros((names.size, columns))
+    np.add.at(gains, group_of, others - values)
+    places = np.random.default_rng(seed).integers(columns, size=(DRAWS, names.size))
+    places[0] = 0
+    drawn = gains[np.arange(names.size), places].sum(axis=1)
+    return float((drawn >= drawn[0] - 1e-9 * (1 + abs(drawn[0]))).mean())
+
+
 def smallest_flip_p(groups: int) -> float:
     """The smallest p-value of `max_t` with so many groups: one pattern of all that are tried."""
     return 0.5**groups if groups <= EXACT else 1 / DRAWS

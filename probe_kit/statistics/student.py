@@ -27,14 +27,19 @@ def student_interval(
     return max(bounds[0], low), min(bounds[1], high)
 
 
-def unbounded_student_interval(values: NDArray[np.floating], groups: ArrayLike) -> tuple[float, float]:
-    """The same of (E,) values without bounds: of no width where all groups agree, infinite for a single group."""
+def unbounded_student_interval(
+    values: NDArray[np.floating], groups: ArrayLike, tail: float = SIGNIFICANCE / 2
+) -> tuple[float, float]:
+    """The same of (E,) values without bounds: of no width where all groups agree, infinite for a single group.
+
+    tail: chance that the mean lies beyond one limit. With SIGNIFICANCE, each limit alone is a one-sided test.
+    """
     names, group_of = np.unique(np.asarray(groups), return_inverse=True)
     if names.size == 1:
         return -inf, inf
     mean, sizes = float(values.mean()), np.bincount(group_of)
     residuals = np.bincount(group_of, values) - mean * sizes
-    spread = _reach(residuals, values.size)
+    spread = _reach(residuals, values.size, tail)
     return mean - spread, mean + spread
 
 
@@ -65,12 +70,12 @@ def explained_interval(
     return min(low, explained), max(high, explained)
 
 
-def _reach(residuals: NDArray[np.floating], count: int) -> float:
+def _reach(residuals: NDArray[np.floating], count: int, tail: float = SIGNIFICANCE / 2) -> float:
     """Student's quantile times the standard error of a mean over `count` episodes of G groups.
 
-    residuals: (G,) sums over the episodes of a group of the values without their mean.
+    residuals: (G,) sums over the episodes of a group of the values without their mean. tail: beyond the quantile.
     """
     from scipy.special import stdtrit  # type: ignore[import-untyped]
 
     error = sqrt(float(residuals @ residuals) * residuals.size / (residuals.size - 1)) / count
-    return float(stdtrit(residuals.size - 1, 1 - SIGNIFICANCE / 2)) * error
+    return float(stdtrit(residuals.size - 1, 1 - tail)) * error

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from probe_kit.diagnose.importance import Exchanges, importance_of
 from probe_kit.diagnose.inputs import PICTURE, STATE
 from probe_kit.diagnose.measure import InputExchange, count_inferences
 from probe_kit.diagnose.results import exit_code
@@ -109,6 +110,38 @@ def test_words_that_mean_the_same_move_as_much_as_others_in_five_of_a_hundred_dr
         (words,) = InputExchange(policy, frames(16, 8, seed), seed).measure(["instruction"])
         alarms += words.verdict in ("moves", "decides")
     assert alarms <= 10, "5 % of 100, and three standard deviations"
+
+
+def turned_around(chance: float, alike: float, seed: int) -> Exchanges:
+    """Exchanges of 24 frames that turn the action around or leave it, as a policy with two answers does.
+
+    chance: that an exchange of one input does; of all inputs, in half. alike: how alike donors of a frame are.
+    """
+    rng = np.random.default_rng(seed)
+    of_frame = rng.beta(chance * (1 - alike) / alike, (1 - chance) * (1 - alike) / alike, (24, 1))
+    exchanged = 2.0 * (rng.random((24, 3)) < of_frame).ravel()
+    every = 2.0 * (rng.random(72) < 0.5)
+    groups = np.repeat([f"group {index}" for index in range(24)], 3)
+    first = np.tile([True, False, False], 24)
+    return Exchanges(exchanged, np.zeros(72), every, groups, first, exchanged, np.ones(24))
+
+
+@pytest.mark.parametrize("alike", [0.3, 0.9])
+def test_an_input_that_changes_half_as_much_as_all_decides_in_five_of_a_hundred_draws(alike: float) -> None:
+    verdicts = [importance_of("words", turned_around(0.25, alike, seed)).verdict for seed in range(400)]
+    assert verdicts.count("decides") <= 0.05 * 400 + 3 * np.sqrt(0.05 * 0.95 * 400)
+
+
+def test_one_of_two_inputs_that_are_needed_together_is_seen_to_decide_in_nine_of_ten_draws() -> None:
+    verdicts = [importance_of("words", turned_around(0.5, 0.5, seed)).verdict for seed in range(200)]
+    assert verdicts.count("decides") >= 0.85 * 200
+    assert verdicts.count("decides") + verdicts.count("moves") == 200
+
+
+def test_few_large_changes_are_more_than_those_of_a_control() -> None:
+    """An input that turns one action in twenty around matters little, and not nothing."""
+    verdicts = [importance_of("words", turned_around(0.05, 0.1, seed)).verdict for seed in range(100)]
+    assert verdicts.count("no effect") <= 5
 
 
 def test_an_input_that_all_frames_share_is_not_varied_and_the_others_are_tested() -> None:

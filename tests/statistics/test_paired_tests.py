@@ -13,6 +13,7 @@ from probe_kit.statistics.paired_tests import (
     flip_p,
     greater_p,
     holm,
+    least_column_p,
     max_t,
     mcnemar_p,
     overlap_p,
@@ -160,3 +161,30 @@ def test_no_world_without_effects_is_called_significant_too_often() -> None:
         values = draw.normal(size=(16, 28)) + draw.normal(size=(1, 28))
         found += bool((max_t(values, items, items, world)[2] < 0.05).any())
     assert found <= 15  # P(more | 200, 0.05) < 0.05
+
+
+def test_a_first_column_below_all_others_is_as_likely_as_that_place_in_every_group() -> None:
+    values = np.column_stack([np.zeros(6), np.ones((6, 3))])
+    assert least_column_p(values, list("abcdef"), 0) == pytest.approx(4.0**-6, abs=1e-3)
+    assert least_column_p(values, list("aabbcc"), 0) == pytest.approx(4.0**-3, abs=1e-2), (
+        "rows of a group move as one"
+    )
+    assert least_column_p(np.ones((6, 3)), list("abcdef"), 0) == 1.0
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_two_columns_are_the_test_by_signs(seed: int) -> None:
+    values = np.random.default_rng(seed).lognormal(0.0, 1.5, (10, 2)) / [2, 1]
+    _, (p,), _ = max_t((values[:, 1] - values[:, 0])[None], range(10), range(10), 0)
+    assert least_column_p(values, range(10), 0) == pytest.approx(p, abs=0.04)
+
+
+@pytest.mark.parametrize("columns", [2, 4])
+def test_columns_that_do_not_differ_are_told_apart_in_five_of_a_hundred_draws(columns: int) -> None:
+    rng = np.random.default_rng(columns)
+    groups = np.repeat(np.arange(8), 2)
+    alarms = 0
+    for seed in range(400):
+        of_group = rng.lognormal(0.0, 2.0, (8, columns))[groups]
+        alarms += least_column_p(of_group * rng.lognormal(0.0, 0.5, (16, columns)), groups, seed) < 0.05
+    assert alarms <= 0.05 * 400 + 3 * np.sqrt(0.05 * 0.95 * 400)
