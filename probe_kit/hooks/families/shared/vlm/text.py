@@ -185,7 +185,7 @@ def words_of(tokenizer: Any, ids: Sequence[int], ends: Collection[int]) -> str:
 
 
 def _ends(folder: Path, config: Any) -> frozenset[int]:
-    """The end tokens in generation_config.json, or else in the language model's configuration."""
+    """The end tokens in generation_config.json, or else in the configuration. Raises CheckpointError for none."""
     stored = _read(folder / GENERATION_FILE).get("eos_token_id", getattr(config, "eos_token_id", None))
     numbers = stored if isinstance(stored, list) else [stored]
     if None in numbers or not numbers:
