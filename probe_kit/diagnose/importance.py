@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._tables.numbers import whole_percent
 from probe_kit.diagnose.results import IDLE, MATTERS, BaseComparison, Change, InputDiagnosis, Verdict
 from probe_kit.hashing import derive_seed
 from probe_kit.statistics.paired_tests import least_column_p, max_t
@@ -150,7 +151,9 @@ def _verdict(exchanges: Exchanges, p: float) -> tuple[Verdict, str]:
             changed
         )
     if unbounded_student_interval(above, groups)[1] < TRACE:
-        return "no effect", "it changes the action no more than a change that should not matter"
+        # No interval holds an effect in rare frames of which none was drawn.
+        unseen = 1 - SIGNIFICANCE ** (1 / np.unique(groups).size)
+        return "no effect", f"in these frames; up to {whole_percent(unseen)} % of all frames may have one"
     if p >= SIGNIFICANCE:
         return "open", f"p {p:.2g} that it changes more than its control; more frames decide"
     # Both must be shown, each by a one-sided test. The ratio's interval in logarithms is narrower, and too narrow

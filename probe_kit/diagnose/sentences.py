@@ -92,7 +92,7 @@ def sentences(diagnosis: "Diagnosis") -> list[str]:
 
 def sentence(diagnosed: "InputDiagnosis") -> str:
     """Return one sentence: what became of an input, and where."""
-    reasoned = diagnosed.verdict in ("not varied", "not an input", "open")
+    reasoned = diagnosed.verdict in ("not varied", "not an input", "open", "no effect")
     reason = f" ({diagnosed.reason})" if reasoned else ""
     where = f"; {diagnosed.where}" if diagnosed.where else ""
     base = f"; {_CHANGES[diagnosed.base.change]}" if diagnosed.base is not None else ""

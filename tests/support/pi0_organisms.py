@@ -100,7 +100,8 @@ _BEFORE = "ends before the first layer"
 _BEHIND_KV = "ends behind kv.02; expert.00 is bit-equal"
 ORGANISMS = {
     "trained": Organism(leave, {"instruction": ("decides",), "picture": ("decides",)}, {"instruction": "kv.02"}),
-    "state": Organism(leave, {"instruction": ("moves",), "picture": ("moves", *NOTHING)}, {}, "state"),
+    # The words of State turn the action around in 1 frame of 64, which few draws hold.
+    "state": Organism(leave, {"instruction": ("moves", *NOTHING), "picture": ("moves", *NOTHING)}, {}, "state"),
     "deaf": Organism(
         make_deaf,
         {"instruction": ("does not arrive",), "picture": ("decides", "moves")},
