@@ -1,6 +1,7 @@
 """How often is a diagnosis right about organisms whose answer is known by construction?
 
-    PYTHONPATH=. python benchmarks/diagnose_organisms.py FOLDER [--draws 20] [--first 0] [--frames 24] [--organisms deaf,blind]
+    PYTHONPATH=. python benchmarks/diagnose_organisms.py FOLDER [--draws 20] [--first 0]
+        [--frames 24] [--organisms deaf,blind]
 
 A draw is a run of its own seed, whose frames and donors are fresh. Organisms are edits of the embedded policy, see
 `tests/support/pi0_organisms.py`. A verdict is right, open, or wrong. Finished draws in FOLDER are read. Exits
