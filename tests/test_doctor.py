@@ -73,7 +73,7 @@ def test_a_trial_that_crashes_is_a_finding_with_its_last_words(monkeypatch: pyte
     monkeypatch.setattr(sys, "executable", "/bin/false")
     (finding,) = doctor._scene()
     assert finding.state == "missing"
-    assert "code 1" in finding.seen
+    assert "code 1" in finding.result
     assert "C++ compiler" in finding.advice
 
 
@@ -84,7 +84,7 @@ def test_a_trial_without_an_answer_in_time_says_that_the_machine_is_busy_and_not
     monkeypatch.setattr(doctor, "PATIENCE", 0.01)
     (finding,) = trial()
     assert finding.state == "note"
-    assert finding.seen.startswith("not known: no answer within 0.01 s")
+    assert finding.result.startswith("not known: no answer within 0.01 s")
     assert "busy" in finding.advice
     assert "nstall" not in finding.advice
 
@@ -110,17 +110,17 @@ def test_a_hub_that_does_not_answer_is_a_note_and_no_failure(monkeypatch: pytest
     monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", "http://127.0.0.1:9")
     finding = doctor._hub()
     assert finding.state == "note"
-    assert "127.0.0.1:9 does not answer" in finding.seen
+    assert "127.0.0.1:9 does not answer" in finding.result
 
 
 def test_offline_mode_is_respected(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
-    assert "offline" in doctor._hub().seen
+    assert "offline" in doctor._hub().result
 
 
 def test_a_machine_without_a_gpu_is_noted_and_one_with_is_described() -> None:
     assert doctor._gpu([]).state == "note"
-    assert doctor._gpu([{"name": "H200", "gigabytes": 141.2}]).seen == "H200 with 141 GB"
+    assert doctor._gpu([{"name": "H200", "gigabytes": 141.2}]).result == "H200 with 141 GB"
 
 
 def test_an_extra_lacks_what_is_not_installed() -> None:

@@ -75,7 +75,7 @@ def _row(diagnosed: "InputDiagnosis", headings: Sequence[Heading]) -> Sequence[C
             base.change,
         ]
     texts += ["–"] * (len(headings) - len(texts))
-    alarms = {"arrives", "verdict"} if diagnosed.matters is False else set()
+    alarms = {"arrives", "effect"} if diagnosed.matters is False else set()
     if base is not None and base.change == "lost in fine-tuning":
         alarms.add("change")
     return [Cell(text, alarm=heading.text in alarms) for heading, text in zip(headings, texts, strict=True)]

@@ -75,7 +75,7 @@ def _pack(study: LoadedStudy, folder: Path, partial: bool, extras: Collection[Ex
         except ProbeKitError as error:
             if not partial:
                 raise RunIncompleteError(
-                    f"{cell.name} cannot be packed: {error}. Finish it with `probe-kit study run {study.file}`, "
+                    f"{cell.name} cannot be packed: {error}. Finish it with `probe-kit study run {study.typed}`, "
                     "or leave it out (--partial)"
                 ) from error
             missing[cell.name] = str(error)

@@ -46,6 +46,11 @@ class LoadedStudy:
         """The folder of the archive, None without one."""
         return None if self.pack is None else self.file.parent
 
+    @property
+    def typed(self) -> str:
+        """The argument of `probe-kit study` for this study: the name of a shipped one, else the file."""
+        return self.file.stem if self.file in shipped_studies().values() else str(self.file)
+
 
 def find_study(name: str) -> Path:
     """The file of this path, or the study of the package of this name. Raises UsageError if there is neither."""

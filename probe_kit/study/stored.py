@@ -99,7 +99,7 @@ def stored_runs(
             if not partial:
                 raise RunIncompleteError(
                     f"{cell.name} is not whole: {_first_sentence(error)}. Finish it with `probe-kit study run "
-                    f"{study.file}`, or accept what is there (--partial)"
+                    f"{study.typed}`, or accept what is there (--partial)"
                 ) from error
             unfinished.append(f"{label} is missing: {_why_missing(study, cell, error)}")
         else:
@@ -107,7 +107,7 @@ def stored_runs(
             if len(stored.run.episodes) < stored.run.planned:
                 unfinished.append(f"{label} has {len(stored.run.episodes)} of {stored.run.planned} episodes")
     if not runs:
-        raise UsageError(f"no run of {subject} is stored. Play it with `probe-kit study run {study.file}`")
+        raise UsageError(f"no run of {subject} is stored. Play it with `probe-kit study run {study.typed}`")
     check_same_items([stored.run for stored in runs])
     check_same_weights([(stored.cell, stored.run) for stored in runs])
     return StoredRuns(tuple(runs), tuple(missing), tuple(unfinished), tuple(models))
@@ -212,7 +212,7 @@ def _probe_key(study: LoadedStudy, stored: StoredRun, run: "Run", partial: bool)
     also = f" It has those of other settings: {', '.join(other_keys)}." if other_keys else ""
     names = ", ".join(f"[probes.{name}]" for name in tables)
     raise RunIncompleteError(
-        f"{stored.cell.name} has no probes of {names}.{also} Fit them with `probe-kit study run {study.file}`, or "
+        f"{stored.cell.name} has no probes of {names}.{also} Fit them with `probe-kit study run {study.typed}`, or "
         "accept what is there (--partial)"
     )
 

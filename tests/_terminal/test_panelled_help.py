@@ -14,7 +14,7 @@ from probe_kit.cli import app, commands_of
 
 LEAVES: dict[str, Any] = dict(commands_of(typer.main.get_command(app), None))
 LONG = sorted(name for name, command in LEAVES.items() if len(command.params) > MOST_OPTIONS)
-SCREEN = 60
+SCREEN = 66
 
 
 def shown(command: str, flag: str, width: int = 80) -> str:

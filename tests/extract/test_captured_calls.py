@@ -313,7 +313,7 @@ def test_all_inferences_are_those_that_enough_episodes_reached_and_the_others_ar
 
 @pytest.mark.filterwarnings("ignore:.*classes are not balanced")
 @pytest.mark.parametrize("call", [3, 4, 5])
-@pytest.mark.parametrize("target", ["correct", "shuffled"])
+@pytest.mark.parametrize("target", ["side.correct", "side.shuffled"])
 def test_of_an_inference_that_few_episodes_reached_nothing_is_said_to_be_missing(
     early: Run, call: int, target: str
 ) -> None:

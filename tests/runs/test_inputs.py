@@ -12,7 +12,6 @@ from probe_kit.runs import Run, copy_run, export_run, verify_run
 from probe_kit.runs.store import locate
 from probe_kit.runs.writer import RunWriter
 from probe_kit.train import train_probes
-from probe_kit.view.viewed_run import view_runs
 from tests.support.recorded_run import CALLS, EVERY, recorded_plan, write_recorded_run
 
 
@@ -70,8 +69,7 @@ def test_it_grows_by_further_episodes_and_keeps_those_it_has(tmp_path: Path) -> 
     ("wanted", "refused"),
     [
         ("retention table", lambda run: retention_table([run])),
-        ("probe of the side .correct.", train_probes),
-        ("viewer", lambda run: view_runs([run])),
+        ("probe of the side .side.correct.", train_probes),
     ],
 )
 def test_what_needs_a_scene_or_an_outcome_is_refused_by_name(shown_run: Run, wanted: str, refused: object) -> None:

@@ -62,7 +62,7 @@ def test_differences_are_one_family_and_means_another(runs: list[SaidRun]) -> No
 
 def test_joins_that_a_report_shows_together_are_one_family(runs: list[SaidRun]) -> None:
     table = retention_table(runs)
-    joins = joins_of(runs, table).found
+    joins = joins_of(runs, table).tables
     tests = [one for join in joins for row in join.rows if row.category != OVERALL for one in row.comparisons]
     check([(one.p, one.p_holm) for one in tests], len(list(product(range(2), range(3), SHARES))))
     summaries = [one for join in joins for row in join.rows if row.category == OVERALL for one in row.comparisons]
@@ -82,7 +82,7 @@ class Worded(SaidRun):
     wordings = ("knowledge", "named", "side")
 
     @property
-    def whole(self) -> SaidRun:
+    def all_wordings(self) -> SaidRun:
         plain = [acted(Path(str(self.path)), by_chance(self.seed + n, -0.2 * n)).episodes for n in range(3)]
         tables = [
             table.assign(wording=name, episode_id=table["episode_id"] + f":{name}")

@@ -103,7 +103,7 @@ def test_packing_of_another_configuration_is_refused(tmp_path: Path) -> None:
     path = folder / "config.json"
     chunk = json.loads(path.read_text(encoding="utf-8"))["chunk_size"]
     write_steps(folder, [{"registry_name": "molmoact2_pack_inputs", "config": {"chunk_size": chunk + 1}}])
-    with pytest.raises(CheckpointError, match=rf"chunk_size: {chunk + 1} \(chunk_size: {chunk}\)"):
+    with pytest.raises(CheckpointError, match=rf"chunk_size: {chunk + 1} \(config.json: {chunk}\)"):
         load_policy("molmoact2", str(folder))
 
 

@@ -127,5 +127,5 @@ def test_towers_that_no_released_ovis_has_are_refused(vision: dict[str, object],
     values = json.loads((folder / "config.json").read_text(encoding="utf-8"))
     values["vit_config"] |= vision
     (folder / "config.json").write_text(json.dumps(values), encoding="utf-8")
-    with pytest.raises(CheckpointError, match="the vision tower has"):
+    with pytest.raises(CheckpointError, match="vit_config"):
         load_model("ovis2.5", str(folder))
