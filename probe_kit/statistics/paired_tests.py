@@ -200,9 +200,9 @@ def least_column_p(values: NDArray[np.float64], groups: ArrayLike, seed: int) ->
     """
     names, group_of = np.unique(np.asarray(groups), return_inverse=True)
     columns = values.shape[1]
-    others = (values.sum(axis=1, keepdims=True) - values) / (columns - 1)
+    treated = (values.sum(axis=1, keepdims=True) - values) / (columns - 1)
     gains = np.zeros((names.size, columns))
-    np.add.at(gains, group_of, others - values)
+    np.add.at(gains, group_of, treated - values)
     places = np.random.default_rng(seed).integers(columns, size=(DRAWS, names.size))
     places[0] = 0
     drawn = gains[np.arange(names.size), places].sum(axis=1)

@@ -212,8 +212,8 @@ def _probe_key(study: LoadedStudy, stored: StoredRun, run: "Run", partial: bool)
     also = f" It has those of other settings: {', '.join(other_keys)}." if other_keys else ""
     names = ", ".join(f"[probes.{name}]" for name in tables)
     raise RunIncompleteError(
-        f"{stored.cell.name} has no probes of {names}.{also} Fit them with `probe-kit study run {study.typed}`, or "
-        "accept what is there (--partial)"
+        f"{stored.cell.name} has no probes of {names}.{also} Fit them with `probe-kit study run {study.typed}`, "
+        "or accept what is there (--partial)"
     )
 
 
