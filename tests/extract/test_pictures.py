@@ -116,6 +116,7 @@ def test_a_table_of_a_spreadsheet_is_read_by_the_rules_of_all_tables(folder: Pat
         source(tmp_path).open()
 
 
+@pytest.mark.slow
 def test_pictures_are_shown_again_for_interventions_and_diagnoses(
     run: pk.Run, folder: Path, pi0_tiny: Policy
 ) -> None:

@@ -139,7 +139,9 @@ def test_a_typed_model_replaces_that_of_a_file() -> None:
 def test_a_file_of_settings_that_holds_no_parts_is_refused_in_words(
     tmp_path: Path, command: str, wrong: dict[str, Any], message: str
 ) -> None:
-    (tmp_path / "settings.json").write_text(json.dumps({"model": {"family": "vlm-tiny"}, **wrong}))
+    (tmp_path / "settings.json").write_text(
+        json.dumps({"model": {"family": "vlm-tiny"}, **wrong}), encoding="utf-8"
+    )
     line = [command, "--config", str(tmp_path / "settings.json"), "--dry-run"]
     ended = CliRunner().invoke(app, line)
     assert ended.exit_code == 2

@@ -104,6 +104,7 @@ def whys(file: Path) -> dict[str, str]:
     return {planned.cell.name: planned.why for planned in plan_study(load_study(file)).cells}
 
 
+@pytest.mark.slow
 def test_a_plan_says_what_changed_since_a_run_of_the_same_name(small_suite: Suite, tmp_path: Path) -> None:
     file = small_study(tmp_path, small_suite, SCRIPTED)
     assert conduct_study(plan_study(load_study(file)), env_workers=0) == []

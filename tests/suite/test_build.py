@@ -29,6 +29,7 @@ def test_another_seed_gives_other_items(tmp_path: Path) -> None:
     assert not {item.item_id for item in one.items} & {item.item_id for item in other.items}
 
 
+@pytest.mark.slow
 def test_a_small_suite_is_the_beginning_of_a_large_one(small_suite: Suite, embedded: Suite) -> None:
     large = [item for item in embedded.items if item.category == "shape"]
     small = [item for item in small_suite.items if item.category == "shape"]

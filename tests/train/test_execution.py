@@ -86,6 +86,7 @@ def test_a_column_whose_process_is_killed_is_fitted_by_another(deadly: Any) -> N
 
 
 @pytest.mark.filterwarnings("ignore::probe_kit._execution.executor.WorkerLostWarning")
+@pytest.mark.slow
 def test_a_column_that_kills_two_processes_is_named_with_a_way_out(deadly: Any) -> None:
     with pytest.raises(WorkerDiedError, match=r"column backbone\.00\.residual mean .*code -9.*fewer --jobs"):
         list(probe_columns(islice(columns([]), 1), {"color": deadly(2)}, ExecutionSettings(jobs=2)))
