@@ -23,6 +23,7 @@ from probe_kit.errors import NoInterventionsError
 from probe_kit.intervene.settings import FORMAT, key_of
 from probe_kit.runs.layout import INTERVENTIONS
 from probe_kit.runs.location import Location
+from probe_kit.runs.reader import RunReader
 from probe_kit.runs.records import as_json
 from probe_kit.runs.results import (
     HEAD,
@@ -32,7 +33,6 @@ from probe_kit.runs.results import (
     tidy_bundle,
     write_bundle,
 )
-from probe_kit.train.data.run_reader import RunReader
 
 CLEAN, IMAGE_SWAP, INSTRUCTION_SWAP, NOISE = "clean", "image_swap", "instruction_swap", "noise"
 """Conditions: as in the run, the two pictures swapped, the counterpart's instruction, the noise drawn anew."""

@@ -20,7 +20,7 @@ from probe_kit.intervene.outcomes import (
     stored_interventions,
 )
 from probe_kit.intervene.settings import FIRST_CHUNK, PER_STEP
-from probe_kit.train.data.run_reader import RunReader
+from probe_kit.runs.reader import RunReader
 
 Rank = tuple[bool, int, bool]
 

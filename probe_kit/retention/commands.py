@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from probe_kit._tables.table import Table
     from probe_kit.retention.choices import Section, TableFormat
     from probe_kit.retention.table import RetentionTable
-    from probe_kit.train.data.run_reader import RunReader
+    from probe_kit.runs.reader import RunReader
 
 WITH_STAGES = ("runs", "probes", "views", "wording", "score", "with_side_words", "style", "figures")
 WITH_TARGET = (

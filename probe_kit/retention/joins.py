@@ -10,7 +10,7 @@ from probe_kit.retention.behaviour.vlm_answers import ask_of
 from probe_kit.retention.compare.known_used import KnownUsedTable, correct_joins, match_runs
 from probe_kit.retention.rows.outcome_rules import can_be_judged, under_rule
 from probe_kit.retention.table import RetentionTable
-from probe_kit.train.data.run_reader import RunReader
+from probe_kit.runs.reader import RunReader
 
 
 @dataclass(frozen=True)

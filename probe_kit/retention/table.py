@@ -38,9 +38,8 @@ from probe_kit.retention.rows.label_rows import label_notes, label_rows, read_la
 from probe_kit.retention.rows.outcome_rules import can_be_judged, check_epsilons, under_rule
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.runs.location import Location
-from probe_kit.runs.reader import check_sides
+from probe_kit.runs.reader import RunReader, check_sides
 from probe_kit.statistics.estimates.verdict import ABSENT_BELOW
-from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.train.results.store import is_current, load_side_results
 

@@ -13,7 +13,7 @@ from probe_kit.retention.columns.text import spell
 from probe_kit.retention.compare.origins import checkpoint_of, split_checkpoint
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.retention.table import RetentionTable
-from probe_kit.train.data.run_reader import RunReader
+from probe_kit.runs.reader import RunReader
 
 _COLUMNS = {
     "category": "",

@@ -16,10 +16,10 @@ from probe_kit.retention.compare.common_items import common_items, wording_of
 from probe_kit.retention.compare.compare import Difference
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.retention.table import retention_table
+from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.estimates.cka import unbiased_cka
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.study.transfer import Agreement, ProbedRun, Transfer, agreement, transfer
-from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.train.results.store import load_results
 

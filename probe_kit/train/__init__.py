@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 from probe_kit._system.lazy import lazy_names
 
 if TYPE_CHECKING:
+    from probe_kit.runs.reader import RunReader
     from probe_kit.statistics.folds import FOLD_UNITS, FoldUnit
     from probe_kit.train.array_probe import ArrayProbes, probe
     from probe_kit.train.choices import CONTROLS, INCOMPLETE, SIDES, Control, Incomplete, Side
     from probe_kit.train.data.array_run import ArrayRun
-    from probe_kit.train.data.run_reader import RunReader
     from probe_kit.train.probe_sweep import Progress, train_probes
     from probe_kit.train.results.control_scores import ControlComparison, Controls, ControlScore, UntrainedScore
     from probe_kit.train.results.probe_curve import ProbeCurve
@@ -79,7 +79,7 @@ __getattr__, __dir__ = lazy_names(
         "ProbeResults": "results.probe_results",
         "ProbeSettings": "settings",
         "Progress": "probe_sweep",
-        "RunReader": "data.run_reader",
+        "RunReader": "probe_kit.runs.reader",
         "UntrainedScore": "results.control_scores",
         "load_results_by_call": "results.store",
         "load_results": "results.store",

@@ -10,12 +10,12 @@ from probe_kit._terminal.notebook import notebook_progress
 from probe_kit.errors import NoProbesError, RunIncompleteError, UnknownCategoryError, UsageError
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.contract.sites import Site
+from probe_kit.runs.reader import RunReader, check_several_wordings
 from probe_kit.statistics.folds import FoldUnit
 from probe_kit.train.choices import CORRECT, Incomplete
 from probe_kit.train.controls.fit import add_controls, prepare_controls
 from probe_kit.train.controls.untrained import add_untrained, check_same_source, check_untrained
 from probe_kit.train.crossval.site_probe import SiteProbe
-from probe_kit.train.data.run_reader import RunReader, check_several_wordings
 from probe_kit.train.data.samples import is_token_view, read_samples, sites_of
 from probe_kit.train.execution import ExecutionSettings, Key, probe_columns
 from probe_kit.train.problem import Problem, make_problem

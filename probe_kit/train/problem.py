@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from probe_kit.errors import TooFewGroupsError, UnbalancedEpisodesError
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.sites import Site
+from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.folds import OUTER_FOLDS, fold_numbers, fold_units, stratified_folds, sums_by_group
 from probe_kit.statistics.label_permutations import (
     exchange_blocks,
@@ -25,7 +26,6 @@ from probe_kit.train.choices import Task
 from probe_kit.train.crossval.metrics import chance_level
 from probe_kit.train.crossval.nested_folds import Matrix, NestedFold, nested_folds
 from probe_kit.train.crossval.site_probe import SiteProbe, probe_labels, probe_site
-from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.data.samples import Samples
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.settings import ProbeSettings

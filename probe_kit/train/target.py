@@ -17,14 +17,13 @@ from probe_kit._terminal.plain_text import terminal_safe
 from probe_kit.errors import UsageError
 from probe_kit.hashing import derive_seed, sha256_json
 from probe_kit.runs.layout import RECORDED_EPISODES
-from probe_kit.runs.reader import check_sides
+from probe_kit.runs.reader import RunReader, check_sides
 from probe_kit.statistics.label_permutations import flip_items
 from probe_kit.train.choices import SIDES, Task
 from probe_kit.train.columns.builtin import builtin_column
 from probe_kit.train.columns.cells import Cell
 from probe_kit.train.columns.table import EPISODE, FRAME, INFERENCE, SOURCE, LabelTable, read_table
 from probe_kit.train.columns.values import LabelValues, code_labels
-from probe_kit.train.data.run_reader import RunReader
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
+from probe_kit.runs.reader import RunReader, check_call, reached_calls
 from probe_kit.train.choices import Incomplete
 from probe_kit.train.columns.table import EPISODE, INFERENCE
-from probe_kit.train.data.run_reader import RunReader, check_call, reached_calls
 from probe_kit.train.target import Target
 
 REACHED = 0.9

@@ -24,10 +24,10 @@ from probe_kit.intervene.replay import CleanRun, Condition, ConditionContext, Co
 from probe_kit.intervene.selection import StoredResult, stored_results
 from probe_kit.intervene.settings import has_sides
 from probe_kit.intervene.tokens import TILES, role_token_mask, token_boxes
+from probe_kit.runs.reader import RunReader
 from probe_kit.runs.run import Run
 from probe_kit.statistics.bootstrap import GAINS, units_seed
 from probe_kit.statistics.student import student_interval
-from probe_kit.train.data.run_reader import RunReader
 
 if TYPE_CHECKING:
     import pandas as pd

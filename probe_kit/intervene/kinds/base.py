@@ -23,10 +23,10 @@ from probe_kit.intervene.replay import Condition, ReplayBatch, replay
 from probe_kit.intervene.settings import FIRST_CHUNK, PairRow, categories_in, has_sides, items_of
 from probe_kit.intervene.tokens import TILES
 from probe_kit.runs.direction_files import FileDirection, names_file, read_direction
+from probe_kit.runs.reader import RunReader
 from probe_kit.runs.run import Run
 from probe_kit.statistics.paired_tests import max_t
 from probe_kit.suite.categories import category_of
-from probe_kit.train.data.run_reader import RunReader
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -29,13 +29,13 @@ from probe_kit.intervene.patching.sweep import SwapShare, share_of_whole
 from probe_kit.intervene.replay import CleanRun, Condition, ControlInput, DonorRun, SourceRun
 from probe_kit.intervene.selection import preferred_by_category
 from probe_kit.intervene.settings import FIRST_CHUNK, has_sides
+from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.bootstrap import GAINS, group_bootstrap, units_seed
 from probe_kit.statistics.paired_tests import paired_greater_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.statistics.student import unbounded_student_interval
 from probe_kit.statistics.sufficiency import SMALLEST_EFFECT_OF_INTEREST
 from probe_kit.suite.categories import category_of
-from probe_kit.train.data.run_reader import RunReader
 
 if TYPE_CHECKING:
     from probe_kit._tables.table import Table

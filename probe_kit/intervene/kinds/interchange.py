@@ -31,8 +31,8 @@ from probe_kit.intervene.patching.patch import Cell, sites_of_cells
 from probe_kit.intervene.places import ALL, SiteGroup, resolve_all, roles_of
 from probe_kit.intervene.replay import CleanRun, Condition, Patched, SourceRun
 from probe_kit.intervene.tokens import TILES
+from probe_kit.runs.reader import RunReader
 from probe_kit.runs.run import Run
-from probe_kit.train.data.run_reader import RunReader
 
 if TYPE_CHECKING:
     from probe_kit._tables.table import Table

@@ -44,9 +44,9 @@ from probe_kit.intervene.places import SEPARATOR, list_places, resolve_all
 from probe_kit.intervene.replay import CleanRun, Condition, Patched, ReplayBatch, SourceRun, replay
 from probe_kit.intervene.selection import StoredResult, stored_results
 from probe_kit.intervene.settings import PER_STEP
+from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.paired_tests import max_t, paired_greater_p, smallest_flip_p
 from probe_kit.statistics.significance import SIGNIFICANCE
-from probe_kit.train.data.run_reader import RunReader
 
 if TYPE_CHECKING:
     from probe_kit._tables.table import Table

@@ -31,8 +31,8 @@ from probe_kit.intervene.patching.attribution import LOCALISATION_SHARE
 from probe_kit.intervene.patching.sweep import SwapShare, share_fields, share_of_whole
 from probe_kit.intervene.places import ALL, RESIDUAL, PlaceName
 from probe_kit.intervene.selection import PooledConditions, Rank, pool_conditions, stored_results
+from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.significance import SIGNIFICANCE
-from probe_kit.train.data.run_reader import RunReader
 
 # -- effects of edits at places ------------------------------------------------------------------------------
 

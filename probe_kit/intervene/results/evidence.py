@@ -33,8 +33,8 @@ from probe_kit.intervene.patching.sets import NOTHING, carries_nothing
 from probe_kit.intervene.places import ALL, list_places, unread_places
 from probe_kit.intervene.results.verdict import Places, UseVerdict, classify_behaviour, control_for
 from probe_kit.intervene.settings import FIRST_CHUNK, PER_STEP
+from probe_kit.runs.reader import RunReader
 from probe_kit.suite.categories import category_of
-from probe_kit.train.data.run_reader import RunReader
 
 if TYPE_CHECKING:
     from probe_kit.train.results.probe_results import ProbeResults

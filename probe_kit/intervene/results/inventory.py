@@ -11,9 +11,9 @@ from probe_kit.intervene.outcomes import StoredIntervention, read_interventions,
 from probe_kit.intervene.results.results import effects_of
 from probe_kit.runs.layout import INTERVENTIONS
 from probe_kit.runs.location import Location
+from probe_kit.runs.reader import RunReader
 from probe_kit.runs.results import PARTIAL, Bundle
 from probe_kit.runs.run import Run
-from probe_kit.train.data.run_reader import RunReader
 
 COMMON = frozenset(
     {"format", "kind", "run_settings", "stamp", "weights", "wording", "categories", "items", "readout", "donors"}

@@ -25,9 +25,9 @@ from probe_kit.intervene.results.evidence import (
 )
 from probe_kit.intervene.results.verdict import Places, UseVerdict, classify_all, describe_readouts, encoded_in
 from probe_kit.intervene.settings import PER_STEP
+from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.paired_tests import smallest_flip_p
 from probe_kit.statistics.significance import SIGNIFICANCE
-from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.store import load_results
 
 if TYPE_CHECKING:

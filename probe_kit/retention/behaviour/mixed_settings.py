@@ -3,8 +3,8 @@
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+from probe_kit.runs.reader import RunReader
 from probe_kit.train.choices import CORRECT, SIDES
-from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.train.settings import ProbeSettings
 

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour.success_rate import capture_only
-from probe_kit.train.data.run_reader import RunReader
+from probe_kit.runs.reader import RunReader
 
 _MARKS: Sequence[Callable[[RunReader, int], str]] = (
     lambda run, _: run.settings_sha256[:6],

@@ -11,10 +11,10 @@ import numpy as np
 from probe_kit.env.scoring.outcome import SENSITIVITY_RADII, success_at
 from probe_kit.errors import UsageError
 from probe_kit.runs.layout import CAPTURE_ONLY
+from probe_kit.runs.reader import check_several_wordings
 from probe_kit.statistics.estimates.shares import Share
 from probe_kit.statistics.paired_tests import heads_p
 from probe_kit.statistics.significance import chance_margin
-from probe_kit.train.data.run_reader import check_several_wordings
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -33,10 +33,10 @@ from probe_kit.retention.estimators.stream_scores import (
 from probe_kit.retention.rows.build import RowWithEstimates
 from probe_kit.retention.rows.parts import Mode
 from probe_kit.retention.rows.row import MEAN
+from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.estimates.retention import Ratio, retention_difference
 from probe_kit.statistics.estimates.scores import Scores
 from probe_kit.statistics.paired_tests import corrected
-from probe_kit.train.data.run_reader import RunReader
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -18,7 +18,7 @@ from probe_kit.hashing import derive_seed
 from probe_kit.retention.behaviour.success_rate import units_of
 from probe_kit.retention.behaviour.vlm_answers import ask_of
 from probe_kit.retention.estimators.retention import best_site
-from probe_kit.runs.reader import check_sides
+from probe_kit.runs.reader import RunReader, check_sides
 from probe_kit.statistics.paired_tests import (
     clopper_pearson,
     corrected,
@@ -27,7 +27,6 @@ from probe_kit.statistics.paired_tests import (
     mcnemar_p,
     overlap_p,
 )
-from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.control_scores import has_signal
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeResults

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 
 from probe_kit.errors import UsageError
 from probe_kit.retention.compare.source_weights import card_of
-from probe_kit.train.data.run_reader import RunReader
+from probe_kit.runs.reader import RunReader
 
 _STEP = re.compile(r"(?:^|.*(?:step|checkpoint|ckpt|iter|iteration)s?[-_=]?)0*(\d+)$", re.IGNORECASE)
 """A folder of a training: `020000`, `checkpoint-500`, `step_20000`, `ckpt-3`."""

@@ -20,7 +20,7 @@ from probe_kit.retention.compare.compare import Difference, Side, compare, with_
 from probe_kit.retention.compare.origins import origins_of
 from probe_kit.retention.compare.source_weights import grew_from
 from probe_kit.retention.rows.build import RowSettings, RowWithEstimates, run_rows
-from probe_kit.train.data.run_reader import RunReader
+from probe_kit.runs.reader import RunReader
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from probe_kit.train.data.run_reader import RunReader
+from probe_kit.runs.reader import RunReader
 
 Relation = Literal["yes", "no", "unknown"]
 

@@ -16,7 +16,7 @@ from probe_kit.retention.displays.base.panels import Panelled, in_panels
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure
 from probe_kit.retention.displays.base.style import layer_axis, series
-from probe_kit.train.data.run_reader import RunReader
+from probe_kit.runs.reader import RunReader
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

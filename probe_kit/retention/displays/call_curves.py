@@ -38,8 +38,8 @@ from probe_kit.retention.estimators.by_call import (
     EventTimes,
     event_calls,
 )
+from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.estimates.balanced import CHANCE
-from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.train.results.store import load_results_by_call
 

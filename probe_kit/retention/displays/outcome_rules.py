@@ -15,7 +15,7 @@ from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure, figure_of
 from probe_kit.retention.displays.base.style import GREEN, VERMILION, axes_for, caption, legend_above, plain
 from probe_kit.retention.rows.outcome_rules import RunUnderRule
-from probe_kit.train.data.run_reader import RunReader
+from probe_kit.runs.reader import RunReader
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -19,7 +19,7 @@ from probe_kit.retention.displays.base.report_figure import (
     file_names,
 )
 from probe_kit.retention.table import RetentionTable
-from probe_kit.train.data.run_reader import RunReader
+from probe_kit.runs.reader import RunReader
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -18,9 +18,9 @@ from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure
 from probe_kit.retention.displays.base.selection import scores_of
 from probe_kit.retention.displays.base.style import layer_axis, series
+from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.estimates.balanced import CHANCE
 from probe_kit.statistics.significance import SIGNIFICANCE
-from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from probe_kit.runs.layout import CAPTURE_ONLY
+from probe_kit.runs.reader import RunReader
 from probe_kit.runs.thumbnails import read_thumbnail
-from probe_kit.train.data.run_reader import RunReader
 
 PICTURES = 4000
 """Episodes a report shows with pictures, over all runs; one full suite of 3,440 makes about 10 MB of them."""

@@ -8,9 +8,9 @@ from probe_kit.retention.displays.base.report_figure import ReportFigure
 from probe_kit.retention.displays.report_figures import collect_figures
 from probe_kit.retention.report.pictures import Picture, arranged
 from probe_kit.retention.table import RetentionTable, retention_table
+from probe_kit.runs.reader import RunReader
 from probe_kit.train.choices import Task
 from probe_kit.train.crossval.task_scores import METRICS
-from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.train.results.store import stored_targets
 from probe_kit.train.results.summary import best_sites_sentences, best_sites_table

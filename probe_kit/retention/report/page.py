@@ -27,7 +27,7 @@ from probe_kit.retention.report.summaries import RunInWords, read_run
 from probe_kit.retention.report.words import words_of
 from probe_kit.retention.rows.outcome_rules import under_rule
 from probe_kit.retention.table import RetentionTable, retention_table
-from probe_kit.train.data.run_reader import RunReader
+from probe_kit.runs.reader import RunReader
 from probe_kit.version import __version__
 
 

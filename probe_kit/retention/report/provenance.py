@@ -7,7 +7,7 @@ from typing import Any
 
 from probe_kit.retention.behaviour.vlm_answers import ask_of
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
-from probe_kit.train.data.run_reader import RunReader
+from probe_kit.runs.reader import RunReader
 from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.version import __version__
 

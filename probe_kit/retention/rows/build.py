@@ -27,9 +27,9 @@ from probe_kit.retention.rows.outcome_rules import OutcomeRuleScores, RunUnderRu
 from probe_kit.retention.rows.parts import AnswerStats, RunInfo
 from probe_kit.retention.rows.probe_parts import number_or_none, with_probes
 from probe_kit.retention.rows.row import RetentionRow
+from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.estimates.verdict import ABSENT_BELOW
 from probe_kit.train.choices import CORRECT
-from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:

@@ -11,9 +11,9 @@ from probe_kit.retention.choices import Family, Iterations
 from probe_kit.retention.rows.build import run_info
 from probe_kit.retention.rows.probe_parts import with_corrected_p, with_probes
 from probe_kit.retention.rows.row import RetentionRow
+from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.paired_tests import holm
 from probe_kit.train.choices import SIDES
-from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.train.results.store import load_results, stored_targets
 

@@ -11,8 +11,8 @@ from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour.success_rate import capture_only, group_names, shares_of
 from probe_kit.retention.behaviour.vlm_answers import ask_of
 from probe_kit.retention.estimators.stream_scores import Limits, limits
+from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.estimates.shares import Share
-from probe_kit.train.data.run_reader import RunReader
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
 from probe_kit.runs.action_errors import compare_actions, why_not_compared
+from probe_kit.runs.reader import RunReader, reached_calls
 from probe_kit.train.choices import Task
 from probe_kit.train.columns.cells import Cell
 from probe_kit.train.columns.table import EPISODE, INFERENCE
-from probe_kit.train.data.run_reader import RunReader, reached_calls
 
 if TYPE_CHECKING:
     import pandas as pd

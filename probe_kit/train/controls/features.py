@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
+from probe_kit.runs.reader import RunReader
 from probe_kit.train.columns.builtin import frames_of_inferences, why_no_sim
-from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.control_scores import RANDOM_FEATURES
 from probe_kit.train.target_samples import TargetSamples
 

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from probe_kit.errors import SuiteNotFoundError, UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.sites import Site
+from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.label_permutations import pointwise_p
 from probe_kit.statistics.paired_bootstrap import better_than_reference
 from probe_kit.train.choices import CONTROLS
 from probe_kit.train.controls.features import LAYERS, PICTURED, ControlInputs, control_features, why_impossible
 from probe_kit.train.crossval.site_probe import SiteProbe
-from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.data.run_suite import suite_of
 from probe_kit.train.data.samples import Samples
 from probe_kit.train.problem import Problem

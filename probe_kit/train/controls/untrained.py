@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
 from probe_kit.runs.layout import DATASET
+from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.estimates.shares import Accuracy
 from probe_kit.statistics.paired_bootstrap import better_than_best
 from probe_kit.train.controls.fit import comparison_seed, comparisons, control_score
-from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.control_scores import UNTRAINED, ControlComparison, ControlScore, UntrainedScore
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeResults

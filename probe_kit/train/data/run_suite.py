@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from probe_kit.errors import SuiteError, SuiteNotFoundError, UsageError
-from probe_kit.train.data.run_reader import RunReader
+from probe_kit.runs.reader import RunReader
 
 if TYPE_CHECKING:
     from probe_kit.suite import Suite

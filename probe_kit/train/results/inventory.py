@@ -5,10 +5,10 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
+from probe_kit.runs.reader import RunReader
 from probe_kit.runs.results import Bundle
 from probe_kit.runs.run import Run
 from probe_kit.train.choices import CORRECT
-from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.control_scores import UNTRAINED
 from probe_kit.train.results.resume import unfinished_sweeps
 from probe_kit.train.results.store import (

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 from probe_kit.errors import UnknownSiteError
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.contract.sites import Site
+from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.label_permutations import permutations_for, shortage
-from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.data.samples import is_token_view
 from probe_kit.train.results.best_sites import results_html
 from probe_kit.train.results.control_scores import Controls

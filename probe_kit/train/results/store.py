@@ -20,6 +20,7 @@ from probe_kit.errors import NoProbesError, RunDamagedError, UsageError
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.runs.layout import PROBE_DIRECTIONS, PROBES
+from probe_kit.runs.reader import RunReader
 from probe_kit.runs.results import (
     HEAD,
     Bundle,
@@ -33,7 +34,6 @@ from probe_kit.runs.results import (
 from probe_kit.runs.store import Location, locate
 from probe_kit.statistics.sufficiency import GROUPS_FOR_PROBES, probe_command
 from probe_kit.train.choices import CORRECT, SIDES
-from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.control_scores import Controls
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_directions import StoredDirections, save_directions

@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 from probe_kit._terminal.notebook import notebook_progress
 from probe_kit.errors import SettingsMismatchError, TooFewGroupsError, UsageError
 from probe_kit.hooks.contract.sites import Site
+from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.folds import OUTER_FOLDS, Fold
 from probe_kit.train.choices import Task
 from probe_kit.train.crossval.nested_folds import NestedFold
 from probe_kit.train.crossval.site_probe import predict_once, probe_labels
 from probe_kit.train.crossval.task_scores import balanced_scores
-from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.data.samples import Samples, read_samples, sites_of
 from probe_kit.train.execution import ExecutionSettings
 from probe_kit.train.probe_sweep import TOKEN_PERMUTATIONS, Progress, Sweep, check_options, check_run

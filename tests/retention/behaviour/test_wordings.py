@@ -11,8 +11,8 @@ from probe_kit.retention.behaviour.success_rate import success_rate
 from probe_kit.retention.columns.comparisons import wording_tables
 from probe_kit.retention.compare.compare import Difference
 from probe_kit.retention.compare.pairing import compare_wordings
+from probe_kit.runs.reader import check_several_wordings
 from probe_kit.train import ArrayRun
-from probe_kit.train.data.run_reader import check_several_wordings
 
 
 @dataclass(frozen=True)

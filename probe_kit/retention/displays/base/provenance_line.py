@@ -5,8 +5,8 @@ from typing import Self
 
 from probe_kit._system.counting import counted
 from probe_kit.retention.rows.row import RetentionRow
+from probe_kit.runs.reader import RunReader
 from probe_kit.train.choices import CORRECT
-from probe_kit.train.data.run_reader import RunReader
 from probe_kit.train.results.probe_results import ProbeResults
 
 RANDOM = "RANDOM WEIGHTS"
