@@ -25,6 +25,7 @@ from probe_kit.retention.displays.base.style import (
     axes_for,
     caption,
     legend_above,
+    legend_handles,
     mark_below,
     panels,
     plain,
@@ -44,7 +45,6 @@ from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.train.results.store import load_results_by_call
 
 if TYPE_CHECKING:
-    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from numpy.typing import ArrayLike
@@ -203,9 +203,7 @@ def _finish(axes: "Axes", title: str, below: str) -> None:
 
 def _complete(figure: "Figure", axes: "Axes", certificate: ProvenanceLine, tested: bool) -> None:
     """tested: whether markers are filled where something is evidence."""
-
-    handles: dict[str, Artist] = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
-    legend_above(figure, [*handles.values(), *(significance_handles() if tested else ())])
+    legend_above(figure, [*legend_handles(axes).values(), *(significance_handles() if tested else ())])
     figure.supylabel("best site, accuracy (%)", fontsize=9)
     caption(figure, replace(certificate, call=None))
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
-from probe_kit.retention.displays.base.panels import Panelled, in_panels
+from probe_kit.retention.displays.base.panels import Panelled, in_streams
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure, label_views
 from probe_kit.retention.displays.base.selection import best_row, probed_curve
@@ -122,9 +122,7 @@ class ClassConfusionDisplay(Panelled):
 
 def class_confusions(results: ProbeResults, view: str | None = None, category: str | None = None) -> "Figure":
     """Confusion matrices, a panel per stream; arguments and errors as of `ClassConfusionDisplay`."""
-    category, view, curve = probed_curve(results, view, category)
-    displays = [ClassConfusionDisplay.from_results(results, stream, view, category) for stream in curve.streams]
-    return in_panels(displays, 3.3, 3.1, share=False)
+    return in_streams(ClassConfusionDisplay.from_results, results, view, category, 3.3, 3.1)
 
 
 PLACE = 17
@@ -135,10 +133,9 @@ def label_figures(source: FigureSource) -> Iterator[ReportFigure]:
     """Yield the figures that a report of these labels shows: of those with classes."""
     for view in label_views(source):
         if view.curve.classes:
-            yield ReportFigure(
-                view.file_name("confusion"), view.title("Confusion matrix"), view.target,
+            yield view.figure(
+                "confusion", "Confusion matrix",
                 "Which class the best site of each part predicts for which, in groups it has not seen. Each row "
                 "sums to 100 %; the mean of the diagonal is the balanced accuracy.",
-                view.position, partial(class_confusions, view.results, view.name, view.category),
-                is_detail=not view.is_first,
+                partial(class_confusions, view.results, view.name, view.category),
             )  # fmt: skip

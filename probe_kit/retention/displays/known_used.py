@@ -20,6 +20,7 @@ from probe_kit.retention.displays.base.style import (
     axes_for,
     footer,
     legend_above,
+    legend_handles,
     plain,
 )
 from probe_kit.retention.joins import joins_of
@@ -83,8 +84,7 @@ class KnownUsedDisplay(Display):
         axes.spines["left"].set_visible(False)
         axes.tick_params(axis="y", length=0)
         if figure is not None:
-            handles = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
-            legend_above(figure, list(handles.values()))
+            legend_above(figure, list(legend_handles(axes).values()))
             footer(figure, self.note)
         self.ax_ = axes
         return self

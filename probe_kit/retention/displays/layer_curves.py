@@ -30,6 +30,7 @@ from probe_kit.retention.displays.base.style import (
     caption,
     layer_axis,
     legend_above,
+    legend_handles,
     mark_below,
     plain,
     significance_handles,
@@ -41,7 +42,6 @@ from probe_kit.train.crossval.task_scores import METRICS
 from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:
-    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
@@ -266,10 +266,7 @@ def _complete(figure: "Figure", grid: "list[list[Axes]]", displays: Sequence[Lay
         grid[0][0].set_ylim(min(low for low, _ in ranges), max(high for _, high in ranges))
     figure.supylabel(displays[0].measure, fontsize=9)
     caption(figure, displays[0].certificate)
-    handles: dict[str, Artist] = {}
-    for ax in grid[0]:
-        handles |= {label: handle for handle, label in zip(*ax.get_legend_handles_labels(), strict=True)}
-    drawn = [handle for label, handle in handles.items() if not label.startswith("iteration")]
+    drawn = [handle for label, handle in legend_handles(*grid[0]).items() if not label.startswith("iteration")]
     drawn += [*significance_handles(), _peak_handle()]
     legend_above(figure, drawn)
     _draw_scales(figure, grid, displays)
@@ -407,11 +404,10 @@ def label_figures(source: FigureSource) -> Iterator[ReportFigure]:
     """Yield the figures that a report of these labels shows."""
     iterations = "best" if source.table.iterations == "all" else source.table.iterations
     for view in label_views(source):
-        yield ReportFigure(
-            view.file_name("layer-curves"), view.title("Layer curves"), view.target,
+        yield view.figure(
+            "layer-curves", "Layer curves",
             "How well a linear probe decodes the label in groups it has not seen, layer by layer, with 95 % "
             f"intervals over groups. {ONLY_FILLED}. Grey: what the same probes reach with labels exchanged "
             "between groups. Dotted: the best control.",
-            view.position, partial(layer_curve, view.results, view.name, iterations, [view.category]),
-            is_detail=not view.is_first,
+            partial(layer_curve, view.results, view.name, iterations, [view.category]),
         )  # fmt: skip

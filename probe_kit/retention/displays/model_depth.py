@@ -22,13 +22,13 @@ from probe_kit.retention.displays.base.style import (
     caption,
     layer_axis,
     legend_above,
+    legend_handles,
     plain,
     series,
 )
 from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:
-    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -135,10 +135,7 @@ def model_depths(
     grid = figure.subplots(1, len(displays), sharey=True, squeeze=False)[0]
     for display, axes in zip(displays, grid, strict=True):
         display.plot(axes)
-    handles: dict[str, Artist] = {}
-    for axes in grid:
-        handles |= {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    legend_above(figure, list(handles.values()))
+    legend_above(figure, list(legend_handles(*grid).values()))
     figure.supylabel("above chance\n(points, mean of categories)", fontsize=8)
     caption(figure, *(certificate for display in displays for certificate in display.certificates))
     return figure

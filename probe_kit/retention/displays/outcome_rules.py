@@ -13,7 +13,15 @@ from probe_kit.retention.behaviour.success_rate import shares_of
 from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure, figure_of
-from probe_kit.retention.displays.base.style import GREEN, VERMILION, axes_for, caption, legend_above, plain
+from probe_kit.retention.displays.base.style import (
+    GREEN,
+    VERMILION,
+    axes_for,
+    caption,
+    legend_above,
+    legend_handles,
+    plain,
+)
 from probe_kit.retention.rows.outcome_rules import RunUnderRule
 from probe_kit.runs.reader import RunReader
 
@@ -74,8 +82,7 @@ class OutcomeRulesDisplay(Display):
         axes.spines["left"].set_visible(False)
         axes.tick_params(axis="y", length=0)
         if figure is not None:
-            handles = dict(zip(*reversed(axes.get_legend_handles_labels()), strict=True))
-            legend_above(figure, list(handles.values()))
+            legend_above(figure, list(legend_handles(axes).values()))
         caption(figure, *self.certificates)
         self.ax_ = axes
         return self

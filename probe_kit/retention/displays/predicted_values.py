@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
-from probe_kit.retention.displays.base.panels import Panelled, in_panels
+from probe_kit.retention.displays.base.panels import Panelled, in_streams
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure, label_views
 from probe_kit.retention.displays.base.selection import best_row, probed_curve
@@ -95,9 +95,7 @@ class PredictedValuesDisplay(Panelled):
 
 def predicted_values(results: ProbeResults, view: str | None = None, category: str | None = None) -> "Figure":
     """Predicted against true, a panel per stream; arguments and errors as of `PredictedValuesDisplay`."""
-    category, view, curve = probed_curve(results, view, category)
-    displays = [PredictedValuesDisplay.from_results(results, stream, view, category) for stream in curve.streams]
-    return in_panels(displays, 3.3, 3.0, share=False, level=True)
+    return in_streams(PredictedValuesDisplay.from_results, results, view, category, 3.3, 3.0, level=True)
 
 
 PLACE = 18
@@ -108,10 +106,9 @@ def label_figures(source: FigureSource) -> Iterator[ReportFigure]:
     """Yield the figures that a report of these labels shows: of continuous ones."""
     for view in label_views(source):
         if not view.curve.classes:
-            yield ReportFigure(
-                view.file_name("predicted"), view.title("Predicted against true"), view.target,
+            yield view.figure(
+                "predicted", "Predicted against true",
                 "A point per sample, predicted by the best site of each part in groups it has not seen. Colours "
                 "are groups. Predictions are clipped to the range of the training labels.",
-                view.position, partial(predicted_values, view.results, view.name, view.category),
-                is_detail=not view.is_first,
+                partial(predicted_values, view.results, view.name, view.category),
             )  # fmt: skip

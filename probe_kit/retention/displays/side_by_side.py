@@ -24,6 +24,7 @@ from probe_kit.retention.displays.base.style import (
     caption,
     layer_axis,
     legend_above,
+    legend_handles,
     panels,
     plain,
     series,
@@ -36,7 +37,6 @@ from probe_kit.statistics.estimates.balanced import CHANCE
 from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:
-    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -77,9 +77,7 @@ def curves_side_by_side(
         curves = [(at, curve) for at, curve in every if curve is not None]
         _draw_panel(axes, curves, names)
         axes.set_title(f"{spell(category)}: {PARTS[part]}", fontsize=9, loc="left")
-    handles: dict[str, Artist] = {}
-    for axes in grid:
-        handles |= {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    handles = legend_handles(*grid)
     order = {name: at for at, name in enumerate(["chance", *names])}
     legend_above(figure, [*(handles[n] for n in sorted(handles, key=order.__getitem__)), *significance_handles()])
     figure.supylabel("held-out accuracy (%)", fontsize=9)

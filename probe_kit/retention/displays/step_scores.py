@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
-from probe_kit.retention.displays.base.panels import Panelled, in_panels
+from probe_kit.retention.displays.base.panels import Panelled, in_streams
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure, label_views
 from probe_kit.retention.displays.base.selection import best_row, probed_curve, scores_of
@@ -156,9 +156,7 @@ def _whole_numbers(axes: "Axes", label: str) -> None:
 
 def step_scores(results: ProbeResults, view: str | None = None, category: str | None = None) -> "Figure":
     """Score of a label by step, a panel per stream; arguments and errors as of `StepScoresDisplay`."""
-    category, view, curve = probed_curve(results, view, category)
-    displays = [StepScoresDisplay.from_results(results, stream, view, category) for stream in curve.streams]
-    return in_panels(displays, 3.1, 2.6, share=False, level=True)
+    return in_streams(StepScoresDisplay.from_results, results, view, category, 3.1, 2.6, level=True)
 
 
 PLACE = 16
@@ -169,10 +167,9 @@ def label_figures(source: FigureSource) -> Iterator[ReportFigure]:
     """Yield the figures that a report of these labels shows: of those with several steps."""
     for view in label_views(source):
         if view.curve.steps.size > 1:
-            yield ReportFigure(
-                view.file_name("steps"), view.title("Score by step"), view.target,
+            yield view.figure(
+                "steps", "Score by step",
                 "The same by inference, at the best site of each part, beside controls. Classes are balanced "
                 "among those of the step. A step of one class is easy, so compare with the controls at that step.",
-                view.position, partial(step_scores, view.results, view.name, view.category),
-                is_detail=not view.is_first,
+                partial(step_scores, view.results, view.name, view.category),
             )  # fmt: skip

@@ -1,12 +1,22 @@
 """Displays that are one panel: on axes of their own with legend and caption, or side by side in one figure."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Self
 
 from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
-from probe_kit.retention.displays.base.style import Line, axes_for, caption, legend_above, panels, plain
+from probe_kit.retention.displays.base.selection import probed_curve
+from probe_kit.retention.displays.base.style import (
+    Line,
+    axes_for,
+    caption,
+    legend_above,
+    legend_handles,
+    panels,
+    plain,
+)
+from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:
     import numpy as np
@@ -80,12 +90,28 @@ def in_panels(
     return figure
 
 
+def in_streams(
+    read: Callable[[ProbeResults, str, str, str], Panelled],
+    results: ProbeResults,
+    view: str | None,
+    category: str | None,
+    width: float,
+    height: float,
+    *,
+    level: bool = False,
+) -> "Figure":
+    """Return a panel per stream that was probed in a view and category, by default the first ones.
+
+    read: makes a display of results, stream, view and category. Others: as in `in_panels`.
+    """
+    category, view, curve = probed_curve(results, view, category)
+    displays = [read(results, stream, view, category) for stream in curve.streams]
+    return in_panels(displays, width, height, share=False, level=level)
+
+
 def _draw_legend(figure: "Figure", grid: "Sequence[Axes]", display: Panelled) -> None:
     """Draw a legend with every name once."""
-    handles: dict[str, Artist] = {}
-    for axes in grid:
-        handles |= {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    if every := [*handles.values(), *display.further_handles()]:
+    if every := [*legend_handles(*grid).values(), *display.further_handles()]:
         legend_above(figure, every)
 
 

@@ -117,28 +117,22 @@ class LabelView:
     position: int
 
     @property
-    def target(self) -> str:
-        """The label."""
-        return self.results.settings.target
-
-    @property
     def curve(self) -> ProbeCurve:
         """Its probes."""
         return self.results.curves[self.category, self.name]
 
-    @property
-    def is_first(self) -> bool:
-        """Whether it is of the first view; figures of others are details."""
-        return self.name == self.results.settings.views[0]
+    def figure(self, name: str, title: str, reading: str, draw: "Callable[[], Figure]") -> ReportFigure:
+        """Return a figure of it for a report; those of other views than the first are details.
 
-    def file_name(self, figure: str) -> str:
-        """Return the stem of a figure's files."""
+        name: of the figure in file names. title: without the view. reading: how to read it, in plain language.
+        """
+        views = self.results.settings.views
         of_category = "" if self.category == EVERYWHERE else f"-{file_names([self.category])[0]}"
-        return f"{self.stem}{of_category}-{figure}{view_suffix(self.name, self.results.settings.views)}"
-
-    def title(self, title: str) -> str:
-        """Return a title, which names the view where there are several."""
-        return in_view(title, self.name, self.results.settings.views)
+        return ReportFigure(
+            f"{self.stem}{of_category}-{name}{view_suffix(self.name, views)}",
+            in_view(title, self.name, views), self.results.settings.target, reading, self.position, draw,
+            is_detail=self.name != views[0],
+        )  # fmt: skip
 
 
 def label_views(source: FigureSource) -> Iterator[LabelView]:

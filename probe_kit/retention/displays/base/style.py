@@ -185,6 +185,14 @@ def legend_above(figure: "Figure", handles: "Sequence[Artist]", title: str = "")
     )  # fmt: skip
 
 
+def legend_handles(*grid: "Axes") -> "dict[str, Artist]":
+    """Return the handles of a legend by their label, each label once, in the order in which they are drawn."""
+    handles: dict[str, Artist] = {}
+    for axes in grid:
+        handles |= {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    return handles
+
+
 def significance_handles(colour: str = "0.3") -> "list[Line2D]":
     """The legend's entries for filled and open markers, which mean the same in every figure."""
     from matplotlib.lines import Line2D
