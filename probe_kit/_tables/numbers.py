@@ -1,6 +1,6 @@
 """Number formats of tables, sentences and figures: a dash stands for a number that there is not."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from math import isfinite
 
 NONE = "–"
@@ -38,6 +38,12 @@ def points(value: float | None) -> str:
 def p_text(value: float | None) -> str:
     """Return a p-value with three decimals."""
     return "< 0.001" if value is not None and value < 0.001 else number(value, 3)
+
+
+def span(values: Sequence[int]) -> str:
+    """Return the least and the largest of some whole numbers, or the only one."""
+    low, high = min(values), max(values)
+    return str(low) if low == high else f"{low}–{high}"
 
 
 def with_limits(value: float | None, limits: Limits | None, write: Write) -> str:

@@ -13,14 +13,13 @@ from numpy.typing import ArrayLike, NDArray
 from probe_kit.errors import UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.sites import Site
-from probe_kit.train.choices import Task
+from probe_kit.train.choices import EVERYWHERE, Task
 from probe_kit.train.data.array_run import ArrayRun
 from probe_kit.train.probe_sweep import train_probes
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.train.results.score_rows import exceeds_column
 from probe_kit.train.target import Target
-from probe_kit.train.target_samples import EVERYWHERE
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -143,7 +142,7 @@ def probe(
         texts = list(map(str, _column(strata, count, "strata")))
         columns["strata"] = [texts[row] for row in order]
     table = pd.DataFrame(columns)
-    episodes = table[["episode_id", "group_id"]].assign(category="all")
+    episodes = table[["episode_id", "group_id"]].assign(category=EVERYWHERE)
     networks = {"arrays": sites}
     if untrained is not None:
         networks["untrained"] = _sites(untrained, "untrained", count)

@@ -15,6 +15,8 @@ SIDES: dict[str, str] = {
     "side.shuffled": "control: side of the correct picture, flipped for a random half of the items",
 }
 """Targets that are sides of a picture."""
+EVERYWHERE = "all"
+"""Category that holds the episodes of all categories, and the only stratum where groups exchange everywhere."""
 INCOMPLETE: dict[str, str] = {
     "keep": "items of which a layout is missing take part with the other",
     "drop": "they do not: the classes are balanced again",

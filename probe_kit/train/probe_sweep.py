@@ -12,7 +12,7 @@ from probe_kit.hashing import sha256_json
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.runs.reader import RunReader, check_several_wordings
 from probe_kit.statistics.folds import FoldUnit
-from probe_kit.train.choices import CORRECT, Incomplete
+from probe_kit.train.choices import CORRECT, EVERYWHERE, Incomplete
 from probe_kit.train.controls.fit import add_controls, prepare_controls
 from probe_kit.train.controls.untrained import add_untrained, check_same_source, check_untrained
 from probe_kit.train.crossval.site_probe import SiteProbe
@@ -27,7 +27,7 @@ from probe_kit.train.results.store import is_stored, load_results, save_results
 from probe_kit.train.settings import ProbeSettings
 from probe_kit.train.solver.backend import check_device
 from probe_kit.train.target import Target
-from probe_kit.train.target_samples import EVERYWHERE, TargetSamples, groups_of, target_samples
+from probe_kit.train.target_samples import TargetSamples, groups_of, target_samples
 
 TOKEN_PERMUTATIONS = 59
 """Label permutations of token views by default."""

@@ -22,7 +22,7 @@ from probe_kit.statistics.label_permutations import (
     smallest_p,
 )
 from probe_kit.statistics.significance import SIGNIFICANCE
-from probe_kit.train.choices import Task
+from probe_kit.train.choices import EVERYWHERE, Task
 from probe_kit.train.crossval.metrics import chance_level
 from probe_kit.train.crossval.nested_folds import Matrix, NestedFold, nested_folds
 from probe_kit.train.crossval.site_probe import SiteProbe, probe_labels, probe_site
@@ -30,7 +30,7 @@ from probe_kit.train.data.samples import Samples
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.settings import ProbeSettings
 from probe_kit.train.target import Target
-from probe_kit.train.target_samples import EVERYWHERE, TargetSamples
+from probe_kit.train.target_samples import TargetSamples
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -9,15 +9,13 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
 from probe_kit.runs.reader import RunReader, check_call, reached_calls
-from probe_kit.train.choices import Incomplete
+from probe_kit.train.choices import EVERYWHERE, Incomplete
 from probe_kit.train.columns.table import EPISODE, INFERENCE
 from probe_kit.train.target import Target
 
 REACHED = 0.9
 """Share of the episodes that reach the last inference of the default window."""
 _TRUE_OR_FALSE = (("False", "True"), ("no", "yes"), ("0", "1"))
-EVERYWHERE = "all"
-"""Category that holds the episodes of all categories, and the only stratum where groups exchange everywhere."""
 
 
 @dataclass(frozen=True)
@@ -130,8 +128,8 @@ def groups_of(run: RunReader, target: Target) -> tuple[NDArray[np.str_], NDArray
     if target.group_by is None:
         groups: NDArray[np.str_] = run.episodes["group_id"].to_numpy(dtype=str)
     else:
-        groups = _column(run, target, target.group_by, target.groups, EVERYWHERE)
-    return groups, _column(run, target, target.exchange_within, target.strata, EVERYWHERE)
+        groups = _column(run, target, target.group_by, target.groups)
+    return groups, _column(run, target, target.exchange_within, target.strata)
 
 
 def _complete(run: RunReader, reached: NDArray[np.bool_], incomplete: Incomplete) -> NDArray[np.bool_]:
@@ -191,7 +189,7 @@ def _label_grid(run: RunReader, target: Target) -> NDArray[np.float64]:
     Raises UsageError for an episode or inference that the run does not have.
     """
     row_of = {name: row for row, name in enumerate(run.episodes[EPISODE].astype(str))}
-    planned = _planned(run)
+    planned = set(run.planned_ids)
     reached = reached_calls(run)
     grid = np.full((len(row_of), reached.shape[1] if target.per_step else 1), np.nan)
     for number, name in enumerate(target.episodes):
@@ -214,17 +212,13 @@ def _label_grid(run: RunReader, target: Target) -> NDArray[np.float64]:
     return grid
 
 
-def _planned(run: Any) -> set[str]:
-    """Ids of episodes that a run plans, finished or not, shown or not."""
-    return {*run.planned_ids}
+def _column(run: RunReader, target: Target, name: str | None, cells: Sequence[str] | None) -> NDArray[np.str_]:
+    """(E,) a column of the table, or else of the run's episodes; empty texts where the table has no line.
 
-
-def _column(
-    run: RunReader, target: Target, name: str | None, cells: Sequence[str] | None, default: str
-) -> NDArray[np.str_]:
-    """(E,) a column of the table, or else of the run's episodes; empty texts where the table has no line."""
+    Without a name all episodes are alike.
+    """
     if name is None:
-        return np.full(len(run.episodes), default)
+        return np.full(len(run.episodes), EVERYWHERE)
     if cells is None:
         if name not in run.episodes:
             raise UsageError(

@@ -15,10 +15,9 @@ _MARKS: Sequence[Callable[[RunReader, int], str]] = (
 """What is added to a name that comes twice, one after the other, until none does: settings, folder, number."""
 
 
-def full_name(label: str, random_weights: bool, heard: bool = False, group: str | None = None) -> str:
-    """A label, marked if the weights are random or the model only captured, with its group if there is one."""
-    name = label + (" (random weights)" if random_weights else "") + (" (capture only)" if heard else "")
-    return name if group is None else f"{group}: {name}"
+def full_name(label: str, random_weights: bool, heard: bool = False) -> str:
+    """A label, marked if the weights are random or the model only captured."""
+    return label + (" (random weights)" if random_weights else "") + (" (capture only)" if heard else "")
 
 
 def distinct_labels(runs: Sequence[RunReader], names: Mapping[str, str] | None = None) -> dict[str, str]:

@@ -16,6 +16,7 @@ from probe_kit.retention.choices import Section
 from probe_kit.retention.columns.modes import Modes
 from probe_kit.retention.columns.text import (
     P_DECIDES,
+    above_chance,
     action_place,
     backbone_place,
     baseline,
@@ -596,12 +597,8 @@ def _label_columns(part: str) -> tuple[Column, ...]:
         _of_label(f"{part}.site", "site", _SITE, lambda of: of.site or "–"),
         _of_label(f"{part}.peak", "score", _LABEL_SCORE, lambda of: number(of.peak), **strong),
         _of_label(f"{part}.chance", "chance", _CHANCE, lambda of: number(of.chance)),
-        _of_label(f"{part}.above", "above chance", _ABOVE_CHANCE, _above_chance, **strong),
+        _of_label(f"{part}.above", "above chance", _ABOVE_CHANCE, above_chance, **strong),
     )
-
-
-def _above_chance(part: StreamPart) -> str:
-    return "–" if part.chance is None else with_limits(part.above, part.above_ci, number)
 
 
 GROUPS = Column(

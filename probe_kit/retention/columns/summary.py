@@ -10,6 +10,7 @@ from probe_kit.retention.columns.findings import finding
 from probe_kit.retention.columns.sentences import chance_only, describe_category, knows, verdict
 from probe_kit.retention.columns.text import (
     P_DECIDES,
+    above_chance,
     by_run,
     difference_test,
     is_vlm,
@@ -108,8 +109,7 @@ def _share(value: float | None, limits: Limits | None, marked: bool) -> str:
 
 def _above(part: StreamPart) -> str:
     """Return the score of a label above chance with its interval, marked where there is signal."""
-    text = with_limits(part.above, part.above_ci, number) if part.chance is not None else "–"
-    return f"{text} {MARK}" if _is_marked(part) else text
+    return f"{above_chance(part)} {MARK}" if _is_marked(part) else above_chance(part)
 
 
 def _retention(row: RetentionRow) -> str:

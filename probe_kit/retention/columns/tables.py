@@ -4,6 +4,7 @@ from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
 from probe_kit._system.counting import counted
+from probe_kit._tables.numbers import span
 from probe_kit._tables.table import Cell, Heading, Row, Table
 from probe_kit.retention.choices import Section
 from probe_kit.retention.columns.columns import TABLES, Column, ColumnGroup, radius_columns
@@ -296,13 +297,8 @@ def _sizes(rows: Sequence[RetentionRow]) -> list[str]:
 def _size(rows: Sequence[RetentionRow]) -> str:
     is_of_sides = all(row.is_side for row in rows)
     samples = [row.success.n_episodes if is_of_sides else row.controls.n_samples or 0 for row in rows]
-    parts = [f"{_span(samples)} {'episodes' if is_of_sides else 'samples'}"]
-    parts += [f"{_span([row.success.n_items for row in rows])} items"] * is_of_sides
+    parts = [f"{span(samples)} {'episodes' if is_of_sides else 'samples'}"]
+    parts += [f"{span([row.success.n_items for row in rows])} items"] * is_of_sides
     if groups := [row.controls.n_groups for row in rows if row.controls.n_groups is not None]:
-        parts.append(f"{_span(groups)} groups")
+        parts.append(f"{span(groups)} groups")
     return f"per {'category' if is_of_sides else 'label'} {', '.join(parts)}"
-
-
-def _span(numbers: Sequence[int]) -> str:
-    low, high = min(numbers), max(numbers)
-    return str(low) if low == high else f"{low}–{high}"

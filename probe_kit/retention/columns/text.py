@@ -7,8 +7,9 @@ from probe_kit.retention.behaviour.success_rate import Regime
 from probe_kit.retention.compare.compare import Difference
 from probe_kit.retention.compare.model_test import ModelTest
 from probe_kit.retention.rows.parts import StreamPart
-from probe_kit.retention.rows.row import EVERYWHERE, RetentionRow
+from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.suite.categories import category_of
+from probe_kit.train.choices import EVERYWHERE
 
 NOT_ACTED = "n/a"
 """In place of a success rate, for a model that did not act."""
@@ -96,6 +97,11 @@ def verdict_text(part: StreamPart) -> str:
         "not shown": f"not shown (could be up to {most})",
     }
     return words[part.verdict]
+
+
+def above_chance(part: StreamPart) -> str:
+    """Return the score of a label above chance with its interval; a dash where no chance is known."""
+    return NONE if part.chance is None else with_limits(part.above, part.above_ci, number)
 
 
 def exceeds_text(part: StreamPart) -> str:

@@ -14,6 +14,7 @@ from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure, label_views
 from probe_kit.retention.displays.base.selection import best_row, probed_curve, scores_of
 from probe_kit.retention.displays.base.style import GREEN, PARTS, Line, significance_handles
+from probe_kit.retention.rows.probe_parts import STEP
 from probe_kit.train.crossval.task_scores import METRICS, score_interval
 from probe_kit.train.results.control_scores import ControlScore
 from probe_kit.train.results.probe_results import ProbeResults
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-STEP = "step"
 _CONTROLS = (Line("black", "", ":"), Line(GREEN, "", (0, (5, 1))))  # type: ignore[arg-type]  # as `SERIES`
 
 

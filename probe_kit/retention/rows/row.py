@@ -16,8 +16,6 @@ from probe_kit.retention.rows.parts import (
 from probe_kit.train.choices import CORRECT, SIDES, Task
 from probe_kit.train.crossval.task_scores import METRICS
 
-EVERYWHERE = "all"
-"""Category of rows over all episodes, which labels have by default."""
 MEAN = "mean"
 """Category of the rows that average over categories."""
 

@@ -14,7 +14,7 @@ from probe_kit.hooks.contract.sites import Site
 from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.label_permutations import pointwise_p
 from probe_kit.statistics.paired_bootstrap import better_than_reference
-from probe_kit.train.choices import CONTROLS
+from probe_kit.train.choices import CONTROLS, EVERYWHERE
 from probe_kit.train.controls.features import LAYERS, PICTURED, ControlInputs, control_features, why_impossible
 from probe_kit.train.crossval.site_probe import SiteProbe
 from probe_kit.train.data.run_suite import suite_of
@@ -30,7 +30,7 @@ from probe_kit.train.results.control_scores import (
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.train.settings import ProbeSettings
-from probe_kit.train.target_samples import EVERYWHERE, TargetSamples
+from probe_kit.train.target_samples import TargetSamples
 
 SIDE_DEFAULT = (RANDOM_FEATURES, "pixels")
 """Controls of a side that are run where the suite's pictures are, unless others, or none, are requested."""

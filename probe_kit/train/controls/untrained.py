@@ -91,16 +91,15 @@ def _identities(run: RunReader, samples: TargetSamples) -> list[tuple[str, str, 
 
 
 def _check_settings(run: RunReader, untrained: RunReader) -> None:
-    settings, untrained_settings = (getattr(reader, "settings", {}) for reader in (run, untrained))
-    if differing := [name for name in _SHOWN if _identity(settings, name) != _identity(untrained_settings, name)]:
+    if differing := [name for name in _SHOWN if _identity(run, name) != _identity(untrained, name)]:
         raise UsageError(
             f"the untrained control {untrained.location} has another {differing[0]} than {run.location}; expected "
             "the same frames. Extract both by the same command, one with --random-weights"
         )
 
 
-def _identity(settings: Any, name: str) -> Any:
-    value = settings.get(name)
+def _identity(run: RunReader, name: str) -> Any:
+    value = run.settings.get(name)
     return value.get("identity", value) if isinstance(value, dict) else value
 
 

@@ -123,7 +123,7 @@ def _probes(readers: Sequence[RunReader], bundle: Bundle, used: Collection[str])
         seed=settings.seed,
         call=settings.call,
         controls=_controls(bundle),
-        wording=(getattr(current[0], "wording", None) or "") if current else "",
+        wording=(current[0].wording or "") if current else "",
     )
 
 

@@ -33,13 +33,12 @@ from probe_kit.runs.results import (
 )
 from probe_kit.runs.store import Location, locate
 from probe_kit.statistics.sufficiency import GROUPS_FOR_PROBES, probe_command
-from probe_kit.train.choices import CORRECT, SIDES
+from probe_kit.train.choices import CORRECT, EVERYWHERE, SIDES
 from probe_kit.train.results.control_scores import Controls
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_directions import StoredDirections, save_directions
 from probe_kit.train.results.probe_results import ProbeResults, episodes_sha256
 from probe_kit.train.settings import FORMAT, ProbeSettings
-from probe_kit.train.target_samples import EVERYWHERE
 
 SCORES, DECISIONS = "scores.csv", "decisions.npz"
 DIRECTIONS, CONTROLS = PROBE_DIRECTIONS, "controls.json"

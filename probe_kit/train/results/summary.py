@@ -8,6 +8,7 @@ from probe_kit._tables.numbers import p_text
 from probe_kit._tables.table import Table
 from probe_kit.hooks.contract.sites import label_of
 from probe_kit.suite.categories import category_of
+from probe_kit.train.choices import EVERYWHERE
 from probe_kit.train.crossval.task_scores import METRICS
 from probe_kit.train.results.best_sites import best_sites, score_text, site_cells
 from probe_kit.train.results.control_scores import ControlScore
@@ -83,7 +84,7 @@ def _name(results: ProbeResults, category: str, stream: str) -> str:
     """Return the category, and for a target that is no side the stream."""
     if results.settings.is_side:
         return str(category)
-    pooled = results.settings.categories == ("all",)
+    pooled = results.settings.categories == (EVERYWHERE,)
     return " · ".join(filter(None, ["" if pooled else str(category), label_of(stream) if stream else ""]))
 
 
@@ -141,7 +142,7 @@ def best_sites_findings(results: ProbeResults) -> list[str]:
         name = category_of(category).title if settings.is_side else settings.target
         if not settings.is_side:
             name = ", ".join(
-                [name, *[category] * (settings.categories != ("all",)), *[view] * (len(settings.views) > 1)]
+                [name, *[category] * (settings.categories != (EVERYWHERE,)), *[view] * (len(settings.views) > 1)]
             )
         lines.append((name, "; ".join([*_findings(results, rows), *by_pictures])))
     width = max((len(name) for name, _ in lines), default=0)
@@ -188,7 +189,7 @@ def _subject(results: ProbeResults, category: str, view: str, row: "pd.Series") 
     if settings.is_side:
         return f"{category_of(category).title} ({counted(row['n'], 'episode')}): {_SIDES[settings.target]}"
     facts = [counted(row["groups"], "group"), counted(row["n"], "sample")]
-    facts += [f"category {category}"] * (settings.categories != ("all",)) + [f"view {view}"] * (
+    facts += [f"category {category}"] * (settings.categories != (EVERYWHERE,)) + [f"view {view}"] * (
         len(settings.views) > 1
     )
     return f"{settings.target} ({', '.join(facts)})"

@@ -12,7 +12,7 @@ from probe_kit.errors import SettingsMismatchError, TooFewGroupsError, UsageErro
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.folds import OUTER_FOLDS, Fold
-from probe_kit.train.choices import Task
+from probe_kit.train.choices import EVERYWHERE, Task
 from probe_kit.train.crossval.nested_folds import NestedFold
 from probe_kit.train.crossval.site_probe import predict_once, probe_labels
 from probe_kit.train.crossval.task_scores import balanced_scores
@@ -23,7 +23,7 @@ from probe_kit.train.problem import Problem, least_p, make_problem
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.solver.row_subset import RowSubset
 from probe_kit.train.target import Target
-from probe_kit.train.target_samples import EVERYWHERE, TargetSamples
+from probe_kit.train.target_samples import TargetSamples
 from probe_kit.train.transfer.transfer_results import TransferCurve, TransferResults
 
 Matrix = NDArray[np.float64]

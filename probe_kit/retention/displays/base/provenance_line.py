@@ -4,9 +4,10 @@ from dataclasses import dataclass
 from typing import Self
 
 from probe_kit._system.counting import counted
+from probe_kit._tables.numbers import span
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.runs.reader import RunReader
-from probe_kit.train.choices import CORRECT
+from probe_kit.train.choices import CORRECT, EVERYWHERE
 from probe_kit.train.results.probe_results import ProbeResults
 
 RANDOM = "RANDOM WEIGHTS"
@@ -45,7 +46,7 @@ class ProvenanceLine:
         """Return the line of probes in one view."""
         settings = results.settings
         sizes = [curve.labels.size for (_, name), curve in results.curves.items() if name == view]
-        n = f"n = {_span(sizes)} episodes per category, view {view}"
+        n = f"n = {span(sizes)} episodes per category, view {view}"
         return cls(
             results.label, settings.random_weights, settings.weights, settings.suite, n, settings.run_settings,
             results.key, settings.target, settings.call,
@@ -55,7 +56,7 @@ class ProvenanceLine:
     def of_label(cls, results: ProbeResults, category: str, view: str) -> Self:
         """Return the line of probes of a label in one category and view."""
         settings, curve = results.settings, results.curves[category, view]
-        of = "" if category == "all" else f", category {category}"
+        of = "" if category == EVERYWHERE else f", category {category}"
         sizes = f"{counted(curve.labels.size, 'sample')} in {counted(curve.n_groups, 'group')}"
         n = f"n = {sizes}, view {view}{of}"
         return cls(
@@ -98,8 +99,3 @@ class ProvenanceLine:
     def line(self) -> str:
         """Everything in one line, for a caption."""
         return " · ".join(filter(None, [*self.parts, f"settings {self.settings[:SHOWN]}"]))
-
-
-def _span(numbers: list[int]) -> str:
-    low, high = min(numbers), max(numbers)
-    return str(low) if low == high else f"{low}–{high}"

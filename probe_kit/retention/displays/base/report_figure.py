@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 from probe_kit.retention.displays.base.style import SIGNAL
 from probe_kit.retention.rows.outcome_rules import can_be_judged, under_rule
-from probe_kit.retention.rows.row import EVERYWHERE
 from probe_kit.retention.table import RetentionTable
 from probe_kit.runs.reader import RunReader
+from probe_kit.train.choices import EVERYWHERE
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeResults
 

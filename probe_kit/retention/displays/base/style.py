@@ -193,13 +193,13 @@ def legend_handles(*grid: "Axes") -> "dict[str, Artist]":
     return handles
 
 
-def significance_handles(colour: str = "0.3") -> "list[Line2D]":
+def significance_handles() -> "list[Line2D]":
     """The legend's entries for filled and open markers, which mean the same in every figure."""
     from matplotlib.lines import Line2D
 
     return [
-        Line2D([], [], color=colour, ls="none", marker="o", ms=4.5, label=FILLED),
-        Line2D([], [], color=colour, ls="none", marker="o", ms=4.5, mfc="white", label=OPEN),
+        Line2D([], [], color="0.3", ls="none", marker="o", ms=4.5, label=FILLED),
+        Line2D([], [], color="0.3", ls="none", marker="o", ms=4.5, mfc="white", label=OPEN),
     ]
 
 
