@@ -46,22 +46,19 @@ class ObservedSession(ReplaySession):
     by which donors are chosen. items: those whose clean actions are the unit of displacements.
     """
 
-    def __init__(self, run: Run, policy: "Policy", frames: Frames) -> None:
+    def __init__(self, run: Run, policy: "Policy", frames: Frames, choice: PairChoice | None = None) -> None:
+        """Raises UsageError for a varied input that the frames do not have, or that no other group varies."""
         super().__init__(run, policy)
         self.frames = frames
         self.vary, self.frames_each = PICTURE, FRAMES
         self.table: tuple[PairRow, ...] = ()
         self.items: Sequence[str] = tuple(dict.fromkeys(frame.item for frame in frames.index))
-        self._weights: NDArray[np.float64] | None = None
         self._ends: dict[tuple[int, int], tuple[Chunk, NDArray[np.float64]]] = {}
         self._spread = _state_spread(frames.index)
-
-    def choose(self, choice: PairChoice | None) -> None:
-        """Take the varied input, the number of frames, the table and the items of an intervention."""
         if choice is not None:
             self.vary, self.frames_each = choice.varied, choice.frames or FRAMES
-            self.table, self.items = choice.pairs, choice.items_in(self.run)
-            self.check_vary()
+            self.table, self.items = choice.pairs, choice.items_in(run)
+            self._check_vary()
 
     def close(self) -> None:
         """Close the environment."""
@@ -114,7 +111,7 @@ class ObservedSession(ReplaySession):
                 raise UsageError(f"the run has no frame {number} of {episode!r}, which the table of pairs names")
         return [(by_name[row[:2]], by_name[row[2:]]) for row in self.table]
 
-    def check_vary(self) -> None:
+    def _check_vary(self) -> None:
         """Raise UsageError for an input that the frames do not have, or that no frame of another group varies."""
         inputs = (INSTRUCTION, PICTURE, *(f"{PICTURE}.{name}" for name in self.frames.cameras), STATE)
         if self.vary not in inputs:
@@ -159,13 +156,11 @@ class ObservedSession(ReplaySession):
             self._ends[at] = clean, direction
         return self._ends[at]
 
-    @property
+    @cached_property
     def weights(self) -> NDArray[np.float64]:
         """Return (N,) 1 / spread² of every number of the clean actions, over all pairs of the items."""
-        if self._weights is None:
-            clean = [self.act(pair.clean, pair.seed).ravel() for item in self.items for pair in self.pairs(item)]
-            self._weights = spread_of(np.array(clean))
-        return self._weights
+        clean = [self.act(pair.clean, pair.seed).ravel() for item in self.items for pair in self.pairs(item)]
+        return spread_of(np.array(clean))
 
     # -- words -------------------------------------------------------------------------------------------
 

@@ -1,5 +1,6 @@
 """Opening the session of a run, and the pairs of one category."""
 
+from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
 from probe_kit.intervene.pairs import Pair
@@ -33,18 +34,17 @@ def open_session(
     def policy() -> "Policy":
         return (load or load_policy_of)(run, source)
 
-    session: ReplaySession
-    if has_sides(run):
-        session = SceneSession.of(run, source, policy)
-    else:
-        frames = Frames(run, source)
-        session = ObservedSession(run, policy().with_cameras(list(frames.cameras)), frames)
-        session.choose(choice)
-    try:
+    with ExitStack() as on_failure:
+        session: ReplaySession
+        if has_sides(run):
+            session = SceneSession.of(run, source, policy)
+            on_failure.callback(session.close)
+        else:
+            frames = Frames(run, source)
+            on_failure.callback(frames.close)
+            session = ObservedSession(run, policy().with_cameras(list(frames.cameras)), frames, choice)
         check_policy(run, session.policy)
-    except BaseException:
-        session.close()
-        raise
+        on_failure.pop_all()
     return session
 
 
