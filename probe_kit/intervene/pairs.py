@@ -35,8 +35,8 @@ class Pair:
     Pairs of a run have more. row, episode, category: of the run. side: of the correct picture; None without sides.
     tiles: (H, W) where each tile is seen in the clean picture. stored: (n, D) actions of the clean inference that
     the run has, None where it does not say. step: which inference of the episode it is, or the recorded frame.
-    donor: of frames without sides, the other frame of which the source has one input. control: the clean one after
-    a change of that input that means nothing.
+    donor: of frames without sides, the other frame of which the source has one input. donor_name: of that frame.
+    control: the clean one after a change of that input that means nothing.
     """
 
     clean: Given
@@ -50,6 +50,7 @@ class Pair:
     category: str = ""
     side: Side | None = None
     donor: Given | None = None
+    donor_name: str = ""
     control: Given | None = None
     tiles: Mapping[Side, NDArray[np.bool_]] = field(default=MappingProxyType({}), repr=False)
     stored: Chunk | None = field(default=None, repr=False)

@@ -143,6 +143,19 @@ def test_what_needs_sides_or_another_input_is_refused_by_name(
     assert named in " ".join(answer.stderr.split())
 
 
+def test_a_frame_with_two_donors_is_read_toward_each_of_them(shown: Run, table: Path, twin: "Policy") -> None:
+    choice = ImageSwap(pairs=(*read_pairs(table), ("episode-000000", 0, "episode-000004", 0)))
+    with open_session(shown, ReplaySource(), lambda *_: twin, choice) as opened, opened.ready():
+        assert isinstance(opened, ObservedSession)
+        near, far = (pair for pair in opened.pairs(opened.items[0]) if pair.row == 0)
+        for pair in (near, far):
+            apart = (opened.act(pair.source, pair.seed) - opened.act(pair.clean, pair.seed)).astype(float).ravel()
+            varied = int((opened.weights > 0).sum())
+            size = np.sqrt((apart**2 * opened.weights).sum() / varied)
+            assert size > 0
+            assert opened.displacement(opened.act(pair.source, pair.seed), pair) == pytest.approx(size, rel=1e-5)
+
+
 def test_pairs_are_refused_in_the_scene(copy: Run, table: Path) -> None:
     with pytest.raises(UsageError, match="--vary, --frames and --pairs"):
         ImageSwap(pairs=read_pairs(table)).check_run(copy)

@@ -53,7 +53,7 @@ class ObservedSession(ReplaySession):
         self.vary, self.frames_each = PICTURE, FRAMES
         self.table: tuple[PairRow, ...] = ()
         self.items: Sequence[str] = tuple(dict.fromkeys(frame.item for frame in frames.index))
-        self._ends: dict[tuple[int, int], tuple[Chunk, NDArray[np.float64]]] = {}
+        self._ends: dict[tuple[int, int, str], tuple[Chunk, NDArray[np.float64]]] = {}
         self._spread = _state_spread(frames.index)
         if choice is not None:
             self.vary, self.frames_each = choice.varied, choice.frames or FRAMES
@@ -74,6 +74,7 @@ class ObservedSession(ReplaySession):
                     clean=clean,
                     source=with_input(clean, self.vary, other),
                     donor=other,
+                    donor_name=donor.name,
                     control=hardly_changed(clean, self.vary, self._spread),
                     seed=frame.seed,
                     group=frame.group,
@@ -148,7 +149,7 @@ class ObservedSession(ReplaySession):
 
     def _end(self, pair: Pair) -> tuple[Chunk, NDArray[np.float64]]:
         """Return the clean chunk, and the direction (N,) that displacements of this pair are read along."""
-        at = pair.row, pair.step
+        at = pair.row, pair.step, pair.donor_name  # a table may give a frame several donors
         if at not in self._ends:
             clean, source = self.act(pair.clean, pair.seed), self.act(pair.source, pair.seed)
             start, end = (chunk.astype(np.float64).ravel()[None] for chunk in (clean, source))
