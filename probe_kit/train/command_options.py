@@ -190,7 +190,8 @@ DirectionFile = Annotated[
     further_option(
         "--directions",
         metavar="FILE",
-        help="Also write the probes' directions, for intervene --direction FILE#NAME: safetensors or npz.",
+        help="Also write the directions of the probes of one --call, for intervene --direction FILE#NAME: "
+        "safetensors or npz.",
     ),
 ]
 Jobs = Annotated[

@@ -104,6 +104,7 @@ def train(
         check_direction_file(directions)
         if not target_options.is_side:
             raise UsageError(f"--directions with --target {target}: only probes of a side have directions")
+        _only_call(call, opened, "--directions")
     fitted = _train(opened, target_options, categories, call, options, details)
     if directions is not None:
         count = write_direction_file(fitted[0].directions, directions, opened.weights_sha256)
@@ -174,9 +175,7 @@ def _transfer(
     from probe_kit.train import transfer_probes
     from probe_kit.train.transfer.transfer_summary import transfer_sentences, transfer_table
 
-    numbers = _calls(call, run)
-    if len(numbers) != 1:
-        raise UsageError(f"--call {call!r} with a transfer; expected one number")
+    number = _only_call(call, run, "a transfer")
     fitted_on, scored_on = (
         target_options.read(run, seed=options["seed"]),
         target_options.read(other, transfer.labels, options["seed"]),
@@ -190,7 +189,7 @@ def _transfer(
             fitted_on,
             scored_on,
             categories,
-            call=numbers[0],
+            call=number,
             across_weights=transfer.across_weights,
             progress=counter(bar, "sites"),
             **options,
@@ -266,3 +265,11 @@ def _calls(text: str, run: "RunReader") -> list[int]:
     if not parts or not all(part.isdecimal() for part in parts):
         raise UsageError(f"--call {text!r}; expected numbers from 0, comma-separated, or all")
     return list(dict.fromkeys(map(int, parts)))
+
+
+def _only_call(text: str, run: "RunReader", subject: str) -> int:
+    """Return the captured inference of what is made of one alone. Raises UsageError for several."""
+    numbers = _calls(text, run)
+    if len(numbers) != 1:
+        raise UsageError(f"--call {text!r} with {subject}; expected one number")
+    return numbers[0]

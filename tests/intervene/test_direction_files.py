@@ -8,7 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from probe_kit.cli import app
 from probe_kit.errors import UsageError
 from probe_kit.hooks import Site
 from probe_kit.intervene import Interchange, Steering
@@ -86,6 +88,15 @@ def test_probes_directions_are_written_for_the_sites_and_weights_that_they_are_o
     write_direction_file(probes, path, "0" * 64)
     with pytest.raises(UsageError, match="was found in the weights"):
         Interchange(sites=(SITE,), direction=str(path)).conditions(session)
+
+
+def test_a_file_has_the_directions_of_one_captured_inference(labelled_run: Path, tmp_path: Path) -> None:
+    file = tmp_path / "probes.npz"
+    options = ["--call", "all", "--directions", str(file)]
+    refused = CliRunner().invoke(app, ["train", str(labelled_run), *options])
+    assert refused.exit_code == 2
+    assert "--call 'all' with --directions; expected one number" in " ".join(refused.stderr.split())
+    assert not file.exists()
 
 
 def test_an_export_has_half_the_difference_of_the_class_means_and_steers_by_it(
