@@ -40,10 +40,10 @@ def swap_inputs(run: Run) -> str:
     return key_of(settings)
 
 
-def diagnose(run: Run) -> str:
+def diagnose(run: Run, version: str = FORMAT) -> str:
     """Store a diagnosis of one input that decides, and of one that does not arrive."""
     measured = InputDiagnosis("picture", "decides", "", 0.8, (0.6, 0.9), 0.01, 0.9, 0.001, 36, 6, 36)
-    settings = {"format": FORMAT, "stamp": run.stamp}
+    settings = {"format": version, "stamp": run.stamp}
     key = sha256_json(settings)[:12]
     diagnosis = Diagnosis(key, run.label, 12, 6, (measured,))
     write_bundle(run.location, DIAGNOSES, key, {"settings": settings}, {FILE: as_json(diagnosis.to_json())}, {})
@@ -85,6 +85,19 @@ def test_what_is_stored_is_shown_as_the_tables_of_the_commands(catalogue: Catalo
     assert "the picture decides the action (0.50 of the full exchange)" in swap["findings"][0]
     assert kinds["diagnosis of the inputs"]["rows"][0][2]["text"] == "decides"
     assert [row[0]["text"] for row in kinds["predicted actions"]["rows"]] == ["dx", "grip"]
+
+
+def test_a_diagnosis_of_another_version_is_refused_and_the_other_results_are_shown(tmp_path: Path) -> None:
+    run = write_recorded_run(tmp_path / "run")
+    keys = diagnose(run), diagnose(run, "probe_kit diagnosis 1")
+    _, results = read_payload(Catalogue([open_run(run.path)]).script("run/results"))
+    assert [(table["kind"], table["key"]) for table in results["tables"]] == [
+        ("diagnosis of the inputs", keys[0]), ("predicted actions", "")
+    ]  # fmt: skip
+    (reason,) = results["refused"]
+    assert f"{keys[1]}/settings.json has format probe_kit diagnosis 1; this version of probe_kit reads" in reason
+    assert f"Remove diagnoses/{keys[1]} and run the same `probe-kit diagnose` again" in reason
+    assert str(tmp_path) not in reason
 
 
 def test_a_target_has_a_map_with_the_scores_of_its_probes(catalogue: Catalogue) -> None:

@@ -18,7 +18,8 @@ function Results({ run }) {
   const [[results], trouble] = useLoaded(`${run.key}/results`);
   if (trouble) return html`<p class="trouble" role="alert">${trouble}</p>`;
   if (!results) return html`<p class="loading">Loading …</p>`;
-  return results.tables.length ? html`<div class="results">${results.tables.map((table) => html`<${StoredTable} key=${`${table.kind} ${table.key}`} table=${table} />`)}</div>`
+  const { tables, refused } = results;
+  return tables.length || refused.length ? html`<div class="results">${refused.map((reason) => html`<p class="trouble" role="alert"><${Text}>${reason}<//></p>`)}${tables.map((table) => html`<${StoredTable} key=${`${table.kind} ${table.key}`} table=${table} />`)}</div>`
     : html`<p class="empty">Nothing is stored with this run yet. <code>probe-kit diagnose RUN</code> says which inputs matter, <code>probe-kit intervene RUN</code> where they are used, <code>probe-kit train RUN --target TARGET</code> what can be decoded.</p>`;
 }
 

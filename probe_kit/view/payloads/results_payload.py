@@ -1,11 +1,13 @@
 """The payload of the results that are stored with a run: diagnoses, interventions, probes, action errors."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from typing import Any
 
 from probe_kit._tables.table import Row, Table
 from probe_kit.diagnose.diagnosis import load_diagnosis
 from probe_kit.diagnose.sentences import diagnosis_table
+from probe_kit.errors import RunDamagedError
 from probe_kit.intervene.outcomes import stored_interventions
 from probe_kit.intervene.results.inventory import listed_interventions
 from probe_kit.intervene.results.results import effects_of
@@ -18,11 +20,25 @@ from probe_kit.view.viewed_run import ViewedRun
 
 
 def results_payload(viewed: ViewedRun) -> dict[str, Any]:
-    """Return the tables of a run, each with its kind, its key and its finding in sentences."""
-    if not len(viewed.run.episodes):
-        return {"tables": []}
-    parts = (_diagnoses(viewed), _interventions(viewed), _targets(viewed), _action_errors(viewed))
-    return {"tables": [table for part in parts for table in part]}
+    """Return the tables of a run, each with its kind, its key and its finding in sentences.
+
+    refused: why others cannot be read, such as a diagnosis in the format of another version.
+    """
+    tables, refused = list[dict[str, Any]](), list[str]()
+    for part in _parts(viewed) if len(viewed.run.episodes) else ():
+        try:
+            tables += part()
+        except RunDamagedError as error:
+            refused.append(str(error))
+    return {"tables": tables, "refused": refused}
+
+
+def _parts(viewed: ViewedRun) -> Iterator[Callable[[], Iterable[dict[str, Any]]]]:
+    """Yield functions that read what is stored, each apart, so that one that cannot be read hides no other."""
+    for key in bundle_keys(viewed.run.location, DIAGNOSES):
+        yield partial(_diagnosis, viewed, key)
+    for read in (_interventions, _targets, _action_errors):
+        yield partial(read, viewed)
 
 
 def stored_keys(viewed: ViewedRun) -> list[str]:
@@ -30,10 +46,9 @@ def stored_keys(viewed: ViewedRun) -> list[str]:
     return [key for home in (DIAGNOSES, INTERVENTIONS, PROBES) for key in bundle_keys(viewed.run.location, home)]
 
 
-def _diagnoses(viewed: ViewedRun) -> Iterator[dict[str, Any]]:
-    for key in bundle_keys(viewed.run.location, DIAGNOSES):
-        # The sentences of a diagnosis are the notes of its table.
-        yield _table("diagnosis of the inputs", key, diagnosis_table(load_diagnosis(viewed.run, key)), ())
+def _diagnosis(viewed: ViewedRun, key: str) -> Iterator[dict[str, Any]]:
+    # The sentences of a diagnosis are the notes of its table.
+    yield _table("diagnosis of the inputs", key, diagnosis_table(load_diagnosis(viewed.run, key)), ())
 
 
 def _interventions(viewed: ViewedRun) -> Iterator[dict[str, Any]]:
