@@ -20,7 +20,7 @@ from probe_kit.runs.layout import RECORDED_EPISODES
 from probe_kit.runs.reader import RunReader, check_sides
 from probe_kit.statistics.label_permutations import flip_items
 from probe_kit.train.choices import SIDES, Task
-from probe_kit.train.columns.builtin import builtin_column
+from probe_kit.train.columns.builtin import BuiltinColumn, builtin_column
 from probe_kit.train.columns.cells import Cell
 from probe_kit.train.columns.table import EPISODE, FRAME, INFERENCE, SOURCE, LabelTable, read_table
 from probe_kit.train.columns.values import LabelValues, code_labels
@@ -171,7 +171,18 @@ class Target:
         """
         if name in SIDES:
             return _side(run, name, seed, task, group_by, exchange_within)
-        column = builtin_column(run, name)
+        return cls.of_column(name, builtin_column(run, name), task, group_by, exchange_within)
+
+    @classmethod
+    def of_column(
+        cls,
+        name: str,
+        column: BuiltinColumn,
+        task: Task | None = None,
+        group_by: str | None = None,
+        exchange_within: str | None = None,
+    ) -> "Target":
+        """Return a built-in column that was read, as `of_run` does. Raises UsageError for a constant column."""
         keys: dict[str, list[Cell]] = {EPISODE: list(column.episodes), name: list(column.cells)}
         lines = list(range(1, len(column.episodes) + 1))
         table = LabelTable(f"the built-in column {name}", "sample", tuple(keys), keys, lines)

@@ -14,7 +14,8 @@ from probe_kit.train.choices import CORRECT, SIDES
 
 if TYPE_CHECKING:
     from probe_kit.runs import Run
-    from probe_kit.train import RunReader
+    from probe_kit.train import RunReader, Target
+    from probe_kit.train.columns.builtin import BuiltinColumn
 
 
 def targets(run: common.RunFolder, wording: common.Wording = None, partial: common.Partial = False) -> None:
@@ -27,12 +28,12 @@ def targets(run: common.RunFolder, wording: common.Wording = None, partial: comm
     from rich.text import Text
 
     opened = _open(run, partial, wording)
-    table, constant = Table("target", "task", "per", "values"), constant_columns(opened)
-    listed = [row for row in listed_targets(opened) if row[0] not in constant]
+    table, every = Table("target", "task", "per", "values"), list(listed_targets(opened))
+    listed = [row for row in every if row[1] != CONSTANT]
     for row in listed:
         table.add_row(*map(Text, row))
     out.print(table)
-    if constant:
+    if constant := [name for name, task, *_ in every if task == CONSTANT]:
         say(marked("one value only, so that there is nothing to decode: {}", ", ".join(constant)))
     # Those that need no further option come first, and what is not possible is never the next step.
     possible = sorted((row for row in listed if row[1] != "–"), key=lambda row: row[1] == DOUBTFUL)
@@ -46,21 +47,8 @@ def targets(run: common.RunFolder, wording: common.Wording = None, partial: comm
 
 DOUBTFUL = "classes or continuous"
 """The task of a few integers, which `--task` decides."""
-
-
-def constant_columns(run: "RunReader") -> list[str]:
-    """Return the built-in columns of a run that hold one value, such as the parts of a state that never move."""
-    from probe_kit.train.columns.builtin import builtin_column
-
-    constant = []
-    for name in _names(run):
-        try:
-            cells = () if name in SIDES else builtin_column(run, name).cells
-        except ProbeKitError:
-            continue
-        if len({cell for cell in cells if cell is not None}) == 1:
-            constant.append(name)
-    return constant
+CONSTANT = "one value"
+"""In place of a task, of a column in which there is nothing to decode."""
 
 
 def _names(run: "RunReader") -> list[str]:
@@ -74,23 +62,38 @@ def _names(run: "RunReader") -> list[str]:
 def listed_targets(run: "RunReader") -> Iterator[tuple[str, str, str, str]]:
     """Yield name, task, `episode` or `inference`, and classes with counts or range of every target of a run.
 
-    One that the run cannot give has the reason in the last place.
+    One that the run cannot give has the reason in the last place, one of a single value the task `CONSTANT`.
     """
+    from probe_kit.train.columns.builtin import builtin_column
     from probe_kit.train.target import Target
 
     for name in _names(run):
         try:
-            target = Target.of_run(run, name)
-        except ProbeKitError as error:
-            try:
-                target = Target.of_run(run, name, "classes")
-            except ProbeKitError:
-                yield name, "–", "–", str(error)
+            if name in SIDES:
+                target, task = Target.of_run(run, name), "binary"
+            elif (column := builtin_column(run, name)).is_constant:
+                yield name, CONSTANT, "–", "–"
                 continue
-            task = DOUBTFUL
+            else:
+                target, task = _target_and_task(name, column)
+        except ProbeKitError as error:
+            yield name, "–", "–", str(error)
         else:
-            task = target.task
-        yield name, task, "inference" if target.per_step else "episode", target.values_in_words
+            yield name, task, "inference" if target.per_step else "episode", target.values_in_words
+
+
+def _target_and_task(name: str, column: "BuiltinColumn") -> "tuple[Target, str]":
+    """Return the target of a built-in column, and its task in words."""
+    from probe_kit.train.target import Target
+
+    try:
+        target = Target.of_column(name, column)
+    except UsageError as error:
+        try:
+            return Target.of_column(name, column, "classes"), DOUBTFUL
+        except UsageError:
+            raise error from None
+    return target, target.task
 
 
 def labels(

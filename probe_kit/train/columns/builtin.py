@@ -37,6 +37,11 @@ class BuiltinColumn:
     inferences: tuple[int, ...] | None
     cells: tuple[Cell, ...]
 
+    @property
+    def is_constant(self) -> bool:
+        """Whether it holds one value, such as a part of a state that never moves."""
+        return len({cell for cell in self.cells if cell is not None}) == 1
+
 
 @dataclass(frozen=True)
 class Instant:

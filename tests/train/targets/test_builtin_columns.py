@@ -14,7 +14,7 @@ from probe_kit.runs import open_run
 from probe_kit.train import Target, train_probes
 from probe_kit.train.choices import SIDES
 from probe_kit.train.columns.builtin import SIM_COLUMNS, builtin_names, label_frame
-from probe_kit.train.target_commands import constant_columns, listed_targets
+from probe_kit.train.target_commands import CONSTANT, listed_targets
 from tests.support.labelled_run import CALLS, EVERY, GRASP, RELEASE
 
 
@@ -67,8 +67,9 @@ def test_every_built_in_column_is_the_same_from_the_run_and_from_its_table(
 
 def test_a_constant_or_unknown_column_is_refused_by_name(labelled_run: Path) -> None:
     run = open_run(labelled_run)
-    assert "item.category" in constant_columns(run.only(["color"]))
-    assert not {"item.category", *SIDES} & set(constant_columns(run))
+    assert ("item.category", CONSTANT) in [row[:2] for row in listed_targets(run.only(["color"]))]
+    constant = {name for name, task, *_ in listed_targets(run) if task == CONSTANT}
+    assert not {"item.category", *SIDES} & constant
     with pytest.raises(UsageError, match=r"'item.category' has one value"):
         Target.of_run(run.only(["color"]), "item.category")
     with pytest.raises(UsageError, match=r"no built-in column 'sim.tool_w'; there are: sim.tool_x"):
