@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -145,7 +146,7 @@ def _of_source(run: RunReader, name: str) -> BuiltinColumn:
     pairs = list(_inferences(run))
     rows = _rows(run, [episode for episode, _ in pairs])
     calls = [call for _, call in pairs]
-    cells = _cells(run, column, columns[column][rows, calls])
+    cells = _cells(run, column, columns[column]()[rows, calls])
     episodes, inferences = zip(*pairs, strict=True)
     return BuiltinColumn(None, episodes, inferences, cells)
 
@@ -170,19 +171,28 @@ def outcome_column(run: RunReader) -> dict[str, list[str]]:
     return {OUTCOME: run.episodes["outcome"].astype(str).tolist()}
 
 
-def recorded_columns(run: RunReader) -> dict[str, NDArray[np.float64]]:
-    """(E, C) values of data set or environment by name, of every shown frame; none for a run of scenes."""
+def recorded_columns(run: RunReader) -> dict[str, Callable[[], NDArray[np.float64]]]:
+    """Return by name what reads a column of data set or environment; none for a run of scenes.
+
+    Each returns (E, C) values, of every shown frame; columns of one kind of input read it once.
+    """
     inputs = run.inputs
     if inputs is None:
         return {}
-    columns = {name: inputs.column(name) for name in inputs.columns}
+    read = cache(inputs.read)
+
+    def now(kind: str, number: int) -> NDArray[np.float64]:
+        values = read(kind) if kind == "state" else read(kind)[:, :, 0]
+        return values[..., number].astype(np.float64)
+
+    columns: dict[str, Callable[[], NDArray[np.float64]]] = {
+        name: partial(inputs.column, name) for name in inputs.columns
+    }
     for kind, names in inputs.names.items():
         if kind in inputs.kinds:
-            values = inputs.read(kind)
-            now = values if kind == "state" else values[:, :, 0]
-            columns |= {f"{kind}.{name}": now[..., number].astype(np.float64) for number, name in enumerate(names)}
+            columns |= {f"{kind}.{name}": partial(now, kind, number) for number, name in enumerate(names)}
     if run.recorded and why_not_compared(run) is None:
-        columns[ACTION_ERROR] = compare_actions(run).of_frames[0]
+        columns[ACTION_ERROR] = lambda: compare_actions(run).of_frames[0]
     return columns
 
 
@@ -223,8 +233,8 @@ def label_frame(run: RunReader) -> "pd.DataFrame":
     if run.inputs is not None:
         table["instruction"] = run.episodes["instruction"].iloc[rows].tolist()
         sim = {
-            prefix_of(run) + name: list(_cells(run, name, column[rows, list(inferences)]))
-            for name, column in recorded_columns(run).items()
+            prefix_of(run) + name: list(_cells(run, name, read()[rows, list(inferences)]))
+            for name, read in recorded_columns(run).items()
         }
         sim |= {name: [cells[row] for row in rows] for name, cells in outcome_column(run).items()}
     for name in ("group_id", "category"):
