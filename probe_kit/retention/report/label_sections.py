@@ -85,8 +85,8 @@ def stored_label_sections(
     sections = []
     for run, name in zip(runs, names, strict=True):
         of_one = name if len(runs) > 1 else ""
-        for target in stored_targets(run):
-            table = retention_table([run], target=target)
+        if targets := list(stored_targets(run)):
+            table = retention_table([run], target=targets)
             sections += label_sections([run], table, collect_figures([run], table), [name], places, of_one)
     return sections
 
