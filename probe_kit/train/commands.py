@@ -59,7 +59,6 @@ def train(
     are loaded, not fitted again. To decode a label of your own, give its table and column:
     `probe-kit train RUN --labels labels.csv --target drawer --task classes`.
     """
-    from probe_kit.errors import UsageError
     from probe_kit.runs import open_run
     from probe_kit.runs.direction_files import check_direction_file
     from probe_kit.train.results.probe_directions import write_direction_file

@@ -74,8 +74,11 @@ class Problem:
 
     def probe(self, samples: Samples) -> SiteProbe:
         """Probe one site; `samples` are those of all samples of the target."""
-        drawn = self.permuted_labels if samples.pools else self.permuted_labels[:, : self.token_permutations]
-        return self.fit(samples.of(self.positions), drawn)
+        return self.fit(samples.of(self.positions), self.permuted_for(samples))
+
+    def permuted_for(self, samples: Samples) -> NDArray[Any]:
+        """(E, P) permuted labels that a view is probed with: fewer where every token is a sample."""
+        return self.permuted_labels if samples.pools else self.permuted_labels[:, : self.token_permutations]
 
     def fit(self, samples: Samples, permuted_labels: NDArray[Any] | None = None) -> SiteProbe:
         """Probe the samples of this category, and again for every column of (E, P) permuted labels."""

@@ -6,7 +6,7 @@ products of both. Any random nonlinear layer does. The control is such a layer, 
 with, on the pictures and the words alone; a model that knows more than that must be better.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -46,7 +46,7 @@ class ControlInputs:
 
     def features(self, name: str) -> Features:
         """(n, D) features of a control but `random-features`."""
-        if name in (array_features := control_features(self.run)):
+        if name in (array_features := self.run.control_features):
             return array_features[name][self.samples.rows].astype(np.float32)
         if name == "instruction":
             return self._words()
@@ -133,12 +133,6 @@ def why_impossible(run: RunReader, samples: TargetSamples) -> dict[str, str]:
     if "instruction" not in run.episodes:
         reasons |= dict.fromkeys(("instruction", RANDOM_FEATURES), "the episodes have no column 'instruction'")
     return reasons
-
-
-def control_features(run: RunReader) -> "Mapping[str, NDArray[np.floating]]":
-    """Return (E, D) features of controls that a run of arrays brings, by name, in place of built-in ones."""
-    features: Mapping[str, NDArray[np.floating]] = run.control_features
-    return features
 
 
 def why_no_state(run: RunReader) -> str | None:

@@ -15,7 +15,7 @@ from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.label_permutations import pointwise_p
 from probe_kit.statistics.paired_bootstrap import better_than_reference
 from probe_kit.train.choices import CONTROLS, EVERYWHERE
-from probe_kit.train.controls.features import LAYERS, PICTURED, ControlInputs, control_features, why_impossible
+from probe_kit.train.controls.features import LAYERS, PICTURED, ControlInputs, why_impossible
 from probe_kit.train.crossval.site_probe import SiteProbe
 from probe_kit.train.data.run_suite import suite_of
 from probe_kit.train.data.samples import Samples
@@ -67,7 +67,7 @@ def prepare_controls(
     pictures are missing. folder: of the run's suite, see `suite_of`. Raises UsageError for a control that was
     asked for and is unknown or not possible, and what `suite_of` raises.
     """
-    array_features = control_features(run)
+    array_features = run.control_features
     available = (*array_features, *(name for name in CONTROLS if name not in array_features))
     if unknown := [name for name in names or () if name not in available]:
         raise UsageError(f"unknown control {unknown[0]!r}; expected some of {', '.join(available)}")

@@ -59,7 +59,7 @@ def _embedded(run: RunReader) -> "Suite":
     from probe_kit.suite.generators import GENERATORS
 
     drawable = default_identity()
-    counts = Counter(_items(run).values())
+    counts = Counter(run.planned_items.values())
     if run.suite.rpartition("#")[0] != drawable or not counts.keys() <= GENERATORS.keys():
         raise SuiteNotFoundError(
             f"{run.location} was extracted from {run.suite}, whose pictures are needed; only those of {drawable} "
@@ -77,8 +77,8 @@ def _embedded(run: RunReader) -> "Suite":
             f"{run.location} was extracted from {run.suite}, whose pictures are needed; drawn again they are "
             f"others, so it was drawn with another seed or other versions of what draws. {_GIVE}"
         )
-    item_ids = _items(run)
-    return replace(drawn, items=tuple(item for item in drawn.items if item.item_id in item_ids))
+    planned = run.planned_items
+    return replace(drawn, items=tuple(item for item in drawn.items if item.item_id in planned))
 
 
 def _drawn(counts: Mapping[str, int]) -> Iterator["Suite"]:
@@ -101,10 +101,5 @@ def _holds(suite: "Suite", run: RunReader) -> bool:
 
 def _hash_of_part(suite: "Suite", run: RunReader) -> str:
     """Hex sha256 that `suite` had with only those items that the run has."""
-    item_ids = _items(run)
-    return suite.content_sha256_of(item for item in suite.items if item.item_id in item_ids)
-
-
-def _items(run: RunReader) -> Mapping[str, str]:
-    """Category of every item by id: those the run was to have, also where it was shortened or is unfinished."""
-    return run.planned_items
+    planned = run.planned_items
+    return suite.content_sha256_of(item for item in suite.items if item.item_id in planned)

@@ -229,8 +229,7 @@ def _transfer(
     if code is not None:
         predicted = code[predicted.astype(np.intp)]
     plain, moved = predicted[:other_count], predicted[other_count:]
-    permuted = test.permuted_labels if other_samples.pools else test.permuted_labels[:, : test.token_permutations]
-    truth = np.column_stack([test.labels, permuted]).astype(np.float64)
+    truth = np.column_stack([test.labels, test.permuted_for(other_samples)]).astype(np.float64)
     of_plain, of_moved = (_scores(predictions, truth, test.task) for predictions in (plain, moved))
     scores = probe_labels(other_samples, truth[:, :1], test.task, test.folds).scores
     return _Transferred(
