@@ -42,6 +42,8 @@ def input_notes(certificate: Mapping[str, Any]) -> list[str]:
             notes.append(f"another {name} changes the last layer and no number of the first output")
         elif "nothing" in reaches:
             notes.append(f"another {name} changes no number of the first output, nor the last layer before it")
+        elif "not the output" in reaches:
+            notes.append(f"another {name} changes no number of the first output")
     return notes
 
 

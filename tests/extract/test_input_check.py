@@ -14,12 +14,13 @@ from probe_kit.errors import IgnoredInputsError, InstructionError
 from probe_kit.extract import AskSettings, ExtractSettings, LeRobotSource, ask_run, prepare
 from probe_kit.extract.rollout.input_check import varied
 from probe_kit.extract.sources.inputs import PICTURE, same_input
-from probe_kit.hooks import Observation, Policy
+from probe_kit.hooks import Observation, Policy, Site, Tap
 from probe_kit.hooks.families.pi0.adapter import load_pi0_tiny
 from probe_kit.runs import Run
 from probe_kit.runs.certificates import input_notes
 from tests.support.lerobot_recordings import CAMERA, write_recording
 from tests.support.pi0_organisms import Edit, make_blind, make_deaf
+from tests.support.position_models import Liking, PositionModel, always, likes
 from tests.support.prismatic_checkpoints import write_checkpoint
 
 SETTINGS = ExtractSettings(
@@ -92,6 +93,45 @@ def test_questions_are_checked_by_the_logits_of_their_answers(small_suite: Any, 
     assert ask_run(settings, tmp_path / "shown").certificate["input_check"] == BOTH
     unseen = ask_run(settings.changed(picture="none"), tmp_path / "unseen")
     assert unseen.certificate["input_check"] == {"instruction": "output"}
+
+
+class Uncapturable(PositionModel):
+    """Declares both inputs, and has no layer that can be captured."""
+
+    absent_inputs = frozenset()
+
+    def tap(self, site: Site) -> Tap:
+        raise NotImplementedError(site)
+
+
+def by_length(question: str, option: str) -> float:
+    return float(len(question) if option == "A" else 0)
+
+
+@pytest.mark.parametrize(
+    ("liking", "reaches"),
+    [
+        (by_length, {"picture": "not the output", "instruction": "output"}),
+        (likes("A"), {"picture": "not the output", "instruction": "not the output"}),
+    ],
+)
+def test_a_run_that_stores_nothing_is_checked_by_outputs_alone(
+    liking: Liking, reaches: dict[str, str], small_suite: Any, tmp_path: Path
+) -> None:
+    settings = AskSettings(
+        "stub", suite=small_suite.folder, categories=("color",), items=2, env_workers=0, accept_ignored_inputs=True
+    )
+    run = prepare(settings, None, Uncapturable(liking, always("A"))).run(tmp_path / "run")
+    assert run.certificate["input_check"] == reaches
+    assert "another picture changes no number of the first output" in input_notes(run.certificate)
+
+
+def test_a_scripted_answer_that_reads_nothing_is_refused_without_a_word_of_layers(
+    small_suite: Any, tmp_path: Path
+) -> None:
+    settings = AskSettings("stub", suite=small_suite.folder, categories=("color",), items=2, env_workers=0)
+    with pytest.raises(IgnoredInputsError, match=r"changed no number of the first output of stub; expected"):
+        prepare(settings, None, Uncapturable(likes("A"), always("A"))).run(tmp_path / "run")
 
 
 # -- what is changed --------------------------------------------------------------------------------------

@@ -187,7 +187,9 @@ class ModelController[Loaded: "Model", Question](ABC):
         variants: Mapping[str, Iterable[Question]],
     ) -> None:
         """Note how far changes of an inference's inputs come. Raises IgnoredInputsError if none comes anywhere."""
-        self._input_check = check_inputs(self.model, infer, clean, variants)
+        # A run that stores nothing hooks nothing: its model may have no layer that can be captured.
+        last = self.model.sites()[-1] if self.streams else None
+        self._input_check = check_inputs(self.model, infer, clean, variants, last)
         if not self._machine.accept_ignored_inputs:
             check_not_ignored(self._input_check, self.identity["model"])
 

@@ -18,10 +18,10 @@ from probe_kit.hooks.contract.observation import Observation
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from probe_kit.hooks import Model
+    from probe_kit.hooks import Model, Site
 
-Reach = Literal["output", "last layer", "nothing", "not tested"]
-"""The last thing on the way to the output that changed with an input."""
+Reach = Literal["output", "last layer", "nothing", "not the output", "not tested"]
+"""The last thing on the way to the output that changed with an input; "not the output" where no layer was read."""
 MOST_TEXTS = 32
 """Other instructions that are looked through for one of as many tokens."""
 Ids = Callable[[str], tuple[int, ...] | None]
@@ -32,16 +32,18 @@ def check_inputs[Question](
     infer: Callable[[Question], NDArray[np.float32]],
     clean: Question,
     variants: Mapping[str, Iterable[Question]],
+    last: "Site | None",
 ) -> dict[str, Reach]:
     """Return, by input, how far a change of it came.
 
     infer: one inference, always with the same seed. variants: by input, observations or prompts that differ from
     the clean one in it alone; the first that the model takes is used, and none leaves the input untested.
+    last: the last residual before the output; None where no site may be captured.
     """
     if not variants:
         return {}
     output = infer(clean)
-    return {name: _reach(model, infer, clean, output, changed) for name, changed in variants.items()}
+    return {name: _reach(model, infer, clean, output, changed, last) for name, changed in variants.items()}
 
 
 def _reach[Question](
@@ -50,6 +52,7 @@ def _reach[Question](
     clean: Question,
     output: NDArray[np.float32],
     variants: Iterable[Question],
+    last: "Site | None",
 ) -> Reach:
     for variant in variants:
         try:
@@ -58,24 +61,22 @@ def _reach[Question](
             continue
         if not np.array_equal(changed, output, equal_nan=True):
             return "output"
+        if last is None:
+            return "not the output"
         # Actions that are chosen among bins stay the same under small changes; the layer before them does not.
-        layers = [_last_layer(model, infer, question) for question in (clean, variant)]
-        return "nothing" if all(_same(*pair) for pair in zip(*layers, strict=True)) else "last layer"
+        layers = [_residual(model, last, infer, question) for question in (clean, variant)]
+        return "nothing" if _same(*layers) else "last layer"
     return "not tested"
 
 
-def _last_layer[Question](
-    model: "Model", infer: Callable[[Question], NDArray[np.float32]], question: Question
-) -> "list[Tensor]":
-    """The last residual before the output; empty for a model without streams."""
+def _residual[Question](
+    model: "Model", site: "Site", infer: Callable[[Question], NDArray[np.float32]], question: Question
+) -> "Tensor":
     from probe_kit.hooks import capture
 
-    if not model.streams:
-        return []
-    site = model.sites()[-1]
     with capture(model, [site]) as cache:
         infer(question)
-    return [cache[site]]
+    return cache[site]
 
 
 def _same(first: "Tensor", second: "Tensor") -> bool:
@@ -121,11 +122,12 @@ def _length(text: str, ids: Ids) -> int | None:
 
 
 def check_not_ignored(reaches: Mapping[str, Reach], model: str) -> None:
-    """Raise IgnoredInputsError if inputs were tested and none of them reaches even the last layer."""
+    """Raise IgnoredInputsError if inputs were tested and none of them changes anything that was read."""
     tested = [name for name, reach in reaches.items() if reach != "not tested"]
-    if len(tested) > 1 and all(reaches[name] == "nothing" for name in tested):
+    if len(tested) > 1 and all(reaches[name] in ("nothing", "not the output") for name in tested):
+        layer = ", nor of its last layer" if "nothing" in reaches.values() else ""
         raise IgnoredInputsError(
-            f"another {' and another '.join(tested)} changed no number of the first output of {model}, nor of its "
-            "last layer; expected at least one of them to. `probe-kit diagnose` takes the same settings and says "
+            f"another {' and another '.join(tested)} changed no number of the first output of {model}{layer}; "
+            "expected at least one of them to. `probe-kit diagnose` takes the same settings and says "
             "where they are lost. --accept-ignored-inputs extracts it nevertheless"
         )
