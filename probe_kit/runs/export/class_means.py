@@ -33,15 +33,12 @@ def write_class_means(run: Run, choices: Sequence[StreamChoice], file: Path) -> 
                 for category in dict.fromkeys(episodes["category"].astype(str)):
                     rows = (episodes["category"] == category).to_numpy()
                     left_rows, right_rows = features[rows & is_left], features[rows & ~is_left]
-                    if (
-                        not len(left_rows)
-                        or not len(right_rows)
-                        or np.array_equal(left_rows.mean(axis=0), right_rows.mean(axis=0))
-                    ):
+                    if not len(left_rows) or not len(right_rows):
                         continue
-                    name, entry = about_direction(category, view, site, run.weights_sha256)
-                    vectors[name] = ((left_rows.mean(axis=0) - right_rows.mean(axis=0)) / 2).astype(np.float32)
-                    about[name] = entry
+                    difference = left_rows.mean(axis=0) - right_rows.mean(axis=0)
+                    if difference.any():
+                        name, about[name] = about_direction(category, view, site, run.weights_sha256)
+                        vectors[name] = (difference / 2).astype(np.float32)
     if not vectors:
         raise UsageError(f"{run.location}: the means of left and right are equal at all of these sites")
     write_directions(file, vectors, about)
