@@ -5,15 +5,14 @@ A third party's module is imported only when its family is named: it may import 
 A family of ours is a folder in `families/` whose package lists its `FAMILIES`, and its name in `FOLDERS`.
 """
 
-import sys
 import warnings
 from difflib import get_close_matches
-from functools import cache, lru_cache
+from functools import cache
 from importlib import import_module
-from importlib.metadata import EntryPoint, entry_points
-from pathlib import Path
+from importlib.metadata import EntryPoint
 from typing import TYPE_CHECKING, Any
 
+from probe_kit._system.entry_points import entry_points
 from probe_kit.errors import UnknownModelError, UsageError
 from probe_kit.hooks.family import Family
 
@@ -80,21 +79,8 @@ def third_party_families() -> dict[str, str]:
 
 
 def family_entries() -> tuple[EntryPoint, ...]:
-    """The entry points of third parties' families, read again where a folder of the import path has changed."""
-    return _read_entries(tuple((folder, _modified(folder)) for folder in sys.path))
-
-
-@lru_cache(maxsize=1)
-def _read_entries(_path: tuple[tuple[str, int], ...]) -> tuple[EntryPoint, ...]:
-    # Reads the metadata of every installed package, which takes 40 ms; a study asks a thousand times.
-    return tuple(entry_points(group=ENTRY_POINTS))
-
-
-def _modified(folder: str) -> int:
-    try:
-        return Path(folder).stat().st_mtime_ns
-    except OSError:  # the import path may name what is not there
-        return 0
+    """The entry points of third parties' families."""
+    return entry_points(group=ENTRY_POINTS)
 
 
 def _summary(entry: EntryPoint) -> str:

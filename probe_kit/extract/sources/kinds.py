@@ -6,11 +6,11 @@ torch, and names the module of its `Source` in `opens`.
 
 import warnings
 from collections.abc import Iterator, Mapping
-from importlib.metadata import entry_points
 from typing import Any
 
 from pydantic import BaseModel
 
+from probe_kit._system.entry_points import entry_points
 from probe_kit._terminal.field_options import options_of
 from probe_kit.errors import UsageError
 from probe_kit.extract.sources.environment import EnvSource

@@ -5,13 +5,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from importlib import import_module
-from importlib.metadata import entry_points
 from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from probe_kit._system.entry_points import entry_points
 from probe_kit._terminal.plain_text import UNSAFE
 from probe_kit.errors import ObservationError, OwnEnvironmentError, ProbeKitError, UsageError
 from probe_kit.extract.sources.environment import LEROBOT, EnvSource
