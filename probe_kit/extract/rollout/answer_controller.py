@@ -121,7 +121,7 @@ class AnswerController(ModelController["AnswerModel", "Prompt"]):
 
     def instruction_ids(self, instruction: str) -> tuple[int, ...] | None:
         """The ids of the words around a picture, where the prompt is the instruction; None for a question."""
-        return self._ids_of(instruction) if self.template.is_instruction else None
+        return super().instruction_ids(instruction) if self.template.is_instruction else None
 
     def _try_inputs(self, question: "Prompt") -> None:
         clean = replace(question.observation, instruction=question.text)

@@ -156,6 +156,7 @@ class ModelController[Loaded: "Model", Question](ABC):
         self.on_gpu = card.device.startswith("cuda")
         self._capturer = Capturer(model, streams, settings.capture.tokens == "all", self.outputs)
         self._input_check: dict[str, Reach] | None = None
+        self._instruction_ids: dict[str, tuple[int, ...] | None] = {}
         self.identity: dict[str, Any] = {
             "model": settings.model.family,
             "random_weights": card.random_weights,
@@ -172,6 +173,13 @@ class ModelController[Loaded: "Model", Question](ABC):
             "capture_check": self._capturer.check,
             INPUT_CHECK: dict(self._input_check or {}),
         }
+
+    def instruction_ids(self, instruction: str) -> tuple[int, ...] | None:
+        """The ids that the model's own packing makes of it, frames around it included."""
+        if instruction not in self._instruction_ids:
+            with self._acting():
+                self._instruction_ids[instruction] = self._ids_of(instruction)
+        return self._instruction_ids[instruction]
 
     def _acting(self) -> AbstractContextManager[None]:
         return while_acting(self.identity["model"], self.model.card.checkpoint, self._machine.inference_limit)
@@ -217,7 +225,6 @@ class PolicyController(ModelController["Policy", Observation]):
         self.identity |= {"execute": self.execute} if source.executes else {}
         if self.capture_only and (deaf := policy.zero_filled_inputs()):
             self.identity["zeros_for"] = list(deaf)
-        self._instruction_ids: dict[str, tuple[int, ...] | None] = {}
         self._edit_log: list[dict[str, Any]] = []
 
     def infer(self, turns: Sequence[Turn]) -> list[Inference]:
@@ -281,13 +288,6 @@ class PolicyController(ModelController["Policy", Observation]):
         """One inference of which nothing is kept: what another one will take."""
         with self._acting():
             self._called(observations, seeds)
-
-    def instruction_ids(self, instruction: str) -> tuple[int, ...] | None:
-        """The ids that the policy's own packing makes of it, frames around it included."""
-        if instruction not in self._instruction_ids:
-            with self._acting():
-                self._instruction_ids[instruction] = self._ids_of(instruction)
-        return self._instruction_ids[instruction]
 
     def _executed(self, turn: Turn, chunk: NDArray[np.float32]) -> NDArray[np.float32] | None:
         if self.capture_only:
