@@ -11,7 +11,8 @@ from probe_kit.extract.settings import Settings
 from probe_kit.extract.sources.kinds import kind_of
 from probe_kit.extract.sources.scene import SceneOptions, SceneSettings
 from probe_kit.runs.layout import RUN_FILE
-from probe_kit.runs.origin import Origin, is_here
+from probe_kit.runs.origin import is_here
+from probe_kit.runs.reader import origin_of
 
 if TYPE_CHECKING:
     from probe_kit.runs import Run
@@ -62,7 +63,7 @@ def _of_run(folder: Path, typed: Collection[str], asks: bool) -> Mapping[str, An
         raise UsageError(
             f"{folder} was edited by vectors, which no run stores; repeat it in Python with `vectors`"
         )
-    origin = run.origins[0] if run.origins else Origin()
+    origin = origin_of(run)
     model = {**config["model"], "options": dict(origin.options)}
     if model["checkpoint"] is None and is_here(origin.checkpoint):
         model["checkpoint"] = origin.checkpoint
@@ -84,7 +85,7 @@ def source_of_run(run: "Run", replaced: Collection[str], flags: Mapping[str, str
     config = run.settings.get(CONFIG)
     if config is None:
         raise UsageError(f"{run.location} does not say with which settings it was requested; extract it again")
-    origin = run.origins[0] if run.origins else Origin()
+    origin = origin_of(run)
     source = dict(config["source"])
     for field, stored_path in origin.files.items():
         if field not in replaced:

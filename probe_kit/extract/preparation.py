@@ -231,8 +231,8 @@ def check_model(settings: Settings, fetch: bool = True) -> None:
     family = find_family(model.family, scripts)
     if not asks and not family.acts:
         raise UsageError(f"{model.family} answers and does not act; use `probe-kit ask`, or a model that acts")
-    acts_in_scene = isinstance(settings, ExtractSettings) and not settings.source.command
-    if isinstance(settings, ExtractSettings) and acts_in_scene and not settings.task.capture_only:
+    in_scene = not settings.source.command
+    if isinstance(settings, ExtractSettings) and in_scene and not settings.task.capture_only:
         family.check_acting(model.checkpoint, model.options)
     # Elsewhere there may be other devices than here.
     device = "cpu" if settings.machine.elsewhere else settings.machine.device

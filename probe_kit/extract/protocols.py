@@ -10,6 +10,7 @@ from probe_kit.extract.parts import ActTask, ModelSettings
 from probe_kit.extract.sources.source import SourceSettings
 from probe_kit.hooks.contract.card import EMBEDDED
 from probe_kit.hooks.contract.protocol import ACT2ANSWER, PLAIN, ProtocolRow, as_text
+from probe_kit.runs.origin import is_here
 
 if TYPE_CHECKING:
     from probe_kit.env import SceneSpec
@@ -124,7 +125,7 @@ def _used(model: ModelSettings, task: ActTask, scene: "SceneSpec") -> dict[str, 
 
 def _portable_value(value: str) -> str:
     """Files and folders by their last name: where they lie on this machine is no part of a run."""
-    return Path(value).name if Path(value).expanduser().exists() else value
+    return Path(value).name if is_here(value) else value
 
 
 def _defaults(model: str, row: ProtocolRow) -> dict[str, str]:

@@ -88,12 +88,12 @@ class Origin:
         return asdict(self)
 
 
-def is_here(checkpoint: str | None) -> bool:
-    """Whether a checkpoint is a folder or file of this machine."""
-    if checkpoint in (None, "", EMBEDDED):
+def is_here(text: str | None) -> bool:
+    """Whether a setting, such as a checkpoint, is a folder or file of this machine."""
+    if text in (None, "", EMBEDDED):
         return False
     try:
-        return Path(str(checkpoint)).expanduser().exists()
+        return Path(str(text)).expanduser().exists()
     except (OSError, RuntimeError):  # no path at all, or ~name of an unknown user
         return False
 

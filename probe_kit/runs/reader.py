@@ -237,6 +237,11 @@ class RunReader(Protocol):
         """The reading of answers by which outcomes are given, see `scored`."""
 
 
+def origin_of(run: RunReader) -> Origin:
+    """Return files and choices that the run was made of; none where it does not say."""
+    return run.origins[0] if run.origins else Origin()
+
+
 def check_sides(run: RunReader, purpose: str) -> None:
     """Raise UsageError for a run without sides. purpose: what is not possible without them, in a word."""
     if SIDE not in run.episodes:

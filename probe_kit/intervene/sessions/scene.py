@@ -15,7 +15,8 @@ from probe_kit.extract.sources.scene_source import scene_row
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.intervene.pairs import Chunk, Pair
-from probe_kit.intervene.sessions.session import ReplaySession, ReplaySource, origin_of
+from probe_kit.intervene.sessions.session import ReplaySession, ReplaySource
+from probe_kit.runs.reader import origin_of
 from probe_kit.runs.run import Run
 from probe_kit.suite.grouping import counterparts_of
 from probe_kit.suite.items import Episode, Item, Layout

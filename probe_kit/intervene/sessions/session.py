@@ -21,7 +21,7 @@ from probe_kit.hooks.contract.card import EMBEDDED
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.family import SIZE
 from probe_kit.intervene.pairs import Chunk, Given, Pair
-from probe_kit.runs.origin import Origin
+from probe_kit.runs.reader import origin_of
 from probe_kit.runs.run import Run
 
 if TYPE_CHECKING:
@@ -168,11 +168,6 @@ def load_policy_of(run: Run, source: ReplaySource) -> "Policy":
             origin.weights_seed if source.weights_seed is None else source.weights_seed,
             **{**options, **source.options},
         )
-
-
-def origin_of(run: Run) -> Origin:
-    """Return files and choices that the run was made of; none where it does not say."""
-    return run.origins[0] if run.origins else Origin()
 
 
 def _folder_of(run: Run) -> str | None:
