@@ -110,7 +110,8 @@ def command_with(
             }
             command(typed, **{parameter.name: values[parameter.name] for parameter in parameters})
 
-        required = [parameter for parameter in added.values() if parameter.name in _required(models)]
+        required_names = _required(models)
+        required = [parameter for parameter in added.values() if parameter.name in required_names]
         optional = [parameter for parameter in (*parameters, *added.values()) if parameter not in required]
         ordered = [*required, *sorted(optional, key=lambda parameter: _panel(parameter) is not None)]
         context = inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
