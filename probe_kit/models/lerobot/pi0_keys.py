@@ -16,38 +16,27 @@ _TIME_OF_PI0 = (("time_mlp_in.", "action_time_mlp_in."), ("time_mlp_out.", "acti
 _TIME_OF_PI05 = tuple((new, old) for old, new in _TIME_OF_PI0)
 # Statistics that old files kept among the weights; today they lie in the processor files.
 STATISTICS = ("normalize_inputs.", "normalize_targets.", "unnormalize_outputs.")
-_LM_HEAD = f"model.{_VLM}.lm_head.weight"
-_EMBEDDING = f"model.{_VLM}.model.language_model.embed_tokens.weight"
+LM_HEAD = f"model.{_VLM}.lm_head.weight"
+EMBEDDING = f"model.{_VLM}.model.language_model.embed_tokens.weight"
 
 
 def current_pi0_keys(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The same tensors of a pi0 under the names lerobot 0.6 uses.
-
-    pi0_base holds the tied token embedding once, as `lm_head`; where both are present `embed_tokens` wins.
-    """
+    """The same tensors of a pi0 under the names lerobot 0.6 uses."""
     return _renamed(tensors, (*_MOVED, *_TIME_OF_PI0))
 
 
 def current_pi05_keys(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The same tensors of a pi0.5 under the names lerobot 0.6 uses; see `current_pi0_keys`."""
+    """The same tensors of a pi0.5 under the names lerobot 0.6 uses."""
     return _renamed(tensors, (*_MOVED, *_TIME_OF_PI05))
 
 
 def current_pi0_fast_keys(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The same tensors of a pi0-FAST, whose head puts out tokens; head and embedding may be stored as one."""
-    renamed = _renamed(tensors, _MOVED)
-    if _EMBEDDING in renamed:
-        renamed.setdefault(_LM_HEAD, renamed[_EMBEDDING])
-    return renamed
+    """The same tensors of a pi0-FAST under the names lerobot 0.6 uses."""
+    return _renamed(tensors, _MOVED)
 
 
 def _renamed(tensors: Mapping[str, Tensor], names: Sequence[tuple[str, str]]) -> dict[str, Tensor]:
-    renamed = {
-        _current(name, names): tensor for name, tensor in tensors.items() if not name.startswith(STATISTICS)
-    }
-    if _LM_HEAD in renamed:
-        renamed.setdefault(_EMBEDDING, renamed[_LM_HEAD])
-    return renamed
+    return {_current(name, names): tensor for name, tensor in tensors.items() if not name.startswith(STATISTICS)}
 
 
 def _current(name: str, names: Sequence[tuple[str, str]]) -> str:

@@ -23,7 +23,8 @@ from probe_kit.models.building import build_empty
 from probe_kit.models.sizes_only import building_device
 
 _LANGUAGE = "model.vlm.language_model."
-_EMBEDDINGS = (f"{_LANGUAGE}shared.weight", f"{_LANGUAGE}encoder.embed_tokens.weight")
+EMBEDDINGS = (f"{_LANGUAGE}shared.weight", f"{_LANGUAGE}encoder.embed_tokens.weight")
+"""One tensor under two names, of which a file may hold either."""
 FLORENCE_LARGE: dict[str, Any] = {
     "vision_config": {
         "embed_dim": [256, 512, 1024, 2048],
@@ -68,15 +69,10 @@ def full_size_xvla() -> XVLAPolicy:
 def current_xvla_keys(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """A file's tensors under the names lerobot's network has.
 
-    Files of 2025 have Florence-2 in its authors' layout. Of the tied embeddings a file may hold either.
+    Files of 2025 have Florence-2 in its authors' layout.
     """
-    renamed = dict(tensors)
-    if _is_vendored_florence_state_dict(renamed):
-        renamed = _remap_vendored_florence_state_dict(renamed)
-    for name, other in (_EMBEDDINGS, _EMBEDDINGS[::-1]):
-        if name in renamed:
-            renamed.setdefault(other, renamed[name])
-    return renamed
+    stored = dict(tensors)
+    return _remap_vendored_florence_state_dict(stored) if _is_vendored_florence_state_dict(stored) else stored
 
 
 def denoised_actions(policy: Any, inputs: Mapping[str, Tensor], noise: Tensor) -> Tensor:

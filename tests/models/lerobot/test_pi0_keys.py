@@ -1,6 +1,7 @@
 import torch
 from torch import Tensor
 
+from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.models.embedded.pi0_tiny import SIZE, _config
 from probe_kit.models.lerobot.pi0 import build_pi0
 from probe_kit.models.lerobot.pi0_keys import current_pi0_keys
@@ -43,6 +44,6 @@ def test_openpi_names_gain_prefix_and_time_mlp_names() -> None:
 def test_a_lone_lm_head_becomes_the_embedding_but_never_replaces_one() -> None:
     head, embedding = torch.ones(4, 2), torch.zeros(4, 2)
     name = f"{VLM}.model.language_model.embed_tokens.weight"
-    assert torch.equal(current_pi0_keys({f"{VLM}.lm_head.weight": head})[name], head)
-    both = current_pi0_keys({f"{VLM}.lm_head.weight": head, name: embedding})
+    assert torch.equal(Pi0.current_keys({f"{VLM}.lm_head.weight": head})[name], head)
+    both = Pi0.current_keys({f"{VLM}.lm_head.weight": head, name: embedding})
     assert torch.equal(both[name], embedding)

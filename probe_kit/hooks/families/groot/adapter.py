@@ -153,12 +153,9 @@ class Groot(PackedPolicy):
         return network
 
     @classmethod
-    def current_keys(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def current_names(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Return tensors by lerobot's names, also of NVIDIA's files."""
-        renamed = {
-            name if name.startswith(_MODEL) else f"{_MODEL}{name}": tensor for name, tensor in tensors.items()
-        }
-        return super().current_keys(renamed)
+        return {name if name.startswith(_MODEL) else f"{_MODEL}{name}": tensor for name, tensor in tensors.items()}
 
     def parts(self) -> dict[str, Path]:
         """The base model and the vision-language model."""

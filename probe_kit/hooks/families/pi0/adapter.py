@@ -50,7 +50,7 @@ class Pi0(PaliGemmaPolicy, EvaluatedPi0):
         return network
 
     @classmethod
-    def current_keys(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def current_names(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Old layouts brought to today's."""
         return current_pi0_keys(tensors)
 

@@ -62,7 +62,7 @@ class Pi05(StatePrompt, Pi0):
         return network
 
     @classmethod
-    def current_keys(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def current_names(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Older names brought to today's."""
         return current_pi05_keys(tensors)
 

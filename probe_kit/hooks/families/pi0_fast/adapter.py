@@ -14,7 +14,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -38,7 +38,7 @@ from probe_kit.hooks.families.shared.prompt_kv import ALL_BUT_LAST, kept_prompt
 from probe_kit.hooks.families.shared.sampling import chooser
 from probe_kit.hooks.verification.outputs import Arrays, Produce, RecordedRun, numpy_of
 from probe_kit.models.lerobot.pi0_fast import Pi0FastSize, TokenPrompt, build_pi0_fast, decode_tokens
-from probe_kit.models.lerobot.pi0_keys import current_pi0_fast_keys
+from probe_kit.models.lerobot.pi0_keys import EMBEDDING, LM_HEAD, current_pi0_fast_keys
 
 _LAST = slice(-1, None)
 
@@ -65,6 +65,8 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
     config_type = "pi0_fast"
     known_steps = (CROP, "pi0_fast_prepare_state_tokenizer_processor_step", "action_tokenizer_processor")
     interventions = FAST
+    # Its head puts out tokens, and is read.
+    tied: ClassVar[Mapping[str, str]] = {EMBEDDING: LM_HEAD, LM_HEAD: EMBEDDING}
 
     acting_stream = "action"
     suffix_roles = ("action",)
@@ -84,7 +86,7 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
         return network
 
     @classmethod
-    def current_keys(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def current_names(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Old layouts brought to today's."""
         return current_pi0_fast_keys(tensors)
 

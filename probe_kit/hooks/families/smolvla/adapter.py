@@ -56,7 +56,7 @@ class SmolVLA(LerobotFlow):
         return network
 
     @classmethod
-    def current_keys(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def current_names(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Old files' statistics left out."""
         return current_smolvla_keys(tensors)
 

@@ -35,7 +35,7 @@ from probe_kit.hooks.families.shared.lerobot.stacks import Stack
 from probe_kit.hooks.families.xvla import BLOCK, INTERVENTIONS
 from probe_kit.hooks.families.xvla.steps import STEPS, XvlaSteps, read_steps
 from probe_kit.hooks.verification.outputs import Produce, RecordedRun, numpy_of
-from probe_kit.models.lerobot.xvla import build_xvla, current_xvla_keys, denoised_actions
+from probe_kit.models.lerobot.xvla import EMBEDDINGS, build_xvla, current_xvla_keys, denoised_actions
 from probe_kit.models.pretrained import load_pretrained
 
 SOFT_PROMPT = "soft_prompt"
@@ -94,6 +94,7 @@ class Xvla(DenoisingPolicy):
     family = "xvla"
     config_type = "xvla"
     known_steps = STEPS
+    tied: ClassVar[Mapping[str, str]] = dict((EMBEDDINGS, EMBEDDINGS[::-1]))
     interventions = INTERVENTIONS
 
     other_roles: ClassVar[tuple[str, ...]] = ("language", "special")
@@ -131,7 +132,7 @@ class Xvla(DenoisingPolicy):
         return network
 
     @classmethod
-    def current_keys(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def current_names(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """Also those of files with Florence-2 in its authors' layout."""
         return current_xvla_keys(tensors)
 

@@ -163,7 +163,7 @@ def test_weights_must_be_whole_but_tied_embeddings_may_have_either_name(
     folder: Path, tmp_path: Path, xvla: Xvla, seen: list[Observation], name: str, missing: bool
 ) -> None:
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
-    tensors = network.current_xvla_keys(load_file(tmp_path / "model.safetensors"))
+    tensors = Xvla.current_keys(load_file(tmp_path / "model.safetensors"))
     kept = {key: own.clone() for key, own in tensors.items() if name not in key}
     assert len(kept) == len(tensors) - 1
     save_file(kept, tmp_path / "model.safetensors")

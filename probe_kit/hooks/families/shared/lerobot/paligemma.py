@@ -1,9 +1,9 @@
 """The parts that lerobot's policies on PaliGemma share: sizes, tokenizer, pictures in the prompt."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.shared.lerobot.pipelines import tokenizer_folder, tokenizer_name
 from probe_kit.hooks.families.shared.lerobot.policy import LerobotPolicy
+from probe_kit.models.lerobot.pi0_keys import EMBEDDING, LM_HEAD
 from probe_kit.models.pretrained import load_pretrained
 
 _TOKENIZER = "google/paligemma-3b-pt-224"
@@ -45,6 +46,9 @@ def sizes_file(folder: Path) -> Path | None:
 
 class PaliGemmaPolicy(LerobotPolicy):
     """A lerobot policy whose prompt is read by PaliGemma."""
+
+    # pi0_base holds the embedding as `lm_head` alone.
+    tied: ClassVar[Mapping[str, str]] = {EMBEDDING: LM_HEAD}
 
     @cached_property
     def tokenizer(self) -> Any:

@@ -149,9 +149,14 @@ class LerobotPolicy(Policy):
         """The network with uninitialised weights."""
 
     @classmethod
+    def current_names(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """A file's tensors under the names the network has."""
+        return dict(tensors)
+
+    @classmethod
     def current_keys(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """A file's tensors under the names the network has; see `tied`."""
-        stored = dict(tensors)
+        """The tensors by their current names, and those that a file may lack; see `tied`."""
+        stored = cls.current_names(tensors)
         for name, other in cls.tied.items():
             if other in stored:
                 stored.setdefault(name, stored[other])
@@ -160,7 +165,7 @@ class LerobotPolicy(Policy):
     @classmethod
     def _current_key(cls, name: str) -> str:
         """The network's name of one tensor of a file."""
-        return next(iter(cls.current_keys({name: torch.empty(0)})), name)
+        return next(iter(cls.current_names({name: torch.empty(0)})), name)
 
     @abstractmethod
     def _stacks(self) -> dict[str, Stack]:
