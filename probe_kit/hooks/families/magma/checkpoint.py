@@ -12,8 +12,8 @@ from torch import Tensor
 from probe_kit.errors import UsageError, WeightsError
 from probe_kit.hooks.checkpoints.checkpoint import chosen_dtype
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
-from probe_kit.hooks.checkpoints.weights import Weights, WeightsAudit, load_weights, read_weights
-from probe_kit.hooks.families.shared.network_loading import DTYPES, as_dtype, audit_of_twin, check_filled
+from probe_kit.hooks.checkpoints.weights import Weights, WeightsAudit, read_weights
+from probe_kit.hooks.families.shared.network_loading import DTYPES, as_dtype, assign_weights, audit_of_twin
 from probe_kit.models.initialisation import initialise
 from probe_kit.models.magma import UNUSED_WEIGHTS, MagmaConfig, MagmaNetwork, build_magma, shipped_statistics
 from probe_kit.models.statistics_choice import STATISTICS_FILE, chosen_name, read_statistics, stored_statistics
@@ -111,10 +111,7 @@ def _stored(
         notes += (f"{len(unread)} tensors of the contrastive head are in the file and never read",)
     network = build_magma(config, dtype)
     tied = {"language_model.lm_head.weight"} if config.text.tie_word_embeddings else set()
-    audit = load_weights(network, weights, as_dtype(tensors, dtype), tied, assign=True)
-    if tied:
-        network.language_model.tie_weights()
-    check_filled(network, f"weights in {folder}")
+    audit = assign_weights(network, weights, as_dtype(tensors, dtype), tied, network.language_model.tie_weights)
     return network, audit, notes, stored_name
 
 

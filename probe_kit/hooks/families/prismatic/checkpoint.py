@@ -11,10 +11,10 @@ from probe_kit.errors import CheckpointError
 from probe_kit.hooks.checkpoints.adapter_files import AdapterFiles, adapter_in
 from probe_kit.hooks.checkpoints.checkpoint import PATTERNS, RUN_WEIGHTS, chosen_dtype
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
-from probe_kit.hooks.checkpoints.weights import WeightsAudit, load_weights, read_weights, with_adapter
+from probe_kit.hooks.checkpoints.weights import WeightsAudit, read_weights, with_adapter
 from probe_kit.hooks.families.prismatic.quantised import check_quantisation, quantise
 from probe_kit.hooks.families.prismatic.release import read_release
-from probe_kit.hooks.families.shared.network_loading import DTYPES, as_dtype, audit_of_twin, check_filled
+from probe_kit.hooks.families.shared.network_loading import DTYPES, as_dtype, assign_weights, audit_of_twin
 from probe_kit.models.initialisation import initialise
 from probe_kit.models.prismatic import PrismaticConfig, PrismaticNetwork, build_prismatic
 from probe_kit.models.statistics_choice import stored_statistics
@@ -137,10 +137,9 @@ def _stored(
         weights = with_adapter(weights, adapter)
     network = build_prismatic(config, dtype)
     tied = {"language_model.lm_head.weight"} if config.text.tie_word_embeddings else set()
-    audit = load_weights(network, weights, as_dtype(weights.tensors, dtype), tied, assign=True)
-    if tied:
-        network.language_model.tie_weights()
-    check_filled(network, f"weights in {folder}")
+    audit = assign_weights(
+        network, weights, as_dtype(weights.tensors, dtype), tied, network.language_model.tie_weights
+    )
     return network, audit
 
 

@@ -1,6 +1,6 @@
 """Loading of native networks: from files or seeded random weights."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -43,18 +43,35 @@ def fill[Network: nn.Module](
     tensors = as_dtype({name_in_module(key): value for key, value in weights.tensors.items()}, DTYPES[name])
     if len(tensors) < len(weights.tensors):
         raise WeightsError(f"{weights.source}: two tensors have the same name here; nothing was run")
-    audit = load_weights(network, weights, tensors, tied(network), assign=True, name_in_module=name_in_module)
-    tie: Any = getattr(network, "vlm", network)
-    tie.tie_weights()
-    for double in set(tied(network)) & set(tensors):
+    tying: Any = getattr(network, "vlm", network)
+    audit = assign_weights(network, weights, tensors, tied(network), tying.tie_weights, name_in_module)
+    network.requires_grad_(False)
+    return Filled(network, audit, name, None)
+
+
+def assign_weights(
+    network: nn.Module,
+    weights: Weights,
+    tensors: Mapping[str, Tensor],
+    tied: Collection[str],
+    tie: Callable[[], object],
+    name_in_module: Callable[[str], str] = str,
+) -> WeightsAudit:
+    """Make `tensors` the parameters of a network on the meta device.
+
+    tied: parameters that are another one's double, which a file may leave out. tie: ties them again. Raises
+    WeightsError for a double with other numbers, for tensors without memory, and what `load_weights` raises.
+    """
+    audit = load_weights(network, weights, tensors, tied, assign=True, name_in_module=name_in_module)
+    tie()
+    for double in set(tied) & set(tensors):
         if not torch.equal(network.state_dict()[double], tensors[double]):
             raise WeightsError(
                 f"{weights.source}: {double} differs from the tensor that config.json ties it to "
                 "(tie_word_embeddings); one of the two files is another model's"
             )
-    check_filled(network, weights.source)
-    network.requires_grad_(False)
-    return Filled(network, audit, name, None)
+    _check_filled(network, weights.source)
+    return audit
 
 
 def twin[Network: nn.Module](
@@ -80,7 +97,7 @@ def as_dtype(tensors: Mapping[str, Tensor], dtype: torch.dtype) -> dict[str, Ten
     return {name: value.to(dtype) if value.is_floating_point() else value for name, value in tensors.items()}
 
 
-def check_filled(network: nn.Module, source: str) -> None:
+def _check_filled(network: nn.Module, source: str) -> None:
     """Raise WeightsError for tensors and buffers without memory."""
     every = {**network.state_dict(), **dict(network.named_buffers())}
     if empty := [name for name, tensor in every.items() if tensor.is_meta]:

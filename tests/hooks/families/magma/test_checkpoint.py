@@ -11,12 +11,34 @@ from probe_kit.errors import CheckpointError, UsageError, WeightsError
 from probe_kit.hooks import Observation
 from probe_kit.hooks.families.magma.adapter import load_magma
 from probe_kit.models.magma import UNUSED_WEIGHTS, shipped_statistics
-from tests.support.magma_checkpoints import LAYER_SCALE, small_network, weights, write_checkpoint
+from tests.support.magma_checkpoints import (
+    LAYER_SCALE,
+    config_values,
+    small_network,
+    weights,
+    write_checkpoint,
+)
 
 
 def renamed(tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     """As a loader that renames every gamma to weight saves it."""
     return {name.replace(".gamma", ".weight"): tensor for name, tensor in tensors.items()}
+
+
+def test_a_head_that_is_tied_may_be_left_out_and_has_no_other_numbers(tmp_path: Path) -> None:
+    tied = {**config_values()["text_config"], "tie_word_embeddings": True}
+    network, head = small_network(text_config=tied), "language_model.lm_head.weight"
+    tensors = {name: tensor.clone() for name, tensor in weights(network).items()}
+    for name, stored in (
+        ("both", tensors),
+        ("one", {key: tensor for key, tensor in tensors.items() if key != head}),
+    ):
+        folder = write_checkpoint(tmp_path / name, tensors=stored, text_config=tied)
+        loaded = load_magma(str(folder), unnorm_key="bridge_orig").loaded.network.state_dict()
+        assert torch.equal(loaded[head], tensors[head])
+    other = write_checkpoint(tmp_path / "other", tensors={**tensors, head: tensors[head] + 1}, text_config=tied)
+    with pytest.raises(WeightsError, match=f"{head} differs from the tensor that config.json ties it to"):
+        load_magma(str(other), unnorm_key="bridge_orig")
 
 
 @pytest.mark.parametrize("shards", [1, 3])

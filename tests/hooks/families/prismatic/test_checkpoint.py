@@ -59,6 +59,17 @@ def test_shards_give_the_same_weights_and_the_same_hash_as_one_file(base: Path, 
         assert torch.equal(sharded.network.state_dict()[name], tensor)
 
 
+def test_a_head_with_other_numbers_than_the_embedding_that_it_is_tied_to_is_refused(
+    base: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(base, tmp_path, dirs_exist_ok=True)
+    values = json.loads((tmp_path / "config.json").read_text(encoding="utf-8"))
+    values["text_config"]["tie_word_embeddings"] = True
+    (tmp_path / "config.json").write_text(json.dumps(values), encoding="utf-8")
+    with pytest.raises(WeightsError, match=r"lm_head\.weight differs from the tensor .* ties it to"):
+        load(tmp_path)
+
+
 @pytest.mark.parametrize("damage", ["deleted", "extra", "mis-shaped", "nan"])
 def test_a_damaged_checkpoint_is_refused_by_tensor_name(base: Path, tmp_path: Path, damage: str) -> None:
     copy = Path(shutil.copytree(base, tmp_path / "copy"))
