@@ -63,7 +63,6 @@ Format = Annotated[
     Literal["table", "markdown", "json", "csv"], further_option("--format", help="Format of the output.")
 ]
 Html = Annotated[Path | None, typer.Option("--html", help="Also write a page with a figure.")]
-DryRun = Annotated[bool, typer.Option("--dry-run", help="Print the plan and stop.")]
 
 
 @command_with(*ExtractSettings.option_models(), offers=lambda name: name not in _ACTING)
@@ -80,7 +79,7 @@ def diagnose(
     out_folder: start.OutFolder = None,
     html: Html = None,
     output_format: Format = "table",
-    dry_run: DryRun = False,
+    dry_run: common.DryRun = False,
 ) -> None:
     """Does each input reach the action, does it matter, and where is it lost?
 

@@ -6,6 +6,7 @@ from contextlib import suppress
 from copy import copy
 from dataclasses import replace
 from datetime import UTC, datetime
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,6 +20,7 @@ from probe_kit.errors import ObservationError, UnsupportedInterventionError, Usa
 from probe_kit.extract.sources.inputs import STATE, with_input
 from probe_kit.hashing import sha256_json
 from probe_kit.intervene.pairs import Pair
+from probe_kit.intervene.tokens import roles_of_tokens
 from probe_kit.runs.layout import DIAGNOSES
 from probe_kit.runs.records import as_json
 from probe_kit.runs.results import HEAD, read_bundle, write_bundle
@@ -40,7 +42,7 @@ def diagnose_run(
     frames: int = FRAMES,
     inputs: Sequence[str] = (),
     inside: bool = True,
-    paraphrases: Mapping[str, str] | None = None,
+    paraphrases: Mapping[str, str] = MappingProxyType({}),
     target: "Target | str | None" = None,
     base: str | None = None,
     seed: int = 0,
@@ -75,7 +77,7 @@ def diagnose_run(
         "frames": frames,
         "inputs": list(inputs),
         "inside": inside,
-        "paraphrases": dict(paraphrases or {}),
+        "paraphrases": dict(paraphrases),
         "base": None if base_policy is None else base_policy.card.weights_sha256,
         "seed": seed,
     }
@@ -86,7 +88,7 @@ def diagnose_run(
         if base_policy is not None:
             base_policy = with_inputs_of(session.policy, base_policy)
         progress("frames")
-        drawn = frames_of(session, frames, dict(paraphrases or {}))
+        drawn = frames_of(session, frames, paraphrases)
         exchange = InputExchange(_inference(session), drawn, seed)
         diagnosed = _measure(session, exchange, inputs, inside, progress)
         if base_policy is not None:
@@ -180,7 +182,9 @@ def _look_inside(session: "ReplaySession", exchange: InputExchange, diagnosed: I
         return replace(diagnosed, note=f"sites were not patched: {error}")
 
 
-def _as_many_tokens(policy: "Policy", *observations: "Observation") -> bool:
-    rows = [policy.token_roles([observation]) for observation in observations]
-    counts = [{stream: len(roles[0]) for stream, roles in row.items()} for row in rows]
-    return counts[0] == counts[1]
+def _as_many_tokens(policy: "Policy", clean: "Observation", source: "Observation") -> bool:
+    first, second = (
+        {stream: len(roles) for stream, roles in roles_of_tokens(policy, observation).items()}
+        for observation in (clean, source)
+    )
+    return first == second

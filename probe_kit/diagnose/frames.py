@@ -1,8 +1,9 @@
 """The frames of a run that are diagnosed: first inferences, of as many groups as there are."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from itertools import zip_longest
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -20,14 +21,15 @@ LEAST_GROUPS = 6
 """Fewer groups cannot show at p < 0.05 that anything matters, by sign flips of whole groups: 2⁻⁵ is 0.03."""
 
 
-def frames_of(session: "ReplaySession", count: int, paraphrases: dict[str, str] | None = None) -> list[Frame]:
+def frames_of(
+    session: "ReplaySession", count: int, paraphrases: Mapping[str, str] = MappingProxyType({})
+) -> list[Frame]:
     """The first frames of `count` episodes, from as many groups as possible; all where the run has fewer.
 
     paraphrases: by instruction, other words of the same meaning. Raises UsageError for a run with too few groups.
     """
-    words = paraphrases or {}
     listed = _observed(session, count) if isinstance(session, ObservedSession) else _drawn(session, count)
-    frames = [replace(frame, other_words=words.get(frame.observation.instruction, "")) for frame in listed]
+    frames = [replace(frame, other_words=paraphrases.get(frame.observation.instruction, "")) for frame in listed]
     groups = len({frame.group for frame in frames})
     if groups < LEAST_GROUPS:
         raise UsageError(

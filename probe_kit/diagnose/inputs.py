@@ -1,6 +1,7 @@
 """The inputs that frames hold, their blanks and their controls. Loads no model."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from probe_kit.extract.sources.inputs import (
     STATE,
     hardly_changed,
     same_input,
+    with_other_stop,
 )
 from probe_kit.hooks.contract.observation import Observation
 
@@ -41,11 +43,11 @@ def controls_of(frame: Frame, name: str, spread: NDArray[np.float64]) -> list[Ob
     Without other words of the frame, the first letter's case and the full stop change, or one of them: a tokenizer
     of words may know only one spelling. spread: (D,) of the state.
     """
-    texts = [frame.other_words] if frame.other_words else _retyped(frame.observation.instruction)
-    return [
-        hardly_changed(frame.observation, name, spread, words)
-        for words in (texts if name == INSTRUCTION else texts[:1])
-    ]
+    clean = frame.observation
+    if name != INSTRUCTION:
+        return [hardly_changed(clean, name, spread)]
+    texts = [frame.other_words] if frame.other_words else _retyped(clean.instruction)
+    return [replace(clean, instruction=text) for text in texts]
 
 
 def spread_of_states(frames: Sequence[Frame]) -> NDArray[np.float64]:
@@ -56,5 +58,5 @@ def spread_of_states(frames: Sequence[Frame]) -> NDArray[np.float64]:
 
 def _retyped(words: str) -> list[str]:
     """The full stop added or removed, and the first letter in the other case; then one of both alone."""
-    stopped = words.removesuffix(".") if words.endswith(".") else f"{words}."
+    stopped = with_other_stop(words)
     return [text[:1].swapcase() + text[1:] for text in (stopped, words)] + [stopped]

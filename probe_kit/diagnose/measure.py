@@ -59,16 +59,10 @@ class InputExchange:
         available = inputs_of(self.frames, camera)
         if unknown := [name for name in names if name not in available]:
             raise UsageError(f"no input is called {unknown[0]!r}; this source has {', '.join(available)}")
-        if not self.scale.varies.any():
-            raise UsageError(
-                f"all {2 * len(self.frames)} actions are equal, whatever is seen; give frames that differ"
-            )
         measured = map(self._measure, names or available)
         return tuple(_declared(diagnosed) if diagnosed.name in absent else diagnosed for diagnosed in measured)
 
-    def against(
-        self, base: Infer, inputs: Sequence[InputDiagnosis], absent: Collection[str] = ()
-    ) -> tuple[InputDiagnosis, ...]:
+    def against(self, base: Infer, inputs: Sequence[InputDiagnosis]) -> tuple[InputDiagnosis, ...]:
         """Return the inputs with their comparison with a base checkpoint, of those that were exchanged.
 
         base: infers with it. Raises what `measure` raises.
@@ -78,9 +72,7 @@ class InputExchange:
         for diagnosed in inputs:
             comparison = None
             if diagnosed.matters is not None:
-                (of_base,) = other.measure(
-                    [diagnosed.name], absent=absent, camera=diagnosed.name.partition(".")[2]
-                )
+                of_base = other._measure(diagnosed.name)
                 exchanges = self._exchanges[diagnosed.name], other._exchanges[diagnosed.name]
                 comparison = compare_with_base(diagnosed, of_base, *exchanges)
             compared.append(replace(diagnosed, base=comparison))
@@ -109,9 +101,14 @@ class InputExchange:
 
     @cached_property
     def scale(self) -> ActionScale:
-        """The spread of clean actions over frames and seeds."""
+        """The spread of clean actions over frames and seeds. Raises UsageError if all are equal."""
         other = self.infer(self.observations, [derive_seed(seed, "other") for seed in self._seeds])
-        return ActionScale.of(np.concatenate([self.clean, other]))
+        scale = ActionScale.of(np.concatenate([self.clean, other]))
+        if not scale.varies.any():
+            raise UsageError(
+                f"all {2 * len(self.frames)} actions are equal, whatever is seen; give frames that differ"
+            )
+        return scale
 
     @cached_property
     def _blank(self) -> "Observation":

@@ -40,10 +40,10 @@ class Frame:
     stored: NDArray[np.float32] | None = None
 
     @classmethod
-    def of(cls, name: str, observation: Observation, group: str, seed: int, other_words: str = "") -> "Frame":
+    def of(cls, name: str, observation: Observation, group: str, seed: int) -> "Frame":
         """Return the frame of an observation that is there already."""
         state = np.asarray(observation.state, np.float64)
-        return cls(name, group, seed, observation.instruction, state, lambda _: observation, other_words)
+        return cls(name, group, seed, observation.instruction, state, lambda _: observation)
 
     @property
     def observation(self) -> Observation:

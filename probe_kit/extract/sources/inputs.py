@@ -40,19 +40,22 @@ def same_input(first: Observation, second: Observation, vary: str) -> bool:
     return all(np.array_equal(_picture(first, name), _picture(second, name)) for name in _cameras(first, vary))
 
 
-def hardly_changed(clean: Observation, vary: str, spread: NDArray[np.floating], words: str = "") -> Observation:
+def hardly_changed(clean: Observation, vary: str, spread: NDArray[np.floating]) -> Observation:
     """Return the clean observation after a change of one input that means nothing.
 
-    Other words or the full stop, a JPEG round trip, a hundredth of the state's spread. spread: (D,) of the state.
-    words: of the same meaning; empty to add or remove the full stop.
+    The full stop, a JPEG round trip, a hundredth of the state's spread. spread: (D,) of the state.
     """
     if vary == INSTRUCTION:
-        text = clean.instruction
-        return replace(clean, instruction=words or (text[:-1] if text.endswith(".") else f"{text}."))
+        return replace(clean, instruction=with_other_stop(clean.instruction))
     if vary == STATE:
         moved = clean.state + STATE_SHARE * spread[: clean.state.size]
         return replace(clean, state=moved.astype(np.float32))
     return _with_pictures(clean, vary, lambda name: through_jpeg(_picture(clean, name)))
+
+
+def with_other_stop(text: str) -> str:
+    """Return a text with its full stop removed, or one added."""
+    return text[:-1] if text.endswith(".") else f"{text}."
 
 
 def blank_of(observations: Sequence[Observation]) -> Observation:
