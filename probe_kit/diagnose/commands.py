@@ -127,7 +127,9 @@ def diagnose(
 
 def _is_run(name: str, typed: Mapping[str, Any]) -> bool:
     """Whether this is a stored run. Raises UsageError for one with settings of a new run."""
-    if "/" not in name and not (Path(name) / "run.json").exists():
+    from probe_kit.runs.layout import RUN_FILE
+
+    if "/" not in name and not (Path(name) / RUN_FILE).exists():
         return False
     if typed:
         option = next(iter(typed)).replace("_", "-")
@@ -213,6 +215,7 @@ def _say_cost(planned: Planned, frames: int, inside: bool, base: bool) -> None:
 
 def _print(diagnosis: "Diagnosis", output_format: str) -> None:
     from probe_kit.diagnose.sentences import diagnosis_table
+    from probe_kit.retention.output import print_text_of
 
     table = diagnosis_table(diagnosis)
     if output_format == "json":
@@ -220,4 +223,4 @@ def _print(diagnosis: "Diagnosis", output_format: str) -> None:
     elif output_format == "table":
         out.print(table)
     else:
-        out.print(table.to_markdown() if output_format == "markdown" else table.to_csv(), markup=False)
+        print_text_of(table, output_format)

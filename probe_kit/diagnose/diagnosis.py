@@ -18,8 +18,8 @@ from probe_kit.diagnose.passage import measure_passage
 from probe_kit.diagnose.results import Diagnosis, InputDiagnosis
 from probe_kit.errors import ObservationError, UnsupportedInterventionError, UsageError
 from probe_kit.extract.sources.inputs import STATE, with_input
-from probe_kit.hashing import sha256_json
 from probe_kit.intervene.pairs import Pair
+from probe_kit.intervene.settings import key_of
 from probe_kit.intervene.tokens import roles_of_tokens
 from probe_kit.runs.layout import DIAGNOSES
 from probe_kit.runs.records import as_json
@@ -81,7 +81,7 @@ def diagnose_run(
         "base": None if base_policy is None else base_policy.card.weights_sha256,
         "seed": seed,
     }
-    key = sha256_json(settings)[:12]
+    key = key_of(settings)
     if run.location.exists(f"{DIAGNOSES}/{key}/{HEAD}"):
         return replace(load_diagnosis(run, key), knowledge=knowledge)
     with open_session(run, source, load) as session, session.ready():

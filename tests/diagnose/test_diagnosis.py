@@ -3,6 +3,7 @@
 The policy decides Color by what block 2 hands over (`kv.02`), and nothing reads its last backbone layer.
 """
 
+import csv
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -119,6 +120,16 @@ def test_a_plan_says_how_many_inferences_it_takes_and_plays_nothing(tmp_path: Pa
 def test_too_few_groups_are_refused_with_their_number(run: Run) -> None:
     with pytest.raises(UsageError, match="frames of 3 groups"):
         diagnose_run(run, frames=3)
+
+
+def test_csv_and_markdown_have_a_whole_line_for_every_input(folder: Path) -> None:
+    answer = run_command(folder / "run", *FRAMES, "--format", "csv")
+    rows = list(csv.DictReader(answer.stdout.splitlines()))
+    assert [row["name"] for row in rows] == ["instruction", "picture", "state"]
+    assert all(None not in row and None not in row.values() for row in rows), "no line is cut"
+    lines = run_command(folder / "run", *FRAMES, "--format", "markdown").stdout.splitlines()
+    assert sum(line.startswith("|") for line in lines) == 2 + len(rows)
+    assert all(line.endswith("|") for line in lines if line.startswith("|"))
 
 
 def test_paraphrases_must_differ(tmp_path: Path, folder: Path) -> None:
