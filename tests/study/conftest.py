@@ -4,45 +4,11 @@ import pytest
 
 from probe_kit.study import LoadedStudy, conduct_study, load_study, plan_study
 from probe_kit.suite import Suite
-from tests.study.small_study import small_study
+from tests.study.small_study import LIGHT, small_study
 
-PLAYED = """
-schema = 1
-name = "scripted"
-out = "{out}"
-
-[suite]
-path = "{suite}"
-categories = ["color"]
-items = 2
-
-[models.expert]
-family = "expert"
-
-[models.idle]
-family = "idle"
-label = "Idle"
-
-[conditions.short]
-max_steps = 1
-
-[conditions.dark]
-max_steps = 1
-light_level = 0.7
-
-[[runs]]
-name = "main"
-models = ["expert", "idle"]
-conditions = ["short"]
-
-[[runs]]
-name = "light"
-models = ["idle"]
-conditions = ["dark"]
-
-[comparisons.light]
-pairs = {{ conditions = ["short", "dark"], models = ["idle"] }}
-
+PLAYED = (
+    LIGHT.replace('family = "idle"', 'family = "idle"\nlabel = "Idle"')
+    + """
 [tables.main]
 kind = "success"
 runs = ["main"]
@@ -76,11 +42,12 @@ runs = ["main"]
 kind = "dose"
 runs = ["main"]
 """
+)
 
 
 @pytest.fixture(scope="session")
 def played(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> LoadedStudy:
     """Whole, without probes."""
-    study = load_study(small_study(tmp_path_factory.mktemp("played"), small_suite, PLAYED))
+    study = load_study(small_study(tmp_path_factory.mktemp("played"), small_suite, PLAYED, items=2))
     assert conduct_study(plan_study(study), env_workers=0) == []
     return study

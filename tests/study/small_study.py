@@ -7,7 +7,7 @@ from probe_kit.study import load_study
 from probe_kit.suite import Suite
 from tests.support.killed_commands import run_files
 
-TEXT = """
+HEAD = """
 schema = 1
 name = "small"
 out = "{out}"
@@ -15,8 +15,10 @@ out = "{out}"
 [suite]
 path = "{suite}"
 categories = ["color"]
-items = 12
+items = {items}
 
+"""
+TEXT = """
 [models.first]
 family = "pi0-tiny"
 random_weights = true
@@ -71,15 +73,6 @@ runs = ["vlms"]
 """
 EPISODES = 4 * 24
 SCRIPTED = """
-schema = 1
-name = "scripted"
-out = "{out}"
-
-[suite]
-path = "{suite}"
-categories = ["color"]
-items = 6
-
 [models.expert]
 family = "expert"
 
@@ -103,12 +96,42 @@ kind = "success"
 runs = ["main"]
 """
 """Without a network, so that twenty kills take minutes."""
+LIGHT = """
+[models.expert]
+family = "expert"
+
+[models.idle]
+family = "idle"
+
+[conditions.short]
+max_steps = 1
+
+[conditions.dark]
+max_steps = 1
+light_level = 0.7
+
+[[runs]]
+name = "main"
+models = ["expert", "idle"]
+conditions = ["short"]
+
+[[runs]]
+name = "light"
+models = ["idle"]
+conditions = ["dark"]
+
+[comparisons.light]
+pairs = {{ conditions = ["short", "dark"], models = ["idle"] }}
+
+"""
+"""Two scripted models and a dark scene for one of them, without tables."""
 
 
-def small_study(folder: Path, suite: Suite, text: str = TEXT) -> Path:
-    """Its file in `folder`; runs lie in `folder/out`."""
+def small_study(folder: Path, suite: Suite, text: str = TEXT, items: int = 12) -> Path:
+    """Its file in `folder`, the head of all and `text`; runs lie in `folder/out`."""
     file = folder / "study.toml"
-    file.write_text(text.format(out=folder / "out", suite=suite.folder), encoding="utf-8")
+    content = (HEAD + text).format(out=folder / "out", suite=suite.folder, items=items)
+    file.write_text(content, encoding="utf-8")
     return file
 
 

@@ -21,48 +21,11 @@ from probe_kit.study import (
     playing,
 )
 from probe_kit.suite import Suite
-from tests.study.small_study import small_study
+from tests.study.small_study import LIGHT, small_study
 
-TEXT = """
-schema = 1
-name = "played"
-out = "{out}"
-
-[suite]
-path = "{suite}"
-categories = ["color"]
-items = 2
-
-[models.expert]
-family = "expert"
-
-[models.broken]
-family = "pi0-tiny"
-checkpoint = "{out}/nowhere"
-
-[models.idle]
-family = "idle"
-
-[conditions.short]
-max_steps = 1
-
-[conditions.dark]
-max_steps = 1
-light_level = 0.7
-
-[[runs]]
-name = "main"
-models = ["expert", "broken", "idle"]
-conditions = ["short"]
-
-[[runs]]
-name = "light"
-models = ["idle"]
-conditions = ["dark"]
-
-[comparisons.light]
-pairs = {{ conditions = ["short", "dark"], models = ["idle"] }}
-
+BROKEN = '[models.broken]\nfamily = "pi0-tiny"\ncheckpoint = "{out}/nowhere"\n\n[models.idle]'
+SHORT = LIGHT.replace("[models.idle]", BROKEN).replace('["expert", "idle"]', '["expert", "broken", "idle"]')
+TEXT = f"""{SHORT}
 [tables.main]
 kind = "success"
 runs = ["main"]
@@ -75,7 +38,7 @@ comparison = "light"
 
 @pytest.fixture(scope="module")
 def file(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return small_study(tmp_path_factory.mktemp("study"), small_suite, TEXT)
+    return small_study(tmp_path_factory.mktemp("study"), small_suite, TEXT, items=2)
 
 
 def states(file: Path) -> dict[str, tuple[str, int]]:
@@ -238,10 +201,8 @@ def test_a_policy_is_loaded_once_for_all_of_its_runs(
         return load(settings)
 
     monkeypatch.setattr(playing, "load_acting_policy", count)
-    text = TEXT.format(out=tmp_path / "out", suite=small_suite.folder)
-    text = text.replace('family = "idle"', 'family = "pi0-tiny"\nrandom_weights = true')
-    file = tmp_path / "study.toml"
-    file.write_text(text, encoding="utf-8")
+    text = TEXT.replace('family = "idle"', 'family = "pi0-tiny"\nrandom_weights = true')
+    file = small_study(tmp_path, small_suite, text, items=2)
     assert [one.model for one in conduct_study(plan_study(load_study(file)), env_workers=0)] == ["broken"]
     assert loaded == ["pi0-tiny"]
     assert states(file)["idle/dark"] == states(file)["idle/short"] == ("whole", 4)
@@ -249,13 +210,12 @@ def test_a_policy_is_loaded_once_for_all_of_its_runs(
 
 @pytest.mark.slow
 def test_probes_of_the_file_are_fitted_once_and_shown(small_suite: Suite, tmp_path: Path) -> None:
-    text = TEXT.format(out=tmp_path / "out", suite=small_suite.folder).replace("items = 2", "items = 12")
     network = 'family = "pi0-tiny"\nrandom_weights = true'
-    text = text.replace('family = "idle"', f'{network}\nuntrained = "expert"\nweights_seed = 1')
-    text = text.replace('family = "expert"', network).replace('categories = ["color"]', 'categories = ["color"]')
+    text = TEXT.replace('family = "idle"', f'{network}\nuntrained = "expert"\nweights_seed = 1')
+    text = text.replace('family = "expert"', network)
     probes = '[probes.main]\nruns = ["main"]\npermutations = 19\ncontrols = ["position"]\n'
-    file = tmp_path / "study.toml"
-    file.write_text(f'{text}{probes}[tables.probing]\nkind = "probing"\nruns = ["main"]\n', encoding="utf-8")
+    probing = '[tables.probing]\nkind = "probing"\nruns = ["main"]\n'
+    file = small_study(tmp_path, small_suite, f"{text}{probes}{probing}")
     study = load_study(file)
     conduct_study(plan_study(study))
     (missing,) = fit_probes(plan_study(study))

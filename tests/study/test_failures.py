@@ -106,7 +106,7 @@ def whys(file: Path) -> dict[str, str]:
 
 @pytest.mark.slow
 def test_a_plan_says_what_changed_since_a_run_of_the_same_name(small_suite: Suite, tmp_path: Path) -> None:
-    file = small_study(tmp_path, small_suite, SCRIPTED)
+    file = small_study(tmp_path, small_suite, SCRIPTED, items=6)
     assert conduct_study(plan_study(load_study(file)), env_workers=0) == []
     assert set(whys(file).values()) == {"whole"}
     text = file.read_text(encoding="utf-8")

@@ -11,13 +11,13 @@ from tests.support.killed_commands import KilledCommand, committed, kill_often, 
 KILLS = 20
 
 
-def command(suite: Suite, text: str, *options: str) -> KilledCommand:
+def command(suite: Suite, text: str, items: int, *options: str) -> KilledCommand:
     def runs(place: Path) -> list[Path]:
         return run_folders(place / "study.toml")
 
     return KilledCommand(
         "study run",
-        lambda place: small_study(place, suite, text),
+        lambda place: small_study(place, suite, text, items),
         lambda place: ["study", "run", str(place / "study.toml"), *options],
         lambda place: bytes_of(place / "study.toml"),
         lambda place: committed(*runs(place)),
@@ -26,9 +26,9 @@ def command(suite: Suite, text: str, *options: str) -> KilledCommand:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("text", [SCRIPTED, TEXT], ids=["scripted", "probed"])
+@pytest.mark.parametrize(("text", "items"), [(SCRIPTED, 6), (TEXT, 12)], ids=["scripted", "probed"])
 @pytest.mark.parametrize("options", [(), ("--slots", "2")], ids=["here", "processes"])
 def test_twenty_kills_lose_nothing_and_change_no_byte(
-    text: str, options: tuple[str, ...], small_suite: Suite, tmp_path: Path
+    text: str, items: int, options: tuple[str, ...], small_suite: Suite, tmp_path: Path
 ) -> None:
-    print(kill_often(command(small_suite, text, *options), tmp_path, KILLS, seed=len(options)))
+    print(kill_often(command(small_suite, text, items, *options), tmp_path, KILLS, seed=len(options)))
