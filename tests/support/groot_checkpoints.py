@@ -61,7 +61,7 @@ def write_nvidias(
 
 def write_groot(folder: Path, seed: int = 22, cameras: Sequence[str] = ("image",), **fields: Any) -> Path:
     """What lerobot saves of a policy that grew from `base`; `fields` go into its configuration."""
-    from probe_kit.hooks.families.groot.adapter import load_groot
+    from probe_kit.hooks.families.groot.adapter import Groot
     from probe_kit.models.lerobot.groot import GrootConfig
 
     write_nvidias(folder / "base", seed, cameras)
@@ -72,7 +72,7 @@ def write_groot(folder: Path, seed: int = 22, cameras: Sequence[str] = ("image",
     )  # fmt: skip
     from lerobot.policies.groot.processor_groot import make_groot_pre_post_processors
 
-    policy = load_groot(str(folder / "base"), embodiment=TAG).network
+    policy = Groot.load(str(folder / "base"), embodiment=TAG).network
     for pipeline, name in zip(make_groot_pre_post_processors(config), ("pre", "post"), strict=True):
         pipeline.save_pretrained(folder, config_filename=f"policy_{name}processor.json")
     config.base_model_path = "base"

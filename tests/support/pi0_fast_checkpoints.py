@@ -97,9 +97,9 @@ def write_trained(folder: Path, steps: int = 400) -> Path:
     import torch
     from lerobot.policies.pi0_fast.modeling_pi0_fast import PI0FastPolicy
 
-    from probe_kit.hooks.families.pi0_fast.adapter import load_pi0_fast
+    from probe_kit.hooks.families.pi0_fast.adapter import Pi0Fast
 
-    policy, rng = load_pi0_fast(str(write_pi0_fast(folder))), np.random.default_rng(0)
+    policy, rng = Pi0Fast.load(str(write_pi0_fast(folder))), np.random.default_rng(0)
     network: PI0FastPolicy = policy.network
     processor = fast_processor(folder / "fast")
     rows = [[policy.tokenizer.bos_token_id, *policy.action_text.ids(ids)] for ids in processor(TRAINED)]

@@ -10,7 +10,7 @@ from safetensors.torch import load_file, save_file
 from probe_kit.errors import WeightsError
 from probe_kit.hooks import Observation
 from probe_kit.hooks.checkpoints.weights import INDEX_FILE, SINGLE_FILE, read_weights
-from probe_kit.hooks.families.pi0.adapter import Pi0, load_pi0
+from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.models.embedded.folder import embedded_checkpoint
 
 NAME = "model.state_proj.weight"
@@ -46,40 +46,40 @@ def rewrite(checkpoint: Path, change: dict[str, torch.Tensor | None]) -> None:
 def test_a_changed_file_is_refused_by_tensor_name(checkpoint: Path, change, complaint: str) -> None:
     rewrite(checkpoint, change)
     with pytest.raises(WeightsError, match=complaint) as caught:
-        load_pi0(str(checkpoint))
+        Pi0.load(str(checkpoint))
     assert caught.value.exit_code == 3
 
 
 def test_missing_weights_are_refused_and_not_replaced_by_random_ones(checkpoint: Path) -> None:
     (checkpoint / SINGLE_FILE).unlink()
     with pytest.raises(WeightsError, match="no weights in"):
-        load_pi0(str(checkpoint))
+        Pi0.load(str(checkpoint))
 
 
 def test_a_truncated_file_is_refused(checkpoint: Path) -> None:
     file = checkpoint / SINGLE_FILE
     file.write_bytes(file.read_bytes()[:-1000])
     with pytest.raises(WeightsError, match="cannot be read"):
-        load_pi0(str(checkpoint))
+        Pi0.load(str(checkpoint))
 
 
 def test_a_dead_output_head_may_be_absent_and_is_listed(checkpoint: Path) -> None:
     head = "model.paligemma_with_expert.gemma_expert.lm_head.weight"
     rewrite(checkpoint, {head: None})
-    assert load_pi0(str(checkpoint)).card.audit["allowed_missing"] == (head,)
+    assert Pi0.load(str(checkpoint)).card.audit["allowed_missing"] == (head,)
 
 
 def test_shards_load_like_one_file(checkpoint: Path) -> None:
-    whole = load_pi0(str(checkpoint)).card
+    whole = Pi0.load(str(checkpoint)).card
     shard(checkpoint)
-    assert load_pi0(str(checkpoint)).card.weights_sha256 == whole.weights_sha256
+    assert Pi0.load(str(checkpoint)).card.weights_sha256 == whole.weights_sha256
 
 
 def test_a_missing_shard_is_named(checkpoint: Path) -> None:
     shard(checkpoint)
     (checkpoint / "model-00002-of-00002.safetensors").unlink()
     with pytest.raises(WeightsError, match=r"model-00002-of-00002\.safetensors is missing"):
-        load_pi0(str(checkpoint))
+        Pi0.load(str(checkpoint))
 
 
 def test_an_index_that_contradicts_its_shards_is_refused(checkpoint: Path) -> None:
@@ -88,7 +88,7 @@ def test_an_index_that_contradicts_its_shards_is_refused(checkpoint: Path) -> No
     del index["weight_map"][NAME]
     (checkpoint / INDEX_FILE).write_text(json.dumps(index), encoding="utf-8")
     with pytest.raises(WeightsError, match=f"disagree about {NAME}"):
-        load_pi0(str(checkpoint))
+        Pi0.load(str(checkpoint))
 
 
 def test_the_hash_names_every_bit(checkpoint: Path) -> None:
@@ -101,10 +101,10 @@ def test_the_hash_names_every_bit(checkpoint: Path) -> None:
 
 def test_the_random_mark_travels_in_the_weights_file(checkpoint: Path) -> None:
     save_file(load_file(checkpoint / SINGLE_FILE), checkpoint / SINGLE_FILE, metadata=RANDOM)
-    assert load_pi0(str(checkpoint)).card.random_weights
+    assert Pi0.load(str(checkpoint)).card.random_weights
     save_file(load_file(checkpoint / SINGLE_FILE), checkpoint / SINGLE_FILE)
-    assert not load_pi0(str(checkpoint)).card.random_weights
-    assert load_pi0(str(checkpoint), random_weights=True).card.random_weights
+    assert not Pi0.load(str(checkpoint)).card.random_weights
+    assert Pi0.load(str(checkpoint), random_weights=True).card.random_weights
 
 
 def shard(checkpoint: Path) -> None:
@@ -134,7 +134,7 @@ def test_a_checkpoint_in_the_layout_of_early_2025_acts_like_todays(
     assert old.keys() != tensors.keys()
     save_file(old, checkpoint / SINGLE_FILE, metadata=RANDOM)
     np.testing.assert_array_equal(
-        load_pi0(str(checkpoint)).act([observation], [1]), pi0_tiny.act([observation], [1])
+        Pi0.load(str(checkpoint)).act([observation], [1]), pi0_tiny.act([observation], [1])
     )
 
 
@@ -143,22 +143,22 @@ def test_a_file_that_holds_the_embedding_only_as_lm_head_loads_it_from_there(che
     embedding = f"{vlm}.model.language_model.embed_tokens.weight"
     head = load_file(checkpoint / SINGLE_FILE)[f"{vlm}.lm_head.weight"]
     rewrite(checkpoint, {embedding: None})
-    assert torch.equal(load_pi0(str(checkpoint)).network.state_dict()[embedding], head)
+    assert torch.equal(Pi0.load(str(checkpoint)).network.state_dict()[embedding], head)
 
 
 def test_a_loaded_policy_is_in_eval_mode(checkpoint: Path) -> None:
-    assert not load_pi0(str(checkpoint)).network.training
+    assert not Pi0.load(str(checkpoint)).network.training
 
 
 def test_a_pickled_state_dict_is_read_without_running_code(checkpoint: Path, tmp_path: Path) -> None:
-    whole = load_pi0(str(checkpoint)).card.weights_sha256
+    whole = Pi0.load(str(checkpoint)).card.weights_sha256
     tensors = load_file(checkpoint / SINGLE_FILE)
     (checkpoint / SINGLE_FILE).unlink()
     torch.save(tensors, checkpoint / "model.pt")
-    assert load_pi0(str(checkpoint)).card.weights_sha256 == whole
+    assert Pi0.load(str(checkpoint)).card.weights_sha256 == whole
     torch.save({"trap": Path(tmp_path)}, checkpoint / "model.pt")
     with pytest.raises(WeightsError, match="plain tensors"):
-        load_pi0(str(checkpoint))
+        Pi0.load(str(checkpoint))
 
 
 @pytest.mark.parametrize(
@@ -175,7 +175,7 @@ def test_a_name_in_front_of_all_tensors_is_told(checkpoint: Path, before: str, t
     tensors = {before + name: tensor for name, tensor in load_file(checkpoint / SINGLE_FILE).items()}
     save_file(tensors, checkpoint / SINGLE_FILE)
     with pytest.raises(WeightsError, match=f"names hold '{told}'.*save its tensors again without") as caught:
-        load_pi0(str(checkpoint))
+        Pi0.load(str(checkpoint))
     assert "missing" not in str(caught.value)
 
 
@@ -184,7 +184,7 @@ def test_a_wrapper_inside_the_names_is_told(checkpoint: Path) -> None:
                for name, tensor in load_file(checkpoint / SINGLE_FILE).items()}  # fmt: skip
     save_file(tensors, checkpoint / SINGLE_FILE)
     with pytest.raises(WeightsError, match="_checkpoint_wrapped_module"):
-        load_pi0(str(checkpoint))
+        Pi0.load(str(checkpoint))
 
 
 def write_index(checkpoint: Path, shard: str) -> None:
@@ -195,7 +195,7 @@ def write_index(checkpoint: Path, shard: str) -> None:
 def test_two_sets_of_weights_are_refused_because_nothing_says_which_is_meant(checkpoint: Path) -> None:
     write_index(checkpoint, "model-00001-of-00001.safetensors")
     shutil.copy(checkpoint / SINGLE_FILE, checkpoint / "model-00001-of-00001.safetensors")
-    for load in (read_weights, lambda folder: load_pi0(str(folder))):
+    for load in (read_weights, lambda folder: Pi0.load(str(folder))):
         with pytest.raises(WeightsError, match="two sets of weights"):
             load(checkpoint)
 

@@ -21,7 +21,6 @@ from probe_kit.hooks.checkpoints.folders import inside_or_hub
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.eo1 import INTERVENTIONS
-from probe_kit.hooks.families.shared.lerobot.evaluation import Evaluation
 from probe_kit.hooks.families.shared.lerobot.packed import PackedBatch, PackedPolicy, Tokens, chat_labels
 from probe_kit.hooks.families.shared.lerobot.pipelines import PREPROCESSOR, check_same, saved_steps
 from probe_kit.hooks.families.shared.lerobot.policy import IMAGES, STATE, checked_steps
@@ -47,8 +46,8 @@ class Eo1(PackedPolicy):
     other_roles: ClassVar[tuple[str, ...]] = ("language", "state", "special")
     suffix_roles = ("action",)
 
-    def __init__(self, network: Any, folder: Path) -> None:
-        super().__init__(network, folder)
+    def __init__(self, network: Any, folder: Path, checkpoint: str) -> None:
+        super().__init__(network, folder, checkpoint)
         self.passages = network.model.prompt_kv
         self.prompt_kv = kept_prompt(network.model.vlm_backbone.config.text_config)
 
@@ -60,7 +59,7 @@ class Eo1(PackedPolicy):
         return values
 
     @classmethod
-    def parse_config(cls, folder: Path, evaluation: Evaluation) -> Any:
+    def parse_config(cls, folder: Path, evaluation: Any) -> Any:
         """lerobot's configuration, with what the processor files say: lerobot packs as they do."""
         config = super().parse_config(folder, evaluation)
         saved = {step.name: step.config for step in saved_steps(folder, PREPROCESSOR)}

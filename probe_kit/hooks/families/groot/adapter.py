@@ -7,7 +7,7 @@ attend by turns to the end of the bridge and to themselves.
 Source: arXiv 2503.14734 and the released GR00T N1.7, through lerobot's `GrootPolicy`.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -24,7 +24,6 @@ from probe_kit.hooks.families.groot.checkpoint import GrootChoice, Places, is_nv
 from probe_kit.hooks.families.groot.packing import Packing, Steps, read_steps
 from probe_kit.hooks.families.groot.pictures import NvidiasPictures, lerobots_rule
 from probe_kit.hooks.families.groot.units import BoundedUnits, StateUnits, action_units, state_units
-from probe_kit.hooks.families.shared.lerobot.evaluation import AS_STORED, Evaluation
 from probe_kit.hooks.families.shared.lerobot.packed import PackedPolicy
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack
 from probe_kit.hooks.families.shared.qwen.tower import tower_tap
@@ -94,6 +93,7 @@ class Groot(PackedPolicy):
 
     family = "groot"
     config_type = "groot"
+    choice = GrootChoice
     known_steps = None
     interventions = INTERVENTIONS
     unread = (_HEAD,)
@@ -113,29 +113,28 @@ class Groot(PackedPolicy):
         dtype: str | None = None,
         random_weights: bool = False,
         weights_seed: int = 0,
-        evaluation: Evaluation = AS_STORED,
+        **options: Any,
     ) -> Self:
         """See `LerobotPolicy.load`. dtype: bfloat16 for lerobot's autocast around float32 weights."""
-        policy = super().load(checkpoint, device, dtype, random_weights, weights_seed, evaluation)
+        policy = super().load(checkpoint, device, dtype, random_weights, weights_seed, **options)
         execute = min(int(policy.network._action_queue_steps), policy.chunk)
         policy.card = replace(policy.card, chunk=policy.chunk, execute=execute, batch=1)
         return policy
 
     @classmethod
-    def parse_config(cls, folder: Path, evaluation: Evaluation) -> Any:
+    def parse_config(cls, folder: Path, evaluation: Any) -> Any:
         """lerobot's configuration, also for NVIDIA's layout. Raises UsageError for an option that has no use."""
-        choice = evaluation if isinstance(evaluation, GrootChoice) else GrootChoice()
         if is_nvidias(folder):
-            config = nvidias_config(folder, choice.embodiment)
-        elif choice.embodiment is not None:
+            config = nvidias_config(folder, evaluation.embodiment)
+        elif evaluation.embodiment is not None:
             raise UsageError(
-                f"-M embodiment={choice.embodiment} belongs to NVIDIA's layout; {folder} is lerobot's, which "
+                f"-M embodiment={evaluation.embodiment} belongs to NVIDIA's layout; {folder} is lerobot's, which "
                 "names its own. Leave it out"
             )
         else:
             config = super().parse_config(folder, evaluation)
-        config.resize, config.letterbox = choice.resize, choice.letterbox
-        config.places = Places.of(folder, config.base_model_path, choice.vlm)
+        config.resize, config.letterbox = evaluation.resize, evaluation.letterbox
+        config.places = Places.of(folder, config.base_model_path, evaluation.vlm)
         return config
 
     @classmethod
@@ -264,37 +263,3 @@ class Groot(PackedPolicy):
             "backbone_end": lambda: numpy_of(run.tape[end]),
             "velocity": lambda: run.outputs("velocity")[:, :, -horizon:],
         }
-
-
-def load_groot(
-    checkpoint: str,
-    device: str = "cpu",
-    dtype: str | None = None,
-    random_weights: bool = False,
-    *,
-    embodiment: str | None = None,
-    vlm: str | None = None,
-    resize: str | None = None,
-    letterbox: bool | None = None,
-    weights_seed: int = 0,
-) -> Groot:
-    """Load a GR00T N1.7 checkpoint of lerobot, or in NVIDIA's own layout; see `LerobotPolicy.load`.
-
-    embodiment: tag of NVIDIA's layout; None where there is one only. vlm: folder or hub id of the vision-language
-    model's configuration, tokenizer and processor, where not the one that the checkpoint names. resize: `nvidia`
-    or `lerobot`, whose code resizes pictures; None for the layout's own. letterbox: whether black bars make
-    pictures square first; None for what the files say.
-    """
-    choice = GrootChoice(embodiment=embodiment, vlm=vlm, resize=resize, letterbox=letterbox)
-    return Groot.load(checkpoint, device, dtype, random_weights, weights_seed, choice)
-
-
-def check_groot_words(
-    checkpoint: str,
-    instructions: Sequence[str],
-    embodiment: str | None = None,
-    vlm: str | None = None,
-    **_: Any,
-) -> None:
-    """See `Family.words`."""
-    Groot.check_words(checkpoint, instructions, GrootChoice(embodiment=embodiment, vlm=vlm))

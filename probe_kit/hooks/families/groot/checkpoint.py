@@ -23,9 +23,12 @@ _AGAIN = "Download the checkpoint again"
 
 @dataclass(frozen=True)
 class GrootChoice(Evaluation):
-    """The choices that GR00T's files leave open. embodiment: of NVIDIA's layout. vlm: folder or hub id.
+    """The choices that GR00T's files leave open.
 
-    resize: whose code brings pictures to their size. letterbox: whether they are made square with bars first.
+    embodiment: tag of NVIDIA's layout; None where there is one only. vlm: folder or hub id of the vision-language
+    model's configuration, tokenizer and processor, where not the one that the checkpoint names. resize: `nvidia`
+    or `lerobot`, whose code resizes pictures; None for the layout's own. letterbox: whether black bars make
+    pictures square first; None for what the files say.
     """
 
     embodiment: str | None = None

@@ -28,7 +28,6 @@ from probe_kit.hooks.families.molmoact2.steps import STEPS, in_packed_order, rea
 from probe_kit.hooks.families.molmoact2.units import SteppedUnits
 from probe_kit.hooks.families.shared.attention_weights import Note, recording_weights, shares
 from probe_kit.hooks.families.shared.lerobot.config_fields import Inert
-from probe_kit.hooks.families.shared.lerobot.evaluation import Evaluation
 from probe_kit.hooks.families.shared.lerobot.normaliser import Normaliser
 from probe_kit.hooks.families.shared.lerobot.packed import PackedPolicy
 from probe_kit.hooks.families.shared.lerobot.policy import checked_steps
@@ -78,8 +77,8 @@ class MolmoAct2(PackedPolicy):
     other_roles: ClassVar[tuple[str, ...]] = ("language", "state", "special")
     suffix_roles = ("action",)
 
-    def __init__(self, network: Any, folder: Path) -> None:
-        super().__init__(network, folder)
+    def __init__(self, network: Any, folder: Path, checkpoint: str) -> None:
+        super().__init__(network, folder, checkpoint)
         text = network.model.config.text_config
         self.passages = network._backbone().prompt_kv
         self.prompt_kv = kv_stream(int(text.num_hidden_layers), int(text.num_key_value_heads * text.head_dim))
@@ -100,7 +99,7 @@ class MolmoAct2(PackedPolicy):
         return renamed
 
     @classmethod
-    def parse_config(cls, folder: Path, evaluation: Evaluation) -> Any:
+    def parse_config(cls, folder: Path, evaluation: Any) -> Any:
         """lerobot's configuration, with what the processor files say: lerobot packs as they do.
 
         checkpoint_path: then the folder of the VLM's configuration and tokenizer.

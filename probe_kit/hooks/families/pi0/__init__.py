@@ -53,7 +53,7 @@ FAMILIES = (
         "pi0",
         "pi0 (PaliGemma 3B + 300M flow-matching expert) through lerobot",
         "juexzz/INTACT-pi0-finetune-bridge",
-        "probe_kit.hooks.families.pi0.adapter:load_pi0",
+        "probe_kit.hooks.families.pi0.adapter:Pi0.load",
         streams="backbone 19 layers, expert 19 layers x 10 iterations",
         embodiment="WidowX end-effector delta at 5 Hz; other fine-tunes as --checkpoint",
         hub=(("google/paligemma-3b-pt-224", "tokenizer.json"),),
@@ -65,7 +65,7 @@ FAMILIES = (
         config_types=("pi0",),
         source="paligemma",
         source_weights=SourceWeights("google/paligemma-3b-pt-224", parameters=2_923_466_480),
-        words="probe_kit.hooks.families.pi0.adapter:check_pi0_words",
+        words="probe_kit.hooks.families.pi0.adapter:Pi0.check_words",
         declared={
             "": (
                 backbone(19, 2048, 304, camera="top"),

@@ -4,7 +4,7 @@ Prefix: every camera's patches, then the language, one bidirectional block.
 Suffix: the state, then the action chunk.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import partial
@@ -16,7 +16,6 @@ from torch import Tensor, nn
 from probe_kit.hooks.contract.card import EMBEDDED
 from probe_kit.hooks.families.pi0.evaluated import EvaluatedPi0
 from probe_kit.hooks.families.shared.attention_weights import Note, recording_weights, returned
-from probe_kit.hooks.families.shared.lerobot.evaluation import Evaluation, Picture
 from probe_kit.hooks.families.shared.lerobot.paligemma import PaliGemmaPolicy, sizes_file
 from probe_kit.hooks.families.shared.lerobot.pipelines import CROP
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack, flow_stacks
@@ -83,32 +82,6 @@ class Pi0(PaliGemmaPolicy, EvaluatedPi0):
         return recording_weights(
             [layer.self_attn for layer in self._joint.gemma_expert.model.layers], note_acting, returned
         )
-
-
-def load_pi0(
-    checkpoint: str,
-    device: str = "cpu",
-    dtype: str | None = None,
-    random_weights: bool = False,
-    *,
-    statistics: str | None = None,
-    picture: Picture | None = None,
-    openness: str = "measured",
-    unread: str = "",
-    weights_seed: int = 0,
-) -> Pi0:
-    """Load a lerobot pi0 checkpoint, of today's layout or that of early 2025; see `LerobotFlow.load`.
-
-    statistics, picture, openness, unread: see `Evaluation`; unread is comma-separated.
-    """
-    names = tuple(name for name in unread.split(",") if name)
-    evaluation = Evaluation(statistics, picture, openness, names)
-    return Pi0.load(checkpoint, device, dtype, random_weights, weights_seed, evaluation)
-
-
-def check_pi0_words(checkpoint: str, instructions: Sequence[str], *, unread: str = "", **_: Any) -> None:
-    """See `Family.words`; of the options only `unread` decides what the text is read with."""
-    Pi0.check_words(checkpoint, instructions, Evaluation(unread=tuple(name for name in unread.split(",") if name)))
 
 
 def load_pi0_tiny(

@@ -11,7 +11,7 @@ FAMILIES = (
         "pi05",
         "pi0.5 (PaliGemma 3B + 300M flow-matching expert with adaptive norms) through lerobot",
         "lerobot/pi05_base",
-        "probe_kit.hooks.families.pi05.adapter:load_pi05",
+        "probe_kit.hooks.families.pi05.adapter:Pi05.load",
         streams="backbone 19 layers, expert 19 layers x 10 iterations",
         embodiment="as fine-tuned; the base model acts in 32 unnamed dimensions",
         hub=(("google/paligemma-3b-pt-224", "tokenizer.json"),),
@@ -24,7 +24,7 @@ FAMILIES = (
         config_types=("pi05",),
         source="paligemma",
         source_weights=SourceWeights("google/paligemma-3b-pt-224", parameters=2_923_466_480),
-        words="probe_kit.hooks.families.pi05.adapter:check_pi05_words",
+        words="probe_kit.hooks.families.pi05.adapter:Pi05.check_words",
         declared={
             "": (
                 backbone(19, 2048, 968, "state", camera="base_0_rgb"),

@@ -6,7 +6,7 @@ Suffix: the action chunk, with the time of the flow step in the expert's adaptiv
 Source: arXiv 2504.16054, through lerobot's `PI05Policy`.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 from torch import Tensor, nn
@@ -15,7 +15,6 @@ from probe_kit.hooks.contract.model import Tap
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.hooks.families.shared.lerobot.config_fields import Inert
-from probe_kit.hooks.families.shared.lerobot.evaluation import Evaluation, Picture
 from probe_kit.hooks.families.shared.lerobot.pipelines import CROP
 from probe_kit.hooks.families.shared.lerobot.policy import LerobotPolicy
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack
@@ -71,25 +70,3 @@ class Pi05(StatePrompt, Pi0):
         return {**stacks, "expert": GatedStack(**vars(stacks["expert"]))}
 
     suffix_labels = LerobotPolicy.suffix_labels
-
-
-def load_pi05(
-    checkpoint: str,
-    device: str = "cpu",
-    dtype: str | None = None,
-    random_weights: bool = False,
-    *,
-    statistics: str | None = None,
-    picture: Picture | None = None,
-    openness: str = "measured",
-    weights_seed: int = 0,
-) -> Pi05:
-    """Load a lerobot pi0.5 checkpoint; see `LerobotFlow.load`. statistics, picture, openness: see `Evaluation`."""
-    return Pi05.load(
-        checkpoint, device, dtype, random_weights, weights_seed, Evaluation(statistics, picture, openness)
-    )
-
-
-def check_pi05_words(checkpoint: str, instructions: Sequence[str], **_: Any) -> None:
-    """See `Family.words`."""
-    Pi05.check_words(checkpoint, instructions)

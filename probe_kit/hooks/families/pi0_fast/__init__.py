@@ -18,7 +18,7 @@ FAMILIES = (
         "pi0-fast",
         "pi0-FAST (PaliGemma 3B, actions as compressed tokens) through lerobot",
         "lerobot/pi0fast-base",
-        "probe_kit.hooks.families.pi0_fast.adapter:load_pi0_fast",
+        "probe_kit.hooks.families.pi0_fast.adapter:Pi0Fast.load",
         streams=f"backbone 19 layers, action 19 layers x {CAPTURED} action tokens of a variable number",
         embodiment="as fine-tuned; the base model acts in 32 unnamed dimensions",
         hub=(
@@ -34,7 +34,7 @@ FAMILIES = (
         config_types=("pi0_fast",),
         source="paligemma",
         source_weights=SourceWeights("google/paligemma-3b-pt-224", parameters=2_923_466_480),
-        words="probe_kit.hooks.families.pi0_fast.adapter:check_pi0_fast_words",
+        words="probe_kit.hooks.families.pi0_fast.adapter:Pi0Fast.check_words",
         declared={
             "": (
                 backbone(19, 2048, 968, "state", camera="base_0_rgb"),

@@ -45,12 +45,13 @@ _LAST = slice(-1, None)
 
 @dataclass(frozen=True)
 class Decoding(Evaluation):
-    """The decoding of action tokens. captured: those that are sites. temperature: None for the checkpoint's.
+    """The decoding of action tokens. captured_tokens: those that are sites.
 
-    lowercase: the instruction in lower case, as openpi has it; lerobot keeps its case.
+    temperature: 0 for the likeliest token; above, drawn by each row's seed; None for the checkpoint's. lowercase:
+    the instruction in lower case, as openpi has it; lerobot keeps its case.
     """
 
-    captured: int = CAPTURED
+    captured_tokens: int = CAPTURED
     temperature: float | None = None
     lowercase: bool = False
 
@@ -63,6 +64,8 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
 
     family = "pi0-fast"
     config_type = "pi0_fast"
+    choice = Decoding
+    evaluation: Decoding
     known_steps = (CROP, "pi0_fast_prepare_state_tokenizer_processor_step", "action_tokenizer_processor")
     interventions = FAST
     # Its head puts out tokens, and is read.
@@ -72,15 +75,22 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
     suffix_roles = ("action",)
     prompt_tokens = ALL_BUT_LAST
 
-    def __init__(self, network: Any, folder: Path) -> None:
+    def __init__(self, network: Any, folder: Path, checkpoint: str) -> None:
         self.problems: list[tuple[str, ...]] = []
-        super().__init__(network, folder)
+        super().__init__(network, folder, checkpoint)
         self.passages = network.model.paligemma_with_expert.prompt_kv
         self.prompt_kv: Stream | None = kept_prompt(self._decoder.config)
 
     @classmethod
     def build(cls, config: Any, folder: Path) -> nn.Module:
-        """lerobot's policy at the size `dims.json` gives, or at the released size."""
+        """lerobot's policy at the size `dims.json` gives, or at the released size.
+
+        Raises UsageError for a number of captured tokens that an inference cannot put out, and for a temperature.
+        """
+        captured, most = config.evaluation.captured_tokens, int(config.max_decoding_steps)
+        if not 1 <= captured <= most:
+            raise UsageError(f"captured_tokens is {captured}; expected 1 to {most}")
+        chooser(config.evaluation.temperature or 0, ())
         sizes = sizes_file(folder)
         network: nn.Module = build_pi0_fast(config, None if sizes is None else Pi0FastSize.from_file(sizes))
         return network
@@ -90,40 +100,25 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
         """Old layouts brought to today's."""
         return current_pi0_fast_keys(tensors)
 
-    def prepare(self, checkpoint: str, evaluation: Evaluation) -> None:
-        """Count the captured tokens. Raises UsageError for a number of them that an inference cannot put out."""
-        super().prepare(checkpoint, evaluation)
-        if isinstance(evaluation, Decoding):
-            most = int(self.config.max_decoding_steps)
-            if not 1 <= evaluation.captured <= most:
-                raise UsageError(f"captured_tokens is {evaluation.captured}; expected 1 to {most}")
-            chooser(evaluation.temperature or 0, ())
-            self.stacks |= self._stacks()
-            self._read_streams()
-            self._show(self.shown_cameras)
-
-    @property
-    def decoding(self) -> Decoding:
-        """The decoding, as chosen or as the checkpoint has it."""
-        return self.evaluation if isinstance(self.evaluation, Decoding) else Decoding()
-
     @property
     def temperature(self) -> float:
         """0 for the likeliest token."""
-        requested = self.decoding.temperature
+        requested = self.evaluation.temperature
         return float(self.config.temperature if requested is None else requested)
 
     def further_settings(self) -> dict[str, str]:
         """The settings of instruction and decoding."""
         return {
-            "captured_tokens": str(self.decoding.captured),
-            "lowercase": str(self.decoding.lowercase),
+            "captured_tokens": str(self.evaluation.captured_tokens),
+            "lowercase": str(self.evaluation.lowercase),
             "temperature": repr(self.temperature),
         }
 
     def prompts(self, instructions: Sequence[str], state: NDArray[np.float32]) -> list[str]:
         """Return prompts as lerobot words them, in lower case where that is chosen."""
-        return super().prompts([text.lower() if self.decoding.lowercase else text for text in instructions], state)
+        return super().prompts(
+            [text.lower() if self.evaluation.lowercase else text for text in instructions], state
+        )
 
     def _notes(self) -> tuple[str, ...]:
         most, chunk, executed = (
@@ -134,10 +129,10 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
         )
         return (
             *super()._notes(),
-            f"of up to {most} action tokens the first {self.decoding.captured} are captured",
+            f"of up to {most} action tokens the first {self.evaluation.captured_tokens} are captured",
             *((other,) if executed != chunk else ()),
             "the instruction is in lower case, as openpi has it; lerobot keeps its case"
-            if self.decoding.lowercase
+            if self.evaluation.lowercase
             else "the instruction keeps its case, as in lerobot; openpi writes lower case (-M lowercase=true)",
         )
 
@@ -172,7 +167,7 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
             begin = int(self.tokenizer.bos_token_id)
             prompt = TokenPrompt(pictures, masks, batch[TOKENS], batch[MASK], begin, text.end)
             most = int(self.config.max_decoding_steps)
-            return decode_tokens(self.network.model, prompt, self.decoding.captured, most, choose)
+            return decode_tokens(self.network.model, prompt, self.evaluation.captured_tokens, most, choose)
 
     def chunks(self, ids: Tensor) -> list[DecodedChunk]:
         """The normalised chunk in every row of (B, n) ids.
@@ -199,7 +194,7 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
         layers, norm, width = decoder.layers, decoder.norm, decoder.config.hidden_size
         return {
             "backbone": TokenStack(layers, norm, width, None, tokens=ALL_BUT_LAST),
-            "action": TokenStack(layers, norm, width, self.decoding.captured, tokens=_LAST),
+            "action": TokenStack(layers, norm, width, self.evaluation.captured_tokens, tokens=_LAST),
             "vision": flow_stacks(decoder, decoder, vision, 1)["vision"],
         }
 
@@ -256,29 +251,3 @@ def _warn_of_problems() -> None:
         "trained ones do, prompt, tokenizers or max_decoding_steps are wrong",
         stacklevel=3,
     )
-
-
-def load_pi0_fast(
-    checkpoint: str,
-    device: str = "cpu",
-    dtype: str | None = None,
-    random_weights: bool = False,
-    *,
-    captured_tokens: int = CAPTURED,
-    temperature: float | None = None,
-    lowercase: bool = False,
-    weights_seed: int = 0,
-) -> Pi0Fast:
-    """Load a lerobot pi0-FAST checkpoint; see `LerobotPolicy.load`.
-
-    captured_tokens: how many of the action tokens are sites. temperature: 0 for the likeliest token; above, drawn
-    by each row's seed; None for the checkpoint's. lowercase: the instruction in lower case, as openpi has it.
-    Raises UsageError for values outside of these.
-    """
-    decoding = Decoding(captured=captured_tokens, temperature=temperature, lowercase=lowercase)
-    return Pi0Fast.load(checkpoint, device, dtype, random_weights, weights_seed, decoding)
-
-
-def check_pi0_fast_words(checkpoint: str, instructions: Sequence[str], lowercase: bool = False, **_: Any) -> None:
-    """See `Family.words`."""
-    Pi0Fast.check_words(checkpoint, instructions, Decoding(lowercase=lowercase))

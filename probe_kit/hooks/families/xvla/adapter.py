@@ -28,7 +28,7 @@ from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import HEADS, Site, Stream
 from probe_kit.hooks.contract.views import PADDING
-from probe_kit.hooks.families.shared.lerobot.evaluation import AS_STORED, Evaluation, Picture
+from probe_kit.hooks.families.shared.lerobot.evaluation import Evaluation
 from probe_kit.hooks.families.shared.lerobot.flow import DenoisingPolicy
 from probe_kit.hooks.families.shared.lerobot.policy import IMAGES, STATE
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack
@@ -44,7 +44,10 @@ SOFT_PROMPT = "soft_prompt"
 
 @dataclass(frozen=True)
 class XvlaChoice(Evaluation):
-    """The choices that X-VLA's files may leave open. domain: the robot's number."""
+    """The choices that X-VLA's files may leave open.
+
+    domain: number of the robot's soft prompts; None for the one that the processor files name.
+    """
 
     domain: int | None = None
 
@@ -93,6 +96,7 @@ class Xvla(DenoisingPolicy):
 
     family = "xvla"
     config_type = "xvla"
+    choice = XvlaChoice
     known_steps = STEPS
     tied: ClassVar[Mapping[str, str]] = dict((EMBEDDINGS, EMBEDDINGS[::-1]))
     interventions = INTERVENTIONS
@@ -103,11 +107,10 @@ class Xvla(DenoisingPolicy):
     # -- loading -----------------------------------------------------------------------------------------
 
     @classmethod
-    def parse_config(cls, folder: Path, evaluation: Evaluation) -> Any:
+    def parse_config(cls, folder: Path, evaluation: Any) -> Any:
         """lerobot's configuration, with what the processor files say."""
         config = super().parse_config(folder, evaluation)
-        domain = evaluation.domain if isinstance(evaluation, XvlaChoice) else None
-        config.steps = read_steps(folder, domain, tuple(config.image_features))
+        config.steps = read_steps(folder, evaluation.domain, tuple(config.image_features))
         config.tokenizer_max_length = config.steps.length or config.tokenizer_max_length
         config.picture = evaluation.picture or ("padded" if config.resize_imgs_with_padding else None)
         if config.picture and config.resize_imgs_with_padding is None:
@@ -295,27 +298,3 @@ class Xvla(DenoisingPolicy):
     def further_outputs(self, run: RecordedRun) -> dict[str, Produce]:
         """The pictures as the network reads them."""
         return {"pixels": lambda: numpy_of(self.network._prepare_images(run.batch)[0])}
-
-
-def load_xvla(
-    checkpoint: str,
-    device: str = "cpu",
-    dtype: str | None = None,
-    random_weights: bool = False,
-    *,
-    domain: int | None = None,
-    picture: Picture | None = None,
-    weights_seed: int = 0,
-) -> Xvla:
-    """Load a lerobot X-VLA checkpoint; see `LerobotPolicy.load`.
-
-    domain: number of the robot's soft prompts; None for the one that the processor files name. picture: `padded`
-    as lerobot or `squashed` as the authors; None for what `config.json` says.
-    """
-    choice = XvlaChoice(domain=domain, picture=picture)
-    return Xvla.load(checkpoint, device, dtype, random_weights, weights_seed, choice)
-
-
-def check_xvla_words(checkpoint: str, instructions: Sequence[str], domain: int | None = None, **_: Any) -> None:
-    """See `Family.words`."""
-    Xvla.check_words(checkpoint, instructions, XvlaChoice(domain=domain) if domain is not None else AS_STORED)

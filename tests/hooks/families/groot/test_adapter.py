@@ -18,7 +18,7 @@ from safetensors.torch import load_file, save_file
 from probe_kit.errors import CheckpointError, InstructionError, ObservationError, UsageError, WeightsError
 from probe_kit.hooks import Observation, Site, capture, edit
 from probe_kit.hooks.conformance.subject import examples_for
-from probe_kit.hooks.families.groot.adapter import Groot, check_groot_words, load_groot
+from probe_kit.hooks.families.groot.adapter import Groot
 from probe_kit.models.lerobot import groot as network
 from tests.support.groot_checkpoints import CHUNK, HORIZON, TAG, write_groot, write_nvidias
 from tests.support.pi05_checkpoints import HIGH, LEAST, MOST
@@ -31,7 +31,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def groot(folder: Path) -> Groot:
-    return load_groot(str(folder))
+    return Groot.load(str(folder))
 
 
 @pytest.fixture
@@ -49,7 +49,7 @@ def lerobots(folder: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[GrootPolicy
     build = processor_groot._build_n1_7_processor
     monkeypatch.setattr(processor_groot, "_build_n1_7_processor", lambda _: build("vlm"))
     if nvidias:
-        own = load_groot(str(folder), embodiment=TAG).config
+        own = Groot.load(str(folder), embodiment=TAG).config
         config = GrootConfig(
             device="cpu", base_model_path=str(folder), embodiment_tag=TAG, max_state_dim=12, max_action_dim=10,
             input_features=own.input_features, output_features=own.output_features,
@@ -69,7 +69,7 @@ def test_actions_are_those_of_lerobots_own_loading_processors_and_sampling_bit_f
 ) -> None:
     """From the raw picture and state to metres, with noise that lerobot draws itself of the same seed."""
     place = folder if layout == "lerobot" else folder / "base"
-    ours = load_groot(str(place), dtype=dtype, embodiment=TAG if layout == "nvidia" else None, resize="lerobot")
+    ours = Groot.load(str(place), dtype=dtype, embodiment=TAG if layout == "nvidia" else None, resize="lerobot")
     policy, before, behind = lerobots(place, monkeypatch)
     policy.config.use_bf16 = dtype == "bfloat16"
     (one,) = seen
@@ -185,7 +185,7 @@ def test_roles_name_pictures_and_the_instruction_as_lerobot_writes_it(
 
 
 def test_two_cameras_are_told_apart_in_the_checkpoints_order(tmp_path: Path, seen: list[Observation]) -> None:
-    policy = load_groot(str(write_groot(tmp_path, cameras=("image", "wrist")))).showing(["image", "wrist"])
+    policy = Groot.load(str(write_groot(tmp_path, cameras=("image", "wrist")))).showing(["image", "wrist"])
     one = replace(seen[0], cameras={"wrist": seen[0].image[:, ::-1].copy()})
     (roles,) = policy.roles([one])["bridge"]
     counts = [int(roles.mask(f"image.{camera}").sum()) for camera in ("image", "wrist")]
@@ -203,7 +203,7 @@ def test_a_checkpoint_that_reads_a_video_says_that_its_frame_is_repeated(
     content = json.loads(file.read_text(encoding="utf-8"))
     content["processor_kwargs"]["modality_configs"][TAG]["video"]["delta_indices"] = [-5, 0]
     file.write_text(json.dumps(content), encoding="utf-8")
-    policy = load_groot(str(tmp_path), embodiment=TAG)
+    policy = Groot.load(str(tmp_path), embodiment=TAG)
     assert any("given 2 times" in note for note in policy.card.notes)
     (roles,) = policy.roles(seen)["backbone"]
     assert roles.mask("image.image").sum() == 2 * groot.roles(seen)["backbone"][0].mask("image.image").sum()
@@ -229,7 +229,7 @@ def test_one_observation_at_a_time_because_the_bridge_reads_padding(groot: Groot
 def test_actions_relative_to_the_state_are_captured_and_not_carried_out(
     tmp_path: Path, seen: list[Observation]
 ) -> None:
-    policy = load_groot(str(write_nvidias(tmp_path, relative=True)), embodiment=TAG)
+    policy = Groot.load(str(write_nvidias(tmp_path, relative=True)), embodiment=TAG)
     assert policy.predicts_relative
     assert "relative to the state" in str(policy.embodiment_mismatch())
     with pytest.raises(CheckpointError, match="relative to the state"):
@@ -239,12 +239,12 @@ def test_actions_relative_to_the_state_are_captured_and_not_carried_out(
 
 def test_the_embodiment_of_nvidias_layout_must_be_chosen_and_be_there(folder: Path) -> None:
     with pytest.raises(UsageError, match="libero_sim, other"):
-        load_groot(str(folder / "base"))
+        Groot.load(str(folder / "base"))
     with pytest.raises(UsageError, match="no embodiment 'gr1'"):
-        load_groot(str(folder / "base"), embodiment="gr1")
+        Groot.load(str(folder / "base"), embodiment="gr1")
     with pytest.raises(UsageError, match="Leave it out"):
-        load_groot(str(folder), embodiment=TAG)
-    one, other = (load_groot(str(folder / "base"), embodiment=tag) for tag in (TAG, "other"))
+        Groot.load(str(folder), embodiment=TAG)
+    one, other = (Groot.load(str(folder / "base"), embodiment=tag) for tag in (TAG, "other"))
     observation = examples_for(one, "put the cube on the star")
     actions = [own.infer_without_acting(observation, [0]) for own in (one, other)]
     assert not np.array_equal(*actions)
@@ -257,9 +257,9 @@ def test_an_instruction_without_words_is_refused_and_never_replaced(
     """lerobot would write 'Perform the task.' for an empty one."""
     with pytest.raises(InstructionError, match="no word"):
         groot.act([replace(seen[0], instruction=text)], [0])
-    check_groot_words(str(groot.folder), ["put the cube on the star"])
+    Groot.check_words(str(groot.folder), ["put the cube on the star"])
     with pytest.raises(InstructionError, match="no word"):
-        check_groot_words(str(groot.folder), [text])
+        Groot.check_words(str(groot.folder), [text])
 
 
 @pytest.mark.parametrize(
@@ -279,7 +279,7 @@ def test_files_that_would_change_numbers_in_silence_are_refused(
     assert old in text
     (tmp_path / file).write_text(text.replace(old, new), encoding="utf-8")
     with pytest.raises(CheckpointError, match=message):
-        load_groot(str(tmp_path)).act(seen, [0])
+        Groot.load(str(tmp_path)).act(seen, [0])
 
 
 def test_remote_code_beside_the_language_model_is_never_run(
@@ -292,7 +292,7 @@ def test_remote_code_beside_the_language_model_is_never_run(
         content = json.loads((vlm / name).read_text(encoding="utf-8"))
         entry = ["evil.Thing", None] if kind == "AutoTokenizer" else "evil.Thing"
         (vlm / name).write_text(json.dumps({**content, "auto_map": {kind: entry}}), encoding="utf-8")
-    load_groot(str(tmp_path)).act(seen, [0])
+    Groot.load(str(tmp_path)).act(seen, [0])
     assert not (tmp_path / "ran").exists()
 
 
@@ -308,10 +308,10 @@ def test_weights_must_be_whole_but_for_the_output_weights_that_nothing_reads(
     tensors |= {key: own.clone() for key in both.values()}
     save_file({key: own for key, own in tensors.items() if name not in key}, tmp_path / "model.safetensors")
     if name in both:
-        np.testing.assert_array_equal(load_groot(str(tmp_path)).act(seen, [0]), groot.act(seen, [0]))
+        np.testing.assert_array_equal(Groot.load(str(tmp_path)).act(seen, [0]), groot.act(seen, [0]))
     else:
         with pytest.raises(WeightsError, match="vl_self_attention"):
-            load_groot(str(tmp_path))
+            Groot.load(str(tmp_path))
 
 
 def network_name(name: str) -> str:
@@ -321,7 +321,7 @@ def network_name(name: str) -> str:
 def test_without_a_bridge_the_expert_reads_the_norm_of_the_backbone(
     tmp_path: Path, seen: list[Observation]
 ) -> None:
-    policy = load_groot(str(write_nvidias(tmp_path, vl_self_attention_cfg={"num_layers": 0})), embodiment=TAG)
+    policy = Groot.load(str(write_nvidias(tmp_path, vl_self_attention_cfg={"num_layers": 0})), embodiment=TAG)
     assert list(policy.streams) == ["backbone", "expert"]
     with capture(policy, policy.sites()):
         assert np.isfinite(policy.act(seen, [0])).all()

@@ -17,7 +17,7 @@ from torchvision.transforms import v2
 from probe_kit.errors import CheckpointError
 from probe_kit.hooks import Observation
 from probe_kit.hooks.conformance.subject import examples_for
-from probe_kit.hooks.families.groot.adapter import Groot, load_groot
+from probe_kit.hooks.families.groot.adapter import Groot
 from tests.support.groot_checkpoints import TAG, write_nvidias
 from tests.support.pi05_checkpoints import HIGH, LEAST, LOW, MOST
 
@@ -53,7 +53,7 @@ def changed(stored: Path, tmp_path: Path) -> Changed:
         modalities["state"] |= state or {}
         modalities["action"] |= action or {}
         file.write_text(json.dumps(content | (top or {})), encoding="utf-8")
-        return load_groot(str(tmp_path), embodiment=TAG, **(options or {}))
+        return Groot.load(str(tmp_path), embodiment=TAG, **(options or {}))
 
     return load
 

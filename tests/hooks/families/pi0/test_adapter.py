@@ -8,7 +8,7 @@ import torch
 
 from probe_kit.errors import CheckpointError, InstructionError, ObservationError, UnknownSiteError
 from probe_kit.hooks import Observation, Site, capture, load_policy
-from probe_kit.hooks.families.pi0.adapter import Pi0, load_pi0
+from probe_kit.hooks.families.pi0.adapter import Pi0
 
 TOLERANCE = 1e-5
 
@@ -17,7 +17,7 @@ def test_capture_reproduces_the_golden_streams_and_actions(golden_pi0: Path) -> 
     """Backbone at every layer, expert at every layer and iteration, against lerobot's original outputs."""
     reference = np.load(golden_pi0 / "reference.npz")
     cameras = json.loads((golden_pi0 / "dims.json").read_text(encoding="utf-8"))["cameras"]
-    policy = load_pi0(str(golden_pi0 / "checkpoint"))
+    policy = Pi0.load(str(golden_pi0 / "checkpoint"))
     batch = {
         "observation.state": torch.from_numpy(reference["in_state"]),
         "observation.language.tokens": torch.from_numpy(reference["in_lang_tokens"]),
@@ -38,7 +38,7 @@ def test_capture_reproduces_the_golden_streams_and_actions(golden_pi0: Path) -> 
 
 def test_golden_statistics_turn_into_the_recorded_units(golden_pi0: Path) -> None:
     reference = np.load(golden_pi0 / "reference.npz")
-    policy = load_pi0(str(golden_pi0 / "checkpoint"))
+    policy = Pi0.load(str(golden_pi0 / "checkpoint"))
     np.testing.assert_allclose(
         policy.state_units.normalise(reference["in_raw_state"]), reference["in_state"], atol=TOLERANCE
     )
@@ -139,6 +139,6 @@ def test_missing_statistics_are_an_error_and_not_an_identity(tmp_path: Path, pi0
 
     copy = Path(shutil.copytree(pi0_tiny.folder, tmp_path / "checkpoint"))
     next(copy.glob("policy_postprocessor*.safetensors")).unlink()
-    policy = load_pi0(str(copy))
+    policy = Pi0.load(str(copy))
     with pytest.raises(CheckpointError, match=r"action\.mean"):
         _ = policy.action_units

@@ -14,7 +14,7 @@ from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.hooks import Observation
 from probe_kit.hooks.contract.state_layout import CLOSED, OPENED, laid_out
 from probe_kit.hooks.families.pi0 import adapter, evaluated
-from probe_kit.hooks.families.pi0.adapter import Pi0, load_pi0
+from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.hooks.families.shared.statistics_bounds import StatisticsFile
 from probe_kit.hooks.registry import find_family
 from tests.support.pi0_checkpoints import bounds_of, network_chunk, write_intact, write_statistics
@@ -34,7 +34,7 @@ def statistics(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def policy(folder: Path, statistics: Path) -> Pi0:
-    return load_pi0(str(folder), statistics=str(statistics))
+    return Pi0.load(str(folder), statistics=str(statistics))
 
 
 @pytest.fixture
@@ -50,7 +50,7 @@ def test_actions_are_those_of_the_bare_network_in_the_evaluations_units(
 ) -> None:
     """Everything around the network recomputed in float64: squashed picture, seven numbers, p01 and p99."""
     asked = (
-        policy if openness == "measured" else load_pi0(str(folder), statistics=str(statistics), openness=openness)
+        policy if openness == "measured" else Pi0.load(str(folder), statistics=str(statistics), openness=openness)
     )
     low, high = bounds_of("proprio")
     gripper = 0.8 if openness == "measured" else 1 - (0.015 + 0.8 * 0.022)
@@ -74,7 +74,7 @@ def test_what_the_evaluation_decides_is_part_of_the_identity(folder: Path, stati
     assert settings["statistics"] == StatisticsFile.read(str(statistics)).sha256
     assert settings["picture"] == "squashed"
     assert "openness" not in settings
-    released = load_pi0(str(folder), statistics=str(statistics), openness="release", picture="padded")
+    released = Pi0.load(str(folder), statistics=str(statistics), openness="release", picture="padded")
     assert released.card.settings["openness"] == "release"
     assert "picture" not in released.card.settings
     assert policy.card.chunk == 4
@@ -82,7 +82,7 @@ def test_what_the_evaluation_decides_is_part_of_the_identity(folder: Path, stati
 
 
 def test_without_statistics_the_checkpoint_is_refused_with_the_way_out(folder: Path, seen: Observation) -> None:
-    policy = load_pi0(str(folder))
+    policy = Pi0.load(str(folder))
     assert "-M statistics=bridge" in str(policy.embodiment_mismatch())
     with pytest.raises(CheckpointError, match="-M statistics=bridge"):
         policy.act([seen], [0])
@@ -91,7 +91,7 @@ def test_without_statistics_the_checkpoint_is_refused_with_the_way_out(folder: P
 def test_statistics_that_lie_in_the_folder_are_read(folder: Path, statistics: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(folder, tmp_path / "pi0"))
     shutil.copy(statistics, copy / "dataset_statistics.json")
-    policy = load_pi0(str(copy))
+    policy = Pi0.load(str(copy))
     assert policy.embodiment_mismatch() is None
     np.testing.assert_allclose(policy.action_units.low, bounds_of("action")[0], rtol=1e-6)
 
@@ -103,7 +103,7 @@ def test_the_protocols_checkpoint_by_its_name_gets_the_shipped_statistics(
     name = find_family("pi0").default_checkpoint
     assert name in evaluated.EVALUATED_WITH
     monkeypatch.setattr("probe_kit.hooks.families.shared.lerobot.policy.checkpoint_folder", lambda _: folder)
-    policy = adapter.load_pi0(str(name))
+    policy = adapter.Pi0.load(str(name))
     assert policy.embodiment_mismatch() is None
     assert policy.state_units.source == "bridge statistics shipped with probe_kit"
     assert policy.picture == "squashed"
@@ -136,7 +136,7 @@ def test_statistics_that_cannot_be_meant_are_refused(tmp_path: Path, content: st
 
 def test_a_statistics_file_that_is_not_there_is_named(folder: Path) -> None:
     with pytest.raises(CheckpointError, match=r"no statistics at nowhere\.json"):
-        load_pi0(str(folder), statistics="nowhere.json")
+        Pi0.load(str(folder), statistics="nowhere.json")
 
 
 def test_openness_as_the_release_has_it_uses_the_fingers_of_our_widowx() -> None:
@@ -161,7 +161,7 @@ def test_a_checkpoint_of_other_actions_and_another_state_can_be_captured(
     config["input_features"]["observation.state"]["shape"] = [32]
     config["output_features"]["action"]["shape"] = [32]
     (copy / "config.json").write_text(json.dumps(config), encoding="utf-8")
-    policy = load_pi0(str(copy))
+    policy = Pi0.load(str(copy))
     assert "acts in 32 dimensions" in str(policy.embodiment_mismatch())
     assert policy.zero_filled_inputs() == ("state",)
     with pytest.raises(CheckpointError, match="acts in 32 dimensions"):

@@ -10,7 +10,7 @@ from safetensors.torch import load_file, save_file
 
 from probe_kit.errors import CheckpointError, WeightsError
 from probe_kit.hooks import Observation
-from probe_kit.hooks.families.pi0.adapter import Pi0, load_pi0
+from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.hooks.families.pi0.old_layout import current_config
 from probe_kit.hooks.verification.verify import verify_reference
 from tests.support.pi0_checkpoints import old_golden
@@ -23,7 +23,7 @@ def golden(golden_pi0: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def policy(golden: Path) -> Pi0:
-    return load_pi0(str(golden / "checkpoint"))
+    return Pi0.load(str(golden / "checkpoint"))
 
 
 def test_the_golden_reference_in_the_old_layout_gives_every_recorded_number(golden: Path) -> None:
@@ -34,7 +34,7 @@ def test_the_golden_reference_in_the_old_layout_gives_every_recorded_number(gold
 
 
 def test_statistics_among_the_weights_are_those_of_the_processor_files(golden_pi0: Path, policy: Pi0) -> None:
-    today = load_pi0(str(golden_pi0 / "checkpoint"))
+    today = Pi0.load(str(golden_pi0 / "checkpoint"))
     for old, new in ((policy.state_units, today.state_units), (policy.action_units, today.action_units)):
         assert old.source == "the weights"
         np.testing.assert_array_equal(old.low, new.low)
@@ -55,7 +55,7 @@ def test_pictures_are_padded_on_the_left_and_top_as_that_lerobot_did(policy: Pi0
 
 
 def test_a_random_twin_keeps_the_statistics_that_lie_among_the_weights(golden: Path, policy: Pi0) -> None:
-    twin = load_pi0(str(golden / "checkpoint"), random_weights=True)
+    twin = Pi0.load(str(golden / "checkpoint"), random_weights=True)
     assert twin.card.random_weights
     np.testing.assert_array_equal(twin.action_units.low, policy.action_units.low)
 
@@ -66,7 +66,7 @@ def test_a_tensor_of_the_old_layout_that_is_missing_is_named(golden: Path, tmp_p
     weights.pop("model.paligemma_with_expert.paligemma.vision_tower.vision_model.post_layernorm.weight")
     save_file(weights, copy / "model.safetensors")
     with pytest.raises(WeightsError, match=r"1 tensors missing.*post_layernorm"):
-        load_pi0(str(copy))
+        Pi0.load(str(copy))
 
 
 @pytest.mark.parametrize("change", ["absent", "unfilled"])
@@ -79,7 +79,7 @@ def test_statistics_that_nobody_filled_are_no_statistics(golden: Path, tmp_path:
     if change == "absent":
         del weights[name]
     save_file(weights, copy / "model.safetensors")
-    policy = load_pi0(str(copy))
+    policy = Pi0.load(str(copy))
     with pytest.raises(CheckpointError, match=r"buffer_action\.std"):
         _ = policy.action_units
     assert "buffer_action.std" in str(policy.embodiment_mismatch())
@@ -88,7 +88,7 @@ def test_statistics_that_nobody_filled_are_no_statistics(golden: Path, tmp_path:
 def test_statistics_given_to_a_checkpoint_that_has_its_own_are_refused(
     golden: Path, observation: Observation
 ) -> None:
-    policy = load_pi0(str(golden / "checkpoint"), statistics="bridge")
+    policy = Pi0.load(str(golden / "checkpoint"), statistics="bridge")
     assert "leave -M statistics out" in str(policy.embodiment_mismatch())
     with pytest.raises(CheckpointError, match="leave -M statistics out"):
         policy.act([observation], [0])
@@ -101,8 +101,8 @@ def test_a_setting_that_nobody_knows_is_an_error_until_it_is_accepted(golden: Pa
         json.dumps({**config, "flip_pictures": True, "num_views": 1}), encoding="utf-8"
     )
     with pytest.raises(CheckpointError, match="-M unread=flip_pictures,num_views"):
-        load_pi0(str(copy))
-    assert load_pi0(str(copy), unread="flip_pictures,num_views").config.num_inference_steps == 10
+        Pi0.load(str(copy))
+    assert Pi0.load(str(copy), unread="flip_pictures,num_views").config.num_inference_steps == 10
 
 
 def test_settings_that_changed_states_and_actions_are_refused() -> None:

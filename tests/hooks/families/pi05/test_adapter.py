@@ -17,7 +17,7 @@ from safetensors.torch import load_file, save_file
 from probe_kit.errors import CheckpointError, InstructionError, WeightsError
 from probe_kit.hooks import Observation, capture
 from probe_kit.hooks.conformance.subject import examples_for
-from probe_kit.hooks.families.pi05.adapter import Pi05, load_pi05
+from probe_kit.hooks.families.pi05.adapter import Pi05
 from probe_kit.models.lerobot import pi05 as network
 from tests.support.pi05_checkpoints import write_pi05
 
@@ -29,7 +29,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def pi05(folder: Path) -> Pi05:
-    return load_pi05(str(folder))
+    return Pi05.load(str(folder))
 
 
 @pytest.fixture
@@ -131,11 +131,11 @@ def test_older_names_of_tensors_are_read(pi05: Pi05, folder: Path, tmp_path: Pat
                for name, tensor in tensors.items()}  # fmt: skip
     assert renamed.keys() != tensors.keys()
     save_file(renamed, tmp_path / "model.safetensors")
-    assert load_pi05(str(tmp_path)).network.state_dict().keys() == pi05.network.state_dict().keys()
+    assert Pi05.load(str(tmp_path)).network.state_dict().keys() == pi05.network.state_dict().keys()
 
 
 def test_statistics_beside_those_of_the_checkpoint_are_refused(folder: Path) -> None:
-    assert load_pi05(str(folder), statistics="bridge").embodiment_mismatch() is not None
+    assert Pi05.load(str(folder), statistics="bridge").embodiment_mismatch() is not None
 
 
 def test_the_weights_of_a_pi0_are_refused(folder: Path, tmp_path: Path) -> None:
@@ -146,7 +146,7 @@ def test_the_weights_of_a_pi0_are_refused(folder: Path, tmp_path: Path) -> None:
     tensors["model.state_proj.weight"] = torch.zeros(24, 10)
     save_file(tensors, tmp_path / "model.safetensors")
     with pytest.raises(WeightsError, match="state_proj"):
-        load_pi05(str(tmp_path))
+        Pi05.load(str(tmp_path))
 
 
 def test_the_released_size_has_the_tensors_of_lerobots_policy() -> None:
@@ -178,4 +178,4 @@ def test_counts_with_which_no_action_is_made_are_refused(
     path = tmp_path / "config.json"
     path.write_text(json.dumps(json.loads(path.read_text(encoding="utf-8")) | {field: value}), encoding="utf-8")
     with pytest.raises(CheckpointError, match=message):
-        load_pi05(str(tmp_path))
+        Pi05.load(str(tmp_path))

@@ -17,7 +17,7 @@ from safetensors.torch import load_file, save_file
 from probe_kit.errors import InstructionError, UsageError
 from probe_kit.hooks import Observation, capture
 from probe_kit.hooks.conformance.subject import examples_for
-from probe_kit.hooks.families.pi0_fast.adapter import Pi0Fast, check_pi0_fast_words, load_pi0_fast
+from probe_kit.hooks.families.pi0_fast.adapter import Pi0Fast
 from probe_kit.models.lerobot import pi0_fast as network
 from tests.support.pi0_fast_checkpoints import HEAD, INSTRUCTIONS, TRAINED, write_pi0_fast
 
@@ -32,12 +32,12 @@ def folder(golden_pi0_fast: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def pi0_fast(folder: Path) -> Pi0Fast:
-    return load_pi0_fast(str(folder))
+    return Pi0Fast.load(str(folder))
 
 
 @pytest.fixture(scope="module")
 def untrained(tmp_path_factory: pytest.TempPathFactory) -> Pi0Fast:
-    return load_pi0_fast(str(write_pi0_fast(tmp_path_factory.mktemp("untrained"))))
+    return Pi0Fast.load(str(write_pi0_fast(tmp_path_factory.mktemp("untrained"))))
 
 
 @pytest.fixture
@@ -57,7 +57,7 @@ def test_whole_chunks_are_acted_on_without_a_flag(pi0_fast: Pi0Fast, seen: list[
 
 @pytest.mark.parametrize("dtype", ["float32", "bfloat16"])
 def test_tokens_are_those_of_lerobots_sampling(untrained: Pi0Fast, seen: list[Observation], dtype: str) -> None:
-    fast = untrained if dtype == "float32" else load_pi0_fast(str(untrained.folder), dtype=dtype)
+    fast = untrained if dtype == "float32" else Pi0Fast.load(str(untrained.folder), dtype=dtype)
     batch, policy = fast.batch(seen), fast.network
     ours = fast.tokens(batch, [0, 0])
     policy.model._paligemma_tokenizer = fast.tokenizer
@@ -72,7 +72,7 @@ def test_tokens_are_those_of_lerobots_sampling(untrained: Pi0Fast, seen: list[Ob
 def test_the_instruction_keeps_its_case_as_in_lerobot_or_loses_it_as_in_openpi(
     folder: Path, pi0_fast: Pi0Fast, seen: list[Observation]
 ) -> None:
-    lower = load_pi0_fast(str(folder), lowercase=True)
+    lower = Pi0Fast.load(str(folder), lowercase=True)
     text, state = [seen[0].instruction.title()], np.zeros((1, 7), np.float32)
     assert text[0] != text[0].lower()
     assert pi0_fast.prompts(text, state)[0].startswith(f"Task: {text[0]}, State:")
@@ -80,7 +80,7 @@ def test_the_instruction_keeps_its_case_as_in_lerobot_or_loses_it_as_in_openpi(
     assert lower.token_ids(text) == pi0_fast.token_ids([text[0].lower()])
     assert any("openpi writes lower case" in note for note in pi0_fast.card.notes)
     assert lower.card.settings["lowercase"] == "True"
-    check_pi0_fast_words(str(folder), text, lowercase=True)
+    Pi0Fast.check_words(str(folder), text, lowercase=True)
 
 
 def test_the_card_says_where_lerobot_decodes_another_number_of_actions(folder: Path, tmp_path: Path) -> None:
@@ -88,12 +88,12 @@ def test_the_card_says_where_lerobot_decodes_another_number_of_actions(folder: P
     path = tmp_path / "config.json"
     text = path.read_text(encoding="utf-8")
     path.write_text(text.replace('"n_action_steps": 4', '"n_action_steps": 2'), encoding="utf-8")
-    notes = [load_pi0_fast(str(place)).card.notes for place in (folder, tmp_path)]
+    notes = [Pi0Fast.load(str(place)).card.notes for place in (folder, tmp_path)]
     assert [any("lerobot decodes 2" in note for note in one) for one in notes] == [False, True]
 
 
 def test_a_chunk_that_does_not_end_is_flagged_and_warned_of(folder: Path, seen: list[Observation]) -> None:
-    cut = load_pi0_fast(str(folder))
+    cut = Pi0Fast.load(str(folder))
     cut.config.max_decoding_steps = 12
     with pytest.warns(UserWarning, match="no whole chunk of actions"):
         actions = cut.act(seen, [0, 0])
@@ -114,7 +114,7 @@ def test_a_row_that_has_ended_does_not_flag_for_the_tokens_behind_its_end(
 
 
 def test_more_tokens_are_captured_than_a_row_needs(folder: Path, seen: list[Observation]) -> None:
-    policy = load_pi0_fast(str(folder), captured_tokens=23)
+    policy = Pi0Fast.load(str(folder), captured_tokens=23)
     with capture(policy, policy.streams["action"].sites()) as cache:
         policy.act(seen, [0, 0])
     assert len(cache) == 23 * policy.streams["action"].layers
@@ -125,11 +125,11 @@ def test_more_tokens_are_captured_than_a_row_needs(folder: Path, seen: list[Obse
 @pytest.mark.parametrize("captured", [0, 25])
 def test_a_number_of_captured_tokens_that_never_come_is_refused(folder: Path, captured: int) -> None:
     with pytest.raises(UsageError, match="expected 1 to 24"):
-        load_pi0_fast(str(folder), captured_tokens=captured)
+        Pi0Fast.load(str(folder), captured_tokens=captured)
 
 
 def test_drawn_tokens_come_from_the_rows_own_seed(folder: Path, seen: list[Observation]) -> None:
-    policy = load_pi0_fast(str(folder), temperature=3.0)
+    policy = Pi0Fast.load(str(folder), temperature=3.0)
     batch = policy.batch([seen[0], seen[0], seen[1]])
     ids = policy.tokens(batch, [1, 2, 1])
     assert not torch.equal(ids[0], ids[1])
@@ -139,7 +139,7 @@ def test_drawn_tokens_come_from_the_rows_own_seed(folder: Path, seen: list[Obser
 
 
 def test_half_precision_acts_as_captured_and_puts_out_whole_chunks(folder: Path, seen: list[Observation]) -> None:
-    policy = load_pi0_fast(str(folder), dtype="bfloat16")
+    policy = Pi0Fast.load(str(folder), dtype="bfloat16")
     assert policy.card.dtype == "bfloat16"
     plain = policy.act(seen, [0, 0])
     with capture(policy, policy.sites()) as cache:
@@ -175,11 +175,11 @@ def test_a_prompt_that_does_not_fit_is_refused_and_never_cut(pi0_fast: Pi0Fast, 
     long = "put the cube on " + "the red shape " * 12
     with pytest.raises(InstructionError, match="this checkpoint reads 64"):
         pi0_fast.act([replace(seen[0], instruction=long)], [0])
-    check_pi0_fast_words(str(pi0_fast.folder), ["put the cube on the star"])
+    Pi0Fast.check_words(str(pi0_fast.folder), ["put the cube on the star"])
     with pytest.raises(InstructionError, match="this checkpoint reads 64"):
-        check_pi0_fast_words(str(pi0_fast.folder), ["put the cube on the star", long])
+        Pi0Fast.check_words(str(pi0_fast.folder), ["put the cube on the star", long])
     with pytest.raises(InstructionError, match="does not know"):
-        check_pi0_fast_words(str(pi0_fast.folder), ["put the cube on the zebra"])
+        Pi0Fast.check_words(str(pi0_fast.folder), ["put the cube on the zebra"])
 
 
 @pytest.mark.parametrize("left_out", [HEAD, EMBEDDING])
@@ -189,7 +189,7 @@ def test_head_and_embedding_may_be_stored_as_one(untrained: Pi0Fast, tmp_path: P
     (kept,) = {HEAD, EMBEDDING} - {left_out}
     del tensors[left_out]
     save_file(tensors, tmp_path / "model.safetensors")
-    loaded = load_pi0_fast(str(tmp_path)).network.state_dict()
+    loaded = Pi0Fast.load(str(tmp_path)).network.state_dict()
     assert torch.equal(loaded[left_out], tensors[kept])
 
 

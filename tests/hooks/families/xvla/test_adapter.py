@@ -19,7 +19,7 @@ from safetensors.torch import load_file, save_file
 from probe_kit.errors import CheckpointError, InstructionError, ObservationError, UsageError, WeightsError
 from probe_kit.hooks import Observation, Site, capture, edit
 from probe_kit.hooks.conformance.subject import examples_for
-from probe_kit.hooks.families.xvla.adapter import Xvla, check_xvla_words, load_xvla
+from probe_kit.hooks.families.xvla.adapter import Xvla
 from probe_kit.models.lerobot import xvla as network
 from tests.support.xvla_checkpoints import CHUNK, DOMAIN, DOMAINS, TEXT, to_authors_layout, write_xvla
 
@@ -31,7 +31,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def xvla(folder: Path) -> Xvla:
-    return load_xvla(str(folder))
+    return Xvla.load(str(folder))
 
 
 @pytest.fixture
@@ -63,7 +63,7 @@ def test_actions_are_those_of_lerobots_own_loading_processors_and_sampling_bit_f
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     text = (tmp_path / "config.json").read_text(encoding="utf-8")
     (tmp_path / "config.json").write_text(text.replace('"float32"', f'"{dtype}"'), encoding="utf-8")
-    ours = load_xvla(str(tmp_path))
+    ours = Xvla.load(str(tmp_path))
     assert ours.card.dtype == dtype
     policy, before, behind = lerobots(tmp_path)
     (one,) = seen
@@ -101,12 +101,12 @@ def network_reads(policy: Xvla, seen: list[Observation]) -> np.ndarray[Any, Any]
 def test_pictures_are_padded_as_the_configuration_says_or_squashed_as_the_authors_do(
     folder: Path, xvla: Xvla, seen: list[Observation]
 ) -> None:
-    squashed = load_xvla(str(folder), picture="squashed")
+    squashed = Xvla.load(str(folder), picture="squashed")
     own = np.asarray(Image.fromarray(seen[0].image).resize((64, 64), Image.Resampling.BICUBIC), np.float32)
     np.testing.assert_allclose(network_reads(squashed, seen), own.transpose(2, 0, 1), atol=1e-3)
     assert xvla.card.settings["picture"] == "padded"
     assert np.abs(network_reads(xvla, seen) - network_reads(squashed, seen)).max() > 10
-    np.testing.assert_array_equal(load_xvla(str(folder), picture="padded").act(seen, [0]), xvla.act(seen, [0]))
+    np.testing.assert_array_equal(Xvla.load(str(folder), picture="padded").act(seen, [0]), xvla.act(seen, [0]))
     assert any("authors squash" in note for note in xvla.card.notes)
     assert any("squashed to 64 x 64" in note for note in squashed.card.notes)
 
@@ -120,8 +120,8 @@ def test_a_checkpoint_that_resizes_nothing_can_be_given_either_way(
     values["input_features"]["observation.images.image"]["shape"] = [3, 64, 64]
     (place / "config.json").write_text(json.dumps(values), encoding="utf-8")
     with pytest.raises(ObservationError, match="resizes nothing"):
-        load_xvla(str(place)).act(seen, [0])
-    actions = [load_xvla(str(place), picture=own).act(seen, [0]) for own in ("padded", "squashed")]
+        Xvla.load(str(place)).act(seen, [0])
+    actions = [Xvla.load(str(place), picture=own).act(seen, [0]) for own in ("padded", "squashed")]
     assert not np.array_equal(*actions)
 
 
@@ -152,7 +152,7 @@ def test_files_of_2025_have_florence_in_its_authors_layout(
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     to_authors_layout(tmp_path)
     assert "model.vlm.image_projection" in load_file(tmp_path / "model.safetensors")
-    np.testing.assert_array_equal(load_xvla(str(tmp_path)).act(seen, [0]), xvla.act(seen, [0]))
+    np.testing.assert_array_equal(Xvla.load(str(tmp_path)).act(seen, [0]), xvla.act(seen, [0]))
 
 
 @pytest.mark.parametrize(
@@ -169,9 +169,9 @@ def test_weights_must_be_whole_but_tied_embeddings_may_have_either_name(
     save_file(kept, tmp_path / "model.safetensors")
     if missing:
         with pytest.raises(WeightsError, match=name):
-            load_xvla(str(tmp_path))
+            Xvla.load(str(tmp_path))
     else:
-        np.testing.assert_array_equal(load_xvla(str(tmp_path)).act(seen, [0]), xvla.act(seen, [0]))
+        np.testing.assert_array_equal(Xvla.load(str(tmp_path)).act(seen, [0]), xvla.act(seen, [0]))
 
 
 def test_the_expert_reads_the_end_of_the_backbone_as_tokens_of_its_own(
@@ -221,7 +221,7 @@ def test_each_layer_of_the_backbone_norms_what_it_adds(xvla: Xvla, seen: list[Ob
 
 def test_further_cameras_reach_the_expert_past_the_backbone(tmp_path: Path, seen: list[Observation]) -> None:
     folder = write_xvla(tmp_path, cameras=("image", "wrist"), views=3)
-    policy = load_xvla(str(folder)).showing(["image", "wrist"])
+    policy = Xvla.load(str(folder)).showing(["image", "wrist"])
     one = replace(seen[0], cameras={"wrist": seen[0].image[:, ::-1].copy()})
     other = replace(one, cameras={"wrist": seen[0].image})
     roles = policy.roles([one])
@@ -244,17 +244,17 @@ def test_the_robot_is_read_from_the_files_and_may_be_chosen(
     folder: Path, tmp_path: Path, xvla: Xvla, seen: list[Observation]
 ) -> None:
     assert xvla.card.settings["domain"] == str(DOMAIN)
-    assert not np.array_equal(load_xvla(str(folder), domain=1).act(seen, [0]), xvla.act(seen, [0]))
+    assert not np.array_equal(Xvla.load(str(folder), domain=1).act(seen, [0]), xvla.act(seen, [0]))
     with pytest.raises(UsageError, match=f"0 to {DOMAINS - 1}"):
-        load_xvla(str(folder), domain=DOMAINS)
+        Xvla.load(str(folder), domain=DOMAINS)
     shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     file = tmp_path / "policy_preprocessor.json"
     content = json.loads(file.read_text(encoding="utf-8"))
     content["steps"] = [one for one in content["steps"] if one["registry_name"] != "xvla_add_domain_id"]
     file.write_text(json.dumps(content), encoding="utf-8")
     with pytest.raises(CheckpointError, match="names no robot"):
-        load_xvla(str(tmp_path))
-    np.testing.assert_array_equal(load_xvla(str(tmp_path), domain=DOMAIN).act(seen, [0]), xvla.act(seen, [0]))
+        Xvla.load(str(tmp_path))
+    np.testing.assert_array_equal(Xvla.load(str(tmp_path), domain=DOMAIN).act(seen, [0]), xvla.act(seen, [0]))
 
 
 @pytest.mark.parametrize(
@@ -273,16 +273,16 @@ def test_files_that_would_change_numbers_in_silence_are_refused(
     assert old in text
     (tmp_path / file).write_text(text.replace(old, new), encoding="utf-8")
     with pytest.raises(CheckpointError, match=message):
-        load_xvla(str(tmp_path))
+        Xvla.load(str(tmp_path))
 
 
 def test_a_text_that_does_not_fit_is_refused_where_lerobot_cuts_it(xvla: Xvla, seen: list[Observation]) -> None:
     long = "put the cube on " + "the red shape " * 5
     with pytest.raises(InstructionError, match=f"reads {TEXT}"):
         xvla.act([replace(seen[0], instruction=long)], [0])
-    check_xvla_words(str(xvla.folder), ["put the cube on the star"])
+    Xvla.check_words(str(xvla.folder), ["put the cube on the star"])
     with pytest.raises(InstructionError, match=f"reads {TEXT}"):
-        check_xvla_words(str(xvla.folder), [long])
+        Xvla.check_words(str(xvla.folder), [long])
 
 
 def test_a_picture_of_another_size_is_refused_where_nothing_resizes(
@@ -293,7 +293,7 @@ def test_a_picture_of_another_size_is_refused_where_nothing_resizes(
     content |= {"resize_imgs_with_padding": None, "max_len_seq": 160}
     content["input_features"]["observation.images.image"]["shape"] = [3, 64, 96]
     (tmp_path / "config.json").write_text(json.dumps(content), encoding="utf-8")
-    policy = load_xvla(str(tmp_path))
+    policy = Xvla.load(str(tmp_path))
     with pytest.raises(ObservationError, match="resizes nothing"):
         policy.act(seen, [0])
     fitting = replace(seen[0], image=np.zeros((64, 96, 3), np.uint8))
@@ -310,7 +310,7 @@ def test_absolute_poses_are_captured_and_not_carried_out(tmp_path: Path, seen: l
     content["action_mode"], content["max_state_dim"] = "ee6d", 20
     content["output_features"]["action"]["shape"] = [20]
     (folder / "config.json").write_text(json.dumps(content), encoding="utf-8")
-    policy = load_xvla(str(folder), random_weights=True)
+    policy = Xvla.load(str(folder), random_weights=True)
     assert "20 dimensions" in str(policy.embodiment_mismatch())
     assert policy.infer_without_acting(seen, [0]).shape == (1, CHUNK, 20)
 

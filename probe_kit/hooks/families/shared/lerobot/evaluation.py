@@ -30,19 +30,15 @@ EVALUATION_OPTIONS = (
 
 @dataclass(frozen=True)
 class Evaluation:
-    """The treatment of observations and actions around the network.
+    """The treatment of observations and actions around the network; its fields are the options of loaders.
 
     statistics: a file, the name of a shipped one, `none` for numbers that are units already, or None for what the
     checkpoint says. picture: how a picture comes to the network's resolution; None for what the layout of the
     checkpoint implies. openness: the state's last number, see `state_layout`. unread: settings of an old
-    config.json that are left out.
+    config.json that are left out, comma-separated.
     """
 
     statistics: str | None = None
     picture: Picture | None = None
     openness: str = "measured"
-    unread: tuple[str, ...] = ()
-
-
-AS_STORED = Evaluation()
-"""Nothing but what the checkpoint says."""
+    unread: str = ""

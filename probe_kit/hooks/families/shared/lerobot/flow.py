@@ -71,8 +71,8 @@ class LerobotFlow(DenoisingPolicy):
 
     interventions = FLOW
 
-    def __init__(self, network: Any, folder: Path) -> None:
-        super().__init__(network, folder)
+    def __init__(self, network: Any, folder: Path, checkpoint: str) -> None:
+        super().__init__(network, folder, checkpoint)
         checked_steps(self.iterations, folder)
         self.passages = attach_prompt_kv(self._joint, len(self.stacks["backbone"].layers))
         self.prompt_kv = kv_stream(len(self.passages.keys), self._kv_width)

@@ -14,7 +14,6 @@ from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.state_layout import ARM_NUMBERS
 from probe_kit.hooks.contract.views import PADDING
-from probe_kit.hooks.families.shared.lerobot.evaluation import AS_STORED, Evaluation
 from probe_kit.hooks.families.shared.lerobot.flow import DenoisingPolicy
 from probe_kit.hooks.families.shared.lerobot.policy import IMAGES
 
@@ -121,9 +120,9 @@ class PackedPolicy(DenoisingPolicy):
         return [tuple(number for number, role in row if role in self.word_roles) for row in rows]
 
     @classmethod
-    def check_words(cls, checkpoint: str, instructions: Sequence[str], evaluation: Evaluation = AS_STORED) -> None:
+    def check_words(cls, checkpoint: str, instructions: Sequence[str], **options: Any) -> None:
         """Raise InstructionError as `pack` would, from configuration and tokenizer alone."""
-        cls._text_reader(checkpoint, evaluation).token_ids(instructions)
+        cls._text_reader(checkpoint, options).token_ids(instructions)
 
     def _no_state(self, rows: int) -> NDArray[np.float32]:
         return np.zeros((rows, self._state_numbers), np.float32)

@@ -32,7 +32,7 @@ from probe_kit.hooks.contract.sites import Site
 from probe_kit.hooks.contract.state_layout import ARM_NUMBERS
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.shared.lerobot.config_fields import Inert, check_one_frame, known_values
-from probe_kit.hooks.families.shared.lerobot.evaluation import AS_STORED, Evaluation
+from probe_kit.hooks.families.shared.lerobot.evaluation import Evaluation
 from probe_kit.hooks.families.shared.lerobot.normaliser import (
     Normaliser,
     Units,
@@ -81,6 +81,9 @@ class LerobotPolicy(Policy):
 
     family: ClassVar[str]
     config_type: ClassVar[str]
+    choice: ClassVar[type[Evaluation]] = Evaluation
+    """The options of its loader."""
+    evaluation: Evaluation
     unread: ClassVar[tuple[str, ...]] = ()
     """Parameters that inference never reads and a file may lack."""
     tied: ClassVar[Mapping[str, str]] = MappingProxyType({})
@@ -101,9 +104,10 @@ class LerobotPolicy(Policy):
     suffix_roles: ClassVar[tuple[str, ...]]
     """What positions of the acting stream hold."""
 
-    def __init__(self, network: Any, folder: Path) -> None:
-        self.checkpoint, self.evaluation = str(folder), AS_STORED
-        self.network, self.folder, self.config = network, folder, network.config
+    def __init__(self, network: Any, folder: Path, checkpoint: str) -> None:
+        """checkpoint: the name by which `folder` was requested."""
+        self.network, self.folder, self.checkpoint = network, folder, checkpoint
+        self.config, self.evaluation = network.config, network.config.evaluation
         self.stacks = self._stacks()
         self._read_streams()
         keys = [key.removeprefix(IMAGES) for key in self.config.image_features]
@@ -203,16 +207,16 @@ class LerobotPolicy(Policy):
         dtype: str | None = None,
         random_weights: bool = False,
         weights_seed: int = 0,
-        evaluation: Evaluation = AS_STORED,
+        **options: Any,
     ) -> Self:
         """Load a lerobot checkpoint from a folder or hub id.
 
         dtype: float32 or bfloat16; default what the checkpoint's config says.
         random_weights: same architecture, tokenizer and statistics, but random weights of `weights_seed`.
-        evaluation: what its files do not say.
+        options: what its files do not say, the fields of `choice`.
         Raises CheckpointError for missing files, WeightsError for weights that are not exactly the model's.
         """
-        folder = checkpoint_folder(checkpoint)
+        folder, evaluation = checkpoint_folder(checkpoint), cls.choice(**options)
         config = cls._read_config(folder, evaluation)
         if dtype is not None:
             config.dtype = dtype
@@ -225,8 +229,7 @@ class LerobotPolicy(Policy):
         tensors = cls.current_keys(weights.tensors)
         audit = load_weights(network, weights, tensors, cls.unread, name_in_module=cls._current_key)
         config.device = device
-        policy = cls(network.to(device), folder)
-        policy.prepare(checkpoint, evaluation)
+        policy = cls(network.to(device), folder, checkpoint)
         policy.card = ModelCard(
             family=cls.family,
             checkpoint=checkpoint,
@@ -247,7 +250,7 @@ class LerobotPolicy(Policy):
         return policy
 
     @classmethod
-    def _read_config(cls, folder: Path, evaluation: Evaluation) -> Any:
+    def _read_config(cls, folder: Path, evaluation: Any) -> Any:
         if not (folder / "config.json").is_file():
             raise CheckpointError(f"{folder / 'config.json'} is missing; {folder} is not a lerobot checkpoint")
         config: Any = cls.parse_config(folder, evaluation)
@@ -266,6 +269,7 @@ class LerobotPolicy(Policy):
                     "Take the original configuration"
                 )
         config.compile_model = False  # compiled graphs drop hooks
+        config.evaluation = evaluation
         return config
 
     @classmethod
@@ -274,10 +278,11 @@ class LerobotPolicy(Policy):
             check_steps(folder, pipeline, (*NORMALISERS, *RELATIVE, TOKENIZER, *cls.known_steps))
 
     @classmethod
-    def parse_config(cls, folder: Path, evaluation: Evaluation) -> Any:
+    def parse_config(cls, folder: Path, evaluation: Any) -> Any:
         """lerobot's configuration object of the folder's `config.json`, also of one that a newer lerobot wrote.
 
-        Raises CheckpointError for a policy of another kind, and for a field that may change inference.
+        evaluation: of `choice`. Raises CheckpointError for a policy of another kind, and for a field that may
+        change inference.
         """
         path = folder / CONFIG_FILE
         values = cls.current_values(read_json_object(path, CheckpointError, "Take the original file"), path)
@@ -287,9 +292,8 @@ class LerobotPolicy(Policy):
             )
         config_class = PreTrainedConfig.get_choice_class(cls.config_type)
         field_names = {field.name for field in fields(config_class)}
-        values = known_values(
-            values, {*field_names, "type"}, cls.newer_fields, evaluation.unread, path, cls.takes_unread
-        )
+        unread = tuple(filter(None, evaluation.unread.split(",")))
+        values = known_values(values, {*field_names, "type"}, cls.newer_fields, unread, path, cls.takes_unread)
         if "rtc_config" in values:
             values["rtc_config"] = None  # real-time chunking mixes in actions of the chunk before
         # `from_pretrained` decodes in the same way, behind a command line with a help text for every field: 80 ms.
@@ -300,10 +304,6 @@ class LerobotPolicy(Policy):
         """The fields of `config.json` under the names that the installed lerobot has. Raises CheckpointError."""
         del path
         return values
-
-    def prepare(self, checkpoint: str, evaluation: Evaluation) -> None:
-        """Look at files once, before the card is written. checkpoint: the name by which it was requested."""
-        self.checkpoint, self.evaluation = checkpoint, evaluation
 
     def further_settings(self) -> dict[str, str]:
         """Settings that numbers depend on besides weights and side files; empty where a checkpoint holds all."""
@@ -544,16 +544,16 @@ class LerobotPolicy(Policy):
         return tokens, mask
 
     @classmethod
-    def check_words(cls, checkpoint: str, instructions: Sequence[str], evaluation: Evaluation = AS_STORED) -> None:
+    def check_words(cls, checkpoint: str, instructions: Sequence[str], **options: Any) -> None:
         """Raise InstructionError as `tokenise` would, from configuration and tokenizer alone."""
-        cls._text_reader(checkpoint, evaluation).tokenise(instructions)
+        cls._text_reader(checkpoint, options).tokenise(instructions)
 
     @classmethod
-    def _text_reader(cls, checkpoint: str, evaluation: Evaluation) -> Self:
-        """Return a policy without a network, which still packs and tokenises."""
+    def _text_reader(cls, checkpoint: str, options: Mapping[str, Any]) -> Self:
+        """Return a policy without a network, which still packs and tokenises. options: of its loader."""
         text = cls.__new__(cls)
-        text.folder, text.evaluation = checkpoint_folder(checkpoint, TEXT_FILES), evaluation
-        text.config = cls._read_config(text.folder, evaluation)
+        text.folder, text.evaluation = checkpoint_folder(checkpoint, TEXT_FILES), cls.choice(**options)
+        text.config = cls._read_config(text.folder, text.evaluation)
         text.cameras = text.shown_cameras = tuple(key.removeprefix(IMAGES) for key in text.config.image_features)[
             :1
         ]

@@ -8,7 +8,6 @@ from typing import Any
 import pytest
 
 from probe_kit.errors import CheckpointError
-from probe_kit.hooks.families.shared.lerobot.evaluation import AS_STORED
 
 POLICIES = {
     "pi0": "pi0.adapter:Pi0",
@@ -25,7 +24,7 @@ def test_a_checkpoint_that_reads_several_frames_is_refused(kind: str, tmp_path: 
     for frames in (1, 2):
         (tmp_path / "config.json").write_text(json.dumps({"type": kind, "n_obs_steps": frames}), encoding="utf-8")
         if frames == 1:
-            assert policy._read_config(tmp_path, AS_STORED).n_obs_steps == 1
+            assert policy._read_config(tmp_path, policy.choice()).n_obs_steps == 1
         else:
             with pytest.raises(CheckpointError, match=r"reads the last 2 observations \(n_obs_steps\)"):
-                policy._read_config(tmp_path, AS_STORED)
+                policy._read_config(tmp_path, policy.choice())

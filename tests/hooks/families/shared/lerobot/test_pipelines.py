@@ -18,8 +18,8 @@ from safetensors.torch import load_file, save_file
 from probe_kit.errors import CheckpointError, InstructionError
 from probe_kit.hooks import Observation
 from probe_kit.hooks.conformance.subject import examples_for
-from probe_kit.hooks.families.pi0_fast.adapter import load_pi0_fast
-from probe_kit.hooks.families.pi05.adapter import load_pi05
+from probe_kit.hooks.families.pi0_fast.adapter import Pi0Fast
+from probe_kit.hooks.families.pi05.adapter import Pi05
 from probe_kit.models.lerobot.pi0 import Pi0Size, resized
 from probe_kit.models.lerobot.pi0_fast import Pi0FastSize, sized
 from tests.support.lerobot_pipelines import changed, raw, save_pipelines, without_hub
@@ -73,7 +73,7 @@ def test_pi05_acts_as_lerobots_own_loading_processors_and_policy_bit_for_bit(
     before, behind = save_pipelines(folder, normalization_mapping=modes, dtype=dtype)
     with resized(modeling_pi05, Pi0Size.from_file(folder / "dims.json")):
         theirs = modeling_pi05.PI05Policy.from_pretrained(folder).eval()
-    every = load_pi05(str(folder))
+    every = Pi05.load(str(folder))
     for shown in (CAMERAS, CAMERAS[:1]):
         ours = every.showing(shown)
         for seed, one in enumerate(seen()):
@@ -107,7 +107,7 @@ def test_pi0_fast_decodes_broken_chunks_as_lerobot_does_and_flags_them(
 def _fast_acts_as_lerobot(folder: Path, patch: pytest.MonkeyPatch) -> Any:
     without_hub(folder, patch)
     before, behind = save_pipelines(folder)
-    ours, fast = load_pi0_fast(str(folder)), fast_processor(folder / "fast")
+    ours, fast = Pi0Fast.load(str(folder)), fast_processor(folder / "fast")
     for name, own in (("AutoTokenizer", ours.tokenizer), ("AutoProcessor", fast)):
         patch.setattr(modeling_pi0_fast, name, SimpleNamespace(from_pretrained=lambda *_, own=own, **__: own))
     with sized(Pi0FastSize.from_file(folder / "dims.json"), ours.config):
@@ -142,7 +142,7 @@ def test_a_step_that_would_change_numbers_unread_is_refused_by_name(
     with suppress(KeyError, ImportError, ValueError, TypeError):  # lerobot may not know it either
         save_pipelines(folder, change)
     with pytest.raises(CheckpointError, match=message):
-        load_pi05(str(folder))
+        Pi05.load(str(folder))
 
 
 def test_an_unknown_step_behind_the_policy_forbids_to_act_and_not_to_capture(folder: Path) -> None:
@@ -151,7 +151,7 @@ def test_an_unknown_step_behind_the_policy_forbids_to_act_and_not_to_capture(fol
     content = json.loads(path.read_text(encoding="utf-8"))
     _inserted(content["steps"])
     path.write_text(json.dumps(content), encoding="utf-8")
-    policy = load_pi05(str(folder))
+    policy = Pi05.load(str(folder))
     seen = examples_for(policy, "put the cube on the star")
     with pytest.raises(CheckpointError, match="vla_jepa_binarize_gripper"):
         policy.act(seen, [0])
@@ -163,13 +163,13 @@ def test_pictures_that_lerobot_would_normalise_are_refused(folder: Path) -> None
     save_pipelines(
         folder, normalization_mapping={"VISUAL": "MEAN_STD", "STATE": "QUANTILES", "ACTION": "QUANTILES"}
     )
-    assert load_pi05(str(folder)).embodiment_mismatch() is None  # without statistics of pictures lerobot does not
+    assert Pi05.load(str(folder)).embodiment_mismatch() is None  # without statistics of pictures lerobot does not
     (file,) = folder.glob("policy_preprocessor_*.safetensors")
     tensors = load_file(file)
     pictures = {f"observation.images.base.{name}": torch.full((3, 1, 1), 0.5) for name in ("mean", "std")}
     save_file(tensors | pictures, file)
     with pytest.raises(CheckpointError, match=r"normalises observation\.images\.base by statistics"):
-        load_pi05(str(folder))
+        Pi05.load(str(folder))
 
 
 @pytest.mark.parametrize("where", ["configuration", "relative_actions_processor", "absolute_actions_processor"])
@@ -177,7 +177,7 @@ def test_changes_relative_to_the_state_are_no_actions_of_this_arm(folder: Path, 
     """lerobot adds the state; a delta of the end effector without it would be another motion."""
     save_pipelines(folder, None if where == "configuration" else changed(where, enabled=True),
                    use_relative_actions=where == "configuration")  # fmt: skip
-    policy = load_pi05(str(folder))
+    policy = Pi05.load(str(folder))
     save_pipelines(folder, use_relative_actions=False)  # what was read at loading counts
     assert policy.predicts_relative
     assert any("relative to the state" in note for note in policy.card.notes)
@@ -188,7 +188,7 @@ def test_changes_relative_to_the_state_are_no_actions_of_this_arm(folder: Path, 
 
 def test_the_length_of_the_text_is_that_of_the_saved_step(folder: Path) -> None:
     save_pipelines(folder, changed("tokenizer_processor", max_length=20))
-    policy = load_pi05(str(folder))
+    policy = Pi05.load(str(folder))
     (one,) = examples_for(policy, "put the cube on the star")
     with pytest.raises(InstructionError, match="this checkpoint reads 20"):
         policy.act([one], [0])
@@ -201,11 +201,11 @@ def test_statistics_of_another_width_are_no_units(folder: Path, numbers: int) ->
     (file,) = folder.glob("policy_postprocessor_*.safetensors")
     tensors = load_file(file)
     save_file({name: own[:numbers] if name.startswith("action") else own for name, own in tensors.items()}, file)
-    assert f"statistics of shape ({numbers},)" in str(load_pi05(str(folder)).embodiment_mismatch())
+    assert f"statistics of shape ({numbers},)" in str(Pi05.load(str(folder)).embodiment_mismatch())
 
 
 def test_a_state_that_the_pipeline_leaves_out_is_read_as_it_is(folder: Path) -> None:
     save_pipelines(folder, changed("normalizer_processor", normalize_observation_keys=[]))
-    policy = load_pi05(str(folder))
+    policy = Pi05.load(str(folder))
     assert policy.state_units.mode == "IDENTITY"
     assert policy.action_units.mode == "QUANTILES"
