@@ -1,17 +1,23 @@
-"""Files of settings for `extract --config`: written by `--print-config`, or those of a run."""
+"""Files of settings for `extract --config`: written by `--print-config`, or those of a run.
+
+A run records where it had its checkpoint, the files of its source and those of the model's options. They are
+searched for there, unless an option beside `--config` gives another one.
+"""
 
 from collections.abc import Collection, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from probe_kit._system.bounded_json import read_json_object
 from probe_kit._terminal.field_options import options_of
 from probe_kit.errors import UsageError
 from probe_kit.extract.settings import Settings
-from probe_kit.extract.sources.kinds import kind_of
+from probe_kit.extract.sources.kinds import SOURCES, kind_of
 from probe_kit.extract.sources.scene import SceneOptions, SceneSettings
+from probe_kit.hooks.contract.options import read_pairs
 from probe_kit.runs.layout import RUN_FILE
-from probe_kit.runs.origin import is_here
+from probe_kit.runs.origin import is_here, option_files
 from probe_kit.runs.reader import origin_of
 
 if TYPE_CHECKING:
@@ -24,21 +30,23 @@ CONFIG = "config"
 def portable(settings: Settings) -> dict[str, Any]:
     """The settings by part as a run stores them: without machine, label and places of this machine.
 
-    Where checkpoint and files of the source lie is recorded by the process that played.
+    Where these files lie is recorded by the process that played.
     """
     config = {name: part for name, part in settings.config().items() if name not in ("machine", "label")}
-    model, source = config["model"], config["source"]
+    model, source = config["model"], settings.source
     if is_here(model["checkpoint"]):
         model["checkpoint"] = None
-    for field, path in settings.source.files().items():
-        _put(source, field, path.name)
-    return config
+    model["options"] |= {name: path.name for name, path in option_files(settings.model).items()}
+    files = {field: path.name for field, path in source.files().items()}
+    return {**config, "source": source.with_files(config["source"], files)}
 
 
-def read_config(path: Path, typed: Collection[str] = (), asks: bool = False) -> Mapping[str, Any]:
+def read_config(
+    path: Path, typed: Mapping[str, Any] = MappingProxyType({}), asks: bool = False
+) -> Mapping[str, Any]:
     """Settings by part, from a file of `--print-config`, or from a run that its folder or `run.json` names.
 
-    typed: parameters that a command line names; what they replace is not searched for. asks: whether the run is
+    typed: values of a command line by parameter; what they replace is not searched for. asks: whether the run is
     one of `probe-kit ask`.
     Raises UsageError for a file that holds neither, for a run without its settings, and for files of a run that
     are gone.
@@ -48,8 +56,8 @@ def read_config(path: Path, typed: Collection[str] = (), asks: bool = False) -> 
     return read_json_object(path, UsageError, "Write one with `probe-kit extract … --print-config`")
 
 
-def _of_run(folder: Path, typed: Collection[str], asks: bool) -> Mapping[str, Any]:
-    """The settings of a run, with its checkpoint and the files of its source where the run found them."""
+def _of_run(folder: Path, typed: Mapping[str, Any], asks: bool) -> Mapping[str, Any]:
+    """The settings of a run, with its checkpoint and its files where the run had them."""
     from probe_kit.runs.run import open_run
 
     run = open_run(folder, allow_partial=True)
@@ -63,21 +71,43 @@ def _of_run(folder: Path, typed: Collection[str], asks: bool) -> Mapping[str, An
         raise UsageError(
             f"{folder} was edited by vectors, which no run stores; repeat it in Python with `vectors`"
         )
-    origin = origin_of(run)
-    model = {**config["model"], "options": dict(origin.options)}
-    if model["checkpoint"] is None and is_here(origin.checkpoint):
-        model["checkpoint"] = origin.checkpoint
-    kind = kind_of(config["source"])
+    return {**config, "model": _model_of_run(run, config["model"], typed), **_typed_or_stored_source(run, typed)}
+
+
+def _model_of_run(run: "Run", model: Mapping[str, Any], typed: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings of a run's model as values. Raises UsageError for files that are gone and not typed."""
+    origin, checkpoint = origin_of(run), model["checkpoint"]
+    if typed.get("model") not in (None, model["family"]):
+        return dict(model)
+    if checkpoint is None and Path(origin.checkpoint).is_absolute():
+        # Without it the family's default would be loaded, and nothing would say so.
+        if "checkpoint" not in typed:
+            _check_there(run, "checkpoint", Path(origin.checkpoint), "--checkpoint")
+        checkpoint = origin.checkpoint
+    for name in model["options"].keys() - read_pairs(typed.get("model_option", ())).keys():
+        path = Path(str(origin.options.get(name, "")))
+        if path.is_absolute():
+            _check_there(run, name, path, f"-M {name}")
+    return {**model, "checkpoint": checkpoint, "options": dict(origin.options)}
+
+
+def _typed_or_stored_source(run: "Run", typed: Mapping[str, Any]) -> dict[str, Any]:
+    """The part `source` of a run's settings; empty where a command line names one of another kind."""
+    kind = kind_of(run.settings[CONFIG]["source"])
     options = {option.field: option for option in options_of(kind)}
+    other_kinds = [next(options_of(other)).parameter for other in SOURCES[1:] if other is not kind]
+    if any(parameter in typed for parameter in other_kinds):
+        return {}
     if kind is SceneSettings:
+        # A preset that is typed takes the place of the whole scene.
         options |= {f"scene.{option.field}": option for option in options_of(SceneOptions)}
     replaced = [field for field, option in options.items() if option.parameter in typed]
-    source = source_of_run(run, replaced, {field: option.flag for field, option in options.items()})
-    return {**config, "model": model, "source": source}
+    replaced += [field for field in options if field.startswith("scene.") and "scene.scene" in replaced]
+    return {"source": source_of_run(run, replaced, {field: option.flag for field, option in options.items()})}
 
 
 def source_of_run(run: "Run", replaced: Collection[str], flags: Mapping[str, str]) -> dict[str, Any]:
-    """The settings of a run's source as values, with its files where the run found them.
+    """The settings of a run's source as values, with its files where the run had them.
 
     replaced: fields that are given anew. flags: options of a command that give fields.
     Raises UsageError for a run without its settings, and for files that are gone.
@@ -85,30 +115,19 @@ def source_of_run(run: "Run", replaced: Collection[str], flags: Mapping[str, str
     config = run.settings.get(CONFIG)
     if config is None:
         raise UsageError(f"{run.location} does not say with which settings it was requested; extract it again")
-    origin = origin_of(run)
-    source = dict(config["source"])
-    for field, stored_path in origin.files.items():
+    kind = kind_of(config["source"])
+    files = {field: path for field, path in origin_of(run).files.items() if field not in replaced}
+    source = kind.with_files(config["source"], files)
+    # A run that does not say where its files were leads to their names, which may lie here.
+    for field, path in (kind(**source).files() | {field: Path(path) for field, path in files.items()}).items():
         if field not in replaced:
-            _check_there(run, field, Path(stored_path), flags)
-            _put(source, field, stored_path)
-    kind = kind_of(source)
-    kind.find_again(origin.files)
-    for field, path in kind(**source).files().items():  # of a run that does not say where they were
-        if field not in replaced:
-            _check_there(run, field, path, flags)
+            _check_there(run, field, path, flags.get(field))
+    kind.find_again(files)
     return source
 
 
-def _check_there(run: "Run", field: str, path: Path, flags: Mapping[str, str]) -> None:
+def _check_there(run: "Run", field: str, path: Path, flag: str | None) -> None:
+    """Raise UsageError for a file that is gone. flag: the option that gives another one."""
     if not path.exists():
-        again = f"Give it with {flags[field]}" if field in flags else "Put it there again"
+        again = f"Give it with {flag}" if flag else "Put it there again"
         raise UsageError(f"{run.location} was made of {path}, its {field}, which is not here any more. {again}")
-
-
-def _put(source: dict[str, Any], field: str, value: str) -> None:
-    """Set a field of a source's settings, such as `folder` or `scene.background`; others are no settings."""
-    first, _, inner = field.partition(".")
-    if inner and first in source:
-        source[first] = {**source[first], inner: value}
-    elif first in source:
-        source[first] = value

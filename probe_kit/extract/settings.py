@@ -18,7 +18,16 @@ from pydantic import AfterValidator, BeforeValidator, SerializeAsAny
 from probe_kit._terminal import options as common
 from probe_kit._terminal.field_options import Part, options_of
 from probe_kit.errors import UsageError
-from probe_kit.extract.parts import ActMachine, ActTask, AskCapture, AskMachine, AskTask, Capture, ModelSettings
+from probe_kit.extract.parts import (
+    ActMachine,
+    ActTask,
+    AskCapture,
+    AskMachine,
+    AskTask,
+    Capture,
+    ModelSettings,
+    read_options,
+)
 from probe_kit.extract.protocols import has_network, protocol_identity, protocol_row, scene_of
 from probe_kit.extract.sources.kinds import SOURCES, kind_of
 from probe_kit.extract.sources.scene import SceneOptions, SceneSettings
@@ -178,13 +187,17 @@ class Settings(Part):
         except TypeError as error:  # a name in the file that is no part
             raise UsageError(f"--config: {error}") from error
         kind, fields = cls._typed_source(source_options, None if before is None else before.source)
+        if before is not None and values.get("family") in (None, before.model.family):
+            values = _merged(before.model, values)
         if kind is SceneSettings:
             values |= fields
         else:
             if refused := [name for name in values if name in kind.decides]:
                 _refuse(refused, kind)
-            former = dict(before.source) if before is not None and isinstance(before.source, kind) else {}
-            values["source"] = kind(**{**former, **fields})
+            former = None if before is None else before.source
+            values["source"] = (
+                former.changed(**_merged(former, fields)) if isinstance(former, kind) else kind(**fields)
+            )
         return cls(values.pop("family", None), **values) if before is None else before.changed(**values)
 
     @classmethod
@@ -452,6 +465,13 @@ def refuse(settings: Settings, names: Iterable[str], why: str) -> None:
             wrong.append(" ".join(filter(None, (flags.get(name, name), value))))
     if wrong:
         raise UsageError(f"{', '.join(wrong)} {why}")
+
+
+def _merged(former: Part, fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Typed fields, in which KEY=VALUE options replace those of equal keys alone."""
+    if "options" not in fields:
+        return dict(fields)
+    return {**fields, "options": {**dict(former)["options"], **read_options(fields["options"])}}
 
 
 def _refuse(names: Iterable[str], source: type[SourceSettings]) -> NoReturn:

@@ -18,6 +18,10 @@ class LoadedModel(Protocol):
     """The model of a run's settings; see `ModelSettings`."""
 
     @property
+    def family(self) -> str:
+        """Its name."""
+
+    @property
     def options(self) -> Mapping[str, Any]:
         """Options of the family."""
 
@@ -36,9 +40,9 @@ class Origin:
 
     files: absolute, by field of the source's settings, such as `suite`, `folder` or `scene.background`.
     checkpoint: absolute folder, hub id, or a word of the family; empty if unknown. options: of the family, as they
-    were passed. random_weights: whether random weights were requested, which a file that calls its weights random
-    is not. weights_seed: of requested random weights. repositories: commits of further repositories of the hub, by
-    name, which a repetition reads again.
+    were passed, files and folders absolute. random_weights: whether random weights were requested, which a file
+    that calls its weights random is not. weights_seed: of requested random weights. repositories: commits of
+    further repositories of the hub, by name, which a repetition reads again.
     """
 
     files: Mapping[str, str] = field(default_factory=dict)
@@ -60,7 +64,7 @@ class Origin:
         return cls(
             files={name: _absolute(path) for name, path in files.items()},
             checkpoint=_absolute(checkpoint) if is_here(checkpoint) else checkpoint,
-            options=dict(model.options),
+            options={**model.options, **{name: _absolute(path) for name, path in option_files(model).items()}},
             random_weights=model.random_weights,
             weights_seed=model.weights_seed,
             repositories=dict(repositories),
@@ -86,6 +90,16 @@ class Origin:
     def to_json(self) -> dict[str, Any]:
         """Return plain values."""
         return asdict(self)
+
+
+def option_files(model: LoadedModel) -> dict[str, Path]:
+    """Files and folders of this machine that options of a model name."""
+    from probe_kit.hooks.registry import get_family
+
+    family = get_family(model.family)
+    names = [option.name for option in (() if family is None else family.options) if option.is_path]
+    # The same text may be a word of the family, such as a data set's name.
+    return {name: Path(str(model.options[name])) for name in names if is_here(model.options.get(name))}
 
 
 def is_here(text: str | None) -> bool:

@@ -14,7 +14,6 @@ from probe_kit.extract.sources.recording import Episodes, Pixels
 from probe_kit.extract.sources.source import SourceSettings
 
 LEROBOT = "lerobot"
-_IMPORTED_FROM = "imported_from"
 MAX_STEPS = 200
 MOST_STEPS = 10_000
 _option = partial(typer.Option, rich_help_panel="Own environments")
@@ -82,12 +81,18 @@ class EnvSource(SourceSettings):
         if file is None or Path(file).is_relative_to(sys.prefix):
             return {}
         path = Path(file).parent if Path(file).name == "__init__.py" else Path(file)
-        return {_IMPORTED_FROM: path.parents[name.count(".")]}
+        return {"environment": path.parents[name.count(".")]}
+
+    @classmethod
+    def with_files(cls, values: Mapping[str, Any], files: Mapping[str, str]) -> dict[str, Any]:
+        """Return the same values: they name a module, and `find_again` leads to it."""
+        del files
+        return dict(values)
 
     @classmethod
     def find_again(cls, files: Mapping[str, str]) -> None:
         """Let the module be imported from where a run imported it, behind all other places."""
-        if (folder := files.get(_IMPORTED_FROM)) is not None and folder not in sys.path:
+        if (folder := files.get("environment")) is not None and folder not in sys.path:
             sys.path.append(folder)
 
     def steps(self) -> int:

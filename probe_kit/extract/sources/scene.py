@@ -1,5 +1,6 @@
 """The scene as a source: settings of what is played there."""
 
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     from probe_kit.env import SceneSpec
 
 _option = partial(typer.Option, rich_help_panel="Scene")
+_SCENE = "scene."
+"""Beginning of the name of a file that a field of the scene gives."""
 
 
 def _size(value: Any) -> Any:
@@ -136,7 +139,14 @@ class SceneSettings(SourceSettings):
         """Count the actions that an episode can have."""
         return self.scene.max_steps
 
+    @classmethod
+    def with_files(cls, values: Mapping[str, Any], files: Mapping[str, str]) -> dict[str, Any]:
+        """Return settings as values, with other texts for `files`."""
+        of_scene = {name.removeprefix(_SCENE): file for name, file in files.items() if name.startswith(_SCENE)}
+        suite = {name: file for name, file in files.items() if not name.startswith(_SCENE)}
+        return {**values, **suite, "scene": {**values["scene"], **of_scene}}
+
     def files(self) -> dict[str, Path]:
         """Return the suite, where it is a folder, and the files of the scene by its field."""
-        scene = {f"scene.{name}": getattr(self.scene, name) for name in ("arm_urdf", "background")}
+        scene = {f"{_SCENE}{name}": getattr(self.scene, name) for name in ("arm_urdf", "background")}
         return {name: path for name, path in ({"suite": self.suite} | scene).items() if path is not None}

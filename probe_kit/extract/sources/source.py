@@ -68,11 +68,16 @@ class SourceSettings(Part):
         return 0
 
     def files(self) -> dict[str, Path]:
-        """Return files and folders of this machine that the source is made of, by field.
+        """Return files and folders of this machine that the source is made of, by the field that gives them.
 
         A field of a scene is `scene.NAME`. A run records them, so that `--config RUN` finds them again.
         """
         return {}
+
+    @classmethod
+    def with_files(cls, values: Mapping[str, Any], files: Mapping[str, str]) -> dict[str, Any]:
+        """Return settings as values, with other texts for `files`."""
+        return {**values, **files}
 
     @classmethod
     def find_again(cls, files: Mapping[str, str]) -> None:

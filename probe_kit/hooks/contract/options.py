@@ -21,7 +21,8 @@ class Option:
     """One option of a family.
 
     kind: bool, int, float or str. help: one line for `probe-kit models NAME`. default: as people read it.
-    choices: the admissible values; empty for any of the kind.
+    choices: the admissible values; empty for any of the kind. is_path: whether it may name a file or folder, which
+    a run finds again wherever its command was typed.
     """
 
     name: str
@@ -29,6 +30,7 @@ class Option:
     help: str
     default: str = ""
     choices: tuple[Any, ...] = ()
+    is_path: bool = False
 
     def value(self, raw: Any) -> Any:
         """Return `raw`, text or already of the kind, as the loader gets it. Raises UsageError."""

@@ -1,8 +1,10 @@
 """A run is made again from its `run.json`, wherever its command was typed: one promise for every source."""
 
+import json
 import shutil
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +13,10 @@ from typer.testing import CliRunner
 
 import probe_kit as pk
 from probe_kit.cli import app
+from probe_kit.errors import UsageError
+from probe_kit.extract import ExtractSettings
+from probe_kit.extract.config_files import read_config
+from probe_kit.runs.origin import Origin
 from probe_kit.suite import Suite
 
 RED = "Put the cube on the red shape"
@@ -90,6 +96,71 @@ def test_a_file_that_is_gone_is_named_before_anything_is_made(
     message = extract("--config", str(first), "--out", str(tmp_path / "again"), code=2)
     assert ("reach_env" if source == "environment" else str(gone)) in message.replace("\n", "")
     assert not (tmp_path / "again").exists()
+
+
+AGAIN = {
+    "scene": ["--suite", "moved/suite"],
+    "scene with a photo": ["--suite", "moved/suite", "--background", "moved/photo.png"],
+    "recordings": ["--dataset", "moved/rec"], "environment": ["--env", "reach_env:ReachEnv"],
+    "pictures": ["--pictures", "moved/pictures", "--table", "moved/table.csv"],
+}  # fmt: skip
+"""The options that give what was moved; a module is imported from where the command is typed."""
+
+
+def test_an_option_takes_the_place_of_every_file_that_was_moved(
+    made: tuple[str, Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source, home, first = made
+    (tmp_path / "elsewhere").mkdir()
+    home.rename(tmp_path / "elsewhere" / "moved")
+    monkeypatch.chdir(tmp_path / "elsewhere" / ("moved" if source == "environment" else ""))
+    monkeypatch.setattr(sys, "path", [folder for folder in sys.path if folder != str(home)])
+    sys.modules.pop("reach_env", None)
+    again = ["--config", str(first), "--out", str(tmp_path / "again")]
+    option = AGAIN[source][0]
+    assert f"Give it with {option}" in " ".join(extract(*again, code=2).split())
+    accepted = ["--accept-units"] if source == "recordings" else []
+    extract(*again, *AGAIN[source], *accepted)
+    before, after = pk.open_run(first), pk.open_run(tmp_path / "again")
+    assert before.root.identity == after.root.identity
+    here = after.origins[0].files
+    assert all(str(tmp_path / "elsewhere") in path for path in here.values())
+    assert here.keys() == before.origins[0].files.keys()
+
+
+def test_files_of_the_model_that_were_moved_are_named_and_given_by_their_options(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A lost checkpoint is never replaced by the family's default one."""
+    from probe_kit.hooks.registry import find_family
+
+    run = SimpleNamespace(
+        location=tmp_path / "run",
+        settings={"config": ExtractSettings("openvla", options={"tokenizer": "tok", "top_k": "3"}).config()},
+        origins=[
+            Origin(
+                checkpoint=str(tmp_path / "weights"), options={"tokenizer": str(tmp_path / "tok"), "top_k": "3"}
+            )
+        ],
+    )
+    assert {"tokenizer", "top_k"} <= {option.name for option in find_family("openvla").options}
+    monkeypatch.setattr("probe_kit.runs.run.open_run", lambda *_, **__: run)
+    with pytest.raises(UsageError, match=r"weights, its checkpoint.*Give it with --checkpoint"):
+        read_config(tmp_path, {})
+    typed = {"checkpoint": "elsewhere"}
+    with pytest.raises(UsageError, match=r"tok, its tokenizer.*Give it with -M tokenizer"):
+        read_config(tmp_path, typed)
+    typed |= {"model_option": ["tokenizer=other"]}
+    model = ExtractSettings.of_command(typed, read_config(tmp_path, typed)).model
+    assert (model.checkpoint, model.options) == ("elsewhere", {"tokenizer": "other", "top_k": "3"})
+
+
+def test_a_source_of_another_kind_needs_no_file_of_the_run(made: tuple[str, Path, Path], tmp_path: Path) -> None:
+    source, home, first = made
+    home.rename(tmp_path / "gone")
+    other = ["--env", "lerobot:pusht"] if source != "environment" else ["--dataset", "rec"]
+    printed = json.loads(extract("--config", str(first), *other, "--print-config"))
+    assert printed["source"]["kind"] == ("lerobot" if source == "environment" else "env")
 
 
 def test_a_photo_that_is_gone_is_named_with_its_option_which_gives_another(tmp_path: Path) -> None:

@@ -57,7 +57,9 @@ FAMILIES = (
             Option("embodiment", str, "Tag in NVIDIA's layout, such as libero_sim.", "the only one"),
             Option("letterbox", bool, "Black bars make pictures square first.", "as the files say, or false"),
             Option("resize", str, "Whose code resizes pictures.", "as the layout", RESIZES),
-            Option("vlm", str, "Folder or hub id of its Qwen3-VL; no weights.", "as config.json says"),
+            Option(
+                "vlm", str, "Folder or hub id of its Qwen3-VL; no weights.", "as config.json says", is_path=True
+            ),
         ),
         interventions=INTERVENTIONS,
     ),

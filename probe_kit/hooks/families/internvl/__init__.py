@@ -33,7 +33,7 @@ FAMILIES = (
             Option(
                 "tiles", str, "1: every picture as one tile; auto: as released.", "auto", choices=("auto", "1")
             ),
-            Option("tokenizer", str, "Folder of another tokenizer.json.", "the checkpoint's"),
+            Option("tokenizer", str, "Folder of another tokenizer.json.", "the checkpoint's", is_path=True),
         ),
         acts=False,
         reads=True,

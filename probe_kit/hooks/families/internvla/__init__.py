@@ -60,8 +60,12 @@ FAMILIES = (
             Option(
                 "weights", str, "File of a step, by its name.", "the only one, or steps_50000_pytorch_model.pt"
             ),
-            Option("vlm", str, "Folder or hub id of its Qwen2.5-VL; no weights.", "as config.yaml says"),
-            Option("tokenizer", str, "Folder of another tokenizer.json.", "the vision-language model's"),
+            Option(
+                "vlm", str, "Folder or hub id of its Qwen2.5-VL; no weights.", "as config.yaml says", is_path=True
+            ),
+            Option(
+                "tokenizer", str, "Folder of another tokenizer.json.", "the vision-language model's", is_path=True
+            ),
         ),
         protocols={
             ACT2ANSWER: ProtocolRow(

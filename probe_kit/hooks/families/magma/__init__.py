@@ -25,7 +25,13 @@ FAMILIES = (
         parameters={"": 8_903_549_824},
         options=(
             Option("unnorm_key", str, "Data set whose units the actions get.", "the only one"),
-            Option("statistics", str, "File with action statistics, instead of the checkpoint's.", "none"),
+            Option(
+                "statistics",
+                str,
+                "File with action statistics, instead of the checkpoint's.",
+                "none",
+                is_path=True,
+            ),
             Option("shrink", int, "Side to which pictures are shrunk first; 0: whole, at any resolution.", "256"),
             Option(
                 "prompt",
@@ -35,7 +41,7 @@ FAMILIES = (
                 choices=("magma", "act2answer"),
             ),
             Option("temperature", float, "0: the likeliest token; 0.7: drawn as the release does.", "0"),
-            Option("tokenizer", str, "Folder of another tokenizer.", "the checkpoint's"),
+            Option("tokenizer", str, "Folder of another tokenizer.", "the checkpoint's", is_path=True),
             Option(
                 "layer_scale",
                 str,

@@ -18,7 +18,7 @@ FAMILIES = (
         declared={"": answering(37, 4096, 240)},
         full_size="probe_kit.models.ovis2_5:full_size_ovis2_5",
         parameters={"": 9_174_807_784},
-        options=(Option("tokenizer", str, "Folder of another tokenizer.json.", "the checkpoint's"),),
+        options=(Option("tokenizer", str, "Folder of another tokenizer.json.", "the checkpoint's", is_path=True),),
         acts=False,
         reads=True,
     ),

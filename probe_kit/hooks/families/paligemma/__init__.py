@@ -35,7 +35,7 @@ FAMILIES = (
         full_size="probe_kit.models.paligemma:full_size_paligemma",
         parameters={"": 2_923_466_480},
         stored_names="probe_kit.models.paligemma:FILE_NAMES",
-        options=(Option("tokenizer", str, "Folder of another tokenizer.json.", "the checkpoint's"),),
+        options=(Option("tokenizer", str, "Folder of another tokenizer.json.", "the checkpoint's", is_path=True),),
         acts=False,
         reads=True,
     ),

@@ -6,7 +6,11 @@ from probe_kit.hooks.contract.options import Option
 from probe_kit.hooks.family import Family
 
 TOKENIZER = Option(
-    "tokenizer", str, "Folder of another tokenizer; bytes: for development checkpoints.", "the checkpoint's"
+    "tokenizer",
+    str,
+    "Folder of another tokenizer; bytes: for development checkpoints.",
+    "the checkpoint's",
+    is_path=True,
 )
 BITS = Option("bits", int, "Quantised, not exact (extra quantized, GPU).", "none", choices=(4, 8))
 

@@ -28,7 +28,7 @@ FAMILIES = (
             ("32B", "Qwen/Qwen2.5-VL-32B-Instruct"),
             ("3B", "Qwen/Qwen2.5-VL-3B-Instruct"),
         ),
-        options=(Option("tokenizer", str, "Folder of another tokenizer.json.", "the checkpoint's"),),
+        options=(Option("tokenizer", str, "Folder of another tokenizer.json.", "the checkpoint's", is_path=True),),
         acts=False,
         reads=True,
     ),

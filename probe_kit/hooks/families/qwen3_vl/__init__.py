@@ -27,7 +27,7 @@ FAMILIES = (
             ("32B", "Qwen/Qwen3-VL-32B-Instruct"),
             ("4B", "Qwen/Qwen3-VL-4B-Instruct"),
         ),
-        options=(Option("tokenizer", str, "Folder of another tokenizer.json.", "the checkpoint's"),),
+        options=(Option("tokenizer", str, "Folder of another tokenizer.json.", "the checkpoint's", is_path=True),),
         acts=False,
         reads=True,
     ),

@@ -45,7 +45,7 @@ FAMILIES = (
         options=(
             Option("robot", str, "Robot whose statistics, picture and state are used.", "the only one"),
             Option("steps", int, "Euler steps of the flow.", "5"),
-            Option("tokenizer", str, "Folder of another tokenizer.json.", "the checkpoint's"),
+            Option("tokenizer", str, "Folder of another tokenizer.json.", "the checkpoint's", is_path=True),
             Option("openness", str, "release: as Act2Answer's evaluation has it.", "measured", OPENNESS),
         ),
         protocols={

@@ -15,6 +15,7 @@ EVALUATION_OPTIONS = (
         "File with p01 and p99 of action and proprio, or bridge (shipped), where the checkpoint has none; "
         "none: its numbers are metres and radians.",
         "the checkpoint's",
+        is_path=True,
     ),
     Option(
         "picture",
