@@ -272,7 +272,6 @@ NOT_TYPED = {
     r"with-uv probe-kit demo": "minutes; tests/test_cli.py types it",
     r"with-uv pytest": "is what runs this",
     r"^probe-kit view \S+$": "serves until Ctrl-C; tests/view/test_server.py has the server",
-    r"^python benchmarks/intervention_acceptance": "hours",
     r"^python -m probe_kit.hooks.families.internvla.convert RUN OUT": "RUN is a training of InternVLA's",
     r"^export AWS_|s3://": "needs keys of an object store; tests/runs/test_remote.py has a server of its own",
     r"--model (pi0|magma|openvla|spatialvla|xiaomi-r0|internvla-m1)( |$)": "needs released weights (8 to 18 GB)",
