@@ -253,15 +253,10 @@ class SceneSpec:
     def to_json(self) -> dict[str, Any]:
         """The record as plain JSON values, with the outcome radius that is really used.
 
-        A file is identified by the sha256 of its content, not by its path. Fields that
-        came after the first stored runs are written only where they differ from the default: those runs keep their
-        identity.
+        A file is identified by the sha256 of its content, not by its path.
         Raises SceneError if a file cannot be read.
         """
         plain = asdict(self) | {"epsilon": self.zone_radius}
-        for name in _LATER:
-            if getattr(self, name) == type(self).__dataclass_fields__[name].default:
-                del plain[name]
         return {key: _content_sha256(value) if isinstance(value, Path) else value for key, value in plain.items()}
 
     @classmethod
@@ -339,22 +334,6 @@ class SceneSpec:
                     f"a cube that starts at {self.cube_xy} may lie in the zone of the tile at {tile} without "
                     "having been moved. Use a smaller `epsilon` or `start_jitter`, or start it elsewhere."
                 )
-
-
-# Fields that are newer than runs which are still read, see `SceneSpec.to_json`.
-_LATER = (
-    "home_rpy",
-    "home_joints",
-    "home_opening",
-    "closing_steps",
-    "cube_z",
-    "forced_closed",
-    "tile_mass",
-    "euler",
-    "scoring_side",
-    "box_margin",
-    "box_height",
-)
 
 
 def _as_tuple(value: Any) -> Any:

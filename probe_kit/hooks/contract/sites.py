@@ -26,7 +26,7 @@ HEADS = "heads"
 _PATTERN = re.compile(
     r"(?P<stream>[a-z][a-z_0-9]*)\.(?P<layer>\d{2,})\.(?P<quantity>[a-z_]+)(@(?P<iteration>\d+))?"
 )
-# Streams of runs and adapters from before streams declared their part.
+# Streams whose name says their part, so that an adapter need not.
 _KNOWN_PARTS: dict[str, Part] = {
     "backbone": "backbone",
     "expert": "action",
@@ -156,7 +156,7 @@ def kv_stream(blocks: int, width: int) -> Stream:
 
 
 def part_of(stream: str) -> Part:
-    """The part of a stream known by name only, as in results of 0.2; `backbone` if the name tells nothing."""
+    """The part of a stream known by name only, as in curves of controls; `backbone` if the name tells nothing."""
     return _KNOWN_PARTS.get(stream, "backbone")
 
 
