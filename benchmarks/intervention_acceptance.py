@@ -1,11 +1,11 @@
-"""What an intervention must find in the organisms: every property of the list, true, inconclusive or false.
+"""What an intervention must find in the organisms: every property of the list, true, undecided or false.
 
     python benchmarks/intervention_acceptance.py FOLDER [--seed 0] [--items 24] [--steps N] [--loop 4]
 
 Draws a suite of its own seed, has every organism of `probe_kit.demo.organisms` act on it, fits probes, intervenes.
 What is true of each is taken from there; places and layers from what is found. --steps plays shorter episodes:
 enough for all that is read off first actions, and the closed loop then repeats those. --loop: items per category
-that are played again. Finished work in FOLDER is reused. An inconclusive verdict is neither true nor false. Exits
+that are played again. Finished work in FOLDER is reused. An undecided verdict is neither true nor false. Exits
 with 1 unless every property is true.
 """
 
@@ -44,14 +44,14 @@ ABSENT = "counting"
 
 @dataclass(frozen=True)
 class Property:
-    """Whether one property holds, and what was seen. holds: None for a verdict that is inconclusive."""
+    """Whether one property holds, and what was seen. holds: None for a verdict that is undecided."""
 
     name: str
     holds: bool | None
     seen: str
 
     def __str__(self) -> str:
-        said = {True: "true", None: "inconclusive", False: "FALSE"}[self.holds]
+        said = {True: "true", None: "undecided", False: "FALSE"}[self.holds]
         return f"{said:12}  {self.name}: {self.seen}"
 
 
@@ -78,7 +78,7 @@ def acted(organism: Organism, suite: Suite, folder: Path, steps: int | None, unt
 
 def verdicts(runs: Sequence[tuple[Organism, Run]]) -> Iterator[Property]:
     """Every organism and category."""
-    holds: dict[Agreement, bool | None] = {"true": True, "inconclusive": None, "wrong": False}
+    holds: dict[Agreement, bool | None] = {"true": True, "undecided": None, "wrong": False}
     for one in findings(runs):
         use = one.row.image_swap.use
         moved = "" if use is None else f"; {use.reason}"
@@ -246,9 +246,7 @@ def main() -> int:
     for one in properties(trial, runs, arguments.loop):
         print(one, flush=True)
         found.append(one.holds)
-    print(
-        f"{found.count(True)} of {len(found)} hold, {found.count(None)} inconclusive, {found.count(False)} false"
-    )
+    print(f"{found.count(True)} of {len(found)} hold, {found.count(None)} undecided, {found.count(False)} false")
     return 0 if all(found) else 1
 
 

@@ -20,7 +20,7 @@ def demo(
         typer.Option(
             "--compare",
             help="Validate the pipeline instead: run policies with known ground truth, print expected and "
-            "measured verdicts. Exits with 1 if a verdict is wrong; inconclusive ones are counted apart.",
+            "measured verdicts. Exits with 1 if a verdict is wrong; undecided ones are counted apart.",
         ),
     ] = False,
     full: Annotated[

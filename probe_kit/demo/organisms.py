@@ -28,8 +28,8 @@ from probe_kit.train import ProbeResults, train_probes
 NamedProgress = Callable[[str], Callable[..., None]]
 Truth = str
 """A behaviour of `UseVerdict`, or `does not decide`, `absent`, `known` or `not shown`."""
-Agreement = Literal["true", "inconclusive", "wrong"]
-"""Of a verdict with the truth. An inconclusive verdict claims no behaviour: it is neither true nor wrong."""
+Agreement = Literal["true", "undecided", "wrong"]
+"""Of a verdict with the truth. An undecided verdict claims no behaviour: it is neither true nor wrong."""
 DOES_NOT_DECIDE: Truth = "does not decide"
 """What is true of an action expert of random weights: nothing was trained to choose a side by the answer.
 
@@ -114,10 +114,10 @@ class Finding:
 
     @property
     def agreement(self) -> Agreement:
-        """The verdict compared with the truth: true, inconclusive or wrong."""
+        """The verdict compared with the truth: true, undecided or wrong."""
         if self.measured in COMPATIBLE.get(self.expected, (self.expected,)):
             return "true"
-        return "inconclusive" if self.measured == "inconclusive" else "wrong"
+        return "undecided" if self.measured == "undecided" else "wrong"
 
 
 def settings_of(organism: Organism, suite: Suite) -> ExtractSettings:
@@ -234,10 +234,10 @@ def organism_table(findings: Sequence[Finding]) -> Table:
 
 
 def count_agreements(agreements: Sequence[Agreement]) -> str:
-    """`20 of 24 verdicts are true, 4 inconclusive, none is wrong`."""
+    """`20 of 24 verdicts are true, 4 undecided, none is wrong`."""
     true, left_open, wrong = (agreements.count(agreement) for agreement in get_args(Agreement))
     return (
-        f"{true} of {len(agreements)} verdicts are true, {left_open} inconclusive, "
+        f"{true} of {len(agreements)} verdicts are true, {left_open} undecided, "
         f"{wrong or 'none'} {'are' if wrong > 1 else 'is'} wrong"
     )
 

@@ -1,9 +1,9 @@
 """The conclusions that a number of groups is enough for: one definition for plans and for later refusals."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache, lru_cache
 from itertools import count
-from math import sqrt
+from math import ceil, inf, isinf, sqrt
 from statistics import NormalDist
 from typing import Any
 
@@ -57,6 +57,32 @@ def groups_for_interventions() -> int:
 def groups_for_not_used() -> int:
     """Fewest groups with which an image swap can find *not used* at all, in episodes that never follow."""
     return _fewest(lambda groups: _net_limit_of_none(groups) < SMALLEST_EFFECT_OF_INTEREST, 2)
+
+
+def groups_to_decide(groups: int, effects: Sequence[tuple[float, float, float]]) -> float:
+    """Return about how many groups tell *used* from *not used*, if the effects stay as these groups measured them.
+
+    effects: each measure, the width of its interval, and the size below which it does not matter. *Not used* takes
+    all of them below, use takes one of them above. A width is taken to fall with the root of the number of groups.
+    Without any interval: the fewest with which something can be *not used*. Infinite for an effect at its bound.
+    """
+    if all(isinf(width) for _, width, _ in effects):
+        return max(groups_for_not_used(), groups + 1)
+    below, above = 0.0, inf
+    for effect, width, bound in effects:
+        gap = bound - abs(effect)
+        times = (width / 2 / gap) ** 2 if gap else inf
+        below, above = (max(below, times), above) if gap > 0 else (inf, min(above, times))
+    times, fewest = min((below, groups_for_not_used()), (above, groups_for_interventions()))
+    return max(times * groups, fewest, groups + 1)
+
+
+def items_for_absence(items: int, groups: int, episodes: int) -> int:
+    """Return the fewest items with which a stream that knows nothing can be called absent, at best.
+
+    items, groups, episodes: of what is measured. More groups are taken to be of the same size.
+    """
+    return ceil(groups_for_absence(round(episodes / groups)) * items / groups)
 
 
 def _net_limit_of_none(groups: int) -> float:

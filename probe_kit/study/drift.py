@@ -27,7 +27,7 @@ FRAME = "first_frame_sha256"
 Verdict = Literal["kept", "transfer not shown", "forgotten", "learned", "not shown in either", "not clear"]
 VERDICTS: Mapping[Verdict, str] = {
     "kept": "signal in both, and probes transfer after recentring",
-    "transfer not shown": "signal in both, and more items would tell whether probes transfer",
+    "transfer not shown": "signal in both, and the items are too few to tell whether probes transfer",
     "forgotten": "signal in the first alone, and the 95 % interval of the drop excludes 0",
     "learned": "signal in the second alone, and the 95 % interval of the gain excludes 0",
     "not shown in either": "signal in neither",

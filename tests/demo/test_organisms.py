@@ -96,16 +96,16 @@ def test_organisms_differ_in_one_truth_at_a_time() -> None:
     ("p", "bounded", "shown", "expected"),
     [
         (0.005, True, True, "not used"),
-        (0.005, True, False, "inconclusive"),
-        (0.005, False, True, "inconclusive"),
-        (0.3, False, True, "inconclusive"),
+        (0.005, True, False, "undecided"),
+        (0.005, False, True, "undecided"),
+        (0.3, False, True, "undecided"),
         (0.3, True, False, "absent"),
     ],
 )
 def test_what_the_trained_one_follows_is_the_control_of_those_that_follow_nothing(
     p: float, bounded: bool, shown: bool, expected: str
 ) -> None:
-    use = UseVerdict(behaviour="inconclusive", reason="why", lacks_control=bounded)
+    use = UseVerdict(behaviour="undecided", reason="why", lacks_control=bounded)
     alone = replace(row(0.4, p), image_swap=SwapEffect(use=use))
     assert measured(alone, shown) == expected
     follows = UseVerdict(behaviour="used", reason="why")
@@ -144,14 +144,14 @@ def test_the_table_counts_the_true_verdicts() -> None:
     findings = [
         Finding("trained", "color", "used", "used", row(0.9, 0.005)),
         Finding("trained", "state", "not used", "absent", row(0.5, 0.3)),
-        Finding("early", "state", DOES_NOT_DECIDE, "inconclusive", row(0.5, 0.3)),
+        Finding("early", "state", DOES_NOT_DECIDE, "undecided", row(0.5, 0.3)),
     ]
     with out.capture() as printed:
         out.print(organism_table(findings), width=160)
     text = " ".join(printed.get().split())
-    assert "1 of 3 verdicts are true, 1 inconclusive, 1 is wrong" in text
+    assert "1 of 3 verdicts are true, 1 undecided, 1 is wrong" in text
     assert "*not used* and *moves with it, does not decide* are both true of it" in text
-    assert [text.count(f" {own} ") for own in ("absent wrong", "inconclusive inconclusive")] == [1, 1]
+    assert [text.count(f" {own} ") for own in ("absent wrong", "undecided undecided")] == [1, 1]
 
 
 @pytest.mark.parametrize(
@@ -160,15 +160,15 @@ def test_the_table_counts_the_true_verdicts() -> None:
         (DOES_NOT_DECIDE, "not used", "true"),
         (DOES_NOT_DECIDE, "moves with it, does not decide", "true"),
         (DOES_NOT_DECIDE, "against: moves with it, does not decide", "true"),
-        (DOES_NOT_DECIDE, "inconclusive", "inconclusive"),
+        (DOES_NOT_DECIDE, "undecided", "undecided"),
         (DOES_NOT_DECIDE, "partly used, graded", "wrong"),
         (DOES_NOT_DECIDE, "against: used", "wrong"),
         (DOES_NOT_DECIDE, "absent", "wrong"),
         ("not used", "moves with it, does not decide", "wrong"),
-        ("used", "inconclusive", "inconclusive"),
+        ("used", "undecided", "undecided"),
     ],
 )
-def test_a_verdict_is_true_inconclusive_or_wrong(expected: str, verdict: str, agreement: str) -> None:
+def test_a_verdict_is_true_undecided_or_wrong(expected: str, verdict: str, agreement: str) -> None:
     """An expert of random weights was not trained to choose by the answer, nor to ignore it."""
     assert Finding("early", "state", expected, verdict, row(0.5, 0.3)).agreement == agreement
 

@@ -218,7 +218,7 @@ def test_tables_show_it_beside_the_success_rate(copy: Run, effects: Intervention
         row.category: row.follow_rate for row in effects.effects
     }
     uses = [row.image_swap.use for row in table.rows]
-    assert {use.behaviour for use in uses if use is not None} <= {"not used", "inconclusive"}
+    assert {use.behaviour for use in uses if use is not None} <= {"not used", "undecided"}
     for text in (table.to_markdown(), table.to_latex("all")):
         assert "ollow / reversal" in text
     stored = json.loads(table.to_json())[0]["image_swap"]["use"]

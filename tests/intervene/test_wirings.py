@@ -36,7 +36,7 @@ VERDICTS = {
     "unread": "not used",
     "nonlinear": "used",
     "marks": "used",
-    "other": "inconclusive",
+    "other": "undecided",
     "constant": "not used",
     "noise": "not used",
     "roles": "used",
@@ -50,7 +50,7 @@ VERDICTS = {
     "weak": "partly used, one-sided (right)",  # was *encoded, unused*
     "shifted": "moves with it, does not decide",  # was *encoded, unused*
     "faint": "partly used, graded",  # was *used*
-    "one-sided": "partly used, one-sided (left)",  # was *inconclusive*
+    "one-sided": "partly used, one-sided (left)",  # was *undecided*
     "rarely": "partly used, graded",  # was *used*
     "trace": "not used",
     "late": "not used",
@@ -64,7 +64,7 @@ VERDICTS = {
     "opposing": "used",
     "balance": "used",
     "behind": "used",
-    "either": "inconclusive",
+    "either": "undecided",
 }
 Verdicts = Mapping[str, UseVerdict]
 

@@ -137,7 +137,7 @@ def test_the_tie_is_of_the_layers_at_which_a_probe_is_significant(run: ArrayRun)
 
 
 def test_a_direction_alone_is_no_search_and_no_map(run: ArrayRun) -> None:
-    """It turned *used* into *inconclusive*, and stopped the report for want of a map to draw."""
+    """It turned *used* into *undecided*, and stopped the report for want of a map to draw."""
     answers = outcomes_of({"color": follower(48)})
     along = inside(answers, "|image|mean-difference", backbone__01=0.0)
     store(run, "interchange", along, direction="mean-difference")

@@ -2,6 +2,7 @@
 
 import re
 import warnings
+from math import ceil, inf
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from scipy import stats  # type: ignore[import-untyped]
 
 from probe_kit.errors import TooFewGroupsError
+from probe_kit.statistics.bootstrap import GAINS, group_bootstrap
 from probe_kit.statistics.estimates.verdict import ABSENT_BELOW
 from probe_kit.statistics.label_permutations import ENUMERATED_BELOW, flip_groups, possible_flips, smallest_p
 from probe_kit.statistics.paired_tests import EXACT, max_t, smallest_flip_p
@@ -21,6 +23,8 @@ from probe_kit.statistics.sufficiency import (
     groups_for_interventions,
     groups_for_not_used,
     groups_for_signal,
+    groups_to_decide,
+    items_for_absence,
     least_probe_p,
 )
 from tests.train.conftest import problem_of
@@ -116,3 +120,29 @@ def test_the_margin_of_so_many_items_is_the_one_that_was_asked_for() -> None:
     for margin in (0.05, 0.1, 0.2):
         items = items_for_width(2 * margin)
         assert chance_margin(items) <= margin < chance_margin(items - 1)
+
+
+def test_groups_that_would_decide_an_effect_grow_with_its_interval_and_its_nearness_to_the_bound() -> None:
+    follow, share = (0.04, 0.8, 0.25), (0.03, 0.16, 0.1)
+    assert groups_to_decide(6, (follow, share)) == pytest.approx(6 * (0.4 / 0.21) ** 2), "both are to be small"
+    assert groups_to_decide(6, (follow, (0.3, 0.4, 0.1))) == pytest.approx(7), "use is all but shown"
+    assert groups_to_decide(6, (follow, (0.1, 0.16, 0.1))) == inf, "it lies at its bound"
+    for groups in (2, 40):
+        needed = groups_to_decide(groups, ((0.0, inf, 0.25), (0.0, inf, 0.1)))
+        assert needed == max(groups + 1, groups_for_not_used()), "there is no interval"
+
+
+def test_as_many_groups_as_are_said_decide_an_effect_that_stays() -> None:
+    """The bootstrap of many more groups of the same kind has the interval that the number was computed from."""
+    effects = 0.1 + 0.4 * np.resize([-1.0, 1.0], (24, 1))
+    (low,), (high,) = group_bootstrap(effects, np.arange(24), 0, bounds=GAINS)
+    needed = ceil(groups_to_decide(24, [(0.1, float(high - low), 0.25)]))
+    assert needed > 24
+    larger = np.resize(effects, (needed, 1))
+    assert group_bootstrap(larger, np.arange(needed), 0, bounds=GAINS)[1][0] == pytest.approx(0.25, abs=0.03)
+
+
+@pytest.mark.parametrize("size", [1, 2, 4])
+def test_items_for_absence_are_those_of_groups_of_the_same_size(size: int) -> None:
+    needed = groups_for_absence(2 * size)
+    assert items_for_absence(10 * size, 10, 20 * size) == needed * size

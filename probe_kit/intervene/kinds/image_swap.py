@@ -410,12 +410,20 @@ class Swapped(Protocol):
         """Share of episodes."""
 
     @property
+    def net_follow_rate(self) -> float | None:
+        """The difference of both."""
+
+    @property
     def net_follow_rate_ci(self) -> tuple[float | None, float | None] | None:
         """95 % interval of the difference."""
 
     @property
     def reach_share(self) -> float | None:
         """Displacement in units of the reach."""
+
+    @property
+    def reach_share_ci(self) -> tuple[float | None, float | None] | None:
+        """95 % interval of the displacement."""
 
 
 def swap_rates(row: ImageSwapEffect, inputs: str) -> str:

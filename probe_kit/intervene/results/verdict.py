@@ -6,7 +6,7 @@ the place (of interchanges) and the tie (is what probes read the thing that is u
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import inf
+from math import ceil, inf
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
@@ -20,7 +20,7 @@ from probe_kit.intervene.kinds.image_swap import (
 from probe_kit.intervene.places import list_places
 from probe_kit.intervene.settings import FIRST_CHUNK, PER_STEP
 from probe_kit.statistics.significance import SIGNIFICANCE
-from probe_kit.statistics.sufficiency import SMALLEST_EFFECT_OF_INTEREST, groups_for_not_used
+from probe_kit.statistics.sufficiency import SMALLEST_EFFECT_OF_INTEREST, groups_to_decide
 from probe_kit.suite.items import Side
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ Behaviour = Literal[
     "partly used, graded",
     "moves with it, does not decide",
     "not used",
-    "inconclusive",
+    "undecided",
 ]
 USES: tuple[Behaviour, ...] = ("used", "partly used, one-sided", "partly used, graded")
 """Those in which the answer decides something."""
@@ -45,6 +45,8 @@ TRACE = 0.01
 """Of the reach. A displacement below it is not worth a sentence."""
 NO_COPY, NOT_TESTED = "no readable copy found", "whether the readable copy is the one used was not tested"
 NOT_LOCATED = "no place that was tried carries half of it"
+MANY = 1000
+"""Groups of items beyond which a number is no plan: the effect lies at the bound."""
 _READOUTS: Mapping[str, str] = MappingProxyType(
     {FIRST_CHUNK: "in the first chunk", PER_STEP: "over the whole episode"}
 )
@@ -159,7 +161,7 @@ class UseVerdict:
             return "not used", "the action does not follow the answer"
         if self.lacks_control:
             return "use undecided", "the action follows neither this answer nor that of another category"
-        return "use undecided", "more items would tell"
+        return "use undecided", "the items do not tell"
 
     def describe(self, swap: Swapped) -> str:
         """Return what an image swap showed, in sentences."""
@@ -174,7 +176,7 @@ class UseVerdict:
         against = ", against the correct picture" * self.reversed
         side = f" ({self.side})" if self.side else ""
         words = {
-            "inconclusive": f"whether {answer} is used {when} remains open",
+            "undecided": f"whether {answer} is used {when} is undecided",
             "moves with it, does not decide": f"{answer} moves the action {when}{against}, does not decide",
         }.get(self.behaviour, f"{answer} is {self.behaviour}{side} {when}{against}")
         return f"{words}: {self.reason}" if self.needs_reason else words
@@ -263,14 +265,14 @@ def classify_behaviour(effect: ImageSwapEffect, control: str | None) -> UseVerdi
                 behaviour=behaviour, reason=_measured(effect), reversed=mirrored, side=side, readout=effect.readout
             )
     if not is_bounded(effect):
-        return UseVerdict(behaviour="inconclusive", reason=_open(effect), readout=effect.readout)
+        return UseVerdict(behaviour="undecided", reason=_open(effect), readout=effect.readout)
     bound = (
         f"within {SMALLEST_SHARE_OF_INTEREST} of its reach and {SMALLEST_EFFECT_OF_INTEREST} of the episodes "
         f"({_measured(effect)})"
     )
     if control is None:
         reason = f"{bound}, and no other category of the run is used, so that use is not known to show"
-        return UseVerdict(behaviour="inconclusive", reason=reason, readout=effect.readout, lacks_control=True)
+        return UseVerdict(behaviour="undecided", reason=reason, readout=effect.readout, lacks_control=True)
     reason = f"{_trace(effect)}{bound}; positive control: {control}"
     return UseVerdict(behaviour="not used", reason=reason, readout=effect.readout)
 
@@ -291,7 +293,7 @@ def _measured(effect: ImageSwapEffect) -> str:
 
 
 def _open(effect: ImageSwapEffect) -> str:
-    """Why it is inconclusive."""
+    """Why it is undecided."""
     is_other = (
         effect.moved_share >= SMALLEST_EFFECT_OF_INTEREST
         and abs(effect.reach_share) < effect.moved_share / 2
@@ -303,9 +305,22 @@ def _open(effect: ImageSwapEffect) -> str:
             f"{_ends(effect.reach_share_ci)}: it depends on something else in the images, or on the answer in "
             "opposite directions, or the items are too few"
         )
-    needed = groups_for_not_used()
-    too_few = f"; “not used” needs {needed} groups of items, there are {effect.n_groups}"
-    return f"{_measured(effect)}{too_few * (effect.n_groups < needed)}"
+    return f"{_measured(effect)}; {more_groups(effect, effect.n_groups)}, there are {effect.n_groups}"
+
+
+def more_groups(swap: Swapped, groups: int) -> str:
+    """Return about how many groups of items would decide an effect that is undecided with so many."""
+    measures = (
+        (swap.net_follow_rate, swap.net_follow_rate_ci, SMALLEST_EFFECT_OF_INTEREST),
+        (swap.reach_share, swap.reach_share_ci, SMALLEST_SHARE_OF_INTEREST),
+    )
+    effects = []
+    for value, (low, high), bound in ((value, limits or (None, None), bound) for value, limits, bound in measures):
+        width = inf if low is None or high is None else high - low
+        effects.append((value or 0.0, width, bound))
+    needed = groups_to_decide(groups, effects)
+    number = f"about {ceil(needed)}" if needed <= MANY else f"more than {MANY}"
+    return f"{number} groups would tell"
 
 
 def _trace(effect: ImageSwapEffect) -> str:
@@ -362,7 +377,7 @@ def classify_use(
     `evidence.stored_other_readouts`; None if that is not stored.
     """
     use = replace(classify_behaviour(effect, control), other=other)
-    if all(verdict.behaviour in ("not used", "inconclusive") for verdict in use.by_readout):
+    if all(verdict.behaviour in ("not used", "undecided") for verdict in use.by_readout):
         return use
     tie_text = "" if encoded is None else tie or (NOT_TESTED if encoded else NO_COPY)
     return replace(use, place=str(places or ""), tie=tie_text)
@@ -452,7 +467,7 @@ def describe_swap(swap: Swapped, use: UseVerdict) -> str:
         return f"the action goes against the pictures, swapped or not, {against}"
     if use.is_bounded:
         return f"the action does not follow a swap of the pictures ({followed})"
-    if use.behaviour == "inconclusive":
-        return f"whether the action follows a swap of the pictures is open ({followed})"
+    if use.behaviour == "undecided":
+        return f"whether the action follows a swap of the pictures is undecided ({followed})"
     numbers = f"{followed}, {net}{moved}" if use.is_used else followed
     return f"the action follows a swap of the pictures in part ({numbers})"

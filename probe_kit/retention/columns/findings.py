@@ -9,10 +9,10 @@ import shlex
 from collections.abc import Sequence
 
 from probe_kit._tables.numbers import whole_percent
-from probe_kit.intervene.results.verdict import UseVerdict
+from probe_kit.intervene.results.verdict import UseVerdict, more_groups
 from probe_kit.retention.behaviour.success_rate import Regime
 from probe_kit.retention.columns.label_sentences import label_finding
-from probe_kit.retention.columns.sentences import is_probed, knows, unprobed
+from probe_kit.retention.columns.sentences import is_probed, knows, more_items, unprobed
 from probe_kit.retention.columns.text import is_vlm
 from probe_kit.retention.rows.parts import StreamPart
 from probe_kit.retention.rows.row import MEAN, RetentionRow
@@ -111,9 +111,11 @@ def _of_use(row: RetentionRow, vlm: RetentionRow | None, use: UseVerdict) -> str
         return _sentence(_head(row, vlm, "not used at first"), what, *_missing(row), row=row)
     if verdict == "not used":
         return _sentence(_head(row, vlm, verdict), *_read_and(row, "the action does not follow"), row=row)
-    if use.behaviour == "inconclusive" and not use.lacks_control:
+    if use.behaviour == "undecided" and not use.lacks_control:
         read = [_READ] if _is_encoded(row) else _missing(row, "the answer")
-        return _sentence(_head(row, vlm, verdict), *read, what, row=row)
+        return _sentence(
+            _head(row, vlm, verdict), *read, more_groups(row.image_swap, row.success.n_groups or 0), row=row
+        )
     if verdict in ("not decisive", "use undecided"):
         return _sentence(_head(row, vlm, verdict), what, *_missing(row), row=row)
     return _sentence(verdict, what, row=row)
@@ -157,7 +159,7 @@ def _unread(row: RetentionRow) -> str:
     missed = [_CONTROLS.get(name, name) for name, better in part.exceeds.items() if better is False]
     if part.exceeds["chance"]:
         return f"probes of the backbone do no better than {' and '.join(missed)}"
-    return f"{items} items are too few to tell what the backbone holds"
+    return more_items(row) or f"{items} items are too few to tell what the backbone holds"
 
 
 def _beside_guessing(row: RetentionRow) -> str:

@@ -27,7 +27,7 @@ VIEWER_WORDS = {
     "success": "The cube ends on the correct picture. Guessing reaches 50 %.",
     "Δ": "How far from 50 % guessing alone may lead. Success is shown beyond it.",
     "shown": "A stream's best site exceeds chance, family-wise, and every control that was run: its signal.",
-    "not shown": "Neither shown nor absent: more items would tell.",
+    "not shown": "Neither shown nor absent: the items are too few to tell.",
     "absent": "For a linear probe of so many items: the best site can be at most as accurate as a stated limit, "
     "65 % by default, and so many items would have shown a site of that accuracy.",
     "retention": "Share of the backbone's accuracy above chance that is left where the action is made.",

@@ -1,17 +1,18 @@
 """The verdict of a row, and the sentence about it."""
 
 from collections.abc import Sequence
+from math import ceil
 from typing import Literal, cast
 
 from probe_kit._system.counting import counted
 from probe_kit._tables.numbers import Limits, whole_percent
 from probe_kit.intervene.results.verdict import UNTESTED, UseVerdict, describe_swap
-from probe_kit.retention.behaviour.success_rate import Regime
+from probe_kit.retention.behaviour.success_rate import Regime, SuccessRate
 from probe_kit.retention.columns.label_sentences import label_details
 from probe_kit.retention.columns.text import is_vlm, model_name
 from probe_kit.retention.rows.parts import StreamPart
 from probe_kit.retention.rows.row import RetentionRow
-from probe_kit.statistics.sufficiency import GROUPS_FOR_PROBES
+from probe_kit.statistics.sufficiency import GROUPS_FOR_PROBES, items_for_absence
 from probe_kit.train.results.control_scores import RANDOM_FEATURES, UNTRAINED
 
 
@@ -40,7 +41,7 @@ _EVIDENCE = {
     "shown": "The probes find the answer in the backbone, beyond every control that was run",
     "absent": "No linear probe of so many items reaches a stated accuracy in the backbone, 65 % by default, and "
     "so many items would have shown it",
-    "not shown": "Neither shown nor absent: more items would tell",
+    "not shown": "Neither shown nor absent: the items are too few to tell",
 }
 _SUCCESS = {
     "success": "the policy is right more often than guessing explains",
@@ -64,7 +65,7 @@ _BEHAVIOUR_HELP = {
     "partly used, graded": "A swap turns the action in fewer episodes, or by less, than where it is used.",
     "moves with it, does not decide": "A swap moves the action by a tenth of the reach, and does not turn it.",
     "not used": "A swap moves the action by less than a tenth of the reach; another category is used.",
-    "inconclusive": "The numbers do not decide whether the answer is used; the sentence says what is missing.",
+    "undecided": "The numbers do not decide whether the answer is used; the sentence says what is missing.",
 }
 VERDICT_HELP = _READABLE_HELP | _BEHAVIOUR_HELP
 """What each verdict says, as an entry of the glossary."""
@@ -139,7 +140,6 @@ def describe_category(row: RetentionRow, vlm: RetentionRow | None = None) -> str
 
 # -- what follows --------------------------------------------------------------------------------------------
 
-_MORE_ITEMS = "more items would tell"
 _UNTESTED = f"{UNTESTED}: run `probe-kit intervene`"
 _LATER = "Yet the policy succeeds: actions after the first inference may follow."
 """An image swap reads the actions of the first inference."""
@@ -195,13 +195,31 @@ def _nothing_shown(row: RetentionRow) -> str:
     clauses = "; ".join(filter(None, parts))
     remedy = ""
     if not absent:
-        remedy = f": {row.backbone.remedy or _MORE_ITEMS}"
+        remedy = f": {row.backbone.remedy or more_items(row) or _POWER}"
     elif behaviour == _NOT_SHOWN:
-        remedy = f": {_MORE_ITEMS}"
+        remedy = _items_for_success(row.success)
     return f"{_capital(clauses)}{remedy}."
 
 
 _NOT_SHOWN = "success is not shown"
+_POWER = "`probe-kit power` simulates how many items would show it"
+
+
+def more_items(row: RetentionRow) -> str:
+    """Return how many items it takes at least to call a backbone without the answer absent; empty for so many."""
+    success = row.success
+    if not success.n_items or not success.n_groups or not success.n_episodes:
+        return ""
+    needed = items_for_absence(success.n_items, success.n_groups, success.n_episodes)
+    return f"fewer than {needed} items cannot tell what the backbone lacks" if needed > success.n_items else ""
+
+
+def _items_for_success(success: SuccessRate) -> str:
+    """Return with how many items guessing would no longer explain the rate, if it stays; empty for one half."""
+    if success.sr is None or not success.chance_margin or not success.n_items or success.sr == 0.5:
+        return ""
+    needed = ceil(success.n_items * (success.chance_margin / (success.sr - 0.5)) ** 2)
+    return f": a rate of {whole_percent(success.sr)} % takes about {needed} items" * (needed > success.n_items)
 
 
 def _backbone(row: RetentionRow) -> str:
@@ -342,7 +360,7 @@ def _acted(row: RetentionRow) -> str:
 def _agrees(row: RetentionRow) -> bool:
     """Whether the image swap lets expect the success rate."""
     use = row.image_swap.use
-    return use is None or (use.behaviour == "inconclusive" and not use.is_bounded) or use.is_used == knows(row)
+    return use is None or (use.behaviour == "undecided" and not use.is_bounded) or use.is_used == knows(row)
 
 
 def _range(limits: Limits | None) -> str:

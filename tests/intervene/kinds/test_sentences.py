@@ -31,7 +31,7 @@ SAID = {
     "follows": "the action follows a swap of the pictures in 92 % of episodes (net of reversals 60 to 100 %).",
     "reverses": "the action goes against the pictures, swapped or not, in 90 % of episodes.",
     "does not follow": "the action does not follow a swap of the pictures (in 4 % of episodes).",
-    "open": "whether the action follows a swap of the pictures is open (in 20 % of episodes).",
+    "open": "whether the action follows a swap of the pictures is undecided (in 20 % of episodes).",
     "in part": "the action follows a swap of the pictures in part (in 20 % of episodes, net of reversals 5 to 35 "
     "%, moved by 0.20 of its reach).",
 }

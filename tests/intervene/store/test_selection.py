@@ -261,9 +261,9 @@ def test_the_verdict_says_first_chunk_and_whole_episode_whichever_is_asked_for(r
         shown = effects_of(run, StoredIntervention(read_bundles(run.location, INTERVENTIONS)[key]))
         found = shown.verdicts["color"]
         assert (found.readout, shown.effects[0].readout) == (readout, readout)
-        assert found.verdict == "first chunk used; episode inconclusive"
+        assert found.verdict == "first chunk used; episode undecided"
         assert found.sentence.startswith(
-            "The answer is used in the first chunk; whether it is used over the whole episode remains open: "
+            "The answer is used in the first chunk; whether it is used over the whole episode is undecided: "
         )
         assert f'"verdict": "{found.verdict}"' in shown.to_json()
     assert verdicts_of(run)["shape"].sentence.startswith("The answer is not used in the first chunk: ")
@@ -273,7 +273,7 @@ def test_a_follow_that_is_asked_for_by_its_key_has_its_own_verdict(run: ArrayRun
     key = key_of(settings_of(run, "follow, few"))
     effects = effects_of(run, StoredIntervention(read_bundles(run.location, INTERVENTIONS)[key]))
     assert effects.effects[0].n_episodes == FEW
-    assert effects.verdicts["color"].behaviour == "inconclusive"
+    assert effects.verdicts["color"].behaviour == "undecided"
 
 
 @pytest.mark.parametrize(

@@ -43,8 +43,8 @@ USES: dict[str, UseVerdict | None] = {
     "moves": UseVerdict(behaviour="moves with it, does not decide", reason=""),
     "not used": UseVerdict(behaviour="not used", reason=""),
     "used later": UseVerdict(behaviour="not used", reason="", other=OTHER_READOUT),
-    "open": UseVerdict(behaviour="inconclusive", reason=""),
-    "no control": UseVerdict(behaviour="inconclusive", reason="", lacks_control=True),
+    "open": UseVerdict(behaviour="undecided", reason=""),
+    "no control": UseVerdict(behaviour="undecided", reason="", lacks_control=True),
 }
 RATES: dict[str, tuple[float | None, Regime | None]] = {
     "success": (0.94, Regime.KNOWLEDGE),

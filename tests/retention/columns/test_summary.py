@@ -203,7 +203,9 @@ def test_of_a_model_that_did_not_act_nothing_is_said_of_acting() -> None:
     (found,) = summarise_runs(rows)
     color, shape = (one.details for one in found.categories)
     assert color.endswith("the model did not act. Shown in the backbone.")
-    assert shape.endswith("the model did not act. Not shown in the backbone: more items would tell.")
+    assert shape.endswith(
+        "Not shown in the backbone: `probe-kit power` simulates how many items would show it."
+    ), "the groups of items are not known"
     assert "success" not in " ".join(cell for line in summary_table([found]).texts for cell in line)
 
 

@@ -78,7 +78,7 @@ def test_what_goes_against_in_half_of_the_episodes_is_not_called_unused() -> Non
     lot = np.random.default_rng(3).choice([-1.0, 1.0], 24, p=[0.6, 0.4]).repeat(2)
     found = of((lot * plain, lot * swapped))
     assert found.net_follow_rate < 0
-    assert classify_behaviour(found, "shape").behaviour == "inconclusive"
+    assert classify_behaviour(found, "shape").behaviour == "undecided"
 
 
 def test_not_used_needs_another_category_that_is_used() -> None:
@@ -86,15 +86,15 @@ def test_not_used_needs_another_category_that_is_used() -> None:
     found = {one.category: one for one in both}
     assert classify_all(found, {})["state"].reason.endswith("positive control: color")
     alone = classify_all({"state": found["state"]}, {})["state"]
-    assert (alone.behaviour, alone.lacks_control, alone.is_bounded) == ("inconclusive", True, True)
+    assert (alone.behaviour, alone.lacks_control, alone.is_bounded) == ("undecided", True, True)
 
 
 def test_not_used_needs_as_many_groups_as_are_said_beforehand() -> None:
     needed = groups_for_not_used()
-    for count, behaviour in ((needed, "not used"), (needed - 1, "inconclusive")):
+    for count, behaviour in ((needed, "not used"), (needed - 1, "undecided")):
         assert classify_behaviour(of(habit(4 * count), groups=count), "shape").behaviour == behaviour
     too_few = classify_behaviour(of(habit(4 * needed - 4), groups=needed - 1), "shape")
-    assert f"needs {needed} groups of items, there are {needed - 1}" in too_few.reason
+    assert f"about {needed} groups would tell, there are {needed - 1}" in too_few.reason
 
 
 # -- by chance -------------------------------------------------------------------------------------------------
@@ -124,9 +124,9 @@ DRAWS = 300
     [
         (12, 0.0, 0.02, 0.0, "not used", 0.95),
         (24, 0.0, 0.10, 0.0, "not used", 0.95),
-        (12, 0.0, 0.02, 1.0, "inconclusive", 0.95),
+        (12, 0.0, 0.02, 1.0, "undecided", 0.95),
         (12, 0.03, 0.02, 0.0, "not used", 0.95),
-        (12, 0.10, 0.05, 0.0, "inconclusive", 0.90),
+        (12, 0.10, 0.05, 0.0, "undecided", 0.90),
         (12, 0.2, 0.05, 0.0, "moves with it, does not decide", 0.95),
         (12, 1.0, 0.2, 0.0, "used", 0.95),
     ],
