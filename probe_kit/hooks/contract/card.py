@@ -4,6 +4,10 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+from probe_kit.hooks.contract.views import CAMERA
+
+ARM = "7-DoF end-effector delta, one third-person camera"
+"""The embodiment of policies that move the arm of the scene."""
 EMBEDDED = "embedded"
 """The checkpoint of a model whose weights come with the package."""
 
@@ -46,10 +50,10 @@ class ModelCard:
     parameters: int
     dtype: str
     device: str
-    embodiment: str
-    cameras: tuple[str, ...]
-    chunk: int
-    execute: int
+    embodiment: str = ""
+    cameras: tuple[str, ...] = (CAMERA,)
+    chunk: int = 0
+    execute: int = 0
     notes: tuple[str, ...] = ()
     audit: Mapping[str, Any] = field(default_factory=dict)
     settings: Mapping[str, str] = field(default_factory=dict)

@@ -50,6 +50,13 @@ class Roles:
                 spans.append(Span(role, position, position + 1))
         return cls(tuple(spans))
 
+    @classmethod
+    def padded(cls, rows: Sequence[Sequence[str]], front: bool = False) -> "list[Roles]":
+        """The roles of a batch: rows of labels, filled up to the longest with padding behind, or in `front`."""
+        longest = max(map(len, rows))
+        filled = [(row, [PADDING] * (longest - len(row))) for row in rows]
+        return [cls.from_labels([*fill, *row] if front else [*row, *fill]) for row, fill in filled]
+
     def __len__(self) -> int:
         return self.spans[-1].stop if self.spans else 0
 

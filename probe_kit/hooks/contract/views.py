@@ -3,6 +3,9 @@
 from collections.abc import Sequence
 
 PADDING = "padding"
+CAMERA = "primary"
+"""The camera of families whose models know one."""
+IMAGE_ROLE = f"image.{CAMERA}"
 
 
 def plays(role: str, group: str) -> bool:

@@ -4,7 +4,7 @@ from probe_kit.hooks.contract.declared import backbone, expert
 from probe_kit.hooks.contract.interventions import Interventions
 from probe_kit.hooks.contract.sites import QUANTITIES
 from probe_kit.hooks.families.shared.capabilities import MERGED
-from probe_kit.hooks.family import Family
+from probe_kit.hooks.families.shared.kinds import lerobot_family
 
 INTERVENTIONS = Interventions(
     edits={"backbone": QUANTITIES, "expert": QUANTITIES},
@@ -20,11 +20,11 @@ INTERVENTIONS = Interventions(
 """One decoder reads the prompt, then the noisy actions at every step, which read its keys and values."""
 
 FAMILIES = (
-    Family(
+    lerobot_family(
         "eo1",
         "EO-1 (Qwen2.5-VL 3B whose decoder denoises actions) through lerobot",
         None,
-        "probe_kit.hooks.families.eo1.adapter:Eo1.load",
+        "eo1.adapter:Eo1",
         streams="backbone 37 layers, expert 37 layers x 10 steps",
         embodiment="as the checkpoint's data set",
         notes=(
@@ -32,10 +32,6 @@ FAMILIES = (
             "processor's files lie beside it or come from the repository that policy_preprocessor.json names"
         ),
         needs_checkpoint=True,
-        outputs="probe_kit.hooks.families.shared.lerobot.outputs:lerobot_outputs",
-        config_types=("eo1",),
-        words="probe_kit.hooks.families.eo1.adapter:Eo1.check_words",
-        full_size="probe_kit.models.lerobot.eo1:full_size_eo1",
         parameters={"": 3_771_607_072},
         declared={
             "": (

@@ -5,7 +5,7 @@ from probe_kit.hooks.contract.interventions import Interventions
 from probe_kit.hooks.contract.options import Option
 from probe_kit.hooks.contract.sites import QUANTITIES, Stream
 from probe_kit.hooks.families.shared.capabilities import MERGED
-from probe_kit.hooks.family import Family
+from probe_kit.hooks.families.shared.kinds import lerobot_family
 
 RESIZES = ("nvidia", "lerobot")
 """Code that brings pictures to their size in two ways."""
@@ -24,11 +24,11 @@ INTERVENTIONS = Interventions(
 """The expert reads the whole backbone through the bridge, also its last residual."""
 
 FAMILIES = (
-    Family(
+    lerobot_family(
         "groot",
         "GR00T N1.7 (Qwen3-VL cut behind layer 16, bridge, diffusion transformer) through lerobot",
         "nvidia/GR00T-N1.7-3B",
-        "probe_kit.hooks.families.groot.adapter:Groot.load",
+        "groot.adapter:Groot",
         streams="backbone 17 layers, bridge 5 layers, expert 33 layers x 4 steps",
         embodiment="as the checkpoint's statistics",
         hub=(("nvidia/Cosmos-Reason2-2B", "tokenizer.json"),),
@@ -37,10 +37,7 @@ FAMILIES = (
             "vision-language model, whose tokenizer and processor files are fetched, not its weights, or given as "
             "-M vlm=FOLDER. No remote code. One observation per call: its bridge reads padding"
         ),
-        outputs="probe_kit.hooks.families.shared.lerobot.outputs:lerobot_outputs",
         config_types=("groot", "Gr00tN1d7"),
-        words="probe_kit.hooks.families.groot.adapter:Groot.check_words",
-        full_size="probe_kit.models.lerobot.groot:full_size_groot",
         always_float32=True,
         parameters={"": 3_144_016_000},
         declared={

@@ -2,18 +2,16 @@
 
 from probe_kit.hooks.contract.declared import answering
 from probe_kit.hooks.contract.options import Option
-from probe_kit.hooks.family import Family
+from probe_kit.hooks.families.shared.kinds import TOKENIZER_FILE, answering_family
 
 FAMILIES = (
-    Family(
+    answering_family(
         "internvl",
         "InternVL3.5 (InternViT, Qwen3 decoder; pictures as tiles), on transformers' own network",
         "OpenGVLab/InternVL3_5-8B-HF",
-        "probe_kit.hooks.families.internvl.adapter:InternVL.load",
+        "internvl.adapter:InternVL.load",
         streams="backbone 37 layers, answer 37 layers (8B)",
-        embodiment="none: answers, does not act",
         notes="the repositories that end in -HF; 8B 17 GB, 38B 77 GB in bfloat16",
-        outputs="probe_kit.hooks.families.shared.vlm.outputs:vlm_outputs",
         config_types=("internvl",),
         instead=(
             (
@@ -33,9 +31,7 @@ FAMILIES = (
             Option(
                 "tiles", str, "1: every picture as one tile; auto: as released.", "auto", choices=("auto", "1")
             ),
-            Option("tokenizer", str, "Folder of another tokenizer.json.", "the checkpoint's", is_path=True),
+            TOKENIZER_FILE,
         ),
-        acts=False,
-        reads=True,
     ),
 )

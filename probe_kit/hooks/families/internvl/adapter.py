@@ -1,16 +1,17 @@
 """The adapter for InternVL: Qwen's chat without a system turn, pictures as tiles."""
 
 from functools import cached_property
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from torch import Tensor
 from transformers import InternVLConfig
 
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.model import Tap
+from probe_kit.hooks.families.shared.network_loading import Loaded
 from probe_kit.hooks.families.shared.qwen.vlm import ASSISTANT, USER
 from probe_kit.hooks.families.shared.vlm.adapter import Pictures, VisionLanguageModel
-from probe_kit.hooks.families.shared.vlm.loading import Loaded, Recipe
+from probe_kit.hooks.families.shared.vlm.loading import Recipe
 from probe_kit.hooks.families.shared.vlm.text import Frame
 from probe_kit.models.internvl import FILE_NAMES, TiledPictures, build_internvl
 
@@ -25,7 +26,7 @@ class InternVL(VisionLanguageModel):
     recipe: ClassVar[Recipe] = Recipe(InternVLConfig.from_dict, build_internvl, FILE_NAMES)
     picture_token: ClassVar[str | None] = "<IMG_CONTEXT>"
 
-    def __init__(self, loaded: Loaded, tokenizer: str | None = None, tiles: str = "auto") -> None:
+    def __init__(self, loaded: Loaded[Any], tokenizer: str | None = None, tiles: str = "auto") -> None:
         if tiles not in TILES:
             raise UsageError(f"tiles is {tiles!r}; expected {' or '.join(TILES)}")
         self.tiles = tiles

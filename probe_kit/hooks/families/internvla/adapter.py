@@ -8,7 +8,6 @@ to be subtracted.
 
 from collections.abc import Sequence
 from functools import cached_property
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -18,8 +17,8 @@ from PIL import Image
 from torch import Tensor
 
 from probe_kit.errors import CheckpointError, UsageError
-from probe_kit.hooks.checkpoints.checkpoint import content_hashes, side_files
-from probe_kit.hooks.contract.card import ModelCard
+from probe_kit.hooks.checkpoints.checkpoint import side_files
+from probe_kit.hooks.contract.card import ARM
 from probe_kit.hooks.contract.model import Rows, Tap
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.roles import Roles
@@ -27,8 +26,9 @@ from probe_kit.hooks.contract.sites import HEADS, Site, Stream
 from probe_kit.hooks.families.internvla import INTERVENTIONS
 from probe_kit.hooks.families.internvla.checkpoint import Parts, find_parts
 from probe_kit.hooks.families.internvla.units import ActionUnits
-from probe_kit.hooks.families.shared.network_loading import Filled, fill, twin
-from probe_kit.hooks.families.shared.qwen.vla import BACKBONE_ROLES, CAMERA, QwenVLA
+from probe_kit.hooks.families.shared.action_statistics import DIMENSIONS, open_or_closed
+from probe_kit.hooks.families.shared.network_loading import Loaded, load_network
+from probe_kit.hooks.families.shared.qwen.vla import BACKBONE_ROLES, QwenVLA
 from probe_kit.hooks.families.shared.sampling import seeded_noise
 from probe_kit.models.internvla import (
     InternVLANetwork,
@@ -47,8 +47,6 @@ STEPS, GUIDANCE = 10, 1.5
 """As the released evaluation runs it."""
 _TIED = ("qwen_vl_interface.model.lm_head.weight",)
 _BLOCK = ("residual", "attention", "mlp")
-_GRIPPER_OPEN = 0.5
-_DIMENSIONS = 7
 _UNCONDITIONAL = "expert_unconditional"
 
 
@@ -61,17 +59,15 @@ class InternVLA(QwenVLA):
 
     def __init__(
         self,
-        filled: Filled[InternVLANetwork],
+        loaded: Loaded[InternVLANetwork],
         parts: Parts,
-        checkpoint: str,
-        device: str,
         unnorm_key: str | None,
         steps: int,
         guidance: float,
         tokenizer: str | None,
     ) -> None:
-        super().__init__(filled.network.vlm, parts.vlm, tokenizer, device)
-        self.network, self.parts, self.config = filled.network, parts, parts.config
+        super().__init__(loaded.network.vlm, parts.vlm, tokenizer, loaded.device)
+        self.network, self.parts, self.config = loaded.network, parts, parts.config
         self.guidance, self._unnorm_key = guidance, unnorm_key
         self.schedule = Schedule.of(steps, self.config.head.steps, self.config.head.schedule)
         self.streams = self._streams()
@@ -86,7 +82,26 @@ class InternVLA(QwenVLA):
         self.role_names = {"backbone": BACKBONE_ROLES, "bridge": ("query",), "expert": expert}
         if guided(guidance):
             self.role_names[_UNCONDITIONAL] = expert
-        self.card = self._card(filled, checkpoint, tokenizer)
+        units = self.units_or_reason()
+        key, numbers = ("none", "none") if isinstance(units, str) else (units.key, units.sha256)
+        note = f"cannot act: {units}" if isinstance(units, str) else f"units of {key}"
+        options = {
+            "unnorm_key": key,
+            "action_statistics": numbers,
+            "steps": str(len(self.schedule)),
+            "guidance": str(guidance),
+        }
+        self.card = loaded.card(
+            "internvla-m1",
+            options,
+            files=side_files(parts.run) | side_files(parts.vlm, "vlm/"),
+            tokenizer=tokenizer,
+            notes=(note, *([f"weights of {parts.weights.name}"] if parts.weights.is_file() else [])),
+            embodiment=ARM,
+            chunk=self.config.head.length,
+            execute=1,
+            batch=1,
+        )
 
     def _streams(self) -> dict[str, Stream]:
         query, head, steps = self.config.query, self.config.head, len(self.schedule)
@@ -110,48 +125,6 @@ class InternVLA(QwenVLA):
                 )
             )
         return {stream.name: stream for stream in streams}
-
-    def _card(self, filled: Filled[InternVLANetwork], checkpoint: str, tokenizer: str | None) -> ModelCard:
-        units = self._units_or_reason()
-        if isinstance(units, ActionUnits):
-            note = f"units of {units.key}"
-            settings = {"unnorm_key": units.key, "action_statistics": units.sha256}
-        else:
-            note = f"cannot act: {units}"
-            settings = {"unnorm_key": "none", "action_statistics": "none"}
-        files = side_files(self.parts.run) | side_files(self.parts.vlm, "vlm/")
-        if tokenizer is not None:
-            files |= side_files(Path(tokenizer).expanduser(), "tokenizer/")
-        return ModelCard(
-            family="internvla-m1",
-            checkpoint=checkpoint,
-            weights_sha256=filled.audit.sha256,
-            random_weights=filled.audit.random,
-            parameters=filled.audit.parameters,
-            dtype=filled.dtype,
-            device=self.device,
-            embodiment="7-DoF end-effector delta, one third-person camera",
-            cameras=(CAMERA,),
-            chunk=self.config.head.length,
-            execute=1,
-            notes=(note, *([f"weights of {self.parts.weights.name}"] if self.parts.weights.is_file() else [])),
-            audit=filled.audit.to_json(),
-            settings={
-                **content_hashes(files),
-                **settings,
-                "steps": str(len(self.schedule)),
-                "guidance": str(self.guidance),
-            },
-            weights_seed=filled.weights_seed,
-            batch=1,
-        )
-
-    def _units_or_reason(self) -> ActionUnits | str:
-        """The statistics, or why there are none: a checkpoint without them can be captured and cannot act."""
-        try:
-            return self.units
-        except CheckpointError as error:
-            return str(error)
 
     @cached_property
     def units(self) -> ActionUnits:
@@ -187,16 +160,14 @@ class InternVLA(QwenVLA):
         """One chunk of actions per observation; see the contract."""
         if (reason := self.embodiment_mismatch()) is not None:
             raise CheckpointError(reason)
-        actions = self.units.restore(self.infer_without_acting(observations, seeds))
-        actions[..., -1] = actions[..., -1] > _GRIPPER_OPEN
-        return actions.astype(np.float32)
+        return open_or_closed(self.units.restore(self.infer_without_acting(observations, seeds)))
 
     def embodiment_mismatch(self) -> str | None:
         """No statistics, or other actions than an end-effector delta."""
-        units, head = self._units_or_reason(), self.config.head
+        units, head = self.units_or_reason(), self.config.head
         if isinstance(units, str):
             return units
-        if len(units.low) == head.action_dim == _DIMENSIONS:
+        if len(units.low) == head.action_dim == DIMENSIONS:
             return None
         return (
             f"{units.key} has actions of {len(units.low)} dimensions, the head {head.action_dim}; Act2Answer "
@@ -311,10 +282,16 @@ def load_internvla(
     def build(kind: torch.dtype, device: str) -> InternVLANetwork:
         return build_internvla(parts.config, kind, device)
 
-    if random_weights:
-        filled = twin(build, name, dtype, weights_seed)
-    else:
-        tied = _TIED if parts.config.vlm.tie_word_embeddings else ()
-        filled = fill(build, parts.read, dtype, lambda _: tied)
-    filled.network.to(device)
-    return InternVLA(filled, parts, name, device, unnorm_key, steps, guidance, tokenizer)
+    loaded = load_network(
+        build,
+        parts.read,
+        name,
+        parts.run,
+        device,
+        dtype,
+        random_weights,
+        weights_seed,
+        tied=lambda _: _TIED if parts.config.vlm.tie_word_embeddings else (),
+        tie=lambda network: network.vlm.tie_weights(),
+    )
+    return InternVLA(loaded, parts, unnorm_key, steps, guidance, tokenizer)

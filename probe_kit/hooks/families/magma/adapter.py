@@ -6,7 +6,6 @@ assistant's turn. Seven tokens follow, one per dimension, then the end of the tu
 """
 
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -16,16 +15,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from probe_kit.errors import CheckpointError, InstructionError, UsageError
-from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES, content_hashes, side_files
+from probe_kit.errors import CheckpointError, UsageError
+from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
-from probe_kit.hooks.contract.card import ModelCard
+from probe_kit.hooks.contract.card import ARM
 from probe_kit.hooks.contract.model import AnswerModel, Policy, Prompt, Reading, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import Site, Stream
-from probe_kit.hooks.contract.unembedding import Unembedding
-from probe_kit.hooks.contract.views import PADDING
+from probe_kit.hooks.contract.views import IMAGE_ROLE
 from probe_kit.hooks.families.magma.answer import Answer
 from probe_kit.hooks.families.magma.checkpoint import (
     LoadedMagma,
@@ -35,17 +33,17 @@ from probe_kit.hooks.families.magma.checkpoint import (
 )
 from probe_kit.hooks.families.magma.text import ChatText, TokenPrompt
 from probe_kit.hooks.families.openvla.actions import ActionTokens
-from probe_kit.hooks.families.shared.action_statistics import ActionStatistics
-from probe_kit.hooks.families.shared.attention_weights import Note, of_decoder
+from probe_kit.hooks.families.shared.action_statistics import GRIPPER_OPEN, ActionStatistics, open_or_closed
 from probe_kit.hooks.families.shared.capabilities import MAPS
-from probe_kit.hooks.families.shared.decoder_tap import decoder_tap
-from probe_kit.hooks.families.shared.prompt_kv import ALL_BUT_LAST, kept_prompt, kv_tap
+from probe_kit.hooks.families.shared.prompt_kv import kept_prompt
 from probe_kit.hooks.families.shared.sampling import CHECKPOINT, TOP, chooser, top_of
+from probe_kit.hooks.families.shared.token_decoder import TokenDecoder
 from probe_kit.models.magma import (
     ACTION_QUESTION,
     Choose,
     Decoded,
     MagmaConfig,
+    MagmaNetwork,
     Picture,
     PictureSettings,
     PictureSpan,
@@ -56,20 +54,19 @@ from probe_kit.models.magma import (
 )
 
 DEFAULT_CHECKPOINT = "microsoft/Magma-8B"
-CAMERA = "primary"
 SEPARATOR = "separator"
 """Role of the vectors that end every row of a picture's map."""
 STEPS, BINS = 7, 256
 PROMPTS = ("magma", "act2answer")
 _SHRINK = 256
-_GRIPPER_OPEN = 0.5
-_PROMPT, _LAST = slice(None, -1), slice(-1, None)
 
 
-class Magma(Policy, AnswerModel):
+class Magma(TokenDecoder, Policy, AnswerModel):
     """A loaded Magma: acts, and answers questions in text."""
 
     interventions = MAPS
+    picture_roles = (IMAGE_ROLE, SEPARATOR)
+    network: MagmaNetwork
 
     def __init__(
         self,
@@ -83,72 +80,42 @@ class Magma(Policy, AnswerModel):
         steps: int = STEPS,
     ) -> None:
         """statistics: of the data set whose units the actions get, or why there are none: it answers without."""
-        self.loaded, self.network, self.config = loaded, loaded.network, loaded.config
+        super().__init__(loaded, loaded.network.config, steps)
         self._units, self.shrink, self.order, self.temperature = statistics, shrink, prompt, temperature
-        self.steps = steps
         self.top = top_of(CHECKPOINT, (loaded.folder,)) if temperature else TOP
         self._text_folder = loaded.folder if tokenizer is None else Path(tokenizer).expanduser()
-        self.decoder: Any = self.network.language_model.model
-        layers, width = len(self.decoder.layers) + 1, int(self.config.text.hidden_size)
-        heads = int(self.config.text.num_attention_heads)
-        self.streams = {
-            "backbone": Stream("backbone", layers, width, heads=heads),
-            "action": Stream("action", layers, width, steps, part="action", heads=heads),
-        }
         self.further_streams = {
             name: Stream(name, len(stage.blocks) + 1, _width(stage), part="vision", quantities=("residual",))
             for name, stage in self._stages.items()
         }
         self.prompt_kv = kept_prompt(self.config.text)
-        self.role_names = {
-            "backbone": (f"image.{CAMERA}", SEPARATOR, "language", "special", PADDING),
-            "action": ("action",),
-        }
-        self.card = self._card({"tokenizer": tokenizer or "the checkpoint's", "layer_scale": loaded.layer_scale})
-
-    def _card(self, options: dict[str, str]) -> ModelCard:
-        loaded, units = self.loaded, self._units
-        if isinstance(units, str):
-            key, numbers, note, whose = "none", "none", f"cannot act: {units}", ""
+        if isinstance(statistics, str):
+            key, numbers, note, whose = "none", "none", f"cannot act: {statistics}", ""
         else:
-            key, numbers, whose = units.key, units.sha256, f", units of {units.key}"
+            key, numbers, whose = statistics.key, statistics.sha256, f", units of {statistics.key}"
             note = f"actions in the units and at the rate of {key}"
-        files = side_files(loaded.folder)
-        if self._text_folder != loaded.folder and self._text_folder.is_dir():
-            files |= side_files(self._text_folder, "tokenizer/")
-        side = f"shrunk to {self.shrink} x {self.shrink} first" if self.shrink else "whole, at any resolution"
+        side = f"shrunk to {shrink} x {shrink} first" if shrink else "whole, at any resolution"
         among = "all" if self.top is None else f"the {self.top} likeliest"
-        how = f"drawn at temperature {self.temperature:g} among {among}" if self.temperature else "the likeliest"
-        return ModelCard(
-            family="magma",
-            checkpoint=loaded.checkpoint,
-            weights_sha256=loaded.audit.sha256,
-            random_weights=loaded.audit.random,
-            parameters=loaded.audit.parameters,
-            dtype=loaded.dtype,
-            device=loaded.device,
-            embodiment=f"7-DoF end-effector delta, one third-person camera{whose}",
-            cameras=(CAMERA,),
+        how = f"drawn at temperature {temperature:g} among {among}" if temperature else "the likeliest"
+        options = {
+            "unnorm_key": key,
+            "action_statistics": numbers,
+            "prompt": prompt,
+            "question": ACTION_QUESTION,
+            "shrink": str(shrink),
+            "temperature": repr(temperature),
+            **({} if self.top == TOP else {"top_k": str(self.top)}),
+            "tokenizer": tokenizer or "the checkpoint's",
+            "layer_scale": loaded.layer_scale,
+        }
+        self.card = loaded.card(
+            "magma",
+            options,
+            tokenizer=tokenizer,
+            notes=(note, f"pictures: {side}; tokens: {how}"),
+            embodiment=f"{ARM}{whose}",
             chunk=1,
             execute=1,
-            notes=(
-                *loaded.notes,
-                note,
-                f"pictures: {side}; tokens: {how}",
-            ),
-            audit=loaded.audit.to_json(),
-            settings={
-                **content_hashes(files),
-                "unnorm_key": key,
-                "action_statistics": numbers,
-                "prompt": self.order,
-                "question": ACTION_QUESTION,
-                "shrink": str(self.shrink),
-                "temperature": repr(self.temperature),
-                **({} if self.top == TOP else {"top_k": str(self.top)}),
-                **options,
-            },
-            weights_seed=loaded.weights_seed,
         )
 
     # -- inputs ------------------------------------------------------------------------------------------
@@ -188,13 +155,10 @@ class Magma(Policy, AnswerModel):
         self, prompts: Sequence[Sequence[int]], pictures: Sequence[Picture] | None, choose: Choose = greedy
     ) -> Decoded:
         """Seven tokens behind every prompt; one inference, as `capture` counts it. Raises InstructionError."""
-        limit = int(self.config.text.max_position_embeddings)
         for row, ids in enumerate(prompts):
-            length = len(ids) + self.steps
-            if pictures is not None:
-                length += self.network.span(ids, pictures[row].grid, self.pictures.base).length - 1
-            if length > limit:
-                raise InstructionError(f"a prompt makes {length} positions; this model has {limit}. Shorten it")
+            placeholder = 0 if pictures is None else 1
+            span = self.network.span(ids, pictures[row].grid, self.pictures.base).length if pictures else 0
+            self.check_length(len(ids) - placeholder + span)
         with torch.inference_mode():
             return self.network.decode(prompts, pictures, self.steps, choose)
 
@@ -204,11 +168,10 @@ class Magma(Policy, AnswerModel):
             raise CheckpointError(reason)
         ids = self._tokens(observations, seeds)
         assert self.flagged is not None
-        actions = self.statistics.restore(self.action_tokens.values(ids))
-        actions[:, -1] = actions[:, -1] > _GRIPPER_OPEN
+        actions = open_or_closed(self.statistics.restore(self.action_tokens.values(ids)))
         for row in np.flatnonzero(self.flagged):
-            actions[row] = [0] * (STEPS - 1) + [observations[row].state[-1] > _GRIPPER_OPEN]
-        return actions[:, None].astype(np.float32)
+            actions[row] = [0] * (STEPS - 1) + [observations[row].state[-1] > GRIPPER_OPEN]
+        return actions[:, None]
 
     @property
     def statistics(self) -> ActionStatistics:
@@ -262,10 +225,6 @@ class Magma(Policy, AnswerModel):
         """The language model's weights in modules of their own, so that what runs there fires no tap."""
         return self.network.unhooked()
 
-    def record_attention(self, note: Note) -> AbstractContextManager[None]:
-        """Computed once more for the position that chooses a token."""
-        return of_decoder(self.decoder.layers, note)
-
     # -- answering ---------------------------------------------------------------------------------------
 
     def read(self, questions: Sequence[Prompt]) -> Reading:
@@ -302,24 +261,19 @@ class Magma(Policy, AnswerModel):
 
     def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
         """Frames are `special`, the question is `language`; the ends of a picture's rows stand apart from it."""
-        return self._roles(
+        return self.roles_of(
             [self._labels(self.prompt(observation.instruction), observation.image) for observation in observations]
         )
 
     def asked_roles(self, questions: Sequence[Prompt]) -> dict[str, list[Roles]]:
         """Roles of questions other than what to do; how an answer has begun is `special`."""
         pictured = self.shows_pictures(questions)
-        return self._roles(
+        return self.roles_of(
             [
                 self._labels(self._question(question), question.observation.image if pictured else None)
                 for question in questions
             ]
         )
-
-    def _roles(self, rows: Sequence[list[str]]) -> dict[str, list[Roles]]:
-        longest = max(map(len, rows))
-        backbone = [Roles.from_labels(labels + [PADDING] * (longest - len(labels))) for labels in rows]
-        return {"backbone": backbone, "action": [Roles.from_labels(["action"])] * len(rows)}
 
     def _labels(self, prompt: TokenPrompt, image: NDArray[np.uint8] | None) -> list[str]:
         """The labels of every position but the last, which belongs to the stream `action`."""
@@ -327,7 +281,7 @@ class Magma(Policy, AnswerModel):
         if image is None:
             return labels[:-1]
         span = self.span(prompt.ids, image)
-        row = [f"image.{CAMERA}"] * span.columns + [SEPARATOR]
+        row = [IMAGE_ROLE] * span.columns + [SEPARATOR]
         labels[span.start : span.start + 1] = row * span.rows
         return labels[:-1]
 
@@ -335,26 +289,12 @@ class Magma(Policy, AnswerModel):
         """The ids of each whole prompt, the picture as one placeholder."""
         return [self.prompt(instruction).ids for instruction in instructions]
 
-    @property
-    def unembedding(self) -> Unembedding:
-        """The language model's final norm and head."""
-        return Unembedding.of_decoder(("backbone", "action"), self.network.language_model, self.decoder.norm)
-
-    def tap(self, site: Site) -> Tap:
-        """The first norm of the block the site enters, the final norm, or a block's output.
-
-        `vision_<k>`: maps of stage k as tokens, one row per crop; the last one is the stage's output.
-        """
-        stream = self.stream_of(site)
-        if stream is self.prompt_kv:
-            return kv_tap(self.network.prompt_kv, site, ALL_BUT_LAST)
-        if stream.part == "vision":
-            blocks = self._stages[site.stream].blocks
-            if site.layer == len(blocks):
-                return Tap(blocks[-1], 1, "output", view=_as_tokens)
-            return Tap(blocks[site.layer], 1, view=_as_tokens)
-        tokens = _PROMPT if site.stream == "backbone" else _LAST
-        return decoder_tap(self.decoder.layers, self.decoder.norm, site, self.steps, tokens)
+    def vision_tap(self, site: Site) -> Tap:
+        """Return the tap of `vision_<k>`: maps of stage k as tokens, one row per crop; the last is its output."""
+        blocks = self._stages[site.stream].blocks
+        if site.layer == len(blocks):
+            return Tap(blocks[-1], 1, "output", view=_as_tokens)
+        return Tap(blocks[site.layer], 1, view=_as_tokens)
 
     @property
     def _stages(self) -> dict[str, Any]:
@@ -432,18 +372,13 @@ def load_magma(
     if shrink < 0:
         raise UsageError(f"shrink is {shrink}; expected a side in pixels, or 0 for whole pictures")
     chooser(temperature, ())
+    name = checkpoint or DEFAULT_CHECKPOINT
     loaded = load_checkpoint(
-        checkpoint or DEFAULT_CHECKPOINT,
-        device,
-        dtype,
-        random_weights,
-        weights_seed=weights_seed,
-        statistics=statistics,
-        layer_scale=layer_scale,
+        name, device, dtype, random_weights, weights_seed=weights_seed, layer_scale=layer_scale
     )
     return Magma(
         loaded,
-        _units(loaded.statistics, loaded.statistics_source, unnorm_key),
+        _units(*magma_statistics(loaded.folder, statistics), unnorm_key),
         shrink=shrink,
         prompt=prompt,
         temperature=temperature,

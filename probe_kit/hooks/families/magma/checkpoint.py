@@ -3,6 +3,7 @@
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,8 @@ from torch import Tensor
 from probe_kit.errors import UsageError, WeightsError
 from probe_kit.hooks.checkpoints.checkpoint import chosen_dtype
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
-from probe_kit.hooks.checkpoints.weights import Weights, WeightsAudit, read_weights
-from probe_kit.hooks.families.shared.network_loading import DTYPES, as_dtype, assign_weights, audit_of_twin
+from probe_kit.hooks.checkpoints.weights import Weights, read_weights
+from probe_kit.hooks.families.shared.network_loading import DTYPES, Loaded, load_network
 from probe_kit.models.initialisation import initialise
 from probe_kit.models.magma import UNUSED_WEIGHTS, MagmaConfig, MagmaNetwork, build_magma, shipped_statistics
 from probe_kit.models.statistics_choice import STATISTICS_FILE, chosen_name, read_statistics, stored_statistics
@@ -21,28 +22,11 @@ from probe_kit.models.statistics_choice import STATISTICS_FILE, chosen_name, rea
 _BLOCK = re.compile(r"(?P<block>vision_tower\..*\.blocks\.\d+)\.(?P<name>gamma|weight)")
 
 
-@dataclass(frozen=True)
-class LoadedMagma:
-    """A loaded network and what belongs to it.
+@dataclass(frozen=True, kw_only=True)
+class LoadedMagma(Loaded[MagmaNetwork]):
+    """A loaded network. layer_scale: under which name the file holds the layer scales, `gamma` or `weight`."""
 
-    checkpoint: as asked for. folder: where its other files lie. statistics: per data set, what un-normalises its
-    actions. statistics_source: the file that holds them.
-    dtype: of the weights, as the card says it. weights_seed: of a random twin. layer_scale: under which
-    name the file holds the layer scales, `gamma` or `weight`.
-    """
-
-    checkpoint: str
-    network: MagmaNetwork
-    config: MagmaConfig
-    folder: Path
-    statistics: Mapping[str, Any]
-    statistics_source: str
-    audit: WeightsAudit
-    dtype: str
-    device: str
-    notes: tuple[str, ...]
-    weights_seed: int | None
-    layer_scale: str = "gamma"
+    layer_scale: str
 
 
 def load_checkpoint(
@@ -52,67 +36,50 @@ def load_checkpoint(
     random_weights: bool,
     *,
     weights_seed: int = 0,
-    statistics: str | None = None,
     layer_scale: str | None = None,
 ) -> LoadedMagma:
     """Load a folder or hub id.
 
-    dtype: float32 or bfloat16; default what the checkpoint says. statistics: a file with action statistics,
-    instead of the checkpoint's own. layer_scale: `gamma` refuses a file that names them otherwise; None and
-    `weight` accept both names.
+    dtype: float32 or bfloat16; default what the checkpoint says. layer_scale: `gamma` refuses a file that names
+    them otherwise; None and `weight` accept both names.
     Raises CheckpointError, WeightsError, UsageError for another dtype, MissingExtraError.
     """
     folder = checkpoint_folder(checkpoint)
     config = MagmaConfig.from_folder(folder)
-    name = chosen_dtype(dtype, config.dtype, DTYPES)
-    if random_weights:
-        network, audit = _random(config, DTYPES[name], checkpoint, weights_seed)
-        notes: tuple[str, ...] = ()
-        stored_name = "gamma"
-    else:
-        network, audit, notes, stored_name = _stored(config, folder, DTYPES[name], layer_scale)
-    network.requires_grad_(False)
-    by_data_set, statistics_source = magma_statistics(folder, statistics)
+    notes, stored_name = tuple[str, ...](), "gamma"
+
+    def tensors_of(weights: Weights) -> dict[str, Tensor]:
+        nonlocal notes, stored_name
+        tensors, notes, stored_name = _with_layer_scales(weights, layer_scale)
+        if unread := [name for name in UNUSED_WEIGHTS if tensors.pop(name, None) is not None]:
+            notes += (f"{len(unread)} tensors of the contrastive head are in the file and never read",)
+        return tensors
+
+    loaded = load_network(
+        partial(build_magma, config),
+        lambda: read_weights(folder, unlisted=UNUSED_WEIGHTS),
+        checkpoint,
+        folder,
+        device,
+        chosen_dtype(dtype, config.dtype, DTYPES),
+        random_weights,
+        weights_seed,
+        tied=lambda _: {"language_model.lm_head.weight"} if config.text.tie_word_embeddings else (),
+        tie=lambda network: network.language_model.tie_weights(),
+        tensors_of=tensors_of,
+        draw=_draw,
+    )
     return LoadedMagma(
-        checkpoint=checkpoint,
-        network=network.to(device),
-        config=config,
-        folder=folder,
-        statistics=by_data_set,
-        statistics_source=statistics_source,
-        audit=audit,
-        dtype=name,
-        device=device,
-        notes=notes,
-        weights_seed=weights_seed if random_weights else None,
-        layer_scale=layer_scale or stored_name,
+        **{**vars(loaded), "notes": (*loaded.notes, *notes)}, layer_scale=layer_scale or stored_name
     )
 
 
-def _random(
-    config: MagmaConfig, dtype: torch.dtype, checkpoint: str, seed: int
-) -> tuple[MagmaNetwork, WeightsAudit]:
-    network = build_magma(config, dtype, device="cpu")
+def _draw(network: MagmaNetwork, seed: int) -> None:
     initialise(network, seed)
     with torch.no_grad():
         for name, parameter in network.named_parameters():
             if name.endswith(".gamma"):
                 parameter.fill_(1)  # at timm's 1e-6 the blocks of the trunk would do nothing
-    return network, audit_of_twin(network, checkpoint)
-
-
-def _stored(
-    config: MagmaConfig, folder: Path, dtype: torch.dtype, layer_scale: str | None
-) -> tuple[MagmaNetwork, WeightsAudit, tuple[str, ...], str]:
-    weights = read_weights(folder, unlisted=UNUSED_WEIGHTS)
-    tensors, notes, stored_name = _with_layer_scales(weights, layer_scale)
-    unread = [name for name in UNUSED_WEIGHTS if tensors.pop(name, None) is not None]
-    if unread:
-        notes += (f"{len(unread)} tensors of the contrastive head are in the file and never read",)
-    network = build_magma(config, dtype)
-    tied = {"language_model.lm_head.weight"} if config.text.tie_word_embeddings else set()
-    audit = assign_weights(network, weights, as_dtype(tensors, dtype), tied, network.language_model.tie_weights)
-    return network, audit, notes, stored_name
 
 
 def _with_layer_scales(

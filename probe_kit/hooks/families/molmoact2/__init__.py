@@ -5,7 +5,7 @@ from dataclasses import replace
 from probe_kit.hooks.contract.declared import backbone, expert
 from probe_kit.hooks.contract.sites import QUANTITIES
 from probe_kit.hooks.families.shared.capabilities import FLOW, MERGED
-from probe_kit.hooks.family import Family
+from probe_kit.hooks.families.shared.kinds import lerobot_family
 
 EXPERT = ("residual", "attention", "cross_attention", "mlp", "final_norm")
 LAYERWISE = replace(
@@ -17,11 +17,11 @@ LAYERWISE = replace(
 """Block n of the expert reads the keys and values of block n of the backbone, and nothing else of it."""
 
 FAMILIES = (
-    Family(
+    lerobot_family(
         "molmoact2",
         "MolmoAct2 (Molmo2-ER, flow-matching expert on the keys and values of each layer) through lerobot",
         "allenai/MolmoAct2-LIBERO-LeRobot",
-        "probe_kit.hooks.families.molmoact2.adapter:MolmoAct2.load",
+        "molmoact2.adapter:MolmoAct2",
         streams="backbone 37 layers, expert 37 layers x 10 flow steps",
         embodiment="LIBERO end-effector delta; other fine-tunes in lerobot's layout as --checkpoint",
         hub=(("allenai/MolmoAct2-LIBERO", "tokenizer.json"),),
@@ -30,10 +30,6 @@ FAMILIES = (
             "billion parameters, 11 GB in bfloat16; lerobot measured 12 GiB. Acts by its flow expert; discrete "
             "actions are refused. CUDA graphs are off"
         ),
-        outputs="probe_kit.hooks.families.shared.lerobot.outputs:lerobot_outputs",
-        config_types=("molmoact2",),
-        words="probe_kit.hooks.families.molmoact2.adapter:MolmoAct2.check_words",
-        full_size="probe_kit.models.lerobot.molmoact2:full_size_molmoact2",
         parameters={"": 5_442_196_208},
         declared={
             "": (

@@ -4,9 +4,7 @@ Sequence: beginning, 256 patches, "In: What action should the robot take to …?
 greedy tokens follow, one per dimension; iteration k of the stream `action` is the position that chooses the k-th.
 """
 
-import warnings
 from collections.abc import Iterable, Sequence
-from contextlib import AbstractContextManager
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -17,6 +15,7 @@ from torch import Tensor
 
 from probe_kit.errors import CheckpointError, InstructionError, UsageError
 from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES
+from probe_kit.hooks.contract.card import ARM
 from probe_kit.hooks.contract.model import Policy
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.families.openvla.actions import ActionTokens
@@ -28,11 +27,11 @@ from probe_kit.hooks.families.prismatic.checkpoint import (
     prismatic_statistics,
 )
 from probe_kit.hooks.families.prismatic.tokenizer import BYTES, find_tokenizer
-from probe_kit.hooks.families.shared.action_statistics import ActionStatistics
-from probe_kit.hooks.families.shared.attention_weights import Note, of_decoder
+from probe_kit.hooks.families.shared.action_statistics import DIMENSIONS, ActionStatistics, open_or_closed
 from probe_kit.hooks.families.shared.capabilities import TOKENS
 from probe_kit.hooks.families.shared.prompt_kv import kept_prompt
 from probe_kit.hooks.families.shared.sampling import ALL, chooser, top_of
+from probe_kit.hooks.families.shared.token_decoder import warn_of_unknown
 from probe_kit.models.prismatic import CROP_AREA, PrismaticConfig, centre_crop
 from probe_kit.models.prismatic.tensor_pictures import prepare_tensor
 
@@ -47,8 +46,6 @@ PROMPTS = {
 # How the Llama-2 tokenizer splits the beginning of the prompt, as recorded from the original software.
 _LLAMA_VOCABULARY = 32000
 _LLAMA_PROMPT = [1, 512, 29901, 1724, 3158, 881, 278, 19964, 2125, 304]
-_GRIPPER_OPEN = 0.5
-_DIMENSIONS = 7
 _PATCH = 14
 
 
@@ -78,7 +75,7 @@ class OpenVLA(PrismaticModel, Policy):
         self.action_tokens = ActionTokens(self.config.action_vocabulary, self.config.action_bins)
         self.card = replace(
             self.card,
-            embodiment=f"7-DoF end-effector delta, one third-person camera, units of {statistics.key}",
+            embodiment=f"{ARM}, units of {statistics.key}",
             chunk=1,
             execute=1,
             notes=(*self.card.notes, *self._notes(tokenizer)),
@@ -113,14 +110,12 @@ class OpenVLA(PrismaticModel, Policy):
             raise CheckpointError(reason)
         ids = self._tokens(observations, seeds)
         if self.flagged is not None and self.flagged.any():
-            self._say_unknown()
-        actions = self.statistics.restore(self.action_tokens.values(ids))
-        actions[:, -1] = actions[:, -1] > _GRIPPER_OPEN
-        return actions[:, None].astype(np.float32)
+            warn_of_unknown()
+        return open_or_closed(self.statistics.restore(self.action_tokens.values(ids)))[:, None]
 
     def embodiment_mismatch(self) -> str | None:
         """Other actions than an end-effector delta."""
-        if self.steps == _DIMENSIONS:
+        if self.steps == DIMENSIONS:
             return None
         return (
             f"{self.statistics.key} has actions of {self.steps} dimensions; Act2Answer needs a 7-DoF end-effector "
@@ -154,18 +149,6 @@ class OpenVLA(PrismaticModel, Policy):
 
     def _look(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
         return centre_crop(image, self.config.towers[0].image_size) if self.crop else image
-
-    def _say_unknown(self) -> None:
-        warnings.warn(
-            "the model put out tokens that name no action; they count as the nearest bin, as in the original "
-            "software, and the step as flagged. Random weights do this; if trained ones do, prompt or tokenizer "
-            "are wrong",
-            stacklevel=3,
-        )
-
-    def record_attention(self, note: Note) -> AbstractContextManager[None]:
-        """Computed once more for the position that chooses a token."""
-        return of_decoder(self.decoder.layers, note)
 
     def prompt(self, instruction: str) -> list[int]:
         """Ids of the whole prompt, the empty token last. Raises CheckpointError for another tokenizer's ids."""
@@ -218,7 +201,8 @@ def load_openvla(
     loaded = load_checkpoint(checkpoint or DEFAULT_CHECKPOINT, device, dtype, random_weights, bits, weights_seed)
     if loaded.config.model_type != "openvla":
         raise CheckpointError(f"{checkpoint} is a Prismatic model without actions; pass --model prismatic")
-    statistics = ActionStatistics.choose(loaded.statistics, unnorm_key, loaded.statistics_source)
+    by_data_set, source = prismatic_statistics(loaded.config, loaded.folders)
+    statistics = ActionStatistics.choose(by_data_set, unnorm_key, source)
     template = _template(prompt, loaded.config)
     top = top_of(top_k, loaded.folders)
     return OpenVLA(loaded, statistics, template, centre_crop, tokenizer, temperature, resize, top)
@@ -244,7 +228,7 @@ def check_openvla_words(
     config = PrismaticConfig.from_folder(folders[-1])
     text = find_tokenizer(folders, tokenizer, config.text.bos_token_id, config.action_vocabulary)
     template = _template(prompt, config)
-    room = int(config.text.max_position_embeddings) - (config.towers[0].image_size // _PATCH) ** 2 - _DIMENSIONS
+    room = int(config.text.max_position_embeddings) - (config.towers[0].image_size // _PATCH) ** 2 - DIMENSIONS
     for instruction in instructions:
         length = len(text.encode(template.replace(_SLOT, instruction.lower())))
         if length > room:

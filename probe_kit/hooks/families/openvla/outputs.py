@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from probe_kit.hooks.families.openvla.adapter import OpenVLA
+from probe_kit.hooks.families.prismatic.checkpoint import prismatic_statistics
 from probe_kit.hooks.families.prismatic.outputs import INPUTS, Reference
 from probe_kit.hooks.families.shared.action_statistics import ActionStatistics
 from probe_kit.hooks.verification.outputs import Arrays, Outputs, Produce
@@ -29,9 +30,9 @@ def openvla_outputs(load: Callable[..., OpenVLA], folder: Path, recorded: Arrays
     ids: list[int] = recorded[_WITHOUT_EMPTY if added else "input_ids"].ravel().tolist()
     reference = Reference(policy, recorded, policy.with_empty_token(ids) if added else ids)
     values = policy.action_tokens.values(reference.decoded.ids[0].numpy())
+    statistics, _ = prismatic_statistics(policy.config, policy.loaded.folders)
     produced: dict[str, Produce] = {
-        _ACTION + key: partial(ActionStatistics.choose(policy.loaded.statistics, key).restore, values)
-        for key in keys
+        _ACTION + key: partial(ActionStatistics.choose(statistics, key).restore, values) for key in keys
     }
     every = np.arange(int(policy.config.text.vocab_size))
     inputs = INPUTS if added else (*INPUTS, "input_ids")

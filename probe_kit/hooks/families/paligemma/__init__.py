@@ -2,41 +2,33 @@
 
 from probe_kit.hooks.contract.declared import answering
 from probe_kit.hooks.contract.default_scene import EMBEDDED
-from probe_kit.hooks.contract.options import Option
-from probe_kit.hooks.family import Family
+from probe_kit.hooks.contract.options import Option as Option
+from probe_kit.hooks.families.shared.kinds import TOKENIZER_FILE, answering_family
 
 FAMILIES = (
-    Family(
+    answering_family(
         "vlm-tiny",
         "PaliGemma at 0.61 million parameters, the embedded VLM: knows Color, Shape, State and Traffic",
         None,
-        "probe_kit.hooks.families.paligemma.adapter:load_vlm_tiny",
+        "paligemma.adapter:load_vlm_tiny",
         streams="backbone 4 layers, answer 4 layers",
-        embodiment="none: answers, does not act",
         notes="its words are those of the embedded suite and of the prompts of `probe-kit ask`; no others",
-        outputs="probe_kit.hooks.families.shared.vlm.outputs:vlm_outputs",
         config_types=("paligemma",),
-        acts=False,
-        reads=True,
         home=EMBEDDED,
         vocabulary="probe_kit.models.embedded.words",
     ),
-    Family(
+    answering_family(
         "paligemma",
         "PaliGemma 3B (SigLIP, Gemma 2B; the prompt attends both ways), pi0's source",
         "google/paligemma-3b-pt-224",
-        "probe_kit.hooks.families.paligemma.adapter:PaliGemma.load",
+        "paligemma.adapter:PaliGemma.load",
         streams="backbone 19 layers, answer 19 layers",
-        embodiment="none: answers, does not act",
         notes="Gemma licence, gated; pt, not mix: it was not trained to follow instructions; 5.9 GB in bfloat16",
-        outputs="probe_kit.hooks.families.shared.vlm.outputs:vlm_outputs",
         config_types=("paligemma",),
         declared={"": answering(19, 2048, 290)},
         full_size="probe_kit.models.paligemma:full_size_paligemma",
         parameters={"": 2_923_466_480},
         stored_names="probe_kit.models.paligemma:FILE_NAMES",
-        options=(Option("tokenizer", str, "Folder of another tokenizer.json.", "the checkpoint's", is_path=True),),
-        acts=False,
-        reads=True,
+        options=(TOKENIZER_FILE,),
     ),
 )

@@ -6,6 +6,7 @@ from probe_kit.hooks.contract.default_scene import EMBEDDED
 from probe_kit.hooks.contract.options import Option
 from probe_kit.hooks.contract.protocol import ACT2ANSWER, OWN_SEEDS, ProtocolRow
 from probe_kit.hooks.families.shared.capabilities import FLOW
+from probe_kit.hooks.families.shared.kinds import lerobot_family
 from probe_kit.hooks.families.shared.lerobot.evaluation import EVALUATION_OPTIONS
 from probe_kit.hooks.family import Family
 
@@ -49,11 +50,11 @@ FAMILIES = (
         "the embedded default, but that it was trained to act on State too",
         "a model organism: see `probe-kit demo --compare`",
     ),
-    Family(
+    lerobot_family(
         "pi0",
         "pi0 (PaliGemma 3B + 300M flow-matching expert) through lerobot",
         "juexzz/INTACT-pi0-finetune-bridge",
-        "probe_kit.hooks.families.pi0.adapter:Pi0.load",
+        "pi0.adapter:Pi0",
         streams="backbone 19 layers, expert 19 layers x 10 iterations",
         embodiment="WidowX end-effector delta at 5 Hz; other fine-tunes as --checkpoint",
         hub=(("google/paligemma-3b-pt-224", "tokenizer.json"),),
@@ -61,18 +62,14 @@ FAMILIES = (
             "Gemma licence; tokenizer google/paligemma-3b-pt-224 is gated. lerobot/pi0_base acts in 32 unnamed "
             "dimensions: --checkpoint lerobot/pi0_base --no-act"
         ),
-        outputs="probe_kit.hooks.families.shared.lerobot.outputs:lerobot_outputs",
-        config_types=("pi0",),
         source="paligemma",
         source_weights=SourceWeights("google/paligemma-3b-pt-224", parameters=2_923_466_480),
-        words="probe_kit.hooks.families.pi0.adapter:Pi0.check_words",
         declared={
             "": (
                 backbone(19, 2048, 304, camera="top"),
                 expert(19, 1024, 10, 5, ("state", "action")),
             )
         },
-        full_size="probe_kit.models.lerobot.pi0:full_size_pi0",
         parameters={"": 4_028_019_472},
         not_acting=("lerobot/pi0_base",),
         options=(

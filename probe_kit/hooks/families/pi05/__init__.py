@@ -3,15 +3,15 @@
 from probe_kit.hooks.contract.card import SourceWeights
 from probe_kit.hooks.contract.declared import backbone, expert
 from probe_kit.hooks.families.shared.capabilities import FLOW
+from probe_kit.hooks.families.shared.kinds import lerobot_family
 from probe_kit.hooks.families.shared.lerobot.evaluation import EVALUATION_OPTIONS
-from probe_kit.hooks.family import Family
 
 FAMILIES = (
-    Family(
+    lerobot_family(
         "pi05",
         "pi0.5 (PaliGemma 3B + 300M flow-matching expert with adaptive norms) through lerobot",
         "lerobot/pi05_base",
-        "probe_kit.hooks.families.pi05.adapter:Pi05.load",
+        "pi05.adapter:Pi05",
         streams="backbone 19 layers, expert 19 layers x 10 iterations",
         embodiment="as fine-tuned; the base model acts in 32 unnamed dimensions",
         hub=(("google/paligemma-3b-pt-224", "tokenizer.json"),),
@@ -20,18 +20,14 @@ FAMILIES = (
             "acting (--no-act); to act it needs a fine-tune for end-effector deltas. The prompt holds the state "
             "as digits"
         ),
-        outputs="probe_kit.hooks.families.shared.lerobot.outputs:lerobot_outputs",
-        config_types=("pi05",),
         source="paligemma",
         source_weights=SourceWeights("google/paligemma-3b-pt-224", parameters=2_923_466_480),
-        words="probe_kit.hooks.families.pi05.adapter:Pi05.check_words",
         declared={
             "": (
                 backbone(19, 2048, 968, "state", camera="base_0_rgb"),
                 expert(19, 1024, 10, 50, ("action",)),
             )
         },
-        full_size="probe_kit.models.lerobot.pi05:full_size_pi05",
         parameters={"": 4_143_404_816},
         not_acting=("lerobot/pi05_base",),
         options=EVALUATION_OPTIONS,

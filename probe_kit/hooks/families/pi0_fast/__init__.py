@@ -6,7 +6,7 @@ from probe_kit.hooks.contract.card import SourceWeights
 from probe_kit.hooks.contract.declared import backbone, chosen_tokens
 from probe_kit.hooks.contract.options import Option
 from probe_kit.hooks.families.shared.capabilities import TOKENS
-from probe_kit.hooks.family import Family
+from probe_kit.hooks.families.shared.kinds import lerobot_family
 
 CAPTURED = 10
 """Action tokens whose positions are sites: "Action: ", and the lowest frequency of about seven dimensions."""
@@ -14,11 +14,11 @@ FAST = replace(TOKENS, readout="first-chunk")
 """One decoder puts out the tokens of a whole chunk."""
 
 FAMILIES = (
-    Family(
+    lerobot_family(
         "pi0-fast",
         "pi0-FAST (PaliGemma 3B, actions as compressed tokens) through lerobot",
         "lerobot/pi0fast-base",
-        "probe_kit.hooks.families.pi0_fast.adapter:Pi0Fast.load",
+        "pi0_fast.adapter:Pi0Fast",
         streams=f"backbone 19 layers, action 19 layers x {CAPTURED} action tokens of a variable number",
         embodiment="as fine-tuned; the base model acts in 32 unnamed dimensions",
         hub=(
@@ -30,18 +30,14 @@ FAMILIES = (
             "without its remote code. Head and embedding are two: 3.4 billion parameters, 14 GB in float32. The "
             "base can be captured without acting (--no-act)"
         ),
-        outputs="probe_kit.hooks.families.shared.lerobot.outputs:lerobot_outputs",
-        config_types=("pi0_fast",),
         source="paligemma",
         source_weights=SourceWeights("google/paligemma-3b-pt-224", parameters=2_923_466_480),
-        words="probe_kit.hooks.families.pi0_fast.adapter:Pi0Fast.check_words",
         declared={
             "": (
                 backbone(19, 2048, 968, "state", camera="base_0_rgb"),
                 chosen_tokens("action", 19, 2048, CAPTURED),
             )
         },
-        full_size="probe_kit.models.lerobot.pi0_fast:full_size_pi0_fast",
         parameters={"": 3_449_982_704},
         not_acting=("lerobot/pi0fast-base",),
         options=(

@@ -34,13 +34,11 @@ from probe_kit.hooks.families.shared.lerobot.pipelines import CROP
 from probe_kit.hooks.families.shared.lerobot.policy import MASK, TOKENS
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack, TokenStack, flow_stacks
 from probe_kit.hooks.families.shared.lerobot.state_prompt import StatePrompt
-from probe_kit.hooks.families.shared.prompt_kv import ALL_BUT_LAST, kept_prompt
+from probe_kit.hooks.families.shared.prompt_kv import ALL_BUT_LAST, LAST, kept_prompt
 from probe_kit.hooks.families.shared.sampling import chooser
 from probe_kit.hooks.verification.outputs import Arrays, Produce, RecordedRun, numpy_of
 from probe_kit.models.lerobot.pi0_fast import Pi0FastSize, TokenPrompt, build_pi0_fast, decode_tokens
 from probe_kit.models.lerobot.pi0_keys import EMBEDDING, LM_HEAD, current_pi0_fast_keys
-
-_LAST = slice(-1, None)
 
 
 @dataclass(frozen=True)
@@ -194,7 +192,7 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
         layers, norm, width = decoder.layers, decoder.norm, decoder.config.hidden_size
         return {
             "backbone": TokenStack(layers, norm, width, None, tokens=ALL_BUT_LAST),
-            "action": TokenStack(layers, norm, width, self.evaluation.captured_tokens, tokens=_LAST),
+            "action": TokenStack(layers, norm, width, self.evaluation.captured_tokens, tokens=LAST),
             "vision": flow_stacks(decoder, decoder, vision, 1)["vision"],
         }
 

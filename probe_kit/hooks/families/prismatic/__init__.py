@@ -3,7 +3,7 @@
 from probe_kit.hooks.checkpoints.checkpoint import PATTERNS, RUN_WEIGHTS
 from probe_kit.hooks.contract.declared import answering
 from probe_kit.hooks.contract.options import Option
-from probe_kit.hooks.family import Family
+from probe_kit.hooks.families.shared.kinds import answering_family
 
 TOKENIZER = Option(
     "tokenizer",
@@ -15,13 +15,12 @@ TOKENIZER = Option(
 BITS = Option("bits", int, "Quantised, not exact (extra quantized, GPU).", "none", choices=(4, 8))
 
 FAMILIES = (
-    Family(
+    answering_family(
         "prismatic",
         "Prismatic vision-language models, OpenVLA's source (one or two towers; Llama 2, Vicuna, Mistral, Phi-2)",
         "TRI-ML/prismatic-vlms/prism-dinosiglip-224px+7b",
-        "probe_kit.hooks.families.prismatic.adapter:load_prismatic",
+        "prismatic.adapter:load_prismatic",
         streams="backbone 33 layers, answer 33 layers (7B)",
-        embodiment="none: answers, does not act",
         packages=(("timm", "openvla"),),
         notes=(
             "MIT, Llama 2 licence; extra openvla; one .pt file, towers of timm, tokenizer of openvla/openvla-7b; "
@@ -39,7 +38,5 @@ FAMILIES = (
         full_size="probe_kit.models.prismatic:full_size_prismatic",
         parameters={"": 7_541_237_184},
         options=(TOKENIZER, BITS, Option("steps", int, "Greedy tokens per inference.", "1")),
-        acts=False,
-        reads=True,
     ),
 )

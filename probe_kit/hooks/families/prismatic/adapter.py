@@ -15,88 +15,55 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
-from probe_kit.errors import CheckpointError, InstructionError, UsageError
-from probe_kit.hooks.checkpoints.checkpoint import content_hashes, side_files
+from probe_kit.errors import CheckpointError, UsageError
+from probe_kit.hooks.checkpoints.checkpoint import side_files
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
-from probe_kit.hooks.contract.card import ModelCard
-from probe_kit.hooks.contract.model import AnswerModel, Model, Prompt, Reading, Tap
+from probe_kit.hooks.contract.model import AnswerModel, Prompt, Reading, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import Site, Stream
-from probe_kit.hooks.contract.unembedding import Unembedding
-from probe_kit.hooks.contract.views import PADDING
+from probe_kit.hooks.contract.views import IMAGE_ROLE
 from probe_kit.hooks.families.prismatic.checkpoint import LoadedPrismatic, load_checkpoint
 from probe_kit.hooks.families.prismatic.frames import TextFrame, frame_of
 from probe_kit.hooks.families.prismatic.tokenizer import ByteTokenizer, TextTokenizer, find_tokenizer, id_behind
-from probe_kit.hooks.families.shared.decoder_tap import decoder_tap
-from probe_kit.hooks.families.shared.prompt_kv import ALL_BUT_LAST, kv_tap
 from probe_kit.hooks.families.shared.sampling import Choose, greedy
+from probe_kit.hooks.families.shared.token_decoder import TokenDecoder
 from probe_kit.hooks.families.shared.vlm.decoding import Prefill
 from probe_kit.models.packing import Packed
-from probe_kit.models.prismatic import Decoded, PictureSettings, prepare_picture
+from probe_kit.models.prismatic import Decoded, PictureSettings, PrismaticNetwork, prepare_picture
 
 DEFAULT_CHECKPOINT = "TRI-ML/prismatic-vlms/prism-dinosiglip-224px+7b"
-CAMERA = "primary"
 _TOKENIZER_FILES = ("tokenizer.json", "tokenizer_config.json")
-_PROMPT, _LAST = slice(None, -1), slice(-1, None)
 
 
-class PrismaticModel(Model):
+class PrismaticModel(TokenDecoder):
     """A loaded network of this kind: looks at a picture, reads a prompt, puts out `steps` greedy tokens."""
 
     family: ClassVar[str]
-    output: ClassVar[str]
-    """The stream of the positions that choose the output."""
+    loaded: LoadedPrismatic
+    network: PrismaticNetwork
 
     def __init__(self, loaded: LoadedPrismatic, steps: int, tokenizer: str | None = None) -> None:
-        self.loaded, self.network, self.config = loaded, loaded.network, loaded.config
-        self.steps, self._chosen_tokenizer = steps, tokenizer
-        self.decoder: Any = self.network.language_model.model
-        layers, width = len(self.decoder.layers) + 1, int(self.config.text.hidden_size)
-        heads = int(self.config.text.num_attention_heads)
-        self.streams = {
-            "backbone": Stream("backbone", layers, width, heads=heads),
-            self.output: Stream(self.output, layers, width, steps, part="action", heads=heads),
-        }
+        super().__init__(loaded, loaded.config, steps)
+        self._chosen_tokenizer = tokenizer
         self.further_streams = {
             name: Stream(name, len(tower.blocks), int(tower.embed_dim), part="vision", quantities=("residual",))
             for name, tower in self._towers.items()
         }
-        self.role_names = {
-            "backbone": (f"image.{CAMERA}", "language", "special", PADDING),
-            self.output: (self.output,),
-        }
-        self.card = ModelCard(
-            family=self.family,
-            checkpoint=loaded.checkpoint,
-            weights_sha256=loaded.audit.sha256,
-            random_weights=loaded.audit.random,
-            parameters=loaded.audit.parameters,
-            dtype=loaded.dtype,
-            device=loaded.device,
-            embodiment="",
-            cameras=(CAMERA,),
-            chunk=0,
-            execute=0,
-            notes=loaded.notes,
-            audit=loaded.audit.to_json(),
-            exact=loaded.exact,
-            settings=self._settings(tokenizer),
-            weights_seed=loaded.weights_seed,
-        )
+        self.card = loaded.card(self.family, self._settings(), files=self._files(), tokenizer=tokenizer)
 
-    def _settings(self, tokenizer: str | None) -> dict[str, str]:
-        """The content of files beside the weights, and of a tokenizer from elsewhere."""
+    def _files(self) -> dict[str, Path]:
+        """Every file besides the weights, with that of a tokenizer that comes from elsewhere."""
         files: dict[str, Path] = {}
         for number, folder in enumerate(self.loaded.folders):
             files |= side_files(folder, "" if number == len(self.loaded.folders) - 1 else "adapter/")
-        if self.loaded.text is not None:
-            files |= side_files(self.loaded.text, "tokenizer/")
-        if tokenizer is not None and Path(tokenizer).is_dir():
-            files |= side_files(Path(tokenizer), "tokenizer/")
-        return {**content_hashes(files), "tokenizer": tokenizer or "the checkpoint's", "steps": str(self.steps)}
+        return files if self.loaded.text is None else files | side_files(self.loaded.text, "tokenizer/")
+
+    def _settings(self) -> dict[str, str]:
+        """The choices that the numbers depend on."""
+        return {"tokenizer": self._chosen_tokenizer or "the checkpoint's", "steps": str(self.steps)}
 
     # -- inputs ------------------------------------------------------------------------------------------
 
@@ -126,10 +93,8 @@ class PrismaticModel(Model):
         """Prompts of ids as a batch. Raises InstructionError for one that is too long, CheckpointError for ids
         the model does not have.
         """
-        limit = int(self.config.text.max_position_embeddings)
         for row in rows:
-            if (length := self.network.patches + len(row) + self.steps) > limit:
-                raise InstructionError(f"a prompt makes {length} positions; this model has {limit}. Shorten it")
+            self.check_length(self.network.patches + len(row))
             if max(row) >= self.config.text.vocab_size:
                 raise CheckpointError(
                     f"the tokenizer gave id {max(row)}; this model has {self.config.text.vocab_size}. "
@@ -156,15 +121,12 @@ class PrismaticModel(Model):
     def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
         """Beginning of sequence, patches, text; padding behind it where another prompt is longer."""
         rows = [self.prompt(observation.instruction) for observation in observations]
-        longest, special, patches = max(map(len, rows)), self.tokenizer.special, self.network.patches
-        image = [f"image.{CAMERA}"] * patches
         backbone = []
-        for first, *text, _ in rows:
-            labels = ["special" if number in special else "language" for number in (first, *text)]
-            labels[1:1] = image
-            labels += [PADDING] * (patches + longest - 1 - len(labels))
-            backbone.append(Roles.from_labels(labels))
-        return {"backbone": backbone, self.output: [Roles.from_labels([self.output])] * len(rows)}
+        for row in rows:
+            labels = ["special" if number in self.tokenizer.special else "language" for number in row[:-1]]
+            labels[1:1] = [IMAGE_ROLE] * self.network.patches
+            backbone.append(labels)
+        return self.roles_of(backbone)
 
     def token_ids(self, instructions: Sequence[str]) -> list[tuple[int, ...]]:
         """The ids of each whole prompt."""
@@ -175,28 +137,9 @@ class PrismaticModel(Model):
         prefix = int(self._towers["vision"].num_prefix_tokens)
         return np.concatenate([np.full(prefix, -1), np.arange(self.network.patches)])
 
-    def tap(self, site: Site) -> Tap:
-        """The first norm of the block the site enters, the final norm, or a block's output.
-
-        A tower's last residual is what the projector reads, class and register tokens in front.
-        """
-        stream = self.stream_of(site)
-        if stream is self.prompt_kv:
-            return kv_tap(self.network.prompt_kv, site, ALL_BUT_LAST)
-        if stream.part == "vision":
-            return Tap(self._towers[site.stream].blocks[site.layer].norm1, 1)
-        tokens = _PROMPT if site.stream == "backbone" else _LAST
-        return decoder_tap(self.decoder.layers, self._final_norm, site, self.steps, tokens)
-
-    @property
-    def unembedding(self) -> Unembedding:
-        """The language model's final norm and head."""
-        return Unembedding.of_decoder(("backbone", self.output), self.network.language_model, self._final_norm)
-
-    @property
-    def _final_norm(self) -> nn.Module:
-        norm: nn.Module = getattr(self.decoder, "norm", None) or self.decoder.final_layernorm
-        return norm
+    def vision_tap(self, site: Site) -> Tap:
+        """The input of a block; the last is what the projector reads, class and register tokens in front."""
+        return Tap(self._towers[site.stream].blocks[site.layer].norm1, 1)
 
     @property
     def _towers(self) -> dict[str, Any]:
@@ -214,8 +157,8 @@ class Prismatic(PrismaticModel, AnswerModel):
         """A space, as words begin with one behind every frame; none for bytes, where it is a token of its own."""
         return "" if isinstance(self.tokenizer, ByteTokenizer) else " "
 
-    def _settings(self, tokenizer: str | None) -> dict[str, str]:
-        return {**super()._settings(tokenizer), "frame": self.frame.around("[question]")}
+    def _settings(self) -> dict[str, str]:
+        return {**super()._settings(), "frame": self.frame.around("[question]")}
 
     @cached_property
     def frame(self) -> TextFrame:
@@ -261,15 +204,13 @@ class Prismatic(PrismaticModel, AnswerModel):
     def asked_roles(self, questions: Sequence[Prompt]) -> dict[str, list[Roles]]:
         """Everything around picture and question is `special`, how an answer has begun too."""
         patches = self.network.patches if self.shows_pictures(questions) else 0
-        image = [f"image.{CAMERA}"] * patches
+        image = [IMAGE_ROLE] * patches
         rows = []
         for question in questions:
             inside = self.tokenizer.inside(self._framed(question), *self.frame.question_span(question.text))
             labels = ["language" if is_question else "special" for is_question in inside]
             rows.append([*labels[:1], *image, *labels[1:-1]])
-        longest = max(map(len, rows))
-        backbone = [Roles.from_labels(labels + [PADDING] * (longest - len(labels))) for labels in rows]
-        return {"backbone": backbone, self.output: [Roles.from_labels([self.output])] * len(rows)}
+        return self.roles_of(rows)
 
     def speak(self, reading: Reading, tokens: int) -> list[str]:
         """Greedy text from the keys and values of the prompt on; see the contract. Raises UsageError."""

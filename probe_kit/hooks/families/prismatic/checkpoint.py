@@ -1,21 +1,19 @@
 """Loading of Prismatic and OpenVLA checkpoints: plain folders, LoRA adapters, random weights."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
-
-import torch
 
 from probe_kit.errors import CheckpointError
 from probe_kit.hooks.checkpoints.adapter_files import AdapterFiles, adapter_in
 from probe_kit.hooks.checkpoints.checkpoint import PATTERNS, RUN_WEIGHTS, chosen_dtype
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
-from probe_kit.hooks.checkpoints.weights import WeightsAudit, read_weights, with_adapter
+from probe_kit.hooks.checkpoints.weights import Weights, read_weights, with_adapter
 from probe_kit.hooks.families.prismatic.quantised import check_quantisation, quantise
 from probe_kit.hooks.families.prismatic.release import read_release
-from probe_kit.hooks.families.shared.network_loading import DTYPES, as_dtype, assign_weights, audit_of_twin
-from probe_kit.models.initialisation import initialise
+from probe_kit.hooks.families.shared.network_loading import DTYPES, Loaded, load_network
 from probe_kit.models.prismatic import PrismaticConfig, PrismaticNetwork, build_prismatic
 from probe_kit.models.statistics_choice import stored_statistics
 
@@ -25,28 +23,16 @@ FILES = (*PATTERNS, RUN_WEIGHTS)
 _OTHER_HEADS = ("action_head--*", "proprio_projector--*", "noisy_action_projector--*", "vision_backbone--*")
 
 
-@dataclass(frozen=True)
-class LoadedPrismatic:
+@dataclass(frozen=True, kw_only=True)
+class LoadedPrismatic(Loaded[PrismaticNetwork]):
     """A loaded network and what belongs to it.
 
-    checkpoint: as asked for. folders: where its other files may lie, an adapter's own before that of its base.
-    statistics: per data set, what un-normalises its actions. statistics_source: the file that holds them.
-    dtype: of the weights, as the card says it. text: the
-    folder of a tokenizer that does not come with the checkpoint.
+    folders: where its other files may lie, an adapter's own before that of its base. text: the folder of a
+    tokenizer that does not come with the checkpoint.
     """
 
-    checkpoint: str
-    network: PrismaticNetwork
     config: PrismaticConfig
     folders: tuple[Path, ...]
-    statistics: Mapping[str, Any]
-    statistics_source: str
-    audit: WeightsAudit
-    dtype: str
-    device: str
-    exact: bool
-    notes: tuple[str, ...]
-    weights_seed: int | None = None
     text: Path | None = None
 
     @property
@@ -82,32 +68,27 @@ def load_checkpoint(
     base = folder if adapter is None else adapter.base_folder()
     _check_other_heads((folder, base))
     config = PrismaticConfig.from_folder(base)
-    name = chosen_dtype(dtype, config.dtype, DTYPES)
-    if random_weights:
-        network, audit = _random(config, DTYPES[name], checkpoint, weights_seed)
-    else:
-        network, audit = _stored(config, base, DTYPES[name], adapter)
-    network.requires_grad_(False)
-    notes: tuple[str, ...] = (audit.adapter,) if audit.adapter else ()
-    if bits is not None:
-        quantise(network, bits)
-        notes += (f"not exact: language model in {bits} bits",)
-    folders = tuple(dict.fromkeys((folder, base)))
-    statistics, statistics_source = prismatic_statistics(config, folders)
-    return LoadedPrismatic(
-        checkpoint=checkpoint,
-        network=network.to(device),
-        config=config,
-        folders=folders,
-        statistics=statistics,
-        statistics_source=statistics_source,
-        audit=audit,
-        dtype=name if bits is None else f"{name}, {bits}-bit",
-        device=device,
-        exact=bits is None,
-        notes=notes,
-        weights_seed=weights_seed if random_weights else None,
+    loaded = load_network(
+        partial(build_prismatic, config),
+        lambda: _read(config, base, adapter),
+        checkpoint,
+        base,
+        device,
+        chosen_dtype(dtype, config.dtype, DTYPES),
+        random_weights,
+        weights_seed,
+        tied=lambda _: {"language_model.lm_head.weight"} if config.text.tie_word_embeddings else (),
+        tie=lambda network: network.language_model.tie_weights(),
+        finish=lambda network: None if bits is None else quantise(network, bits),
     )
+    folders = tuple(dict.fromkeys((folder, base)))
+    if bits is not None:
+        notes = (
+            *loaded.notes,
+            f"not exact: language model in {bits} bits",
+        )
+        loaded = replace(loaded, dtype=f"{loaded.dtype}, {bits}-bit", exact=False, notes=notes)
+    return LoadedPrismatic(**vars(loaded), config=config, folders=folders)
 
 
 def _check_other_heads(folders: tuple[Path, ...]) -> None:
@@ -120,27 +101,10 @@ def _check_other_heads(folders: tuple[Path, ...]) -> None:
                 )
 
 
-def _random(
-    config: PrismaticConfig, dtype: torch.dtype, checkpoint: str, seed: int
-) -> tuple[PrismaticNetwork, WeightsAudit]:
-    network = build_prismatic(config, dtype, device="cpu")
-    initialise(network, seed)
-    return network, audit_of_twin(network, checkpoint)
-
-
-def _stored(
-    config: PrismaticConfig, folder: Path, dtype: torch.dtype, adapter: AdapterFiles | None
-) -> tuple[PrismaticNetwork, WeightsAudit]:
+def _read(config: PrismaticConfig, folder: Path, adapter: AdapterFiles | None) -> Weights:
     released = folder / RUN_WEIGHTS
     weights = read_release(released, config) if released.is_file() else read_weights(folder)
-    if adapter is not None and weights.adapter is None:
-        weights = with_adapter(weights, adapter)
-    network = build_prismatic(config, dtype)
-    tied = {"language_model.lm_head.weight"} if config.text.tie_word_embeddings else set()
-    audit = assign_weights(
-        network, weights, as_dtype(weights.tensors, dtype), tied, network.language_model.tie_weights
-    )
-    return network, audit
+    return weights if adapter is None or weights.adapter is not None else with_adapter(weights, adapter)
 
 
 def prismatic_statistics(config: PrismaticConfig, folders: tuple[Path, ...]) -> tuple[Mapping[str, Any], str]:

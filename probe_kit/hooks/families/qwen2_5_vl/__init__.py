@@ -1,19 +1,17 @@
 """Qwen2.5-VL, on transformers' own network."""
 
 from probe_kit.hooks.contract.declared import answering
-from probe_kit.hooks.contract.options import Option
-from probe_kit.hooks.family import Family
+from probe_kit.hooks.contract.options import Option as Option
+from probe_kit.hooks.families.shared.kinds import TOKENIZER_FILE, answering_family
 
 FAMILIES = (
-    Family(
+    answering_family(
         "qwen2.5-vl",
         "Qwen2.5-VL (vision tower with windows, Qwen2 decoder), on transformers' own network",
         "Qwen/Qwen2.5-VL-7B-Instruct",
-        "probe_kit.hooks.families.qwen2_5_vl.adapter:Qwen25VL.load",
+        "qwen2_5_vl.adapter:Qwen25VL.load",
         streams="backbone 29 layers, answer 29 layers (7B)",
-        embodiment="none: answers, does not act",
         notes="7B 17 GB, 32B 67 GB in bfloat16; 3B is InternVLA-M1's source",
-        outputs="probe_kit.hooks.families.shared.vlm.outputs:vlm_outputs",
         config_types=("qwen2_5_vl",),
         declared={
             "7B": answering(29, 3584, 110),
@@ -28,8 +26,6 @@ FAMILIES = (
             ("32B", "Qwen/Qwen2.5-VL-32B-Instruct"),
             ("3B", "Qwen/Qwen2.5-VL-3B-Instruct"),
         ),
-        options=(Option("tokenizer", str, "Folder of another tokenizer.json.", "the checkpoint's", is_path=True),),
-        acts=False,
-        reads=True,
+        options=(TOKENIZER_FILE,),
     ),
 )

@@ -1,19 +1,17 @@
 """Qwen3-VL, on transformers' own network."""
 
 from probe_kit.hooks.contract.declared import answering
-from probe_kit.hooks.contract.options import Option
-from probe_kit.hooks.family import Family
+from probe_kit.hooks.contract.options import Option as Option
+from probe_kit.hooks.families.shared.kinds import TOKENIZER_FILE, answering_family
 
 FAMILIES = (
-    Family(
+    answering_family(
         "qwen3-vl",
         "Qwen3-VL (vision tower with DeepStack, Qwen3 decoder), on transformers' own network",
         "Qwen/Qwen3-VL-8B-Instruct",
-        "probe_kit.hooks.families.qwen3_vl.adapter:Qwen3VL.load",
+        "qwen3_vl.adapter:Qwen3VL.load",
         streams="backbone 37 layers, answer 37 layers (8B)",
-        embodiment="none: answers, does not act",
         notes="8B 18 GB, 32B 67 GB in bfloat16; 4B is Xiaomi-R0's source",
-        outputs="probe_kit.hooks.families.shared.vlm.outputs:vlm_outputs",
         config_types=("qwen3_vl",),
         declared={
             "8B": answering(37, 4096, 110, sums=False),
@@ -27,8 +25,6 @@ FAMILIES = (
             ("32B", "Qwen/Qwen3-VL-32B-Instruct"),
             ("4B", "Qwen/Qwen3-VL-4B-Instruct"),
         ),
-        options=(Option("tokenizer", str, "Folder of another tokenizer.json.", "the checkpoint's", is_path=True),),
-        acts=False,
-        reads=True,
+        options=(TOKENIZER_FILE,),
     ),
 )

@@ -12,6 +12,10 @@ from probe_kit.hashing import sha256_json
 from probe_kit.models.bounds import check_bounds
 from probe_kit.models.statistics_choice import chosen_name
 
+DIMENSIONS = 7
+"""Of an action: an end-effector's delta, and the gripper last."""
+GRIPPER_OPEN = 0.5
+
 
 @dataclass(frozen=True)
 class ActionStatistics:
@@ -62,3 +66,10 @@ class ActionStatistics:
     def restore(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """(…, D) normalised values in the data set's units."""
         return np.where(self.mask, (values + 1) / 2 * (self.high - self.low) + self.low, values)
+
+
+def open_or_closed(actions: NDArray[Any]) -> NDArray[np.float32]:
+    """(…, D) float32 with the gripper, the last number, open (1) or closed (0)."""
+    decided = actions.copy()
+    decided[..., -1] = decided[..., -1] > GRIPPER_OPEN
+    return decided.astype(np.float32)

@@ -1,52 +1,130 @@
-"""Loading of native networks: from files or seeded random weights."""
+"""Loading of native networks from files or with random weights, and the card of what was loaded."""
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from probe_kit.errors import UsageError, WeightsError
+from probe_kit.hooks.checkpoints.checkpoint import content_hashes, side_files
 from probe_kit.hooks.checkpoints.weights import Weights, WeightsAudit, load_weights
+from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.models.initialisation import initialise
 
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 
 
 @dataclass(frozen=True)
-class Filled[Network: nn.Module]:
-    """A network with its weights, and what loading proved. weights_seed: of a random twin, else None."""
+class Loaded[Network: nn.Module]:
+    """A network with its weights, what loading proved, and where it is from.
+
+    dtype: of the weights, as the card has it. checkpoint: as requested. folder: of its other files. weights_seed:
+    of random weights, else None. notes, exact: of the card.
+    """
 
     network: Network
     audit: WeightsAudit
     dtype: str
-    weights_seed: int | None
+    device: str
+    checkpoint: str
+    folder: Path
+    weights_seed: int | None = None
+    notes: tuple[str, ...] = ()
+    exact: bool = True
+
+    def card(
+        self,
+        family: str,
+        settings: Mapping[str, str],
+        *,
+        files: Mapping[str, Path] | None = None,
+        tokenizer: str | Path | None = None,
+        notes: Iterable[str] = (),
+        **fields: Any,
+    ) -> ModelCard:
+        """The card of the model; its settings begin with the content of every file that is read.
+
+        files: besides the weights, by name; default those of the folder. tokenizer: of another folder, or a name.
+        fields: further ones of `ModelCard`.
+        """
+        read = side_files(self.folder) if files is None else dict(files)
+        if tokenizer is not None and (other := Path(tokenizer).expanduser()) != self.folder and other.is_dir():
+            read |= side_files(other, "tokenizer/")
+        return ModelCard(
+            family=family,
+            checkpoint=self.checkpoint,
+            weights_sha256=self.audit.sha256,
+            random_weights=self.audit.random,
+            parameters=self.audit.parameters,
+            dtype=self.dtype,
+            device=self.device,
+            notes=(*self.notes, *notes),
+            audit=self.audit.to_json(),
+            settings={**content_hashes(read), **settings},
+            exact=self.exact,
+            weights_seed=self.weights_seed,
+            **fields,
+        )
 
 
-def fill[Network: nn.Module](
+def _nothing(_: object) -> None:
+    """Do nothing with a network."""
+
+
+def load_network[Network: nn.Module](
     build: Callable[[torch.dtype, str], Network],
     read: Callable[[], Weights],
+    checkpoint: str,
+    folder: Path,
+    device: str,
     dtype: str | None,
-    tied: Callable[[Network], tuple[str, ...]],
+    random_weights: bool,
+    weights_seed: int,
+    *,
+    tied: Callable[[Network], Collection[str]] = lambda _: (),
+    tie: Callable[[Network], object] = _nothing,
     name_in_module: Callable[[str], str] = str,
-) -> Filled[Network]:
-    """The network with a Qwen VLM that `build(dtype, device)` makes, with exactly the weights of `read()`.
+    tensors_of: Callable[[Weights], Mapping[str, Tensor]] | None = None,
+    draw: Callable[[Network, int], object] = initialise,
+    finish: Callable[[Network], object] = _nothing,
+) -> Loaded[Network]:
+    """Load the network that `build(dtype, device)` makes, with exactly the weights of `read()` or random ones.
 
-    dtype: float32 or bfloat16; default that of the tensors in the file. tied: parameters that are another one's
-    double, which a file may leave out; called with the network. name_in_module: the network's name of a tensor in
-    the file. Raises UsageError for another dtype, WeightsError for weights that are not exactly the network's.
+    dtype: float32 or bfloat16; default that of the tensors in the file, float32 for random weights. tied: names of
+    parameters that are another one's double, which a file may leave out. tie: ties them again. name_in_module: the
+    network's name of a tensor in the file. tensors_of: the tensors under the network's names, where that is not
+    all. draw: random weights of a seed. finish: called with the whole network, before it goes to the device.
+    Raises UsageError for another dtype, WeightsError for weights that are not exactly the network's.
     """
-    weights = read()
-    name = checked_dtype(dtype or _stored_dtype(weights))
-    network = build(DTYPES[name], "meta")
-    tensors = as_dtype({name_in_module(key): value for key, value in weights.tensors.items()}, DTYPES[name])
+    if random_weights:
+        name = checked_dtype(dtype or "float32")
+        network = build(DTYPES[name], "cpu")
+        draw(network, weights_seed)
+        weights = Weights(network.state_dict(), f"random twin of {checkpoint}", random=True)
+        audit = load_weights(network, weights, weights.tensors)
+    else:
+        weights = read()
+        name = checked_dtype(dtype or _stored_dtype(weights))
+        network = build(DTYPES[name], "meta")
+        tensors = tensors_of(weights) if tensors_of else renamed_tensors(weights, name_in_module)
+        typed = as_dtype(tensors, DTYPES[name])
+        audit = assign_weights(network, weights, typed, tied(network), lambda: tie(network), name_in_module)
+    network.requires_grad_(False)
+    finish(network)
+    seed = weights_seed if random_weights else None
+    notes = (audit.adapter,) if audit.adapter else ()
+    return Loaded(network.to(device), audit, name, device, checkpoint, folder, seed, notes)
+
+
+def renamed_tensors(weights: Weights, name_in_module: Callable[[str], str]) -> dict[str, Tensor]:
+    """The tensors of a file under the network's names. Raises WeightsError for two of one name."""
+    tensors = {name_in_module(name): value for name, value in weights.tensors.items()}
     if len(tensors) < len(weights.tensors):
         raise WeightsError(f"{weights.source}: two tensors have the same name here; nothing was run")
-    tying: Any = getattr(network, "vlm", network)
-    audit = assign_weights(network, weights, tensors, tied(network), tying.tie_weights, name_in_module)
-    network.requires_grad_(False)
-    return Filled(network, audit, name, None)
+    return tensors
 
 
 def assign_weights(
@@ -72,24 +150,6 @@ def assign_weights(
             )
     _check_filled(network, weights.source)
     return audit
-
-
-def twin[Network: nn.Module](
-    build: Callable[[torch.dtype, str], Network], checkpoint: str, dtype: str | None, seed: int
-) -> Filled[Network]:
-    """The same architecture with random weights of `seed`; float32 unless asked otherwise."""
-    name = checked_dtype(dtype or "float32")
-    network = build(DTYPES[name], "cpu")
-    initialise(network, seed)
-    audit = audit_of_twin(network, checkpoint)
-    network.requires_grad_(False)
-    return Filled(network, audit, name, seed)
-
-
-def audit_of_twin(network: nn.Module, checkpoint: str) -> WeightsAudit:
-    """The audit of a network whose weights were drawn."""
-    weights = Weights(network.state_dict(), f"random twin of {checkpoint}", random=True)
-    return load_weights(network, weights, weights.tensors)
 
 
 def as_dtype(tensors: Mapping[str, Tensor], dtype: torch.dtype) -> dict[str, Tensor]:

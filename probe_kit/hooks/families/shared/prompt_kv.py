@@ -11,6 +11,8 @@ from probe_kit.models.prompt_kv import PromptKV
 ALL_TOKENS = slice(None)
 ALL_BUT_LAST = slice(None, -1)
 """Models whose last prompt token belongs to the acting stream: its keys and values are not the backbone's."""
+LAST = slice(-1, None)
+"""What that token is of the prompt; every token that is fed back is the last of its pass too."""
 
 
 def kv_tap(kv: PromptKV, site: Site, tokens: slice = ALL_TOKENS) -> HeadsTap:

@@ -2,14 +2,14 @@
 
 from probe_kit.hooks.contract.declared import backbone, expert
 from probe_kit.hooks.families.shared.capabilities import FLOW
-from probe_kit.hooks.family import Family
+from probe_kit.hooks.families.shared.kinds import lerobot_family
 
 FAMILIES = (
-    Family(
+    lerobot_family(
         "smolvla",
         "SmolVLA (SmolVLM2 500M, 16 layers, + flow-matching expert) through lerobot",
         "lerobot/smolvla_base",
-        "probe_kit.hooks.families.smolvla.adapter:SmolVLA.load",
+        "smolvla.adapter:SmolVLA",
         streams="backbone 17 layers, expert 17 layers x 10 iterations",
         embodiment="as fine-tuned; the base model acts in SO-100 joint positions",
         hub=(("HuggingFaceTB/SmolVLM2-500M-Video-Instruct", "tokenizer.json"),),
@@ -17,13 +17,9 @@ FAMILIES = (
             "Apache-2.0; configuration and tokenizer of HuggingFaceTB/SmolVLM2-500M-Video-Instruct. The base can "
             "be captured without acting (--no-act); to act it needs a fine-tune for end-effector deltas"
         ),
-        outputs="probe_kit.hooks.families.shared.lerobot.outputs:lerobot_outputs",
-        config_types=("smolvla",),
-        words="probe_kit.hooks.families.smolvla.adapter:SmolVLA.check_words",
         declared={
             "": (backbone(17, 960, 113, "state", camera="top"), expert(17, 720, 10, 50, ("action",))),
         },
-        full_size="probe_kit.models.lerobot.smolvla:full_size_smolvla",
         always_float32=True,
         parameters={"": 450_046_176},
         not_acting=("lerobot/smolvla_base",),

@@ -5,11 +5,11 @@ by position: `backbone` is the prompt without the new line, `action` the positio
 action token: the new line, then every token fed back but the last. Three tokens are a step, several steps a chunk.
 """
 
-import warnings
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
 from functools import cached_property
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, ClassVar
 
 import numpy as np
@@ -17,23 +17,22 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from probe_kit.errors import CheckpointError, InstructionError, ObservationError, UsageError
+from probe_kit.errors import CheckpointError, ObservationError, UsageError
 from probe_kit.hashing import sha256_json
-from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES, content_hashes, side_files
+from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
-from probe_kit.hooks.contract.card import ModelCard
+from probe_kit.hooks.contract.card import ARM
 from probe_kit.hooks.contract.model import Policy, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import HEADS, Site, Stream
-from probe_kit.hooks.contract.unembedding import Unembedding
-from probe_kit.hooks.contract.views import PADDING
+from probe_kit.hooks.contract.views import IMAGE_ROLE
 from probe_kit.hooks.families.prismatic.tokenizer import BYTES
-from probe_kit.hooks.families.shared.action_statistics import ActionStatistics
+from probe_kit.hooks.families.shared.action_statistics import ActionStatistics, open_or_closed
 from probe_kit.hooks.families.shared.attention_weights import Note, of_decoder
 from probe_kit.hooks.families.shared.capabilities import TOKENS
-from probe_kit.hooks.families.shared.decoder_tap import decoder_tap
-from probe_kit.hooks.families.shared.prompt_kv import ALL_BUT_LAST, kept_prompt, kv_tap
+from probe_kit.hooks.families.shared.prompt_kv import kept_prompt
+from probe_kit.hooks.families.shared.token_decoder import TokenDecoder, warn_of_unknown
 from probe_kit.hooks.families.spatialvla.checkpoint import (
     PROCESSOR_FILE,
     LoadedSpatialVLA,
@@ -49,24 +48,21 @@ from probe_kit.models.spatialvla import (
     Intrinsics,
     PictureSettings,
     SpatialVLAConfig,
+    SpatialVLANetwork,
     known_cameras,
     prepare_picture,
 )
 from probe_kit.models.statistics_choice import stored_statistics
 
-CAMERA = "primary"
 DEFAULT_CHECKPOINT = "IPEC-COMMUNITY/spatialvla-4b-224-pt"
 """The data set of the WidowX arm that Act2Answer imitates."""
 SCENE = "scene"
 """Asks for the camera of the observation."""
 ENSEMBLE = 0.8
 """With this exponent the client for SimplerEnv averages the plans of overlapping chunks."""
-_GRIPPER_OPEN = 0.5
-_ADDED = {"attention": "post_attention_layernorm", "mlp": "post_feedforward_layernorm"}
-_PROMPT, _LAST = slice(None, -1), slice(-1, None)
 
 
-class SpatialVLA(Policy):
+class SpatialVLA(TokenDecoder, Policy):
     """A loaded SpatialVLA.
 
     steps: greedy tokens per inference. captured: how many of them the stream `action` captures.
@@ -74,6 +70,10 @@ class SpatialVLA(Policy):
 
     family: ClassVar[str] = "spatialvla"
     interventions = TOKENS
+    added = MappingProxyType({"attention": "post_attention_layernorm", "mlp": "post_feedforward_layernorm"})
+    """Gemma-2 norms what its attention and its MLP put out before adding it; SigLIP does not."""
+    loaded: LoadedSpatialVLA
+    network: SpatialVLANetwork
 
     def __init__(
         self,
@@ -86,69 +86,38 @@ class SpatialVLA(Policy):
         constrained: bool,
         ensemble: bool = False,
     ) -> None:
-        self.loaded, self.speech, self.statistics = loaded, speech, statistics
-        self.network, self.config = loaded.network, loaded.config
-        self.camera, self.steps, self.constrained = camera, steps, constrained
+        super().__init__(loaded, loaded.config, steps, captured)
+        self.speech, self.statistics = speech, statistics
+        self.camera, self.constrained = camera, constrained
         self.ensemble = ENSEMBLE if ensemble else None
         self.bins = ActionBins.of(
             loaded.processor, self.config.first_action, self.config.actions, loaded.processor_file
         )
         self._preset = _preset(loaded, camera)
-        self.decoder: Any = self.network.language_model.model
         self.tower: Any = self.network.vision_tower.vision_model
-        layers, width = len(self.decoder.layers) + 1, int(self.config.text.hidden_size)
-        heads = int(self.config.text.num_attention_heads)
-        self.streams = {
-            "backbone": Stream("backbone", layers, width, heads=heads),
-            "action": Stream("action", layers, width, captured, part="action", heads=heads),
-        }
-        seeing = len(self.tower.encoder.layers) + 1
+        seeing, vision = len(self.tower.encoder.layers) + 1, self.config.vision
+        heads = int(vision.num_attention_heads)
         self.further_streams = {
-            "vision": Stream(
-                "vision",
-                seeing,
-                int(self.config.vision.hidden_size),
-                part="vision",
-                heads=int(self.config.vision.num_attention_heads),
-            )
+            "vision": Stream("vision", seeing, int(vision.hidden_size), part="vision", heads=heads)
         }
         self.prompt_kv = kept_prompt(self.config.text)
-        self.role_names = {
-            "backbone": (f"image.{CAMERA}", "language", "special", PADDING),
-            "action": ("action",),
-        }
-        self.card = self._card()
-
-    def _card(self) -> ModelCard:
-        loaded, needed = self.loaded, self.config.depth is not None and self._preset is None
-        return ModelCard(
-            family=self.family,
-            checkpoint=loaded.checkpoint,
-            weights_sha256=loaded.audit.sha256,
-            random_weights=loaded.audit.random,
-            parameters=loaded.audit.parameters,
-            dtype=loaded.dtype,
-            device=loaded.device,
-            embodiment=f"7-DoF end-effector delta, one third-person camera, units of {self.statistics.key}",
-            cameras=(CAMERA,),
-            chunk=self.steps // STEP_TOKENS,
-            execute=1,
+        needed = self.config.depth is not None and self._preset is None
+        self.card = loaded.card(
+            self.family,
+            self._settings(),
+            tokenizer=speech.tokenizer_choice,
             notes=self._notes(),
-            audit=loaded.audit.to_json(),
-            settings=self._settings(),
-            weights_seed=loaded.weights_seed,
+            embodiment=f"{ARM}, units of {statistics.key}",
+            chunk=steps // STEP_TOKENS,
+            execute=1,
             needs=frozenset({"intrinsics"}) if needed else frozenset(),
             ensemble=self.ensemble,
         )
 
     def _settings(self) -> dict[str, str]:
-        """The content of files beside the weights and of a tokenizer from elsewhere, and every choice."""
-        files, tokenizer = side_files(self.loaded.folder), self.speech.tokenizer_choice
-        if tokenizer is not None and Path(tokenizer).is_dir():
-            files |= side_files(Path(tokenizer), "tokenizer/")
+        """Every choice."""
         return {
-            **content_hashes(files),
-            "tokenizer": tokenizer or "the checkpoint's",
+            "tokenizer": self.speech.tokenizer_choice or "the checkpoint's",
             "unnorm_key": self.statistics.key,
             "action_statistics": self.statistics.sha256,
             "action_bins": sha256_json(self.bins.content),
@@ -215,11 +184,14 @@ class SpatialVLA(Policy):
 
     def pack(self, rows: Sequence[Sequence[int]]) -> Packed:
         """Prompts of ids as a batch. Raises InstructionError for one that is too long."""
-        text = self.config.text
-        limit = min(int(text.max_position_embeddings), int(text.sliding_window or text.max_position_embeddings))
-        if (longest := max(map(len, rows)) + self.steps) > limit:
-            raise InstructionError(f"a prompt makes {longest} positions; this model has {limit}. Shorten it")
+        self.check_length(max(map(len, rows)))
         return Packed.of(rows, self.config.padding)
+
+    @property
+    def positions(self) -> int:
+        """Also no more than Gemma-2's window: half of its layers attend to no more."""
+        window = self.config.text.sliding_window
+        return min(super().positions, int(window)) if window else super().positions
 
     # -- acting ------------------------------------------------------------------------------------------
 
@@ -234,10 +206,8 @@ class SpatialVLA(Policy):
         ids = ids.reshape(len(observations), -1, STEP_TOKENS)
         self.flagged = ~np.asarray(self.bins.is_action(ids[:, 0]).all(axis=-1))
         if self.flagged.any():
-            _say_unknown()
-        actions = self.actions(ids)
-        actions[..., -1] = actions[..., -1] > _GRIPPER_OPEN
-        return actions.astype(np.float32)
+            warn_of_unknown()
+        return open_or_closed(self.actions(ids))
 
     def actions(self, ids: NDArray[np.int64]) -> NDArray[np.float64]:
         """(…, 7) in the data set's units, the gripper as decoded, of ids (…, 3)."""
@@ -267,60 +237,30 @@ class SpatialVLA(Policy):
     def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
         """Patches, beginning of sequence, text; padding behind it where another prompt is longer."""
         rows = [self.prompt(observation.instruction)[:-1] for observation in observations]
-        longest = max(map(len, rows))
-        return {
-            "backbone": [Roles.from_labels(self._labels(row) + [PADDING] * (longest - len(row))) for row in rows],
-            "action": [Roles.from_labels(["action"])] * len(rows),
-        }
+        return self.roles_of([self._labels(row) for row in rows])
 
     def _labels(self, row: Sequence[int]) -> list[str]:
         special = self.speech.tokenizer.special
-        picture = [f"image.{CAMERA}"] * self.config.patches
+        picture = [IMAGE_ROLE] * self.config.patches
         return picture + ["special" if number in special else "language" for number in row[len(picture) :]]
 
     def patch_order(self) -> NDArray[np.int64]:
         """A token per patch, row by row; where a token lies in space is added to it behind the tower."""
         return np.arange(self.config.patches)
 
-    @property
-    def unembedding(self) -> Unembedding:
-        """The language model's final norm and head."""
-        return Unembedding.of_decoder(("backbone", "action"), self.network.language_model, self.decoder.norm)
-
-    def tap(self, site: Site) -> Tap:
-        """The first norm of the block the site enters, the final norm, or what a block adds.
-
-        Gemma-2 norms what its attention and its MLP put out before adding it; SigLIP does not.
-        """
-        stream = self.stream_of(site)
-        if stream is self.prompt_kv:
-            return kv_tap(self.network.prompt_kv, site, ALL_BUT_LAST)
-        if stream.part == "vision":
-            return _vision_tap(self.tower, site)
-        tokens = _PROMPT if stream.part == "backbone" else _LAST
-        return decoder_tap(self.decoder.layers, self.decoder.norm, site, self.steps, tokens, added=_ADDED)
-
-
-def _say_unknown() -> None:
-    warnings.warn(
-        "the model put out tokens that name no action; they count as the nearest bin, as in the original "
-        "software, and the step as flagged. Random weights do this; if trained ones do, prompt or tokenizer are "
-        "wrong",
-        stacklevel=3,
-    )
-
-
-def _vision_tap(tower: Any, site: Site) -> Tap:
-    if site.quantity == "final_norm":
-        return Tap(tower.post_layernorm, 1, "output")
-    if site.layer == len(tower.encoder.layers):
-        return Tap(tower.post_layernorm, 1)
-    block = tower.encoder.layers[site.layer]
-    if site.quantity == "residual":
-        return Tap(block.layer_norm1, 1)
-    if site.quantity == HEADS:
-        return Tap(block.self_attn.out_proj, 1)
-    return Tap(block.self_attn.out_proj if site.quantity == "attention" else block.mlp, 1, "output")
+    def vision_tap(self, site: Site) -> Tap:
+        """The first norm of a block, the norm behind the last, or what a block adds."""
+        tower = self.tower
+        if site.quantity == "final_norm":
+            return Tap(tower.post_layernorm, 1, "output")
+        if site.layer == len(tower.encoder.layers):
+            return Tap(tower.post_layernorm, 1)
+        block = tower.encoder.layers[site.layer]
+        if site.quantity == "residual":
+            return Tap(block.layer_norm1, 1)
+        if site.quantity == HEADS:
+            return Tap(block.self_attn.out_proj, 1)
+        return Tap(block.self_attn.out_proj if site.quantity == "attention" else block.mlp, 1, "output")
 
 
 def _preset(loaded: LoadedSpatialVLA, camera: str) -> Intrinsics | None:

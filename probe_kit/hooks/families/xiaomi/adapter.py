@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any, ClassVar, cast
 
 import numpy as np
@@ -19,19 +18,20 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from probe_kit.errors import CheckpointError, ObservationError, UsageError
-from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES, chosen_dtype, content_hashes, side_files
+from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES, chosen_dtype
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.checkpoints.weights import read_weights
-from probe_kit.hooks.contract.card import ModelCard
+from probe_kit.hooks.contract.card import ARM
 from probe_kit.hooks.contract.model import Tap
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import HEADS, Site, Stream
 from probe_kit.hooks.contract.state_layout import ARM_NUMBERS, laid_out
+from probe_kit.hooks.families.shared.action_statistics import DIMENSIONS, open_or_closed
 from probe_kit.hooks.families.shared.attention_weights import Note, recording_weights
-from probe_kit.hooks.families.shared.network_loading import DTYPES, Filled, fill, twin
+from probe_kit.hooks.families.shared.network_loading import DTYPES, Loaded, load_network
 from probe_kit.hooks.families.shared.prompt_kv import kv_tap
-from probe_kit.hooks.families.shared.qwen.vla import BACKBONE_ROLES, CAMERA, QwenVLA
+from probe_kit.hooks.families.shared.qwen.vla import BACKBONE_ROLES, QwenVLA
 from probe_kit.hooks.families.shared.sampling import seeded_noise
 from probe_kit.hooks.families.xiaomi import INTERVENTIONS
 from probe_kit.models.qwen import QwenInputs
@@ -53,9 +53,6 @@ DEFAULT_CHECKPOINT = "XiaomiRobotics/Xiaomi-Robotics-0-SimplerEnv-WidowX"
 EXECUTE = 4
 """Actions the released evaluation carries out before it looks again."""
 _TIED = ("vlm.lm_head.weight",)
-_GRIPPER_OPEN = 0.5
-_USED = 7
-"""Of an action's numbers the first ones are the end-effector's delta and the gripper."""
 
 
 class Xiaomi(QwenVLA):
@@ -68,19 +65,16 @@ class Xiaomi(QwenVLA):
 
     def __init__(
         self,
-        filled: Filled[XiaomiNetwork],
+        loaded: Loaded[XiaomiNetwork],
         config: XiaomiConfig,
-        folder: Path,
-        checkpoint: str,
-        device: str,
         robot: str | None,
         steps: int,
         tokenizer: str | None,
         openness: str = "measured",
     ) -> None:
-        super().__init__(filled.network.vlm, folder, tokenizer, device)
+        super().__init__(loaded.network.vlm, loaded.folder, tokenizer, loaded.device)
         self.openness = openness
-        self.network, self.config, self.steps = filled.network, config, steps
+        self.network, self.config, self.steps = loaded.network, config, steps
         self._robot = robot
         layers, first = len(self.network.dit.layers), cast(Any, self.network.dit.layers[0])
         self.streams = {
@@ -100,52 +94,30 @@ class Xiaomi(QwenVLA):
         self.further_streams = {"vision": self.vision_stream()}
         self.prompt_kv = self.backbone_kv()
         self.role_names = {"backbone": BACKBONE_ROLES, "expert": ("special", "state", "action")}
-        self.card = self._card(filled, checkpoint, tokenizer)
-
-    def _card(self, filled: Filled[XiaomiNetwork], checkpoint: str, tokenizer: str | None) -> ModelCard:
-        units = self._units_or_reason()
-        if isinstance(units, ActionUnits):
-            chunk, note = len(units.mean), f"robot: {units.robot}"
-            settings = {"robot": units.robot, "action_statistics": units.sha256}
+        units = self.units_or_reason()
+        if isinstance(units, str):
+            chunk, note, name, numbers = config.action_length, f"cannot act: {units}", "none", "none"
         else:
-            chunk, note = self.config.action_length, f"cannot act: {units}"
-            settings = {"robot": "none", "action_statistics": "none"}
-        files = side_files(self.folder)
-        if tokenizer is not None:
-            files |= side_files(Path(tokenizer).expanduser(), "tokenizer/")
-        return ModelCard(
-            family="xiaomi-r0",
-            checkpoint=checkpoint,
-            weights_sha256=filled.audit.sha256,
-            random_weights=filled.audit.random,
-            parameters=filled.audit.parameters,
-            dtype=filled.dtype,
-            device=self.device,
-            embodiment="7-DoF end-effector delta, one third-person camera",
-            cameras=(CAMERA,),
-            chunk=chunk,
-            execute=min(EXECUTE, chunk),
+            chunk, note, name, numbers = len(units.mean), f"robot: {units.robot}", units.robot, units.sha256
+        options = {"robot": name, "action_statistics": numbers, "steps": str(steps)}
+        if openness != "measured":
+            options["openness"] = openness
+        execute = min(EXECUTE, chunk)
+        self.card = loaded.card(
+            "xiaomi-r0",
+            options,
+            tokenizer=tokenizer,
             notes=(note,),
-            audit=filled.audit.to_json(),
-            settings={
-                **content_hashes(files),
-                **settings,
-                "steps": str(self.steps),
-                **({"openness": self.openness} if self.openness != "measured" else {}),
-            },
-            weights_seed=filled.weights_seed,
+            embodiment=ARM,
+            chunk=chunk,
+            execute=execute,
         )
 
     # -- the robot ---------------------------------------------------------------------------------------
 
-    def _units_or_reason(self) -> ActionUnits | str:
-        """The statistics, or why there are none: a checkpoint without them can be captured and cannot act."""
-        if self._robot is not None:
-            return self.units
-        try:
-            return self.units
-        except CheckpointError as error:
-            return str(error)
+    def units_or_reason(self) -> ActionUnits | str:
+        """The statistics, or why there are none; a robot that was named has to have them."""
+        return self.units if self._robot is not None else super().units_or_reason()
 
     @cached_property
     def units(self) -> ActionUnits:
@@ -158,7 +130,7 @@ class Xiaomi(QwenVLA):
 
         Raises UsageError for one that Act2Answer's arm cannot stand in for.
         """
-        units = self._units_or_reason()
+        units = self.units_or_reason()
         return robot_of(DEFAULT_ROBOT if isinstance(units, str) else units.robot)
 
     def text(self, instruction: str) -> str:
@@ -179,13 +151,11 @@ class Xiaomi(QwenVLA):
     def act(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
         """One chunk of actions per observation; see the contract."""
         units = self.units
-        actions = units.restore(self.infer_without_acting(observations, seeds))[..., :_USED]
-        actions[..., -1] = actions[..., -1] > _GRIPPER_OPEN
-        return actions.astype(np.float32)
+        return open_or_closed(units.restore(self.infer_without_acting(observations, seeds))[..., :DIMENSIONS])
 
     def embodiment_mismatch(self) -> str | None:
         """No statistics."""
-        units = self._units_or_reason()
+        units = self.units_or_reason()
         return units if isinstance(units, str) else None
 
     def infer_without_acting(
@@ -193,7 +163,7 @@ class Xiaomi(QwenVLA):
     ) -> NDArray[np.float32]:
         """(B, chunk, action numbers) as the flow puts them out, without units; all where nothing says which."""
         self.check(observations, seeds)
-        units = self._units_or_reason()
+        units = self.units_or_reason()
         numbers = self.config.action_dim
         used = np.ones((self.card.chunk, numbers), np.float32) if isinstance(units, str) else units.used
         noise = seeded_noise(seeds, (self.card.chunk, numbers), self.device)
@@ -303,10 +273,16 @@ def load_xiaomi(
         return build_xiaomi(config, kind, device)
 
     kind = chosen_dtype(dtype, config.dtype, DTYPES) if dtype or config.dtype else None
-    if random_weights:
-        filled = twin(build, name, kind, weights_seed)
-    else:
-        tied = _TIED if config.vlm.tie_word_embeddings else ()
-        filled = fill(build, lambda: read_weights(folder), kind, lambda _: tied)
-    filled.network.to(device)
-    return Xiaomi(filled, config, folder, name, device, robot, steps, tokenizer, openness)
+    loaded = load_network(
+        build,
+        lambda: read_weights(folder),
+        name,
+        folder,
+        device,
+        kind,
+        random_weights,
+        weights_seed,
+        tied=lambda _: _TIED if config.vlm.tie_word_embeddings else (),
+        tie=lambda network: network.vlm.tie_weights(),
+    )
+    return Xiaomi(loaded, config, robot, steps, tokenizer, openness)

@@ -5,7 +5,7 @@ from probe_kit.hooks.contract.interventions import Interventions
 from probe_kit.hooks.contract.options import Option
 from probe_kit.hooks.contract.sites import Stream
 from probe_kit.hooks.families.shared.capabilities import MERGED
-from probe_kit.hooks.family import Family
+from probe_kit.hooks.families.shared.kinds import lerobot_family
 
 PICTURES = ("padded", "squashed")
 """As lerobot, and as the authors."""
@@ -24,11 +24,11 @@ INTERVENTIONS = Interventions(
 """All cameras but the first reach the expert past the backbone."""
 
 FAMILIES = (
-    Family(
+    lerobot_family(
         "xvla",
         "X-VLA (Florence-2 encoder, soft-prompted transformer) through lerobot",
         "lerobot/xvla-base",
-        "probe_kit.hooks.families.xvla.adapter:Xvla.load",
+        "xvla.adapter:Xvla",
         streams="backbone 13 layers, expert 25 layers x 10 steps",
         embodiment="as the checkpoint's action space; the released ones are absolute poses",
         hub=(("facebook/bart-large", "tokenizer.json"),),
@@ -38,10 +38,6 @@ FAMILIES = (
             "prompts of another robot. Pictures are padded as config.json says; the authors squash them to 224 x "
             "224, bicubic (-M picture=squashed). Absolute poses cannot act here: --no-act"
         ),
-        outputs="probe_kit.hooks.families.shared.lerobot.outputs:lerobot_outputs",
-        config_types=("xvla",),
-        words="probe_kit.hooks.families.xvla.adapter:Xvla.check_words",
-        full_size="probe_kit.models.lerobot.xvla:full_size_xvla",
         parameters={"": 879_851_096},
         not_acting=("lerobot/xvla-base", "2toINF/X-VLA-WidowX"),
         declared={

@@ -13,7 +13,6 @@ from torch import Tensor
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.state_layout import ARM_NUMBERS
-from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.shared.lerobot.flow import DenoisingPolicy
 from probe_kit.hooks.families.shared.lerobot.policy import IMAGES
 
@@ -103,10 +102,7 @@ class PackedPolicy(DenoisingPolicy):
         """Roles from the packing itself; streams besides the acting one have the backbone's tokens."""
         state = self.read_state(observations)
         rows = self.pack(observations, self._no_state(len(observations)) if state is None else state).rows
-        longest = max(map(len, rows))
-        prompts = [
-            Roles.from_labels([label for _, label in row] + [PADDING] * (longest - len(row))) for row in rows
-        ]
+        prompts = Roles.padded([[label for _, label in row] for row in rows])
         suffix = [Roles.from_labels(self.suffix_labels())] * len(rows)
         return {name: suffix if name == self.acting_stream else prompts for name in self.streams}
 

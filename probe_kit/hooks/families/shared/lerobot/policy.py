@@ -21,10 +21,10 @@ from torch import Tensor, nn
 
 from probe_kit._system.bounded_json import read_json_object
 from probe_kit.errors import CheckpointError, InstructionError, ObservationError
-from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, SMALL_FILES, content_hashes, side_files
+from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, SMALL_FILES, side_files
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.checkpoints.weights import Weights, load_weights, read_weights
-from probe_kit.hooks.contract.card import ModelCard
+from probe_kit.hooks.contract.card import ARM
 from probe_kit.hooks.contract.model import Policy, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
@@ -53,6 +53,7 @@ from probe_kit.hooks.families.shared.lerobot.pipelines import (
 )
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack
 from probe_kit.hooks.families.shared.lerobot.window import PictureWindow, read_window
+from probe_kit.hooks.families.shared.network_loading import Loaded
 from probe_kit.hooks.families.shared.prompt_kv import ALL_TOKENS, kv_tap
 from probe_kit.hooks.verification.outputs import Arrays, Produce, RecordedRun
 from probe_kit.models.initialisation import initialise
@@ -230,22 +231,17 @@ class LerobotPolicy(Policy):
         audit = load_weights(network, weights, tensors, cls.unread, name_in_module=cls._current_key)
         config.device = device
         policy = cls(network.to(device), folder, checkpoint)
-        policy.card = ModelCard(
-            family=cls.family,
-            checkpoint=checkpoint,
-            weights_sha256=audit.sha256,
-            random_weights=audit.random,
-            parameters=audit.parameters,
-            dtype=str(getattr(config, "dtype", "float32")),
-            device=device,
-            embodiment="7-DoF end-effector delta, one third-person camera",
+        seed = weights_seed if random_weights else None
+        loaded = Loaded(network, audit, str(getattr(config, "dtype", "float32")), device, checkpoint, folder, seed)
+        policy.card = loaded.card(
+            cls.family,
+            policy.further_settings(),
+            files=policy.side_files(),
+            notes=policy._notes(),
+            embodiment=ARM,
             cameras=policy.cameras,
             chunk=config.chunk_size,
             execute=min(config.n_action_steps, config.chunk_size),
-            notes=policy._notes(),
-            audit=audit.to_json(),
-            settings={**content_hashes(policy.side_files()), **policy.further_settings()},
-            weights_seed=weights_seed if audit.random and random_weights else None,
         )
         return policy
 

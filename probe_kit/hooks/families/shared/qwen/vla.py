@@ -9,12 +9,12 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from probe_kit.errors import InstructionError
+from probe_kit.errors import CheckpointError, InstructionError
 from probe_kit.hooks.contract.model import Policy, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import Site, Stream
-from probe_kit.hooks.contract.views import PADDING
+from probe_kit.hooks.contract.views import IMAGE_ROLE, PADDING
 from probe_kit.hooks.families.shared.decoder_tap import decoder_tap
 from probe_kit.hooks.families.shared.prompt_kv import kept_prompt
 from probe_kit.hooks.families.shared.qwen.text import QwenTokenizer
@@ -22,8 +22,6 @@ from probe_kit.hooks.families.shared.qwen.tower import by_picture, tower_tap
 from probe_kit.hooks.verification.outputs import Arrays
 from probe_kit.models.qwen import QwenInputs, QwenPictures, image_slots, merged_tokens, pack_inputs
 
-CAMERA = "primary"
-IMAGE_ROLE = f"image.{CAMERA}"
 BACKBONE_ROLES = (IMAGE_ROLE, "language", "special", PADDING)
 
 
@@ -70,6 +68,11 @@ class QwenVLA(Policy):
 
     # -- what a family decides ---------------------------------------------------------------------------
 
+    @property
+    @abstractmethod
+    def units(self) -> Any:
+        """The statistics that give actions their units. Raises CheckpointError for none."""
+
     @abstractmethod
     def text(self, instruction: str) -> str:
         """The whole prompt with one image slot."""
@@ -77,6 +80,13 @@ class QwenVLA(Policy):
     @abstractmethod
     def look(self, observation: Observation) -> Any:
         """(H, W, 3) uint8 the processor gets."""
+
+    def units_or_reason(self) -> Any:
+        """The units, or why there are none: a checkpoint without them can be captured and cannot act."""
+        try:
+            return self.units
+        except CheckpointError as error:
+            return str(error)
 
     def patched_picture(self, observation: Observation) -> Any:
         """(H, W, 3) uint8 that is cut into patches; another one where the authors resize once more before."""
@@ -140,14 +150,13 @@ class QwenVLA(Policy):
     def backbone_roles(self, observations: Sequence[Observation]) -> list[Roles]:
         """Chat marks, picture, text; padding behind it where another prompt is longer."""
         rows, special = self.rows(observations), self.tokenizer.special
-        longest = max(map(len, rows))
 
         def role(number: int) -> str:
             if number == self._image_token:
                 return IMAGE_ROLE
             return "special" if number in special else "language"
 
-        return [Roles.from_labels([*map(role, row), *[PADDING] * (longest - len(row))]) for row in rows]
+        return Roles.padded([list(map(role, row)) for row in rows])
 
     def backbone_tap(self, site: Site) -> Tap:
         """The first norm of the block the site enters, the final norm, or a block's output."""

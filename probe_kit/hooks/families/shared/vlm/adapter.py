@@ -16,25 +16,22 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from probe_kit.errors import InstructionError, UsageError
-from probe_kit.hooks.checkpoints.checkpoint import content_hashes, side_files
-from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.hooks.contract.model import AnswerModel, Prompt, Reading, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import Site, Stream
 from probe_kit.hooks.contract.unembedding import Unembedding
-from probe_kit.hooks.contract.views import PADDING
+from probe_kit.hooks.contract.views import IMAGE_ROLE, PADDING
 from probe_kit.hooks.families.shared.decoder_tap import decoder_tap
+from probe_kit.hooks.families.shared.network_loading import Loaded
+from probe_kit.hooks.families.shared.prompt_kv import ALL_BUT_LAST, ALL_TOKENS, LAST
 from probe_kit.hooks.families.shared.vlm.decoding import Prefill
-from probe_kit.hooks.families.shared.vlm.loading import Loaded, Recipe, load_vlm
+from probe_kit.hooks.families.shared.vlm.loading import Recipe, load_vlm
 from probe_kit.hooks.families.shared.vlm.text import Frame, FramedText, TokenPrompt
 from probe_kit.hooks.verification.outputs import Produce
 from probe_kit.models.packing import LeftPacked
 
-CAMERA = "primary"
-IMAGE_ROLE = f"image.{CAMERA}"
 ANSWER = "answer"
-_PROMPT, _LAST = slice(None, -1), slice(-1, None)
 Pictures = list[NDArray[np.uint8]]
 
 
@@ -55,7 +52,7 @@ class VisionLanguageModel(AnswerModel):
     sums: ClassVar[bool] = True
     """Whether a block's attention and MLP are all that is added to the stream."""
 
-    def __init__(self, loaded: Loaded, tokenizer: str | None = None, **settings: str) -> None:
+    def __init__(self, loaded: Loaded[Any], tokenizer: str | None = None, **settings: str) -> None:
         """settings: what else the numbers depend on, for the card."""
         self.loaded, self.network = loaded, loaded.network
         self._text_folder = loaded.folder if tokenizer is None else Path(tokenizer).expanduser()
@@ -70,7 +67,8 @@ class VisionLanguageModel(AnswerModel):
             "vision": Stream("vision", blocks + 1, vision_width, part="vision", quantities=("residual",))
         }
         self.role_names = {"backbone": (IMAGE_ROLE, "language", "special", PADDING), ANSWER: (ANSWER,)}
-        self.card = self._card({"tokenizer": tokenizer or "the checkpoint's", **settings})
+        options = {"frame": str(self.frame), "tokenizer": tokenizer or "the checkpoint's", **settings}
+        self.card = loaded.card(self.family, options, tokenizer=tokenizer)
 
     @classmethod
     def load(
@@ -90,28 +88,6 @@ class VisionLanguageModel(AnswerModel):
         """
         loaded = load_vlm(cls.recipe, checkpoint, device, dtype, random_weights, weights_seed)
         return cls(loaded, tokenizer, **settings)
-
-    def _card(self, settings: dict[str, str]) -> ModelCard:
-        loaded, audit = self.loaded, self.loaded.filled.audit
-        files = side_files(loaded.folder)
-        if self._text_folder != loaded.folder and self._text_folder.is_dir():
-            files |= side_files(self._text_folder, "tokenizer/")
-        return ModelCard(
-            family=self.family,
-            checkpoint=loaded.checkpoint,
-            weights_sha256=audit.sha256,
-            random_weights=audit.random,
-            parameters=audit.parameters,
-            dtype=loaded.filled.dtype,
-            device=loaded.device,
-            embodiment="",
-            cameras=(CAMERA,),
-            chunk=0,
-            execute=0,
-            audit=audit.to_json(),
-            settings={**content_hashes(files), "frame": str(self.frame), **settings},
-            weights_seed=loaded.filled.weights_seed,
-        )
 
     # -- what a family decides ---------------------------------------------------------------------------
 
@@ -241,11 +217,9 @@ class VisionLanguageModel(AnswerModel):
     def asked_roles(self, questions: Sequence[Prompt]) -> dict[str, list[Roles]]:
         """Everything around picture and question is `special`, how an answer has begun too."""
         self.shows_pictures(questions)
-        prompts = [self.prompt(question) for question in questions]
-        longest = max(len(prompt.ids) for prompt in prompts)
-        rows = [[PADDING] * (longest - len(prompt.ids)) + _labels(prompt) for prompt in prompts]
+        rows = [_labels(self.prompt(question))[self._backbone_tokens] for question in questions]
         return {
-            "backbone": [Roles.from_labels(labels[self._backbone_tokens]) for labels in rows],
+            "backbone": Roles.padded(rows, front=True),
             ANSWER: [Roles.from_labels([ANSWER])] * len(rows),
         }
 
@@ -255,13 +229,13 @@ class VisionLanguageModel(AnswerModel):
 
     @property
     def _backbone_tokens(self) -> slice:
-        return slice(None) if self.whole_prompt else _PROMPT
+        return ALL_TOKENS if self.whole_prompt else ALL_BUT_LAST
 
     def tap(self, site: Site) -> Tap:
         """The first norm of the block the site enters, the final norm, or a block's output."""
         if self.stream_of(site).part == "vision":
             return self.vision_tap(site.layer)
-        tokens = self._backbone_tokens if site.stream == "backbone" else _LAST
+        tokens = self._backbone_tokens if site.stream == "backbone" else LAST
         return decoder_tap(self.language.layers, self.language.norm, site, tokens=tokens)
 
     # -- verification ------------------------------------------------------------------------------------

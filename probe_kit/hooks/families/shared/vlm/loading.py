@@ -15,7 +15,7 @@ from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.checkpoints.weights import read_weights
-from probe_kit.hooks.families.shared.network_loading import Filled, fill, twin
+from probe_kit.hooks.families.shared.network_loading import Loaded, load_network
 from probe_kit.models.building import without_precision
 from probe_kit.models.naming import Renames, renamed
 
@@ -37,21 +37,6 @@ class Recipe:
     names: Renames = ()
 
 
-@dataclass(frozen=True)
-class Loaded:
-    """A loaded network and where it is from. checkpoint: as asked for. folder: where its files lie."""
-
-    filled: Filled[Any]
-    checkpoint: str
-    folder: Path
-    device: str
-
-    @property
-    def network(self) -> Any:
-        """The network."""
-        return self.filled.network
-
-
 def load_vlm(
     recipe: Recipe,
     checkpoint: str | None,
@@ -59,7 +44,7 @@ def load_vlm(
     dtype: str | None,
     random_weights: bool,
     weights_seed: int,
-) -> Loaded:
+) -> Loaded[Any]:
     """The network of a checkpoint with exactly the weights of its files, or its random twin.
 
     Raises UsageError without a checkpoint, CheckpointError for a configuration that describes no such network, and
@@ -76,14 +61,19 @@ def load_vlm(
         with _describing(file):
             return recipe.build(config, kind, device)
 
-    if random_weights:
-        filled = twin(build, checkpoint, dtype, weights_seed)
-    else:
-        filled = fill(
-            build, lambda: read_weights(folder), dtype, doubles, lambda name: renamed(name, recipe.names)
-        )
-    filled.network.to(device)
-    return Loaded(filled, checkpoint, folder, device)
+    return load_network(
+        build,
+        lambda: read_weights(folder),
+        checkpoint,
+        folder,
+        device,
+        dtype,
+        random_weights,
+        weights_seed,
+        tied=doubles,
+        tie=lambda network: network.tie_weights(),
+        name_in_module=lambda name: renamed(name, recipe.names),
+    )
 
 
 @contextmanager
