@@ -245,18 +245,3 @@ def test_a_reading_of_another_model_is_refused(unsteered: Magma) -> None:
 
 
 # -- the card --------------------------------------------------------------------------------------------
-
-
-def test_every_option_reaches_the_card(folder: Path, tmp_path: Path) -> None:
-    file = tmp_path / "more.json"
-    file.write_text('{"mine": {"q01": [0, 0, 0, 0, 0, 0, 0], "q99": [1, 1, 1, 1, 1, 1, 1]}}', encoding="utf-8")
-    base = load_magma(str(folder), unnorm_key="bridge_orig").card.settings
-    for options in (
-        {"statistics": str(file), "unnorm_key": "mine"},
-        {"shrink": 0},
-        {"prompt": "act2answer"},
-        {"temperature": 0.7},
-        {"tokenizer": str(folder)},
-        {"layer_scale": "weight"},
-    ):
-        assert load_magma(str(folder), **{"unnorm_key": "bridge_orig", **options}).card.settings != base, options

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from safetensors.torch import load_file, save_file
 
 from probe_kit.errors import CheckpointError, UsageError, WeightsError
 from probe_kit.hooks import Observation
@@ -128,14 +127,10 @@ def test_layer_scales_left_at_their_initial_value_are_damage(tmp_path: Path) -> 
         load_magma(str(write_checkpoint(tmp_path, tensors=initial)), unnorm_key="bridge_orig")
 
 
-def test_a_random_twin_differs_by_its_seed_and_its_trunk_does_something(tmp_path: Path) -> None:
+def test_the_trunk_of_a_network_with_random_weights_does_something(tmp_path: Path) -> None:
     folder = str(write_checkpoint(tmp_path))
-    first, again, other = (
-        load_magma(folder, random_weights=True, weights_seed=seed, unnorm_key="bridge_orig") for seed in (0, 0, 1)
-    )
-    assert first.card.weights_sha256 == again.card.weights_sha256 != other.card.weights_sha256
-    assert (first.card.random_weights, first.card.weights_seed, other.card.weights_seed) == (True, 0, 1)
-    assert float(first.network.state_dict()[LAYER_SCALE].min()) == 1
+    twin = load_magma(folder, random_weights=True, unnorm_key="bridge_orig")
+    assert float(twin.network.state_dict()[LAYER_SCALE].min()) == 1
 
 
 def test_weights_are_as_the_file_says_or_as_asked(tmp_path: Path) -> None:
@@ -145,15 +140,6 @@ def test_weights_are_as_the_file_says_or_as_asked(tmp_path: Path) -> None:
     assert {parameter.dtype for parameter in wide.network.parameters()} == {torch.float32}
     with pytest.raises(UsageError, match="float16"):
         load_magma(str(folder), dtype="float16", unnorm_key="bridge_orig")
-
-
-def test_damaged_numbers_are_refused_by_name(tmp_path: Path) -> None:
-    folder = write_checkpoint(tmp_path, shards=1)
-    tensors = load_file(folder / "model.safetensors")
-    tensors[LAYER_SCALE][0] = float("nan")
-    save_file(tensors, folder / "model.safetensors")
-    with pytest.raises(WeightsError, match=LAYER_SCALE):
-        load_magma(str(folder), unnorm_key="bridge_orig")
 
 
 def entry(scale: float) -> dict[str, list[float]]:

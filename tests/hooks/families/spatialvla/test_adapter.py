@@ -13,7 +13,6 @@ from probe_kit.hooks.families.spatialvla.adapter import SpatialVLA, load_spatial
 from probe_kit.hooks.testing import example_observations
 from probe_kit.models.spatialvla import Decoded
 from tests.support.spatialvla_checkpoints import (
-    BINS,
     SIDE,
     edges,
     processor_values,
@@ -290,17 +289,3 @@ def test_options_are_declared_and_checked(folder: Path) -> None:
     for wrong in ({"iterations": "all"}, {"lowercase": "perhaps"}, {"lower_case": "true"}):
         with pytest.raises(UsageError):
             load_policy("spatialvla", str(folder), **units, **wrong)
-
-
-def test_every_choice_is_part_of_the_identity(folder: Path, plain: SpatialVLA) -> None:
-    choices: list[dict[str, Any]] = [
-        {"lowercase": False}, {"prompt": "question"}, {"camera": "default"}, {"constrained": True},
-        {"ensemble": True}, {"iterations": "chunk"}, {"tokenizer": "bytes"},
-    ]  # fmt: skip
-    for choice in choices:
-        assert (
-            load_spatialvla(str(folder), **choice, unnorm_key="bridge_orig/1.0.0").card.settings
-            != plain.card.settings
-        )
-    assert {"file config.json", "file tokenizer.json"} <= set(plain.card.settings)
-    assert BINS["total"] == plain.config.actions
