@@ -6,13 +6,13 @@ pixels do, before any patch looks at another.
 """
 
 from collections.abc import Mapping, MutableMapping
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import EmptyRoleError, UsageError
+from probe_kit.extract.sources.inputs import PICTURE, picture_of, with_pictures
 from probe_kit.hooks.capturing.token_edits import TokenSelection
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.intervene.pairs import Given, Pair
@@ -87,7 +87,7 @@ def role_token_mask(
     images = token_mask(policy, pair.clean, stream, f"image.{policy.card.cameras[0]}")
     if role not in memo:
         if "patches" not in memo:
-            memo["patches"] = patch_embeddings(policy, pair.clean)
+            memo["patches"] = patch_embeddings(policy, pair.clean, policy.card.cameras[0])
         memo[role] = tokens_overlapping(policy, pair.clean, pair.tiles[TILES[role]], memo["patches"])
     mask = np.zeros_like(images)
     mask[np.flatnonzero(images)[memo[role]]] = True
@@ -115,23 +115,31 @@ def tokens_overlapping(
 ) -> NDArray[np.bool_]:
     """Return (tokens of the picture,) which of them come of patches that see any of some pixels (H, W).
 
-    before: what `patch_embeddings` gives of `observation`, if it is known.
+    Of the first camera's picture, in which the renderer says where tiles are. before: what `patch_embeddings`
+    gives of `observation`, if it is known.
     """
     if not pixels.any():
         return np.zeros(int(policy.patch_order().max()) + 1, bool)
-    before = patch_embeddings(policy, observation) if before is None else before
-    moved = _patch_changes(policy, observation, pixels, before)
+    camera = policy.card.cameras[0]
+    before = patch_embeddings(policy, observation, camera) if before is None else before
+    moved = _patch_changes(policy, observation, pixels, before, camera)
     return _by_token(policy, moved > ENOUGH * moved.max())
 
 
 def _patch_changes(
-    policy: "Policy", observation: Observation, pixels: NDArray[np.bool_], before: NDArray[np.float32]
+    policy: "Policy",
+    observation: Observation,
+    pixels: NDArray[np.bool_],
+    before: NDArray[np.float32],
+    camera: str,
 ) -> NDArray[np.float32]:
-    """Return (V,) by how much the embeddings of patches change with some pixels (H, W)."""
+    """Return (V,) by how much the embeddings of patches change with some pixels (H, W) of a camera's picture."""
+    picture = picture_of(observation, camera)
     # Every pixel changes by at least half of what it can.
-    inverted = np.where(observation.image < 128, 255, 0)
-    turned = np.where(pixels[..., None], inverted, observation.image).astype(np.uint8)
-    after = patch_embeddings(policy, replace(observation, image=turned))
+    inverted = np.where(picture < 128, 255, 0)
+    turned = np.where(pixels[..., None], inverted, picture).astype(np.uint8)
+    changed = with_pictures(observation, f"{PICTURE}.{camera}", lambda _: turned)
+    after = patch_embeddings(policy, changed, camera)
     return np.asarray(np.linalg.norm(after - before, axis=-1))
 
 
@@ -143,22 +151,28 @@ def _by_token[T: np.generic](policy: "Policy", values: NDArray[T]) -> NDArray[T]
     return largest
 
 
-def token_boxes(policy: "Policy", observation: Observation) -> NDArray[np.float32]:
-    """Return (tokens of the picture, 4) where each looks: left, top, right, bottom, as shares of the picture.
+def shown_cameras(policy: "Policy", stream: str) -> tuple[str, ...]:
+    """Return the cameras whose pictures have tokens in a stream, in the order of the pictures."""
+    roles = policy.role_names[policy.tokens_of(stream)]
+    return tuple(camera for camera in policy.card.cameras if f"image.{camera}" in roles)
+
+
+def token_boxes(policy: "Policy", observation: Observation, camera: str) -> NDArray[np.float32]:
+    """Return (tokens of a camera's picture, 4) where each looks: left, top, right, bottom, as shares of it.
 
     Found by changing a band of rows, then of columns, at a time, so that crops, padding and turns of the policy's
     own preprocessing are in it. NaN for a token that no pixel moves. Costs 2 × `BANDS` + 2 inferences.
     """
-    before, ends = patch_embeddings(policy, observation), []
-    for axis in (1, 0):
-        size = observation.image.shape[axis]
+    before, ends = patch_embeddings(policy, observation, camera), []
+    height, width, _ = picture_of(observation, camera).shape
+    for axis, size in ((1, width), (0, height)):
         bands = min(BANDS, size)
         changes = []
         for band in range(bands):
-            pixels = np.zeros(observation.image.shape[:2], bool)
+            pixels = np.zeros((height, width), bool)
             inside = slice(band * size // bands, (band + 1) * size // bands)
             pixels[(slice(None), inside) if axis == 1 else inside] = True
-            changes.append(_by_token(policy, _patch_changes(policy, observation, pixels, before)))
+            changes.append(_by_token(policy, _patch_changes(policy, observation, pixels, before, camera)))
         moved = np.array(changes)
         most = moved.max(axis=0)
         looks = most > ENOUGH * most.max()
@@ -171,11 +185,13 @@ def token_boxes(policy: "Policy", observation: Observation) -> NDArray[np.float3
     return np.stack([x_first, y_first, x_last, y_last], axis=1).astype(np.float32)
 
 
-def patch_embeddings(policy: "Policy", observation: Observation) -> NDArray[np.float32]:
-    """Return (V, D) the first camera's patches as they enter the first block of the vision tower."""
+def patch_embeddings(policy: "Policy", observation: Observation, camera: str) -> NDArray[np.float32]:
+    """Return (V, D) a camera's patches as they enter the first block of the vision tower."""
     from probe_kit.hooks import capture
 
-    site = policy.every_stream()["vision"].sites()[0]
+    # A tower that sees one picture at a time has the cameras as its iterations, in their order.
+    entries = [site for site in policy.every_stream()["vision"].sites() if site.layer == 0]
+    site = entries[policy.card.cameras.index(camera) if len(entries) > 1 else 0]
     with capture(policy, [site]) as tape:
         policy.act([observation], [0])
     embeddings: NDArray[np.float32] = tape[site][0].float().cpu().numpy()

@@ -5,15 +5,18 @@ who looks at a report believes what it shows. All pictures may be deleted, not s
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from io import BytesIO
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from PIL import Image
 
 from probe_kit.errors import RunDamagedError
 from probe_kit.runs.commits import Commit, commit_key, redo, redo_picture
-from probe_kit.runs.layout import FRAME_COLUMNS, FRAMES, FrameChoice
+from probe_kit.runs.layout import CAPTURE_ONLY, DATASET, ENVIRONMENT, FRAME_COLUMNS, FRAMES, FrameChoice
+from probe_kit.runs.reader import RunReader
 from probe_kit.runs.small_frames import SmallFrames, shrink
 from probe_kit.runs.store import Location, locate
 from probe_kit.suite.pictures import decode_bytes
@@ -37,6 +40,45 @@ class FrameSheet:
 
     content: bytes
     count: int | None
+
+
+@dataclass(frozen=True)
+class EpisodeFrames:
+    """The frames of an episode as a reader is shown them. content: one WebP of `count` frames.
+
+    kind: the first and the last one, one before the first action and one behind each, or one per inference.
+    cameras: how many pictures stand side by side in a frame, from the first camera on.
+    """
+
+    content: bytes
+    count: int
+    kind: Literal["ends", "all", "inferences"]
+    cameras: int = 1
+
+    @cached_property
+    def decoded(self) -> SmallFrames:
+        """The frames one by one."""
+        return decode_frames(self.content, self.count)
+
+
+def episode_frames(run: RunReader, position: int) -> EpisodeFrames | None:
+    """Return the stored picture of the episode in a row, else one of what its inferences saw; None without either.
+
+    Raises RunDamagedError for a picture that was changed.
+    """
+    row, inputs = run.episodes.iloc[position], run.inputs
+    sheet = read_sheet(run.location, int(row.get("episode", position)))
+    if sheet is not None and sheet.count is not None:
+        return EpisodeFrames(sheet.content, sheet.count, "all")
+    if sheet is not None:  # a model that did not act has no last frame
+        return EpisodeFrames(sheet.content, 1 if "parse" in row or row["outcome"] == CAPTURE_ONLY else 2, "ends")
+    if inputs is None or "pixels" not in inputs.kinds:
+        return None
+    inferences = int((run.control_steps[position] >= 0).sum())
+    frames = tuple(np.hstack(list(cameras)) for cameras in inputs.row("pixels", position)[:inferences])
+    source = run.settings.get(DATASET) or run.settings.get(ENVIRONMENT) or {}
+    cameras = len(source.get("cameras", ())) or 1
+    return EpisodeFrames(as_thumbnail(frames, "all"), len(frames), "inferences", cameras) if frames else None
 
 
 def as_thumbnail(frames: SmallFrames, choice: FrameChoice = "ends") -> bytes:

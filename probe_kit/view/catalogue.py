@@ -9,6 +9,7 @@ from probe_kit.hashing import sha256_json
 from probe_kit.retention.columns.glossary import VIEWER_WORDS
 from probe_kit.runs import Run
 from probe_kit.runs.layout import COMMITS, FAILED
+from probe_kit.runs.thumbnails import episode_frames
 from probe_kit.view.payloads.coding import failure_script, payload_script
 from probe_kit.view.payloads.episode_payload import episode_payload
 from probe_kit.view.payloads.episodes_payload import episodes_payload
@@ -89,8 +90,8 @@ class Catalogue:
     def picture(self, key: str, number: int) -> bytes | None:
         """The committed frames of an episode, None without any. Raises KeyError; RunDamagedError if changed."""
         viewed = self.runs[key]
-        sheet = viewed.sheet(number)
-        return None if sheet is None else sheet.content
+        frames = episode_frames(viewed.run, viewed.position_of[number])
+        return None if frames is None else frames.content
 
     def _payload(self, name: str) -> Any:
         if name == INDEX_PAYLOAD:

@@ -16,7 +16,6 @@ from probe_kit.intervene.settings import has_sides
 from probe_kit.retention import RetentionRow, RetentionTable, retention_table
 from probe_kit.retention.behaviour.vlm_answers import ask_of
 from probe_kit.runs import Run
-from probe_kit.runs.thumbnails import FrameSheet, as_thumbnail, read_sheet
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.train.results.store import how_to_probe, load_results, load_results_by_call, stored_targets
@@ -121,7 +120,7 @@ class ViewedRun:
 
     @cached_property
     def patch_attention(self) -> dict[str, PatchAttention]:
-        """Return by category the stored attention on the patches of the first camera's picture."""
+        """Return by category the stored attention on the patches of the cameras' pictures."""
         return stored_patch_attention(self.run)
 
     @cached_property
@@ -162,20 +161,6 @@ class ViewedRun:
         """Return the control step, or the recorded frame, of every inference of the episode in a row."""
         steps = self.run.control_steps[position]
         return [int(step) for step in steps[steps >= 0]]
-
-    def sheet(self, number: int) -> FrameSheet | None:
-        """Return the stored picture of an episode, else one of what its inferences saw; None without either.
-
-        Raises KeyError, and RunDamagedError for a picture that was changed.
-        """
-        position, inputs = self.position_of[number], self.run.inputs
-        stored = read_sheet(self.run.location, number)
-        if stored is not None or inputs is None or "pixels" not in inputs.kinds:
-            return stored
-        pixels = inputs.row("pixels", position)[: len(self.inference_steps(position))]
-        # The pictures of all cameras stand side by side.
-        frames = tuple(np.hstack(list(cameras)) for cameras in pixels)
-        return FrameSheet(as_thumbnail(frames, "all"), len(frames)) if frames else None
 
     @cached_property
     def position_of(self) -> dict[int, int]:

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +20,13 @@ from probe_kit.extract.rollout.worker import torch_threads
 from probe_kit.extract.sources.pictures import PictureSource
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks import Observation, Policy
-from probe_kit.intervene import InstructionSwap, ReplaySource, run_intervention
+from probe_kit.intervene import AttentionReadout, InstructionSwap, ReplaySource, run_intervention
 from probe_kit.intervene.sessions.observed import ObservedSession
 from probe_kit.intervene.sessions.opening import open_session
-from probe_kit.runs import verify_run
+from probe_kit.retention.displays import attention_on_picture
+from probe_kit.runs import open_run, verify_run
+from probe_kit.view.catalogue import Catalogue
+from tests.view.payload_reader import floats, read_payload
 
 COUNT = 12
 TEXTS = ("Put the cube on the red shape", "Put the cube on the gray shape")
@@ -130,6 +134,24 @@ def test_pictures_are_shown_again_for_interventions_and_diagnoses(
     swapped = run_intervention(run, InstructionSwap(), load=lambda *_: pi0_tiny)
     assert np.isfinite(swapped.outcomes.displacement).any()
     assert diagnose_run(run, load=lambda *_: pi0_tiny).inputs
+
+
+@pytest.mark.slow
+def test_the_viewer_shows_a_pictures_run_with_its_attention_over_each_picture(
+    run: pk.Run, pi0_tiny: Policy, tmp_path: Path
+) -> None:
+    copy = open_run(shutil.copytree(run.path, tmp_path / "run"))
+    run_intervention(copy, AttentionReadout(items=2), load=lambda *_: pi0_tiny)
+    catalogue = Catalogue([copy])
+    _, viewed = read_payload(catalogue.script("run/run"))
+    assert (viewed["sides"], viewed["committed"]) == (False, COUNT)
+    _, episode = read_payload(catalogue.script("run/e/00001"))
+    assert (episode["frames"]["count"], episode["frames"]["steps"], episode["attention"]["steps"]) == (1, [0], [0])
+    boxes = floats(episode["attention"]["boxes"]).reshape(-1, 4)
+    (weights,) = (floats(packed) for packed in episode["attention"]["weights"])
+    assert weights.size == episode["attention"]["blocks"] * len(boxes)
+    assert catalogue.picture("run", 1) is not None
+    assert attention_on_picture(copy).axes
 
 
 def test_a_picture_that_changes_after_the_plan_is_not_shown(

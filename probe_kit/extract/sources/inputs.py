@@ -28,7 +28,7 @@ def with_input(clean: Observation, vary: str, donor: Observation) -> Observation
         return replace(clean, instruction=donor.instruction)
     if vary == STATE:
         return replace(clean, state=donor.state)
-    return _with_pictures(clean, vary, partial(_picture, donor))
+    return with_pictures(clean, vary, partial(picture_of, donor))
 
 
 def same_input(first: Observation, second: Observation, vary: str) -> bool:
@@ -37,7 +37,7 @@ def same_input(first: Observation, second: Observation, vary: str) -> bool:
         return first.instruction == second.instruction
     if vary == STATE:
         return np.array_equal(first.state, second.state)
-    return all(np.array_equal(_picture(first, name), _picture(second, name)) for name in _cameras(first, vary))
+    return all(np.array_equal(picture_of(first, name), picture_of(second, name)) for name in _cameras(first, vary))
 
 
 def hardly_changed(clean: Observation, vary: str, spread: NDArray[np.floating]) -> Observation:
@@ -50,7 +50,7 @@ def hardly_changed(clean: Observation, vary: str, spread: NDArray[np.floating]) 
     if vary == STATE:
         moved = clean.state + STATE_SHARE * spread[: clean.state.size]
         return replace(clean, state=moved.astype(np.float32))
-    return _with_pictures(clean, vary, lambda name: through_jpeg(_picture(clean, name)))
+    return with_pictures(clean, vary, lambda name: through_jpeg(picture_of(clean, name)))
 
 
 def with_other_stop(text: str) -> str:
@@ -79,7 +79,7 @@ def _mean_colour(pictures: Sequence[Picture]) -> Picture:
     return np.broadcast_to(np.rint(colour).astype(np.uint8), pictures[0].shape).copy()
 
 
-def _with_pictures(clean: Observation, vary: str, picture: Callable[[str], Picture]) -> Observation:
+def with_pictures(clean: Observation, vary: str, picture: Callable[[str], Picture]) -> Observation:
     """The observation with other pictures of the cameras that an input names. picture: by the camera's name."""
     pictures = {name: picture(name) for name in _cameras(clean, vary)}
     image = pictures.pop(FIRST, clean.image)
@@ -93,5 +93,6 @@ def _cameras(observation: Observation, vary: str) -> tuple[str, ...]:
     return (camera,) if camera in observation.cameras else (FIRST,)
 
 
-def _picture(observation: Observation, camera: str) -> Picture:
-    return observation.cameras[camera] if camera else observation.image
+def picture_of(observation: Observation, camera: str) -> Picture:
+    """Return (H, W, 3) the picture of a camera; of the first one for a name that no further camera has."""
+    return observation.cameras.get(camera, observation.image)

@@ -174,7 +174,7 @@ class Model(ABC):
     def patch_order(self) -> NDArray[np.int64]:
         """(V,) which of the picture's tokens, counted from 0, every token of the `vision` stream ends in.
 
-        −1 for those that end in none, such as class tokens. Of the first camera's picture. Raises
+        −1 for those that end in none, such as class tokens. Of one camera's picture, the same for each. Raises
         UnknownSiteError for a model that does not say.
         """
         raise UnknownSiteError(

@@ -5,7 +5,7 @@ is edited. Every inference runs twice, with and without recording, and both acti
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from io import BytesIO
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, get_args
 
@@ -23,7 +23,7 @@ from probe_kit.intervene.places import ALL, TILE_ROLES, roles_of
 from probe_kit.intervene.replay import CleanRun, Condition, ConditionContext, ConditionResult, ReplayBatch
 from probe_kit.intervene.selection import StoredResult, stored_results
 from probe_kit.intervene.settings import has_sides
-from probe_kit.intervene.tokens import TILES, role_token_mask, token_boxes
+from probe_kit.intervene.tokens import TILES, role_token_mask, shown_cameras, token_boxes
 from probe_kit.runs.reader import RunReader
 from probe_kit.runs.run import Run
 from probe_kit.statistics.bootstrap import GAINS, units_seed
@@ -69,12 +69,14 @@ class AttentionReadout(Intervention):
 
     def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
         """Clean, and the same with its attention recorded. Raises UsageError for a role it lacks."""
-        policy, boxes = session.policy, None
+        policy, stream = session.policy, backbone_of(session.policy)
+        boxes: dict[str, NDArray[np.float32]] = {}
         if policy.interventions.supports("tiles"):
             observations = (pair.clean for item in self.items_in(session.run) for pair in session.pairs(item))
             first = next(observations, None)
-            boxes = token_boxes(policy, first) if isinstance(first, Observation) else None
-        return CleanRun(), AttentionRecorded(backbone_of(policy), self._roles(policy), boxes=boxes)
+            if isinstance(first, Observation):
+                boxes = {camera: token_boxes(policy, first, camera) for camera in shown_cameras(policy, stream)}
+        return CleanRun(), AttentionRecorded(stream, self._roles(policy), boxes=boxes)
 
     def certificate_entries(self, conditions: Sequence[Condition], batch: ReplayBatch) -> dict[str, Any]:
         """Return the axes of the stored array. Raises CaptureChangedActionError if recording changed an action."""
@@ -111,10 +113,13 @@ class AttentionReadout(Intervention):
             recording.roles, **columns, sides=sides, calls=batch.inferences[:, 1], mass=batch.mass
         )
         files = {ATTENTION_FILE: attention_records.to_bytes()}
-        if batch.patches is not None and recording.boxes is not None:
+        if batch.patches is not None:
+            boxes = recording.boxes
             files[PATCHES_FILE] = PatchAttention(
-                columns["episodes"], batch.inferences[:, 1], batch.patches.astype(np.float16), recording.boxes
-            ).to_bytes()
+                columns["episodes"], batch.inferences[:, 1], batch.patches.astype(np.float16),
+                np.repeat(list(boxes), [len(places) for places in boxes.values()]),
+                np.concatenate(list(boxes.values())),
+            ).to_bytes()  # fmt: skip
         return files
 
     @staticmethod
@@ -172,13 +177,13 @@ class AttentionReadout(Intervention):
 class AttentionRecorded:
     """The clean inference with attention weights recorded. stream: whose tokens are attended to.
 
-    boxes: (P, 4) where the patches of the first camera lie; None where the family does not say.
+    boxes: by camera (patches, 4) where its patches lie; empty where the family does not say.
     """
 
     stream: str
     roles: tuple[str, ...]
     name: str = RECORDED
-    boxes: NDArray[np.float32] | None = field(default=None, repr=False)
+    boxes: Mapping[str, NDArray[np.float32]] = field(default_factory=dict, repr=False)
 
     def play(self, context: ConditionContext) -> ConditionResult:
         """Nothing is changed."""
@@ -191,12 +196,14 @@ class AttentionRecorded:
         return ConditionResult(chunk, mass=shares_by_role(mass, masks), patches=self._patches(context, mass))
 
     def _patches(self, context: ConditionContext, mass: "AttentionMass") -> NDArray[np.float32] | None:
-        """Return (B, P) shares on the patches of the first camera's picture, means over iterations and heads."""
-        if self.boxes is None:
+        """Return (B, P) shares on the patches of all cameras in turn, means over iterations and heads."""
+        if not self.boxes:
             return None
-        policy, memo = context.session.policy, context.memo
-        role = f"image.{policy.card.cameras[0]}"
-        tokens = np.flatnonzero(role_token_mask(policy, context.pair, self.stream, role, memo))
+        masks = [
+            role_token_mask(context.session.policy, context.pair, self.stream, f"image.{camera}", context.memo)
+            for camera in self.boxes
+        ]
+        tokens = np.concatenate([np.flatnonzero(mask) for mask in masks])
         blocks = max(block for block, _ in mass.by_head) + 1
         shares = [
             [weights[0][:, tokens].mean(axis=0) for (at, _), weights in mass.by_head.items() if at == block]
@@ -215,16 +222,28 @@ class AttentionRecorded:
 
 @dataclass(frozen=True)
 class PatchAttention:
-    """The attention of N inferences on the P patches of the first camera's picture.
+    """The attention of N inferences on the P patches of the cameras' pictures.
 
     episodes, calls: (N,), as of `AttentionShares`. weights: (N, B, P) float16, shares of the acting stream's
-    attention, means over iterations and heads. boxes: (P, 4), see `token_boxes`.
+    attention, means over iterations and heads. cameras: (P,) names, those of a camera together. boxes: (P, 4), see
+    `token_boxes`.
     """
 
     episodes: NDArray[np.str_]
     calls: NDArray[np.int64]
     weights: NDArray[np.float16]
+    cameras: NDArray[np.str_]
     boxes: NDArray[np.float32]
+
+    def on_frame(self, pictures: int) -> Self:
+        """Return it on a frame with the first cameras' pictures side by side: boxes are shares of the frame."""
+        first = list(dict.fromkeys(self.cameras.tolist()))[:pictures]
+        visible = np.isin(self.cameras, first)
+        offset = np.array([[first.index(name), 0.0] * 2 for name in self.cameras[visible]], np.float32)
+        boxes = (self.boxes[visible] + offset) / np.array([len(first), 1.0] * 2, np.float32)
+        return replace(
+            self, weights=self.weights[..., visible], cameras=self.cameras[visible], boxes=boxes.astype(np.float32)
+        )
 
     def to_bytes(self) -> bytes:
         """Return a `.npz`; the same numbers give the same bytes."""

@@ -4,7 +4,7 @@ Without `ax` a display makes its own figure, with a legend and a caption that na
 `collect_figures` makes all figures that fit a table, of sides or of labels.
 """
 
-from probe_kit.retention.displays.attention import AttentionDisplay, attention_curve
+from probe_kit.retention.displays.attention import AttentionDisplay, attention_curve, attention_on_picture
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import ReportFigure
 from probe_kit.retention.displays.call_curves import CallCurveDisplay, aligned_curves, call_curves
@@ -56,6 +56,7 @@ __all__ = [
     "SuccessTableDisplay",
     "aligned_curves",
     "attention_curve",
+    "attention_on_picture",
     "call_curves",
     "class_confusions",
     "collect_figures",

@@ -1,4 +1,4 @@
-"""Attention by block: how much attention the acting stream pays to the pictures, the words and itself."""
+"""Attention by block: how much lies on pictures, words and the acting stream, and where on a picture."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -9,20 +9,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import NoInterventionsError
-from probe_kit.intervene.kinds.attention import ACTION, CORRECT, OTHER, AttentionShares, Axis, stored_attention
+from probe_kit.intervene.kinds.attention import (
+    ACTION,
+    CORRECT,
+    OTHER,
+    AttentionShares,
+    Axis,
+    stored_attention,
+    stored_patch_attention,
+)
 from probe_kit.intervene.places import ALL, TILE_ROLES
 from probe_kit.retention.columns.text import spell
 from probe_kit.retention.displays.base.panels import Panelled, in_panels
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure
-from probe_kit.retention.displays.base.style import layer_axis, series
+from probe_kit.retention.displays.base.style import caption, layer_axis, panels, series
 from probe_kit.runs.reader import RunReader
+from probe_kit.runs.thumbnails import episode_frames
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 Percent = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+Boxes = NDArray[np.float32]
 _LABELS = {CORRECT: "correct picture's tile", OTHER: "other picture's tile", ACTION: "its own tokens"}
 
 
@@ -59,8 +70,10 @@ class AttentionDisplay(Panelled):
     @classmethod
     def _of(cls, recorded: AttentionShares, category: str, certificate: ProvenanceLine) -> Self:
         left_out = {ALL, "special", *TILE_ROLES}
-        blocks = np.unique(recorded.frame(("block",))["block"].to_numpy(np.int64))
-        roles = tuple(role for role in recorded.shares() if role not in left_out)
+        by_block = recorded.frame(("block",))
+        blocks = np.unique(by_block["block"].to_numpy(np.int64))
+        # A role that no token plays has no row, such as a tile outside the scene.
+        roles = tuple(role for role in dict.fromkeys(by_block["role"]) if role not in left_out)
 
         def shares(*by: Axis) -> Percent:
             frame = recorded.frame(("block", *by))
@@ -112,13 +125,83 @@ def attention_curve(run: RunReader) -> "Figure":
     return in_panels(displays)
 
 
+_HEAT = (1.0, 122 / 255, 0.0)
+"""The colour of the viewer's overlay."""
+_HEAVIEST = 0.8
+"""Opacity of the strongest patch, as in the viewer."""
+
+
+def attention_on_picture(run: RunReader, category: str | None = None) -> "Figure":
+    """An episode's first inference: the attention on each patch over the picture, of all blocks and of each.
+
+    Means over heads and iterations; the strongest patch of a panel has the full colour. category: by default the
+    first one with stored patches, of whose episodes the first one with a picture is drawn. Raises
+    NoInterventionsError where patches or pictures are not stored.
+    """
+    from matplotlib.collections import PatchCollection
+    from matplotlib.patches import Rectangle
+
+    drawn = _first_pictured(run, category)
+    if drawn is None:
+        raise NoInterventionsError(
+            f"{run.location} has no attention on patches{f' of {category!r}' if category else ''}, or no picture "
+            f"to draw it on. Run `probe-kit intervene {run.location} --kind attention` on a run that stores "
+            "pictures, with a family that says which token sees which pixels"
+        )
+    episode, picture, on_frame, weights = drawn
+    read = [block for block in range(len(weights)) if not np.isnan(weights[block]).all()]
+    maps = {"all blocks": weights[read].mean(axis=0), **{f"block {block}": weights[block] for block in read}}
+    height, width = picture.shape[:2]
+    figure, grid = panels(len(maps), 1.5, 1.5 * height / width + 0.25, columns=min(5, len(maps)))
+    figure.set_figheight(figure.get_figheight() - 0.8)  # `panels` leaves room for a legend
+    # matplotlib's pixels begin half a pixel before their number.
+    boxes = on_frame * np.tile([width, height], 2) - 0.5
+    visible = ~np.isnan(boxes).any(axis=1)
+    for (title, values), axes in zip(maps.items(), grid, strict=True):
+        axes.imshow(picture, interpolation="nearest")
+        patches = [Rectangle((x, y), right - x, bottom - y) for x, y, right, bottom in boxes[visible]]
+        strength = _HEAVIEST * values[visible] / max(values.max(initial=0.0), 1e-9)
+        axes.add_collection(PatchCollection(patches, facecolors=[(*_HEAT, alpha) for alpha in strength], lw=0))
+        axes.set_title(f"{title}: {100 * values.sum():.0f} %", fontsize=8, loc="left")
+        axes.set_axis_off()
+    caption(figure, ProvenanceLine.of_run(run))
+    figure.caption = f"episode {episode} · {figure.caption}"  # type: ignore[attr-defined]
+    return figure
+
+
+def _first_pictured(run: RunReader, category: str | None = None) -> tuple[str, Picture, Boxes, Percent] | None:
+    """The first episode with attention and a picture: its id, the picture, (P, 4) boxes, (B, P) shares."""
+    stored = stored_patch_attention(run)
+    patches = stored.get(category) if category is not None else next(iter(stored.values()), None)
+    if patches is None:
+        return None
+    positions = {str(name): at for at, name in enumerate(run.episodes["episode_id"])}
+    for row in np.argsort(patches.calls, kind="stable"):
+        position, call = positions[str(patches.episodes[row])], int(patches.calls[row])
+        if (frames := episode_frames(run, position)) is not None:
+            # Interventions count inferences of an episode, and name frames of recordings by their number.
+            inference = int(np.flatnonzero(run.control_steps[position] == call)[0]) if run.recorded else call
+            picture = frames.decoded[inference if frames.kind == "inferences" else 0]
+            on_frame = patches.on_frame(frames.cameras)
+            return str(patches.episodes[row]), picture, on_frame.boxes, on_frame.weights[row].astype(np.float64)
+    return None
+
+
 PLACE = 15
 """Of its figures in the report."""
 
 
 def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
-    """The figures that a report of these runs shows."""
-    for drawn in source.runs:
+    """Yield the figures that a report of these runs shows, once per run."""
+    for drawn in {drawn.position: drawn for drawn in reversed(source.runs)}.values():
+        if _first_pictured(drawn.run) is not None:
+            yield ReportFigure(
+                f"{drawn.stem}-attention-picture", "Attention on the picture", "interventions",
+                "Where on the picture the acting stream's attention lies at one episode's first inference, by "
+                "block, with the share of all attention. The strongest patch has the full colour. Descriptive: an "
+                "attended patch need not be used, and no verdict reads this.",
+                drawn.position, partial(attention_on_picture, drawn.run),
+            )  # fmt: skip
         if stored_attention(drawn.run):
             yield ReportFigure(
                 f"{drawn.stem}-attention", "Attention by layer", "interventions",
@@ -127,3 +210,6 @@ def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
                 "most of any iteration. Descriptive: attended tokens need not be used, and no verdict reads this.",
                 drawn.position, partial(attention_curve, drawn.run), is_detail=True,
             )  # fmt: skip
+
+
+label_figures = report_figures

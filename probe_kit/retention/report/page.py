@@ -88,6 +88,7 @@ def report_html(
             )
             for name, run in zip(names, runs, strict=True)
         ],
+        interventions=arranged(exhibits, "interventions", names, places),
         labels=labels,
         words=words_of([summary, *tables, *(part for label in labels for part in label.tables)]),
         sentence=sentence,
@@ -129,7 +130,7 @@ def _sides(
         "join_notes": [*joins.refused, *dict.fromkeys(note for join in joins.tables for note in join.notes)],
         "pictures": {
             subject: arranged(exhibits, subject, names, places)
-            for subject in ("behaviour", "probes", "retention", "interventions", "join")
+            for subject in ("behaviour", "probes", "retention", "join")
         },
         "grid": grid,
         "heat": heat_key(),

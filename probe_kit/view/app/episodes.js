@@ -122,7 +122,7 @@ function attendedAt(attention, now, block) {
 }
 function Attended({ attention, now, block }) {
   const boxes = floats(attention.boxes), values = attendedAt(attention, now, block), most = Math.max(...values.filter((v) => !Number.isNaN(v)), 1e-9), share = values.reduce((sum, v) => sum + (v || 0), 0);
-  return html`<svg class="attended" style=${{ width: `${100 / attention.cameras}%` }} viewBox="0 0 1 1" preserveAspectRatio="none" role="img" aria-label=${`${(100 * share).toFixed(1)} % of the attention lies on this picture`}>
+  return html`<svg class="attended" viewBox="0 0 1 1" preserveAspectRatio="none" role="img" aria-label=${`${(100 * share).toFixed(1)} % of the attention lies on this frame`}>
     ${values.map((v, p) => !Number.isNaN(v) && !Number.isNaN(boxes[4 * p]) && html`<rect x=${boxes[4 * p]} y=${boxes[4 * p + 1]} width=${boxes[4 * p + 2] - boxes[4 * p]} height=${boxes[4 * p + 3] - boxes[4 * p + 1]} fill-opacity=${0.8 * (v / most)} />`)}</svg>`;
 }
 function Film({ run, one, frames, now, steps, bare, attention, block }) {
@@ -166,7 +166,7 @@ function Episode({ run, one, place, near }) {
     <header><h2>“<${Delivered} text=${one.instruction ?? one.id} lost=${episode.lost_words} />”</h2><${Facts} run=${run} one=${one} episode=${episode} /></header>
     <div class="stage"><div><${Film} run=${run.key} one=${one} frames=${episode.frames} now=${now} steps=${last} attention=${episode.attention} block=${blockOf(episode, place)} />
       ${episode.attention && html`<label class="choice inline"><span>attention</span><select name="attention" value=${blockOf(episode, place)} onChange=${(e) => go({ attention: e.target.value }, true)}><option value="">not shown</option><option value="mean">mean of all blocks</option>${[...Array(episode.attention.blocks).keys()].map((b) => html`<option value=${String(b)}>block ${b}</option>`)}</select></label>
-        ${blockOf(episode, place) && html`<p class="note">Attention of the acting stream on the patches of the first camera, mean over heads. Descriptive: an attended patch need not be used.</p>`}`}
+        ${blockOf(episode, place) && html`<p class="note">Attention of the acting stream on the patches of each picture, mean over heads. Descriptive: an attended patch need not be used.</p>`}`}
       ${last > 0 && html`<div class="scrub"><button type="button" onClick=${play} aria-label=${playing ? "Pause" : "Play"}>${playing ? "❚❚" : "▶"}</button>
         <input type="range" min="0" max=${last} value=${now} aria-label="Control step" onInput=${(e) => step(+e.target.value)} /><output>${now} / ${last}</output></div>`}</div>
       ${episode.trajectory && html`<div><${Plan} trajectory=${episode.trajectory} inferences=${episode.inferences} now=${now} scene=${run.scene} correct=${one.side_correct} names=${names} /><p class="note"><span class="mark toolmark"></span>tool <span class="mark cubemark"></span>cube <span class="mark callmark"></span>inference · circle: zone of the rule disc</p></div>`}

@@ -11,8 +11,8 @@ from probe_kit.env.scoring.rules import RULES, judge, rule_of
 from probe_kit.env.scoring.trajectory import Trajectory
 from probe_kit.errors import RunDamagedError
 from probe_kit.retention.behaviour.vlm_answers import SCORES
-from probe_kit.runs.layout import CAPTURE_ONLY, FRAME_COLUMNS
-from probe_kit.runs.thumbnails import thumbnail_key
+from probe_kit.runs.layout import FRAME_COLUMNS
+from probe_kit.runs.thumbnails import EpisodeFrames, episode_frames
 from probe_kit.suite.pictures import picture_size
 from probe_kit.view.frozen_probes import toward
 from probe_kit.view.payloads.coding import pack_floats, pack_log_odds
@@ -43,9 +43,10 @@ def episode_payload(viewed: ViewedRun, number: int) -> dict[str, Any]:
     probed = None if probes is None else probes.log_odds(position)
     calls = int(viewed.captured_inferences[position])
     trajectory = run.trajectory(position) if run.has_trajectories else None
+    frames = episode_frames(run, position)
     return {
         "number": number,
-        "frames": _frames(viewed, number, row),
+        "frames": None if frames is None else _frames(viewed, number, frames),
         "inferences": viewed.inference_steps(position),
         "log_odds": None if probed is None else pack_log_odds(probed.values),
         "refitted": None if probed is None else _refitted(viewed, row, calls),
@@ -57,7 +58,7 @@ def episode_payload(viewed: ViewedRun, number: int) -> dict[str, Any]:
         "instruction_tokens": len(run.instruction_ids(position) or ()),
         "answers": _answers(viewed, row),
         "inputs": _inputs(viewed, position),
-        "attention": _attention(viewed, row, position),
+        "attention": _attention(viewed, row, position, 1 if frames is None else frames.cameras),
     }
 
 
@@ -88,50 +89,39 @@ def _refitted(viewed: ViewedRun, row: dict[str, Any], calls: int) -> Any:
     return pack_log_odds(log_odds)
 
 
-def _frames(viewed: ViewedRun, number: int, row: dict[str, Any]) -> dict[str, Any] | None:
-    """Return the division of the episode's picture: `count` frames of one size in `columns`; None without one.
+def _frames(viewed: ViewedRun, number: int, frames: EpisodeFrames) -> dict[str, Any]:
+    """Return the division of the episode's picture: `count` frames of one size in `columns`.
 
     steps: of the frames, where there is one for each inference."""
-    sheet = viewed.sheet(number)
-    if sheet is None:
-        return None
-    stored = viewed.run.location.exists(thumbnail_key(number))
-    count = sheet.count or (1 if viewed.answers or row["outcome"] == CAPTURE_ONLY else 2)
-    columns = min(count, FRAME_COLUMNS)
-    size = picture_size(sheet.content)
+    columns = min(frames.count, FRAME_COLUMNS)
+    size = picture_size(frames.content)
     if size is None:
         raise RunDamagedError(f"the picture of episode {number} in {viewed.run.location} cannot be decoded")
     width, height = size
-    cell = {"width": width // columns, "height": height // -(-count // columns)}
-    steps = None if stored else viewed.inference_steps(viewed.position_of[number])
-    return {"count": count, "columns": columns, **cell, "all": sheet.count is not None, "steps": steps}
+    cell = {"width": width // columns, "height": height // -(-frames.count // columns)}
+    of_inferences = frames.kind == "inferences"
+    steps = viewed.inference_steps(viewed.position_of[number]) if of_inferences else None
+    return {"count": frames.count, "columns": columns, **cell, "all": frames.kind != "ends", "steps": steps}
 
 
-def _attention(viewed: ViewedRun, row: dict[str, Any], position: int) -> dict[str, Any] | None:
-    """Return the attention on the patches of the first camera's picture, by step; None where none is stored.
+def _attention(viewed: ViewedRun, row: dict[str, Any], position: int, pictures: int) -> dict[str, Any] | None:
+    """Return the attention on the patches of a frame of so many pictures, by step; None where none is stored.
 
-    boxes: packed (P, 4) shares of the picture. weights: packed (B, P) of every inference.
+    boxes: packed (P, 4) shares of the frame. weights: packed (B, P) of every inference.
     """
     stored = viewed.patch_attention.get(str(row["category"]))
     rows = [] if stored is None else np.flatnonzero(stored.episodes == row["episode_id"]).tolist()
     if stored is None or not rows:
         return None
-    steps, inputs = viewed.inference_steps(position), viewed.run.inputs
+    steps, on_frame = viewed.inference_steps(position), stored.on_frame(pictures)
     # Interventions count inferences of an episode, and name frames of recordings by their number.
     calls = [int(call) for call in stored.calls[rows]]
     return {
         "blocks": stored.weights.shape[1],
-        "cameras": 1 if viewed.has_sides or inputs is None else max(1, _cameras(viewed)),
-        "boxes": pack_floats(stored.boxes),
+        "boxes": pack_floats(on_frame.boxes),
         "steps": calls if viewed.run.recorded else [steps[call] for call in calls],
-        "weights": [pack_floats(stored.weights[at]) for at in rows],
+        "weights": [pack_floats(on_frame.weights[at]) for at in rows],
     }
-
-
-def _cameras(viewed: ViewedRun) -> int:
-    """Return how many pictures stand side by side in a frame that is made of stored pixels."""
-    stored = viewed.run.settings.get("dataset") or viewed.run.settings.get("environment") or {}
-    return len(stored.get("cameras", ())) if "pixels" in stored.get("inputs", {}) else 1
 
 
 def _inputs(viewed: ViewedRun, position: int) -> list[dict[str, Any]]:

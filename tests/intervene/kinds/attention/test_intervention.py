@@ -5,6 +5,7 @@ import shutil
 from dataclasses import replace
 from math import ceil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,8 +14,11 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.errors import CaptureChangedActionError, CaptureError, UnsupportedInterventionError, UsageError
+from probe_kit.extract.sources.inputs import picture_of, with_pictures
 from probe_kit.hooks import Observation
 from probe_kit.hooks.capturing.attention import AttentionMass, capture_attention
+from probe_kit.hooks.conformance.subject import example_observations
+from probe_kit.hooks.families.smolvla.adapter import SmolVLA
 from probe_kit.hooks.registry import find_family
 from probe_kit.intervene import (
     AttentionReadout,
@@ -25,13 +29,20 @@ from probe_kit.intervene import (
     run_intervention,
     stored_attention,
 )
-from probe_kit.intervene.kinds.attention import AttentionRecorded, shares_by_role, stored_patch_attention
+from probe_kit.intervene.kinds.attention import (
+    AttentionRecorded,
+    PatchAttention,
+    shares_by_role,
+    stored_patch_attention,
+)
 from probe_kit.intervene.kinds.base import Measurement, TableContext
-from probe_kit.intervene.replay import ReplayBatch
+from probe_kit.intervene.pairs import Pair
+from probe_kit.intervene.replay import ConditionContext, ReplayBatch
 from probe_kit.intervene.sessions.session import ReplaySession
-from probe_kit.intervene.tokens import BANDS, TILES, tokens_overlapping
+from probe_kit.intervene.tokens import BANDS, TILES, patch_embeddings, token_boxes, tokens_overlapping
 from probe_kit.runs import Run, open_run, verify_run
 from tests.intervene.answers import follower, outcomes_of
+from tests.support.smolvla_checkpoints import write_smolvla
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
@@ -93,6 +104,48 @@ def test_attention_on_patches_adds_up_to_the_pictures_share_and_patches_lie_wher
         assert not crosses.all()
     areas = (right - left) * (bottom - top)
     assert areas.sum() <= 1.2, "patches lie beside each other"
+
+
+def test_every_camera_has_its_patches_where_they_look_and_a_frame_shows_them_side_by_side(tmp_path: Path) -> None:
+    cameras = ("top", "wrist")
+    policy = SmolVLA.load(str(write_smolvla(tmp_path, cameras=cameras))).showing(cameras)
+    (observation,) = example_observations(["Put the cube on the star"], cameras[1:])
+    boxes = {camera: token_boxes(policy, observation, camera) for camera in cameras}
+    for at, camera in enumerate(cameras):
+        pixels = np.zeros(observation.image.shape, bool)
+        pixels[:8, :8] = True
+        turned = np.where(pixels, 255 - picture_of(observation, camera), picture_of(observation, camera))
+        changed = with_pictures(observation, f"picture.{camera}", lambda _, turned=turned: turned)  # type: ignore[misc]
+        moved = [
+            np.abs(patch_embeddings(policy, changed, name) - patch_embeddings(policy, observation, name)).max(
+                axis=1
+            )
+            for name in cameras
+        ]
+        assert moved[1 - at].max() == 0, "another camera's patches do not see it"
+        strongest = boxes[camera][policy.patch_order()[moved[at].argmax()]]
+        assert (strongest[:2] <= 0.15).all(), camera
+    roles = ("all", "image.top", "image.wrist")
+    session = SimpleNamespace(policy=policy, act=lambda seen, seed: policy.act([seen], [seed])[0])
+    context = ConditionContext(session, Pair(observation, observation))  # type: ignore[arg-type]
+    result = AttentionRecorded("backbone", roles, boxes=boxes).play(context)
+    assert result.patches is not None
+    assert result.mass is not None
+    counts = [len(places) for places in boxes.values()]
+    shares = np.split(result.patches, np.cumsum(counts)[:-1], axis=1)
+    for at, of_camera in enumerate(shares, start=1):
+        np.testing.assert_allclose(of_camera.sum(axis=1), np.nanmean(result.mass[..., at], axis=(1, 2)), rtol=1e-4)
+    stored = PatchAttention(
+        np.array(["a"]), np.zeros(1, int), result.patches[None].astype(np.float16),
+        np.repeat(cameras, counts), np.concatenate(list(boxes.values())),
+    )  # fmt: skip
+    stored = PatchAttention.from_bytes(stored.to_bytes())
+    both, first = stored.on_frame(2), stored.on_frame(1)
+    np.testing.assert_allclose(both.boxes[: counts[0], 0::2], boxes["top"][:, 0::2] / 2)
+    np.testing.assert_allclose(both.boxes[counts[0] :, 0::2], 0.5 + boxes["wrist"][:, 0::2] / 2)
+    np.testing.assert_array_equal(both.boxes[:, 1::2], stored.boxes[:, 1::2])
+    np.testing.assert_array_equal(first.boxes, boxes["top"])
+    np.testing.assert_array_equal(first.weights, stored.weights[..., : counts[0]])
 
 
 def test_noting_changes_no_action_bit_for_bit(attention_records: InterventionResult) -> None:
