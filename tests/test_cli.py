@@ -261,8 +261,12 @@ def test_suite_build_list_and_show_go_together(tmp_path: Path) -> None:
         assert Path(shown_item["correct"]) == item.picture(item.correct_side)
         assert Path(shown_item["wrong"]) != Path(shown_item["correct"])
         assert Path(shown_item["wrong"]).is_file()
-    as_text = in_process("suite", "show", tmp_path / "suite")
-    assert " ".join(as_text.stdout.split()).count("Put the") == 4
+    as_text = in_process("suite", "show", tmp_path / "suite", cwd=tmp_path).stdout
+    assert as_text.count("Put the") == 4
+    lines = [line.split(maxsplit=1) for line in as_text.splitlines() if line.startswith("  ")]
+    pictures = [tmp_path / text for name, text in lines if name in ("correct", "wrong")]
+    assert len(pictures) == 8
+    assert all(path.is_file() for path in pictures), "a path can be copied from the terminal"
 
 
 @pytest.mark.slow

@@ -30,6 +30,8 @@ _NEEDS: Mapping[TableKind, str] = {
 """By kind of table, the field that names what it shows; other kinds need `runs`."""
 _COMPARES = {"ablation": "pairs", "chain": "chain", "groups": "groups"}
 """By kind of table, the kind of comparison it shows."""
+_OF_PROBES = ("probing", "as-paper", "curves")
+"""Kinds of tables and figures that have nothing to show without probes of sides."""
 _POOLED = ("mean", "last", "tokens")
 _BY_ROLE = ("mean:", "tokens:")
 """The beginnings of views of one role."""
@@ -368,6 +370,8 @@ def _tables(study: Study, suite: PlannedSuite) -> Iterator[Mistake]:
                 yield Mistake((*path, part), f"a table of kind {table.kind!r} shows no {part}; leave it out")
         yield from _other_comparison(study, table, path)
         yield from _nothing_to_print(study, table, (*path, "runs"))
+        if table.kind in _OF_PROBES:
+            yield from _unprobed(study, table.runs or [], f"a table of kind {table.kind!r}", (*path, "runs"))
         yield from _absent_categories(study, table.runs or [], table.categories, suite, path)
         yield from _elsewhere(study, table, (*path, "elsewhere"))
 
@@ -404,6 +408,18 @@ def _nothing_to_print(study: Study, table: TableTable, path: Place) -> Iterator[
         yield Mistake(path, f"a table of kind {table.kind!r} {text}")
 
 
+def _unprobed(study: Study, runs: list[str], subject: str, path: Place) -> Iterator[Mistake]:
+    """Yield a mistake for blocks whose probes are to be shown, and no run of which a table of probes names."""
+    probed = {name for table in study.probes.values() if table.target == CORRECT for name in table.runs}
+    # Blocks share runs, so that a block without probes of its own can show those of another one.
+    of_runs, of_probes = (
+        {member.run for member in members(study) if member.block.name in blocks} for blocks in (runs, probed)
+    )
+    if of_runs and not of_runs & of_probes:
+        text = f"{subject} shows probes of {CORRECT}; name a block of `runs` in a table [probes.NAME]"
+        yield Mistake(path, text)
+
+
 def _absent_categories(
     study: Study, runs: list[str], categories: list[str] | None, suite: PlannedSuite, path: Place
 ) -> Iterator[Mistake]:
@@ -430,6 +446,8 @@ def _figures(study: Study, suite: PlannedSuite) -> Iterator[Mistake]:
     for name, figure in study.figures.items():
         path = ("figures", name)
         yield from _absent_categories(study, figure.runs, figure.categories, suite, path)
+        if figure.kind in _OF_PROBES:
+            yield from _unprobed(study, figure.runs, f"a figure of kind {figure.kind!r}", (*path, "runs"))
         if figure.view is None:
             continue
         if figure.kind != "curves":

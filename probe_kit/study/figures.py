@@ -74,7 +74,8 @@ def _curves(source: _Source) -> list[ReportFigure]:
     ]
     if not with_probes:
         raise UsageError(
-            f"no run of the figure {source.name!r} has probes; name its block in a table [probes.NAME]"
+            f"no run of the figure {source.name!r} has the probes of the file; `probe-kit study run "
+            f"{source.study.typed}` fits them"
         )
     names, results = [label for label, _ in with_probes], [results_of_run for _, results_of_run in with_probes]
     view = source.figure.view or results[0].settings.views[0]

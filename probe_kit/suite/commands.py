@@ -9,7 +9,6 @@ from probe_kit._system.bounded_json import load_json, parse_json
 from probe_kit._system.counting import counted
 from probe_kit._terminal.console import counter, err, marked, out, print_json, progress
 from probe_kit._terminal.options import AsJson, Categories, Seed, choices, one_of
-from probe_kit._terminal.plain_text import terminal_safe
 from probe_kit.errors import UsageError
 from probe_kit.suite.converters.conversion import EVERY_SOURCE
 
@@ -107,8 +106,6 @@ def show(
     as_json: AsJson = False,
 ) -> None:
     """List items of a suite: the instruction, the picture that answers it, and the other picture."""
-    from rich.table import Table
-
     from probe_kit.suite import default_suite, load_suite
 
     suite = default_suite() if folder is None else load_suite(folder)
@@ -130,12 +127,19 @@ def show(
     if as_json:
         print_json({"suite": suite.identity, "items": rows})
         return
-    table = Table(*rows[0], title=suite.identity)
-    for column in table.columns:
-        column.overflow = "fold"
+    out.print(marked("[bold]{}[/]", suite.identity), soft_wrap=True)
     for row in rows:
-        table.add_row(*map(terminal_safe, row.values()))
-    out.print(table)
+        # Each path on a line of its own: a column of a table would fold it, so that it could not be copied.
+        pictures = {side: _from_here(row[side]) for side in ("correct", "wrong")}
+        out.print(marked("\n[bold]{}[/]", row["instruction"]), soft_wrap=True)
+        for name, text in {"category": row["category"], "item": row["item"], **pictures}.items():
+            out.print(marked("  {} {}", f"{name:<8}", text), soft_wrap=True)
+
+
+def _from_here(path: str) -> str:
+    """Return a path relative to the working directory where it lies below."""
+    folder = Path.cwd()
+    return str(Path(path).relative_to(folder)) if Path(path).is_relative_to(folder) else path
 
 
 def _list_categories(suite: "Suite", as_json: bool) -> None:

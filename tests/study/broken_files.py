@@ -227,6 +227,16 @@ MISTAKES: list[tuple[str, str, str]] = [
         "a table of kind 'success' shows no comparison",
     ),
     ('kind = "success"\nruns', 'kind = "vlms"\nruns', "and no block of `runs` asks one"),
+    (
+        'kind = "success"\nruns = ["main"]',
+        'kind = "probing"\nruns = ["vlms"]  # here',
+        "name a block of `runs` in a table [probes.NAME]",
+    ),
+    (
+        "[tables.light]",
+        '[figures.all]\nkind = "curves"\nruns = ["vlms"]  # here\n\n[tables.light]',
+        "a figure of kind 'curves' shows probes of side.correct",
+    ),
     ('kind = "success"\nruns', 'kind = "stages"\nruns', "`runs` have no policy with its VLM"),
     (
         'kind = "success"\nruns = ["main"]',

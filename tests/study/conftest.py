@@ -34,10 +34,6 @@ runs = ["main"]
 kind = "sides"
 runs = ["main"]
 
-[figures.curves]
-kind = "curves"
-runs = ["main"]
-
 [figures.dose]
 kind = "dose"
 runs = ["main"]

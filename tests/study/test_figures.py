@@ -60,7 +60,6 @@ def test_figures_are_drawn_by_name_from_stored_runs(played: LoadedStudy, tmp_pat
 @pytest.mark.parametrize(
     ("name", "said"),
     [
-        ("curves", r"has probes; name its block in a table \[probes"),
         ("dose", "was steered. Steer one with `probe-kit intervene"),
         ("overveiw", "unknown figure 'overveiw'; known: overview, .* Did you mean 'overview'"),
     ],

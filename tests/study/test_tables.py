@@ -208,7 +208,7 @@ def test_a_table_is_also_rows_of_csv_with_both_ends_of_intervals(played: LoadedS
 @pytest.mark.slow
 def test_a_report_is_one_page_with_state_tables_figures_and_the_file(played: LoadedStudy, tmp_path: Path) -> None:
     file, page, run = tmp_path / "named.toml", tmp_path / "report.html", CliRunner()
-    text = played.file.read_text(encoding="utf-8").partition("[figures.curves]")[0]
+    text = played.file.read_text(encoding="utf-8").partition("[figures.dose]")[0]
     text = text.replace('label = "Idle"', 'label = "<b>Idle & 5 %</b>"')
     file.write_text(text, encoding="utf-8")
     before = file_times(Path(played.study.folder))
