@@ -3,7 +3,6 @@
 import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
-from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,13 +12,9 @@ from probe_kit.errors import EpisodesFailedError, UsageError
 from probe_kit.extract.events import Done, Failed
 from probe_kit.extract.needs import space_needed
 from probe_kit.extract.plan import Plan
-from probe_kit.extract.preparation import Prepared, load, load_answer_model, open_checked
-from probe_kit.extract.settings import (
-    AskSettings,
-    ExtractSettings,
-    Settings,
-    run_label,
-)
+from probe_kit.extract.preparation import Prepared, load, open_checked
+from probe_kit.extract.rollout.task import task_of
+from probe_kit.extract.settings import AskSettings, ExtractSettings, Settings, run_label
 from probe_kit.extract.workers import play
 from probe_kit.hashing import canonical_json
 from probe_kit.runs.commits import failure_key
@@ -35,7 +30,7 @@ from probe_kit.runs.store import locate
 from probe_kit.runs.writer import RunWriter
 
 if TYPE_CHECKING:
-    from probe_kit.hooks import AnswerModel, Policy
+    from probe_kit.hooks import Model
 
 Progress = Callable[[int, int, str], None]
 # If this many episodes were given up and none succeeded, something is wrong with all of them.
@@ -129,29 +124,25 @@ def _failure(writer: RunWriter[Plan], given_up: list[Failed], committed: int) ->
 def prepare(
     settings: Settings,
     out: Path | str | Location | None = None,
-    answer_model: "AnswerModel | None" = None,
-    policy: "Policy | None" = None,
+    model: "Model | None" = None,
     fetch: bool = True,
 ) -> Extraction:
     """Find the suite, load the model and plan the episodes.
 
     out: where it will be written, if that is known; what is wrong there is then said before the model is loaded.
-    answer_model: the model of these `AskSettings`, if it is loaded already. policy: that of these
-    `ExtractSettings`; several runs can share one. Workers load their own. fetch: False plans with the streams that
-    the family declares, without weights, network or GPU; such an extraction cannot be run.
+    model: the policy or answer model of these settings, if it is loaded already; several runs can share it.
+    Workers load their own. fetch: False plans with the streams that the family declares, without weights, network
+    or GPU; such an extraction cannot be run.
     Raises what these raise: UnknownModelError, UnknownCategoryError, SuiteError, WeightsError …
     """
     location = None if out is None else locate(out)
-    if settings.machine.elsewhere:
-        # This process only plans; the GPUs belong to the workers.
-        # Each worker calibrates on its own device.
-        measures = {"batch": 1} if settings.machine.batch == "auto" else {}
-        on_cpu = settings.changed(device="cpu", **measures)
-        planned = load(on_cpu, location=location, answer_model=answer_model, policy=policy, fetch=fetch)
-        for_workers = planned.settings.changed(device=settings.machine.device, batch=settings.machine.batch)
-        return Extraction(for_workers, planned.source, planned.plan, planned.card, None, declared=planned.declared)
-    prepared = load(settings, location=location, answer_model=answer_model, policy=policy, fetch=fetch)
-    return Extraction(**{field.name: getattr(prepared, field.name) for field in fields(prepared)})
+    if not settings.machine.elsewhere:
+        return Extraction(**vars(load(settings, location=location, model=model, fetch=fetch)))
+    # This process only plans: the GPUs belong to the workers, and each of them calibrates on its own device.
+    measures = {"batch": 1} if settings.machine.batch == "auto" else {}
+    planned = load(settings.changed(device="cpu", **measures), location=location, model=model, fetch=fetch)
+    for_workers = planned.settings.changed(device=settings.machine.device, batch=settings.machine.batch)
+    return Extraction(for_workers, planned.source, planned.plan, planned.card, None, declared=planned.declared)
 
 
 def extract_run(settings: ExtractSettings, out: Path | str, progress: Progress | None = None) -> Run:
@@ -178,8 +169,7 @@ def prepare_asks(
     if not fetch:
         yield from (prepare(one_run, out, fetch=False) for one_run, out in zip(settings, outs, strict=True))
         return
-    first = settings[0]
-    elsewhere = first.machine.elsewhere
-    answer_model = load_answer_model(first.changed(device="cpu") if elsewhere else first)
+    first = settings[0].changed(device="cpu") if settings[0].machine.elsewhere else settings[0]
+    model = task_of(first).load(first)
     for one_run, out in zip(settings, outs, strict=True):
-        yield prepare(one_run, out, answer_model)
+        yield prepare(one_run, out, model)

@@ -226,6 +226,9 @@ class AskTask(Part):
     Raises UsageError for an absent object with a prompt that takes no no.
     """
 
+    execute: ClassVar[None] = None
+    capture_only: ClassVar[bool] = False
+
     protocol: Annotated[
         ProtocolName | None,
         typer.Option("--protocol", help="Use the scene of a published protocol. --scene takes precedence."),

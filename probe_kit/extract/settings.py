@@ -10,7 +10,7 @@ from dataclasses import replace
 from difflib import get_close_matches
 from inspect import Parameter, Signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NoReturn, Self
 
 import typer
 from pydantic import AfterValidator, BeforeValidator, SerializeAsAny
@@ -81,7 +81,12 @@ class Settings(Part):
     """Settings of a run of any kind; the defaults are the command line's.
 
     label: the name of the run in tables and legends; None for the model and what sets it apart, see `run_label`.
+    opens: MODULE:CLASS of the task, which is imported when a run is prepared. in_groups: whether runs come in
+    several of one label, so that all of a label's marks are needed.
     """
+
+    opens: ClassVar[str]
+    in_groups: ClassVar[bool] = False
 
     model: ModelSettings
     source: Annotated[SerializeAsAny[SourceSettings], BeforeValidator(_read_source)]
@@ -260,19 +265,38 @@ class Settings(Part):
             name: value for name, value in values.items() if name != "family" and (name, value) != ("batch", 1)
         }
 
-    @property
-    def execute(self) -> int | None:
-        """Actions per inference; None for the model's own, and for one that does not act."""
-        return None
+    def most_inferences(self, execute: int) -> int:
+        """Inferences that an episode can have with `execute` actions per inference."""
+        return -(-self.source.steps() // max(1, execute))
+
+    def with_every_call(self, execute: int) -> Self:
+        """The settings with a number in place of `captured_calls` `all`."""
+        every = self.capture.captured_calls == "all"
+        return self.changed(captured_calls=self.most_inferences(execute)) if every else self
 
     def followed(self) -> Self:
         """The settings with all that a protocol decides of the task; of a question it decides the scene alone."""
         return self
 
-    def with_every_call(self, execute: int) -> Self:
-        """The settings with a number in place of `captured_calls` `all`, of `execute` actions per inference."""
-        del execute
-        return self
+    def follows(self) -> dict[str, Any]:
+        """The protocol that the task follows, as a run stores it; empty without one."""
+        return {}
+
+    def refuse(self, names: Iterable[str], why: str) -> None:
+        """Raise UsageError for fields that were chosen and have no effect.
+
+        names: of fields, or NAME=VALUE where only that value has none. why: the remainder of the sentence.
+        """
+        changed, wrong = self.changed_fields(), []
+        offered = (option for part in _PARTS for option in options_of(type(getattr(self, part))))
+        flags = {option.field: option.flag for option in offered}
+        for name, _, value in (text.partition("=") for text in names):
+            if name == "options":
+                wrong += [f"-M {key}" for key in changed.get(name, {})]
+            elif name in changed and (not value or changed[name] == value):
+                wrong.append(" ".join(filter(None, (flags.get(name, name), value))))
+        if wrong:
+            raise UsageError(f"{', '.join(wrong)} {why}")
 
     def folder_name(self, digest: str) -> str:
         """The default name of a run's folder. digest: of what the run depends on."""
@@ -289,6 +313,8 @@ class ExtractSettings(Settings):
     source: in place of suite and scene, recordings to show, and the model does not act; or an environment of the
     user's own, in which it acts.
     """
+
+    opens = "probe_kit.extract.rollout.act:Act"
 
     capture: Capture
     task: ActTask
@@ -314,21 +340,11 @@ class ExtractSettings(Settings):
         """Return the identity of every run, with the task."""
         task = {"execute": None, **self.task.model_dump(mode="json", exclude_none=True, exclude={"protocol"})}
         rotation = {"rotation": self.task.rotation or PLAIN}
-        return {**super().identity(), **task, **rotation, **protocol_identity(self.model, self.task, self.source)}
+        return {**super().identity(), **task, **rotation, **self.follows()}
 
-    @property
-    def execute(self) -> int | None:
-        """Actions per inference; None for the policy's own."""
-        return self.task.execute
-
-    def most_inferences(self, execute: int) -> int:
-        """Inferences that an episode can have with `execute` actions per inference."""
-        return -(-self.source.steps() // max(1, execute))
-
-    def with_every_call(self, execute: int) -> Self:
-        """The settings with a number in place of `captured_calls` `all`."""
-        every = self.capture.captured_calls == "all"
-        return self.changed(captured_calls=self.most_inferences(execute)) if every else self
+    def follows(self) -> dict[str, Any]:
+        """The protocol, and where the run differs from it."""
+        return protocol_identity(self.model, self.task, self.source)
 
     def followed(self) -> Self:
         """The settings with all that was not chosen as their protocol has it for the model.
@@ -359,6 +375,9 @@ class AskSettings(Settings):
     the words of its instruction about the first observation of each row.
     """
 
+    opens = "probe_kit.extract.rollout.ask:Ask"
+    in_groups = True
+
     capture: AskCapture
     task: AskTask
     machine: AskMachine
@@ -374,7 +393,7 @@ class AskSettings(Settings):
                 f"--prompt {self.task.prompt.name} asks for an object of a suite, and {source.subject} have none. "
                 "Use --prompt instruction, or a file that contains {instruction}"
             )
-        refuse(self, ("picture=side-by-side", "query"), f"does not apply with {source.shows}; remove it")
+        self.refuse(("picture=side-by-side", "query"), f"does not apply with {source.shows}; remove it")
 
     def __init__(self, model: Any = None, checkpoint: str | None = None, **values: Any) -> None:
         super().__init__(model, checkpoint, **values)
@@ -450,23 +469,6 @@ class AskSettings(Settings):
         ]
 
 
-def refuse(settings: Settings, names: Iterable[str], why: str) -> None:
-    """Raise UsageError for fields that were chosen and have no effect.
-
-    names: of fields, or NAME=VALUE where only that value has none. why: the rest of the sentence.
-    """
-    changed, wrong = settings.changed_fields(), []
-    offered = (option for part in _PARTS for option in options_of(type(getattr(settings, part))))
-    flags = {option.field: option.flag for option in offered}
-    for name, _, value in (text.partition("=") for text in names):
-        if name == "options":
-            wrong += [f"-M {key}" for key in changed.get(name, {})]
-        elif name in changed and (not value or changed[name] == value):
-            wrong.append(" ".join(filter(None, (flags.get(name, name), value))))
-    if wrong:
-        raise UsageError(f"{', '.join(wrong)} {why}")
-
-
 def _merged(former: Part, fields: Mapping[str, Any]) -> dict[str, Any]:
     """Typed fields, in which KEY=VALUE options replace those of equal keys alone."""
     if "options" not in fields:
@@ -512,16 +514,12 @@ def _short(checkpoint: str) -> str:
 def run_label(settings: Settings) -> str:
     """The name of the run in tables: checkpoints and options of one family differ in it."""
     if settings.label is not None:
-        asks = isinstance(settings, AskSettings)  # whose runs come in several, all of one label
-        return " · ".join([settings.label, *(settings.marks() if asks else [])])
+        return " · ".join([settings.label, *(settings.marks() if settings.in_groups else [])])
     model, parts = settings.model, [settings.model.family]
-    if isinstance(settings, ExtractSettings) and settings.task.protocol is not None:
-        followed = protocol_identity(model, settings.task, settings.source)["protocol"]
-        variant = (
-            [followed["variant"]] if "variant" in followed and "checkpoint" not in followed["deviations"] else []
-        )
+    if followed := settings.follows().get("protocol"):
+        is_variant = "variant" in followed and "checkpoint" not in followed["deviations"]
         differing = (f"{name}={run}" for name, (_, run) in followed["deviations"].items())
-        parts += [settings.task.protocol, *variant, *differing]
+        parts += [followed["name"], *([followed["variant"]] if is_variant else []), *differing]
     else:
         parts += [] if model.checkpoint is None else [_short(model.checkpoint)]
         parts += settings.source.marks()

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import asdict
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -14,6 +14,9 @@ from probe_kit.extract.parts import ActMachine, ModelSettings
 from probe_kit.extract.settings import ExtractSettings
 from probe_kit.extract.sources.environment import EnvOptions
 from probe_kit.extract.sources.recording import LeRobotSource
+
+if TYPE_CHECKING:
+    from probe_kit.hooks import Policy
 
 FAILED = 1
 _OFFERED = {
@@ -42,7 +45,8 @@ def show_dataset(
     """
     from rich.table import Table
 
-    from probe_kit.extract.preparation import check_recording, load_acting_policy
+    from probe_kit.extract.preparation import check_unloaded
+    from probe_kit.extract.rollout.task import task_of
     from probe_kit.extract.sources.recording_source import RecordingSource
 
     settings = ExtractSettings.of_command({**typed, "model": model or "pi0-tiny", "dataset": folder})
@@ -52,8 +56,9 @@ def show_dataset(
         facts = recording.facts()
     if model is not None:
         with err.status("loading the model"):
-            check_recording(settings, recording)
-            recording, policy = recording.fitted(load_acting_policy(settings))
+            check_unloaded(settings, recording)
+            policy: Policy = task_of(settings).load(settings)  # type: ignore[assignment]  # scripts were refused
+            recording, policy = recording.fitted(policy)
         facts |= recording.facts_of(policy)
     table = Table(show_header=False, box=None)
     table.add_column(style="dim", no_wrap=True)

@@ -8,7 +8,7 @@ from math import ceil
 from pathlib import Path
 from typing import Any
 
-from probe_kit.extract.settings import AskSettings, ExtractSettings, Settings
+from probe_kit.extract.settings import Settings
 from probe_kit.hashing import canonical_json, sha256_json
 from probe_kit.study.planned_suite import PlannedSuite
 
@@ -62,12 +62,12 @@ class Cell:
     @property
     def asks(self) -> bool:
         """Whether a VLM is asked."""
-        return isinstance(self.settings, AskSettings)
+        return self.settings.in_groups
 
     @property
     def captured(self) -> bool:
         """Whether a policy is only captured."""
-        return isinstance(self.settings, ExtractSettings) and self.settings.task.capture_only
+        return self.settings.task.capture_only
 
     @cached_property
     def selection(self) -> Selection:
@@ -92,7 +92,7 @@ class Cell:
     @property
     def inferences(self) -> int:
         """Inferences of a policy at most, where episodes may end early; a VLM has none."""
-        if not isinstance(self.settings, ExtractSettings):
+        if self.asks:
             return 0
         if self.captured:
             return self.episodes

@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, Literal
 from probe_kit._system.counting import counted
 from probe_kit.errors import ProbeKitError, RunIncompleteError, RunNotFoundError, UsageError
 from probe_kit.extract.needs import planned_sizes, space_of
-from probe_kit.extract.settings import ExtractSettings
 from probe_kit.hooks.registry import family_names
 from probe_kit.runs import verify_run
 from probe_kit.runs.disk import in_units
@@ -367,8 +366,7 @@ def bytes_per_episode(cell: Cell, stored: Sequence[StoredStream] | None) -> int 
         if sizes is None:
             return None
         stored = sizes.streams
-    if isinstance(settings, ExtractSettings):
-        settings = settings.with_every_call(settings.task.execute or 1)
+    settings = settings.with_every_call(settings.task.execute or 1)
     space = space_of(stored or (), 1, settings)  # a script has no network, and no stream
     return sum(space.values()) - space["report"]
 

@@ -5,9 +5,9 @@ model whose worker is lost, or whose study is started again, resumes after its l
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from probe_kit._execution.executor import GivenUp, Pool, TaskQueue, work_off
 from probe_kit._execution.process_pool import ProcessPool, share_of_machine
@@ -25,9 +25,9 @@ from probe_kit.errors import (
 )
 from probe_kit.extract import prepare
 from probe_kit.extract.extraction import Extraction
-from probe_kit.extract.preparation import load_acting_policy, load_answer_model, open_checked
-from probe_kit.extract.rollout.controllers import SCRIPTED
-from probe_kit.extract.settings import AskSettings, ExtractSettings, Settings
+from probe_kit.extract.preparation import open_checked
+from probe_kit.extract.rollout.task import task_of
+from probe_kit.extract.settings import Settings
 from probe_kit.runs import seal
 from probe_kit.runs.store import locate
 from probe_kit.study.cells import Cell, Selection
@@ -38,9 +38,6 @@ from probe_kit.study.reading import LoadedStudy
 from probe_kit.study.schema import ProbesTable
 from probe_kit.study.stored import open_cell
 from probe_kit.train import train_probes
-
-if TYPE_CHECKING:
-    from probe_kit.hooks import AnswerModel, Policy
 
 STOPS_ALL = (DiskSpaceError, StoreError)
 """Errors of the place of all runs, which stop the study."""
@@ -221,22 +218,17 @@ def play_model(task: ModelTask, report: Report) -> None:
             return
 
 
-@dataclass
 class _Loaded:
     """The model as policy and as VLM, loaded on first use."""
 
-    policy: "Policy | None" = field(default=None)
-    answer_model: "AnswerModel | None" = field(default=None)
+    def __init__(self) -> None:
+        self._by_task: dict[str, Any] = {}
 
     def prepare(self, settings: Settings, location: str) -> Extraction:
         """Prepare an extraction with the loaded model."""
-        if isinstance(settings, AskSettings):
-            self.answer_model = self.answer_model or load_answer_model(settings)
-            return prepare(settings, location, answer_model=self.answer_model)
-        assert isinstance(settings, ExtractSettings)
-        if settings.model.family not in SCRIPTED and self.policy is None:
-            self.policy = load_acting_policy(settings)
-        return prepare(settings, location, policy=self.policy)
+        if settings.opens not in self._by_task:
+            self._by_task[settings.opens] = task_of(settings).load(settings)
+        return prepare(settings, location, self._by_task[settings.opens])
 
 
 # -- all models --------------------------------------------------------------------------------------------------

@@ -13,10 +13,10 @@ import torch
 from probe_kit.env import SceneSpec
 from probe_kit.errors import InstructionError, SettingsMismatchError, UsageError
 from probe_kit.extract import AskSettings, ExtractSettings, ask_run, extract_run, prepare, prepare_asks
-from probe_kit.extract.preparation import load_answer_model
 from probe_kit.extract.rollout.answer_controller import AnswerController
 from probe_kit.extract.rollout.controllers import Turn
 from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
+from probe_kit.extract.rollout.task import task_of
 from probe_kit.extract.vqa.templates import P1, P2, SEEN, Template
 from probe_kit.hooks import AnswerModel, Prompt, Reading, Site
 from probe_kit.retention import success_rate
@@ -83,7 +83,7 @@ def test_every_episode_has_its_answer_and_the_run_is_whole(asked: Run) -> None:
 
 def test_a_question_by_letter_keeps_what_every_layer_would_answer(settings: AskSettings, asked: Run) -> None:
     """By the model's own final norm and head; the last layer is the stored margin."""
-    model = load_answer_model(settings)
+    model = task_of(settings).load(settings)
     margins = asked.lens_margins
     assert margins is not None
     assert margins.shape == (4, len(asked.sites("answer")))
@@ -176,7 +176,7 @@ def answers(settings: AskSettings, answer_model: AnswerModel | None = None) -> p
     """What the run's episodes would hold. Their frames are noise: which model answers needs no scene."""
     source: Any = settings.source.open()
     blank = source.example(source.instructions[0])
-    model = load_answer_model(settings) if answer_model is None else answer_model
+    model = task_of(settings).load(settings) if answer_model is None else answer_model
     controller = AnswerController(model, source, settings)
     noise = np.random.default_rng(0)
     turns = [

@@ -8,8 +8,9 @@ from typer.testing import CliRunner
 from probe_kit.cli import app
 from probe_kit.env import SceneSpec
 from probe_kit.errors import UsageError
-from probe_kit.extract import ExtractSettings, calibration, extract_run, prepare
-from probe_kit.extract.calibration import choose, inference_times, largest_batch
+from probe_kit.extract import ExtractSettings, extract_run, prepare
+from probe_kit.extract.rollout import calibration
+from probe_kit.extract.rollout.calibration import choose, inference_times, largest_batch
 from probe_kit.extract.rollout.controllers import PolicyController
 from probe_kit.runs import open_run
 from probe_kit.suite import Suite

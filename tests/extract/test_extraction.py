@@ -21,7 +21,7 @@ from probe_kit.errors import (
     UsageError,
 )
 from probe_kit.extract import ExtractSettings, extract_run, prepare
-from probe_kit.extract.preparation import load_acting_policy
+from probe_kit.extract.rollout.task import task_of
 from probe_kit.hooks import Site, Tap
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.runs import open_run
@@ -171,17 +171,17 @@ def test_runs_that_share_a_policy_hold_the_same_bytes_as_runs_that_load_their_ow
     two_items: Suite, tmp_path: Path
 ) -> None:
     settings = ExtractSettings("pi0-tiny", random_weights=True, suite=two_items.folder, scene=SHORT)
-    policy = load_acting_policy(settings)
+    policy = task_of(settings).load(settings)
     shared = [
-        prepare(settings.changed(seed=seed), policy=policy).run(tmp_path / f"shared-{seed}") for seed in (1, 0)
+        prepare(settings.changed(seed=seed), model=policy).run(tmp_path / f"shared-{seed}") for seed in (1, 0)
     ]
     alone = prepare(settings).run(tmp_path / "alone")
     assert (alone.stamp, alone.settings_sha256) == (shared[1].stamp, shared[1].settings_sha256)
     assert shared[0].stamp != alone.stamp
     with pytest.raises(UsageError, match="the loaded policy has random_weights True instead of False"):
-        prepare(settings.changed(random_weights=False), policy=policy)
+        prepare(settings.changed(random_weights=False), model=policy)
     with pytest.raises(UsageError, match="model 'pi0-tiny' instead of 'pi0-tiny-state'"):
-        prepare(settings.changed(model="pi0-tiny-state"), policy=policy)
+        prepare(settings.changed(model="pi0-tiny-state"), model=policy)
 
 
 def test_the_certificate_names_weights_fires_and_versions(recorded_run) -> None:

@@ -39,7 +39,7 @@ def edited(*edits: Edit) -> Policy:
 
 
 def extracted(folder: Path, policy: Policy, settings: ExtractSettings = SETTINGS) -> Run:
-    return prepare(settings, policy=policy).run(folder)
+    return prepare(settings, model=policy).run(folder)
 
 
 def test_a_sound_policy_is_certified_without_a_note(tmp_path: Path, pi0_tiny: Policy) -> None:

@@ -57,7 +57,7 @@ def source(folder: Path) -> PictureFolder:
 @pytest.fixture(scope="module")
 def run(folder: Path, pi0_tiny: Policy, tmp_path_factory: pytest.TempPathFactory) -> pk.Run:
     settings = ExtractSettings("pi0-tiny", source=source(folder), env_workers=0)
-    return prepare(settings, policy=pi0_tiny).run(tmp_path_factory.mktemp("shown") / "run")
+    return prepare(settings, model=pi0_tiny).run(tmp_path_factory.mktemp("shown") / "run")
 
 
 def test_every_line_is_a_row_with_the_models_own_prediction_bit_for_bit(
@@ -159,7 +159,7 @@ def test_a_picture_that_changes_after_the_plan_is_not_shown(
 ) -> None:
     for file in folder.iterdir():
         (tmp_path / file.name).write_bytes(file.read_bytes())
-    planned = prepare(ExtractSettings("pi0-tiny", source=source(tmp_path), env_workers=0), policy=pi0_tiny)
+    planned = prepare(ExtractSettings("pi0-tiny", source=source(tmp_path), env_workers=0), model=pi0_tiny)
     for number in range(COUNT):
         Image.new("RGB", (64, 48)).save(tmp_path / f"{number}.png")
     with pytest.raises(ProbeKitError) as failed:

@@ -38,7 +38,7 @@ def played(_own_modules: None, pi0_tiny: "Pi0", tmp_path_factory: pytest.TempPat
     source = EnvSource("reach_env:ReachEnv", max_steps=6)
     settings = ExtractSettings("pi0-tiny", source=source, captured_calls=2, execute=3, env_workers=0, batch=1)
     folder = tmp_path_factory.mktemp("played") / "run"
-    prepare(settings, policy=pi0_tiny).run(folder)
+    prepare(settings, model=pi0_tiny).run(folder)
     return open_run(folder)
 
 

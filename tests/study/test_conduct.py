@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 from probe_kit._terminal.console import out
 from probe_kit.cli import app
 from probe_kit.errors import RunIncompleteError, UsageError
-from probe_kit.extract import ExtractSettings
+from probe_kit.hooks import load_policy
 from probe_kit.runs import open_run
 from probe_kit.study import (
     Failure,
@@ -18,7 +18,6 @@ from probe_kit.study import (
     load_study,
     make_table,
     plan_study,
-    playing,
 )
 from probe_kit.suite import Suite
 from tests.study.small_study import LIGHT, small_study
@@ -171,11 +170,11 @@ def test_what_fails_while_it_plays_is_kept_with_its_traceback_and_tried_again_on
     changed.write_text(text, encoding="utf-8")
     tries: list[str] = []
 
-    def load(settings: ExtractSettings) -> None:
-        tries.append(settings.model.family)
+    def load(family: str, *_: object) -> None:
+        tries.append(family)
         raise RuntimeError("the loader of a family is wrong")
 
-    monkeypatch.setattr(playing, "load_acting_policy", load)
+    monkeypatch.setattr("probe_kit.hooks.load_policy", load)
     for retry_failed, tried in ((False, 1), (False, 1), (True, 2)):
         (failure,) = conduct_study(plan_study(load_study(changed)), env_workers=0, retry_failed=retry_failed)
         assert (failure.stage, failure.error, failure.run) == ("playing", "RuntimeError", "broken/short")
@@ -194,13 +193,12 @@ def test_a_policy_is_loaded_once_for_all_of_its_runs(
     small_suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     loaded: list[str] = []
-    load = playing.load_acting_policy
 
-    def count(settings):  # type: ignore[no-untyped-def]
-        loaded.append(settings.model.family)
-        return load(settings)
+    def count(family, *given, **options):  # type: ignore[no-untyped-def]
+        loaded.append(family)
+        return load_policy(family, *given, **options)
 
-    monkeypatch.setattr(playing, "load_acting_policy", count)
+    monkeypatch.setattr("probe_kit.hooks.load_policy", count)
     text = TEXT.replace('family = "idle"', 'family = "pi0-tiny"\nrandom_weights = true')
     file = small_study(tmp_path, small_suite, text, items=2)
     assert [one.model for one in conduct_study(plan_study(load_study(file)), env_workers=0)] == ["broken"]

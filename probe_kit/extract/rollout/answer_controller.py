@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from probe_kit.errors import PolicyFailedError, UsageError
-from probe_kit.extract.plan import Row
 from probe_kit.extract.rollout.capturing import stored_streams
 from probe_kit.extract.rollout.controllers import Inference, ModelController, Turn
 from probe_kit.extract.rollout.input_check import varied
@@ -336,17 +335,3 @@ class AnswerController(ModelController["AnswerModel", "Prompt"]):
             else:
                 return form
         return None
-
-
-def asked_rows(rows: Sequence[Row], source: Source[Any], settings: AskSettings) -> tuple[Row, ...]:
-    """The rows with what a question asks for, where that is not the object of the instruction.
-
-    Raises UsageError for items without such a phrase.
-    """
-    if settings.task.query == "target" or source.suite is None:
-        return tuple(rows)
-    objects_by_item = phrases(source.suite, settings.task.query, settings.seed)
-    objects = {item: phrase.with_article for item, phrase in objects_by_item.items()}
-    return tuple(
-        replace(row, columns={**row.columns, "asked_object": objects[row.columns["item_id"]]}) for row in rows
-    )

@@ -96,14 +96,15 @@ class Inference:
 class Controller(Protocol):
     """A task: act, capture or ask.
 
-    script: for the player, None if the controller infers. threads: of its network, None for torch's choice.
-    on_gpu: whether activations come from a GPU. identity: the part of a run's identity that the loaded model
-    decides.
+    script: for the player, None if the controller infers. execute: actions per inference, 0 for none. threads: of
+    its network, None for torch's choice. on_gpu: whether activations come from a GPU. identity: the part of a
+    run's identity that the loaded model decides.
     """
 
     identity: dict[str, Any]
     streams: list[StoredStream]
     script: str | None
+    execute: int
     threads: int | None
     on_gpu: bool
 
@@ -124,6 +125,7 @@ class ScriptedController:
         self.identity: dict[str, Any] = {"model": name, "random_weights": False, "weights_sha256": None}
         self.streams: list[StoredStream] = []
         self.script: str | None = name
+        self.execute = 1
         self.threads: int | None = None
         self.on_gpu = False
 
@@ -146,6 +148,7 @@ class ModelController[Loaded: "Model", Question](ABC):
     """
 
     script: str | None = None
+    execute: int = 0
     outputs: ClassVar[str]
 
     def __init__(self, model: Loaded, settings: "Settings", streams: list[StoredStream]) -> None:

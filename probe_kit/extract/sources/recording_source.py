@@ -1,6 +1,6 @@
 """Opened recordings: chosen frames of a LeRobotDataset that lies here, and the player that shows them."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from importlib.metadata import version
@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit._terminal.plain_text import terminal_safe
-from probe_kit.errors import InstructionError, ObservationError, RecordingError
+from probe_kit.errors import ObservationError, RecordingError
 from probe_kit.extract.plan import Row
 from probe_kit.extract.sources.lerobot_folder import MOST_FRAMES, LeRobotFolder, fetched, open_lerobot
 from probe_kit.extract.sources.lerobot_frames import LeRobotFrames
 from probe_kit.extract.sources.lerobot_meta import IMAGE
 from probe_kit.extract.sources.player import SIDE, Answer, InputsPlayer, Opens
 from probe_kit.extract.sources.recording import ACTION, IMAGES, STATE, LeRobotSource, Pairs
-from probe_kit.extract.sources.source import Played, Source
+from probe_kit.extract.sources.source import Played, Source, raise_together
 from probe_kit.extract.sources.units import (
     MOST_UNUSUAL,
     check_units,
@@ -485,21 +485,6 @@ class RecordingPlayer(InputsPlayer):
 def _span(lengths: Sequence[int]) -> str:
     least, most = min(lengths), max(lengths)
     return f"{least}" if least == most else f"{least} to {most}"
-
-
-def raise_together(checks: Iterable[Callable[[], object]]) -> None:
-    """Make all checks, and raise the error of one that fails, or one error that names those of all that fail."""
-    errors: list[RecordingError | InstructionError] = []
-    for check in checks:
-        try:
-            check()
-        except (RecordingError, InstructionError) as error:
-            errors.append(error)
-    if len(errors) == 1:
-        raise errors[0]
-    if errors:
-        listed = "\n".join(f"  {number}. {error}" for number, error in enumerate(errors, start=1))
-        raise RecordingError(f"{len(errors)} things about the recordings do not fit the model:\n{listed}")
 
 
 def mapped_cameras(typed: Pairs, model: Sequence[str], recorded: Sequence[str]) -> Pairs:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from probe_kit._terminal.field_options import Part
-from probe_kit.errors import UsageError
+from probe_kit.errors import InstructionError, RecordingError, UsageError
 
 if TYPE_CHECKING:
     from probe_kit.env import SceneSpec
@@ -216,3 +216,18 @@ class Source[Chosen: SourceSettings](ABC):
     def targets(self) -> tuple[str, ...]:
         """The built-in targets of probes that the rows have, such as `side.correct` or `env.left`."""
         return ()
+
+
+def raise_together(checks: Iterable[Callable[[], object]]) -> None:
+    """Make all checks, and raise the error of one that fails, or one error that names those of all that fail."""
+    errors: list[RecordingError | InstructionError] = []
+    for check in checks:
+        try:
+            check()
+        except (RecordingError, InstructionError) as error:
+            errors.append(error)
+    if len(errors) == 1:
+        raise errors[0]
+    if errors:
+        listed = "\n".join(f"  {number}. {error}" for number, error in enumerate(errors, start=1))
+        raise RecordingError(f"{len(errors)} things about the recordings do not fit the model:\n{listed}")

@@ -31,7 +31,7 @@ def played(pi0_tiny: Pi0, tmp_path_factory: pytest.TempPathFactory) -> Run:
     """Twelve episodes in six groups, two inferences each."""
 
     def make(folder: Path) -> None:
-        prepare(settings(), policy=pi0_tiny).run(folder / "run")
+        prepare(settings(), model=pi0_tiny).run(folder / "run")
 
     return open_run(made_once(tmp_path_factory, "played", make) / "run")
 
@@ -85,30 +85,30 @@ def test_the_activations_of_an_episode_do_not_depend_on_which_others_are_played(
     played: Run, pi0_tiny: Pi0, tmp_path: Path
 ) -> None:
     """Alone, and as the beginning of a run that grows."""
-    some = prepare(settings(episodes=(3,), batch=1), policy=pi0_tiny).run(tmp_path / "run")
+    some = prepare(settings(episodes=(3,), batch=1), model=pi0_tiny).run(tmp_path / "run")
     check_equal(some, played, [3])
-    grown = prepare(settings(episodes=(1, 3), batch=1), policy=pi0_tiny).run(tmp_path / "run")
+    grown = prepare(settings(episodes=(1, 3), batch=1), model=pi0_tiny).run(tmp_path / "run")
     assert list(grown.episodes["episode_id"]) == ["reach-01", "reach-03"]
     shorter = settings(episodes=(1,), max_steps=5)
     with pytest.raises(SettingsMismatchError, match=r"environment\.max_steps"):
-        prepare(shorter, policy=pi0_tiny).run(tmp_path / "run")
+        prepare(shorter, model=pi0_tiny).run(tmp_path / "run")
 
 
 @pytest.mark.slow
 def test_an_environment_is_played_in_child_processes_with_the_same_numbers(
     played: Run, pi0_tiny: Pi0, tmp_path: Path
 ) -> None:
-    some = prepare(settings(episodes=(3, 1), batch=1, env_workers=2), policy=pi0_tiny).run(tmp_path / "run")
+    some = prepare(settings(episodes=(3, 1), batch=1, env_workers=2), model=pi0_tiny).run(tmp_path / "run")
     check_equal(some, played, [1, 3])
 
 
 def test_what_does_not_fit_the_model_is_refused_before_anything_is_written(pi0_tiny: Pi0) -> None:
     with pytest.raises(OwnEnvironmentError, match=r"takes 8 numbers as an action .* embedded predicts 7"):
-        prepare(settings("Wide"), policy=pi0_tiny)
+        prepare(settings("Wide"), model=pi0_tiny)
     with pytest.raises(UsageError, match="--execute 17: pi0-tiny gives 16 actions"):
-        prepare(settings(execute=17), policy=pi0_tiny)
+        prepare(settings(execute=17), model=pi0_tiny)
     with pytest.raises(UsageError, match="--no-act does not apply with --env"):
-        prepare(settings(capture_only=True), policy=pi0_tiny)
+        prepare(settings(capture_only=True), model=pi0_tiny)
     with pytest.raises(UsageError, match="expert is scripted"):
         prepare(settings().changed(model="expert"))
 
@@ -117,7 +117,7 @@ def test_an_environment_that_fails_costs_its_episode_and_says_where(pi0_tiny: Pi
     from probe_kit.errors import EpisodesFailedError
 
     with pytest.raises(EpisodesFailedError) as failed:
-        prepare(settings("Broken", episodes=(0, 1)), policy=pi0_tiny).run(tmp_path / "run")
+        prepare(settings("Broken", episodes=(0, 1)), model=pi0_tiny).run(tmp_path / "run")
     assert "ZeroDivisionError: the simulator exploded" in failed.value.__notes__[0]
 
 

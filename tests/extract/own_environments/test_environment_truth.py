@@ -122,10 +122,9 @@ def test_states_in_other_units_are_refused_of_an_environment_unless_accepted(
     with pytest.raises(
         UnitsError, match=r"reach_env:Degrees, the state after reset\(\): .*outside the statistics"
     ):
-        prepare(settings("Degrees"), policy=pi0_tiny)
+        prepare(settings("Degrees"), model=pi0_tiny)
     one, two = (
-        prepare(settings(name, accept_units=name == "Degrees"), policy=pi0_tiny)
-        for name in ("Degrees", "ReachEnv")
+        prepare(settings(name, accept_units=name == "Degrees"), model=pi0_tiny) for name in ("Degrees", "ReachEnv")
     )
     assert one.settings.identity() == two.settings.identity(), "accepting units changes no number"
 
@@ -135,16 +134,16 @@ def test_a_scene_whose_states_lie_outside_the_statistics_is_refused_unless_accep
 ) -> None:
     """Of a checkpoint whose state never moved in one number."""
     chosen = ExtractSettings("pi0-tiny", categories=("color",), items=2, env_workers=0)
-    assert prepare(chosen, policy=pi0_tiny).plan.episodes
+    assert prepare(chosen, model=pi0_tiny).plan.episodes
 
     def still(states: np.ndarray) -> np.ndarray:
         return np.arange(states.shape[1]) * np.ones_like(states) == 3
 
     monkeypatch.setattr(pi0_tiny, "unusual_states", still)
     with pytest.raises(UnitsError, match=r"the scene .*outside the statistics of .* \(3 100%\); .*--accept-units"):
-        prepare(chosen, policy=pi0_tiny)
+        prepare(chosen, model=pi0_tiny)
     accepted = ExtractSettings("pi0-tiny", categories=("color",), items=2, env_workers=0, accept_units=True)
-    assert prepare(accepted, policy=pi0_tiny).plan.episodes
+    assert prepare(accepted, model=pi0_tiny).plan.episodes
 
 
 @pytest.mark.parametrize(
@@ -162,7 +161,7 @@ def test_actions_with_names_at_another_place_are_not_executed(
 ) -> None:
     monkeypatch.setattr(Pi0, "action_names", property(lambda _self: own))
     if message is None:
-        assert prepare(settings("ReachEnv"), policy=pi0_tiny).plan.episodes
+        assert prepare(settings("ReachEnv"), model=pi0_tiny).plan.episodes
     else:
         with pytest.raises(OwnEnvironmentError, match=message):
-            prepare(settings("ReachEnv"), policy=pi0_tiny)
+            prepare(settings("ReachEnv"), model=pi0_tiny)

@@ -41,7 +41,7 @@ def settings(folder: Path, **source: Any) -> ExtractSettings:
 
 
 def shown(folder: Path, out: Path, policy: Pi0, **source: Any) -> Run:
-    return prepare(settings(folder, **source), out, policy=policy).run(out)
+    return prepare(settings(folder, **source), out, model=policy).run(out)
 
 
 def rows(run: Run) -> dict[str, np.ndarray]:
@@ -74,13 +74,13 @@ def test_a_data_set_written_from_a_scene_run_gives_that_runs_activations_bit_for
         "pi0-tiny", suite=small_suite.folder, categories=("color",), items=2, scene=SceneSpec(max_steps=6),
         captured_calls=3, execute=2, env_workers=0,
     )  # fmt: skip
-    prepared = prepare(scene, policy=pi0_tiny)
+    prepared = prepare(scene, model=pi0_tiny)
     acted = prepared.run(tmp_path / "scene")
     monkeypatch.setattr(PolicyController, "infer", infer)
     seeds = [int(seed) for seed in acted.episodes["policy_seed"]]
     folder = write_recording(tmp_path / "rec", [seen[seed] for seed in seeds])
 
-    again = prepare(settings(folder), policy=pi0_tiny)
+    again = prepare(settings(folder), model=pi0_tiny)
     stretches = tuple(
         replace(row, columns={**row.columns, "policy_seed": seed})
         for row, seed in zip(again.plan.episodes, seeds, strict=True)
@@ -208,7 +208,7 @@ def test_frames_are_decoded_in_child_processes_with_the_same_numbers(
     run: Run, recording: Path, pi0_tiny: Pi0, tmp_path: Path
 ) -> None:
     own = settings(recording, episodes=(0, 1)).changed(env_workers=2)
-    found = prepare(own, policy=pi0_tiny).run(tmp_path / "run")
+    found = prepare(own, model=pi0_tiny).run(tmp_path / "run")
     for name, every in rows(run).items():
         np.testing.assert_array_equal(rows(found)[name][:, :5], every[:2, :5])
 
@@ -357,8 +357,8 @@ def test_states_far_outside_the_checkpoints_statistics_are_refused_unless_accept
     other = [[replace(one, state=one.state * scale) for one in episode] for episode in observations(1)]
     folder = write_recording(tmp_path / "rec", other)
     with pytest.raises(UnitsError, match=r"outside the statistics of embedded \(s0 100%.*--accept-units"):
-        prepare(settings(folder), policy=pi0_tiny)
-    assert prepare(settings(folder, accept_units=True), policy=pi0_tiny).plan.episodes
+        prepare(settings(folder), model=pi0_tiny)
+    assert prepare(settings(folder, accept_units=True), model=pi0_tiny).plan.episodes
 
 
 def test_statistics_of_the_data_set_change_nothing(
@@ -437,8 +437,8 @@ def test_an_interrupted_run_continues_with_the_same_bytes(
         raise EnoughError
 
     with pytest.raises(EnoughError):
-        prepare(settings(recording), policy=pi0_tiny).run(tmp_path / "run", progress=stop)
-    again = prepare(settings(recording), policy=pi0_tiny).run(tmp_path / "run")
+        prepare(settings(recording), model=pi0_tiny).run(tmp_path / "run", progress=stop)
+    again = prepare(settings(recording), model=pi0_tiny).run(tmp_path / "run")
     assert [one.objects for one in again.commits()] == [one.objects for one in run.commits()]
 
 

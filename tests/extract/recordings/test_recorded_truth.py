@@ -158,7 +158,7 @@ def test_a_run_does_not_grow_after_a_file_was_replaced_with_its_old_time_stamp(
 
     def run(episodes: tuple[int, ...]) -> None:
         source = LeRobotSource(str(copy), episodes=episodes)
-        prepare(ExtractSettings("pi0-tiny", source=source, env_workers=0), policy=pi0_tiny).run(tmp_path / "run")
+        prepare(ExtractSettings("pi0-tiny", source=source, env_workers=0), model=pi0_tiny).run(tmp_path / "run")
 
     run((0,))
     replace_same_size(copy / DATA, negated((copy / DATA).read_bytes(), float(WRITTEN[0, 1])))
@@ -177,7 +177,7 @@ def test_an_episode_whose_files_change_after_the_plan_is_given_up_by_name(
 
     plain(copy)
     source = LeRobotSource(str(copy), episodes=(0,))
-    prepared = prepare(ExtractSettings("pi0-tiny", source=source, env_workers=0), policy=pi0_tiny)
+    prepared = prepare(ExtractSettings("pi0-tiny", source=source, env_workers=0), model=pi0_tiny)
     replace_same_size(copy / DATA, negated((copy / DATA).read_bytes(), float(WRITTEN[0, 0])))
     with pytest.raises(ProbeKitError, match="the files of episode-000000 were changed after the run was planned"):
         prepared.run(tmp_path / "run")
@@ -570,7 +570,7 @@ def misfit(folder: Path, state: int, words: str, camera: str) -> ExtractSettings
 def test_camera_words_and_state_that_do_not_fit_are_refused_together_before_a_network_is_loaded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("probe_kit.extract.preparation.load_acting_policy", lambda _: pytest.fail("it was loaded"))
+    monkeypatch.setattr("probe_kit.hooks.load_policy", lambda *_: pytest.fail("it was loaded"))
     settings = misfit(tmp_path / "rec", 6, "Stack the plates", "wrist")
     with pytest.raises(RecordingError) as refused:
         prepare(settings)
@@ -602,4 +602,4 @@ def test_camera_and_state_are_refused_together_where_only_the_loaded_model_knows
 ) -> None:
     settings = misfit(tmp_path / "rec", 6, "Put the cube on the red shape", "wrist")
     with pytest.raises(RecordingError, match=r"2 things(.|\n)*wrist(.|\n)*6 numbers"):
-        prepare(settings, policy=pi0_tiny)
+        prepare(settings, model=pi0_tiny)

@@ -8,7 +8,7 @@ import pytest
 from probe_kit.errors import UsageError
 from probe_kit.extract import ExtractSettings
 from probe_kit.extract.plan import Row
-from probe_kit.extract.preparation import check_reachable
+from probe_kit.extract.rollout.act import check_reachable
 from probe_kit.extract.rollout.controllers import PolicyController, Turn
 from probe_kit.extract.rollout.executed_actions import ensemble
 from probe_kit.hashing import derive_seed

@@ -4,7 +4,7 @@ It decides how fast a run comes and nothing that is stored, but for the float ro
 which batching changes more says so on its card and is never given more than the card allows.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from time import perf_counter
@@ -14,7 +14,7 @@ import numpy as np
 
 from probe_kit._system.machine import cores_here
 from probe_kit.errors import UsageError
-from probe_kit.extract.plan import Plan
+from probe_kit.extract.plan import Row
 from probe_kit.extract.rollout.controllers import PolicyController
 from probe_kit.extract.rollout.worker import torch_threads
 from probe_kit.extract.settings import ExtractSettings
@@ -63,7 +63,7 @@ class Calibration:
 
 
 def calibrated(
-    settings: ExtractSettings, controller: PolicyController, source: Source[Any], plan: Plan
+    settings: ExtractSettings, controller: PolicyController, source: Source[Any], rows: Sequence[Row]
 ) -> tuple[ExtractSettings, Calibration]:
     """`settings` with a batch and simulating processes chosen for this machine, and what led to them.
 
@@ -71,11 +71,11 @@ def calibrated(
     """
     if settings.machine.env_workers is not None:
         raise UsageError("--batch auto chooses batch and simulating processes: leave out --env-workers")
-    example = source.example(plan.episodes[0].instruction)
-    most = largest_batch(controller.model.card.batch, len(plan.episodes))
+    example = source.example(rows[0].instruction)
+    most = largest_batch(controller.model.card.batch, len(rows))
     with torch_threads(controller.threads):
         times = inference_times(lambda batch: _infer(controller, example, batch), most)
-    calibration = choose(times, _turn(settings, controller, source, plan), cores_here())
+    calibration = choose(times, _turn(settings, controller, source, rows[0]), cores_here())
     return settings.changed(batch=calibration.batch, env_workers=calibration.env_workers), calibration
 
 
@@ -139,11 +139,11 @@ def _infer(controller: PolicyController, example: Observation, batch: int) -> No
         raise MemoryError(str(error)) from error
 
 
-def _turn(settings: ExtractSettings, controller: PolicyController, source: Source[Any], plan: Plan) -> float:
+def _turn(settings: ExtractSettings, controller: PolicyController, source: Source[Any], row: Row) -> float:
     """Seconds per inference that a simulator takes, with zero actions; setting up counts once per episode."""
     player = source.play(Played())()
     try:
-        setting_up = _seconds(lambda: player.begin(plan.episodes[0], False))
+        setting_up = _seconds(lambda: player.begin(row, False))
         if controller.capture_only:
             return setting_up
         steps = min(controller.execute, max(1, settings.scene.max_steps // (TURNS + 1)))

@@ -1,0 +1,176 @@
+"""The tasks act and capture: a policy, or a script, plays the rows of a source, or its inferences are captured."""
+
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Any
+
+from probe_kit._system.bounded_files import read_regular
+from probe_kit._system.bounded_json import parse_json
+from probe_kit.errors import CheckpointError, UsageError
+from probe_kit.extract.needs import PlannedSizes
+from probe_kit.extract.rollout.calibration import calibrated
+from probe_kit.extract.rollout.controllers import SCRIPTED, PolicyController, ScriptedController
+from probe_kit.extract.rollout.task import Fitted, Task, check_fit, load_of, with_source
+from probe_kit.extract.settings import ExtractSettings
+from probe_kit.extract.sources.recording import IMAGES, STATE
+from probe_kit.extract.sources.source import Source
+from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE
+from probe_kit.hooks.checkpoints.third_party import with_origin
+
+if TYPE_CHECKING:
+    from probe_kit.hooks import Policy
+    from probe_kit.hooks.contract.card import ModelCard
+    from probe_kit.hooks.family import Family
+
+_SCRIPT_REFUSES = (
+    "capture_only", "checkpoint", "random_weights", "batch", "execute", "rotation", "dtype", "tokens=all",
+    "captured_calls", "options",
+)  # fmt: skip
+_CAPTURE_REFUSES = ("captured_calls", "execute", "rotation", "video")
+_EMPTY_CAMERA = "empty_camera"
+"""Beginning of the name of a camera that never gets a picture."""
+
+
+class Act(Task[ExtractSettings, "Policy"]):
+    """A policy acts, or is captured once per row; a script acts and has no activations."""
+
+    def check_meaningless(self, settings: ExtractSettings) -> None:
+        """Raise UsageError for what a script, or a policy that does not act, has no use for."""
+        name, source = settings.model.family, settings.source
+        if name in SCRIPTED and source.command:
+            raise UsageError(f"{name} is scripted and looks at nothing; choose a model with weights")
+        if settings.task.capture_only and not source.command:
+            why = "which captures one inference per episode and executes no action; remove it"
+            settings.refuse(_CAPTURE_REFUSES, f"does not apply with --no-act, {why}")
+        if name in SCRIPTED:
+            why = f"{name} is scripted and has no network. Remove it, or choose a model with weights"
+            settings.refuse(_SCRIPT_REFUSES, f"does not apply: {why}")
+
+    def check_family(self, settings: ExtractSettings, family: "Family | None") -> None:
+        """Raise UsageError for a model that answers, and what `Family.check_acting` raises in a scene."""
+        if family is None:
+            return
+        if not family.acts:
+            raise UsageError(f"{family.name} answers and does not act; use `probe-kit ask`, or a model that acts")
+        if not settings.source.command and not settings.task.capture_only:
+            family.check_acting(settings.model.checkpoint, settings.model.options)
+
+    def texts(self, settings: ExtractSettings, source: Source[Any]) -> Iterable[str]:
+        """Return the instructions of a scene; those of others are said together with cameras and state."""
+        return () if settings.source.command else source.instructions
+
+    def early_checks(
+        self, settings: ExtractSettings, source: Source[Any], fetch: bool
+    ) -> list[Callable[[], object]]:
+        """Return checks of instructions, of units that have to be chosen, and of cameras and states."""
+        from probe_kit.hooks.registry import get_family
+
+        model, family = settings.model, get_family(settings.model.family)
+        if family is None:
+            return []
+
+        def check_instructions() -> None:
+            if settings.source.command:
+                family.check_words(source.instructions, model.checkpoint)
+            family.whose_units(model.checkpoint, model.options, fetch)
+            family.check_instructions(model.checkpoint, source.instructions, model.options, fetch)
+
+        inputs = _declared_inputs(family, settings)
+        checkpoint = model.checkpoint or model.family
+        return [check_instructions, *(() if inputs is None else source.early_checks(*inputs, checkpoint))]
+
+    def planned(self, settings: ExtractSettings, sizes: PlannedSizes) -> ExtractSettings:
+        """Return the settings with the inferences of an episode counted."""
+        if not settings.source.command and sizes.outline is not None:
+            check_misfit(settings, sizes.outline.misfit(), sizes.outline.checkpoint)
+        return settings.with_every_call(settings.task.execute or sizes.execute)
+
+    def load(self, settings: ExtractSettings) -> "Policy | None":
+        """Load the policy, with what its protocol decides. Raises what `load_policy` raises."""
+        from probe_kit.hooks import load_policy
+
+        return None if settings.model.family in SCRIPTED else load_of(load_policy, settings.followed())
+
+    def check_loaded(self, settings: ExtractSettings, model: "Policy") -> None:
+        """Raise UsageError for a loaded policy that the settings do not describe."""
+        from probe_kit.hooks.registry import family_names
+
+        card, requested = model.card, settings.model
+        pairs: dict[str, tuple[object, object]] = {}
+        # A file may call its weights random; requested random weights have a seed.
+        if requested.random_weights or card.weights_seed is not None:
+            pairs["random_weights"] = requested.random_weights, card.random_weights
+        if card.weights_seed is not None:
+            pairs["weights_seed"] = requested.weights_seed, card.weights_seed
+        if card.family in family_names():
+            pairs["model"] = requested.family, card.family
+        wrong = [f"{name} {has!r} instead of {right!r}" for name, (right, has) in pairs.items() if right != has]
+        if wrong:
+            raise UsageError(
+                f"the loaded policy has {', '.join(wrong)}. Give the policy of these settings, or leave it out"
+            )
+
+    def fit(self, settings: ExtractSettings, source: Source[Any], model: "Policy | None") -> Fitted:
+        """Show the source to a policy, count its inferences, and choose its batch where that was requested.
+
+        Raises what does not fit.
+        """
+        if settings.model.family in SCRIPTED:
+            return settings, source, ScriptedController(settings.model.family), None
+        assert model is not None, "only scripts have no network"
+        if not source.own_units:
+            check_misfit(settings, model.embodiment_mismatch(), model.card.checkpoint)
+        source, policy = source.check(model, settings.machine.accept_units)
+        settings = with_source(settings, source)
+        check_fit(policy.card, settings, source)
+        check_reachable(settings, policy.card, source)
+        controller = PolicyController(policy, source, settings)
+        settings, calibration = settings.with_every_call(controller.execute), None
+        if settings.machine.batch == "auto":
+            rows = source.rows(settings.seed)
+            settings, calibration = calibrated(settings, controller, source, rows)
+        return settings, source, controller, calibration
+
+
+def _declared_inputs(family: "Family", settings: ExtractSettings) -> tuple[tuple[str, ...], int | None] | None:
+    """Cameras and numbers of the state that a checkpoint in lerobot's layout declares; None where none is here."""
+    folder = family.folder_here(settings.model.checkpoint, settings.model.options)
+    try:
+        inputs = parse_json(read_regular(folder / CONFIG_FILE))["input_features"]
+        cameras = [name.removeprefix(IMAGES) for name in inputs if name.startswith(IMAGES)]
+        state = int(inputs[STATE]["shape"][0]) if STATE in inputs else None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError):
+        return None  # another layout; what it reads is known once it is loaded
+    return tuple(name for name in cameras if not name.startswith(_EMPTY_CAMERA)), state
+
+
+def check_misfit(settings: ExtractSettings, reason: str | None, checkpoint: str) -> None:
+    """Raise CheckpointError for a reason why actions cannot move this arm, unless nothing acts."""
+    if not settings.task.capture_only and reason is not None:
+        problem = with_origin(reason, settings.model.family, checkpoint)
+        raise CheckpointError(
+            f"{problem}. To capture activations without acting, add --no-act. Probing works as usual; there is no "
+            "success rate"
+        )
+
+
+def check_reachable(settings: ExtractSettings, card: "ModelCard", source: Source[Any]) -> None:
+    """Raise UsageError for more actions than a chunk has, or more captured inferences than an episode can have."""
+    if settings.task.capture_only or not source.executes:
+        return
+    family, execute = settings.model.family, settings.task.execute or card.execute
+    chunk = source.chunk or card.chunk
+    if execute > chunk:
+        raise UsageError(
+            f"--execute {execute}: {family} gives {chunk} actions per inference; execute 1 to {chunk} of them"
+        )
+    if card.ensemble is not None and execute != 1:
+        raise UsageError(
+            f"--execute {execute}: {family} averages the plans of overlapping chunks, which needs an "
+            "inference per action; leave --execute out, or the model's option that asks for averaging"
+        )
+    calls, most = settings.capture.captured_calls, settings.most_inferences(execute)
+    if calls != "all" and calls > most:
+        raise UsageError(
+            f"--captured-calls {calls}: episodes of {settings.source.steps()} actions, {execute} per inference, "
+            f"have at most {most}; capture 1 to {most} of them, or raise --max-steps"
+        )
