@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic.fields import FieldInfo
 from typer.models import OptionInfo
 
+from probe_kit._system.complaints import UNKNOWN, complaints_of, in_words
 from probe_kit.errors import UsageError
 
 
@@ -35,27 +36,17 @@ class Part(BaseModel):
         try:
             super().__init__(**dict(zip(names, first, strict=False)), **values)
         except ValidationError as error:
-            raise UsageError(in_words(type(self).__name__, error)) from None
+            raise UsageError(_unknown(type(self).__name__, error) or in_words(error)) from None
 
     def changed(self, **values: Any) -> Self:
         """The group with other values, which are checked."""
         return type(self)(**(dict(self) | values))
 
 
-def in_words(subject: str, error: ValidationError) -> str:
-    """The first mistake of a model's values as a sentence. subject: the name of the model."""
-    first = error.errors(include_url=False)[0]
-    name = ".".join(str(part) for part in first["loc"] if not str(part).startswith("function-"))
-    if first["type"] == "extra_forbidden":
-        return f"{subject} has no setting {name}; leave it out"
-    bounds = {"ge": "at least", "le": "at most", "gt": "more than", "lt": "less than"}
-    bounded = [
-        f"{words} {first['ctx'][bound]}" for bound, words in bounds.items() if bound in first.get("ctx", {})
-    ]
-    choices = str(first.get("ctx", {}).get("expected", "")).replace("'", "").replace(" or ", ", ")
-    other = first["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
-    expected = " and ".join(bounded) or (f"one of {choices}" if choices else other)
-    return f"{name} is {first['input']!r}; expected {expected}"
+def _unknown(subject: str, error: ValidationError) -> str:
+    """A sentence on a field that a model lacks, if that is the first mistake. subject: the model's name."""
+    path, text = next(complaints_of(error))
+    return f"{subject} has no setting {'.'.join(map(str, path))}; leave it out" if text == UNKNOWN else ""
 
 
 @dataclass(frozen=True)

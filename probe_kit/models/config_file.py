@@ -7,6 +7,7 @@ from typing import Annotated, Any, ClassVar, Self
 from pydantic import AliasChoices, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from probe_kit._system.bounded_json import load_json
+from probe_kit._system.complaints import in_words
 from probe_kit.errors import CheckpointError
 
 Count = Annotated[int, Field(ge=1, lt=1 << 31)]
@@ -60,7 +61,7 @@ class ConfigFile(BaseModel):
             return cls.model_validate(values)
         except ValidationError as error:
             raise CheckpointError(
-                f"{source} does not describe {cls.network}: {in_words(error)}. Take the original file"
+                f"{source} does not describe {cls.network}: {in_words(error, most=None)}. Take the original file"
             ) from None
 
 
@@ -85,20 +86,3 @@ def part(make: Callable[[dict[str, Any]], Any], model_type: str = "") -> BeforeV
             raise ValueError(f"cannot be read by transformers ({type(error).__name__}: {error})") from error
 
     return BeforeValidator(checked)
-
-
-def in_words(error: ValidationError) -> str:
-    """Every mistake that pydantic names, with its field and value."""
-    return "; ".join(_mistake(dict(mistake)) for mistake in error.errors(include_url=False))
-
-
-def _mistake(mistake: dict[str, Any]) -> str:
-    field = ".".join(map(str, mistake["loc"]))
-    match mistake["type"]:
-        case "missing":
-            return f"{field} is missing"
-        case "extra_forbidden":
-            return f"{field} is unknown"
-        case "value_error":
-            return f"{field} {mistake['ctx']['error']}".strip()
-    return f"{field} is {mistake['input']!r}; {mistake['msg'].replace('Input should be', 'expected')}"

@@ -19,6 +19,7 @@ from typing import Annotated, Any, ClassVar, NamedTuple, Self
 from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer, PrivateAttr, ValidationError
 
 from probe_kit._system.bounded_json import parse_strict_json
+from probe_kit._system.complaints import in_words
 from probe_kit.errors import RunDamagedError
 from probe_kit.runs.location import Location
 
@@ -113,8 +114,9 @@ class Record(BaseModel):
         try:
             record = cls.model_validate(content)
         except ValidationError as error:
-            wrong = first_error(error)
-            raise RunDamagedError(f"{name} is no {cls.kind} as probe_kit writes it: {wrong}. {advice}") from None
+            raise RunDamagedError(
+                f"{name} is no {cls.kind} as probe_kit writes it: {in_words(error)}. {advice}"
+            ) from None
         if other := [part for part, value in expected.items() if content.get(part) != value]:
             stored, right = (
                 ", ".join(f"{part} {values.get(part)}" for part in other) for values in (content, expected)
@@ -132,13 +134,6 @@ class Record(BaseModel):
         except FileNotFoundError:
             raise RunDamagedError(f"{name} is missing. {advice}") from None
         return cls.parse(raw, name, advice, **expected)
-
-
-def first_error(error: ValidationError) -> str:
-    """The first complaint of pydantic, with the place and the value."""
-    first = error.errors(include_url=False)[0]
-    path = ".".join(map(str, first["loc"]))
-    return f"{path or 'it'} is {str(first['input'])[:40]!r} ({first['msg']})"
 
 
 def is_hash_name(name: str) -> bool:

@@ -29,6 +29,7 @@ from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, ValidationErr
 
 from probe_kit._system.bounded_files import read_regular
 from probe_kit._system.bounded_json import parse_json
+from probe_kit._system.complaints import in_words
 from probe_kit.errors import DiskSpaceError, RunDamagedError, UsageError
 
 PACK_FILE, STUDY_FILE, SUMS_FILE = "pack.json", "study.toml", "SHA256SUMS"
@@ -98,11 +99,7 @@ class Pack(_Part):
         try:
             return cls.model_validate(content)
         except ValidationError as error:
-            (first, *_) = error.errors(include_url=False)
-            path = ".".join(map(str, first["loc"]))
-            raise RunDamagedError(
-                f"{file} is no record of an archive ({path}: {first['msg']}). {_RESTORE}"
-            ) from error
+            raise RunDamagedError(f"{file} is no record of an archive ({in_words(error)}). {_RESTORE}") from error
 
 
 def open_archive(name: str | Path) -> Path | None:

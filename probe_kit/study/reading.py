@@ -12,13 +12,14 @@ from typing import Any, get_args
 from pydantic import BaseModel, ValidationError
 
 from probe_kit._system.bounded_files import read_regular
+from probe_kit._system.complaints import MISSING, UNKNOWN, complaints_of, joined
 from probe_kit.errors import UsageError
 from probe_kit.study import schema
 from probe_kit.study.archive import RUNS, STUDY_FILE, Pack, open_archive
 from probe_kit.study.cells import Cell
 from probe_kit.study.checks import misfits
 from probe_kit.study.expansion import expand
-from probe_kit.study.mistakes import Mistake, Place, StudyFileError, part_in_file, shortened
+from probe_kit.study.mistakes import Mistake, Place, StudyFileError, part_in_file
 from probe_kit.study.planned_suite import PlannedSuite, planned_suite
 from probe_kit.study.references import unknown_names
 
@@ -132,32 +133,16 @@ def _parsed(file: Path) -> dict[str, Any]:
 
 
 def _mistakes(error: ValidationError, content: dict[str, Any]) -> list[Mistake]:
-    """Return the complaints of pydantic, in our words where its own name no key or value of the file."""
+    """Return the complaints about the file, by the path that leads to a value of it."""
     texts: dict[Place, list[str]] = {}
-    for complaint in error.errors(include_url=False, include_context=True):
-        path = part_in_file(complaint["loc"], content)
-        if complaint["type"] == "missing":
-            path, text = (*path, complaint["loc"][-1]), "is missing"
-        elif complaint["type"] == "extra_forbidden":
-            text = f"unknown key{_near(path)}"
-        else:
-            text = _plain(complaint["msg"])
-            if not isinstance(complaint["input"], dict):  # a whole table is no help
-                text += f", not {shortened(repr(complaint['input']))}"
-        texts.setdefault(path, []).append(text)
-    return [Mistake(path, _joined(of_value)) for path, of_value in texts.items()]
-
-
-def _joined(texts: list[str]) -> str:
-    """Join what several choices would take of one value to a sentence."""
-    *before, last = texts
-    return " or ".join([*(text.rpartition(", not ")[0] for text in before), last])
-
-
-def _plain(message: str) -> str:
-    plain = f"{message[:1].lower()}{message[1:]}".removeprefix("value error, ").replace("input should", "should")
-    words = f"{_NAME_PATTERN} (small letters, digits, dots, hyphens and underscores)"
-    return plain.replace(_NAME_PATTERN, words)
+    for whole_path, complaint in complaints_of(error):
+        path = part_in_file(whole_path, content)
+        if complaint == MISSING:
+            path = (*path, whole_path[-1])
+        text = f"unknown key{_near(path)}" if complaint == UNKNOWN else complaint
+        words = f"{_NAME_PATTERN} (small letters, digits, dots, hyphens and underscores)"
+        texts.setdefault(path, []).append(text.replace(_NAME_PATTERN, words))
+    return [Mistake(path, joined(of_value)) for path, of_value in texts.items()]
 
 
 def _near(path: Place) -> str:

@@ -346,7 +346,7 @@ def test_no_record_of_results_makes_a_training_remove_a_file_elsewhere(run: Path
         head["files"]["scores.csv"] = ["../../../thesis.txt", *head["files"]["scores.csv"][1:]]
         write_record(folder / "settings.json", head)
     with pytest.raises(RunDamagedError, match=r"thesis\.txt.*not a file in the same folder"):
-        train_probes(open_run(run), permutations=1, controls=("position",))
+        train_probes(open_run(run), permutations=2, controls=("position",))
     assert victim.read_text(encoding="utf-8") == "do not touch"
     assert any("thesis.txt" in problem for problem in verify_run(run).problems)
 

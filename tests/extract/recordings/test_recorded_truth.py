@@ -548,9 +548,7 @@ def test_actions_are_compared_with_recorded_ones_of_the_same_names_in_the_same_o
     features["action"]["names"] = recorded
     edit_info(copy, features=features)
     monkeypatch.setattr(Pi0, "action_names", property(lambda _self: own))
-    prepared = prepare(
-        ExtractSettings("pi0-tiny", source=LeRobotSource(str(copy)), env_workers=0), policy=pi0_tiny
-    )
+    prepared = prepare(ExtractSettings("pi0-tiny", source=LeRobotSource(str(copy)), env_workers=0), model=pi0_tiny)
     assert reason in prepared.plan.selection["recording"]["other_actions"]
 
 
