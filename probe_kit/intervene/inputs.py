@@ -110,6 +110,19 @@ _VERBS: Mapping[str, str] = {
 }
 
 
+def find_input(row: InputEffect) -> str:
+    """Return the finding of one input, a verdict and what the action does, without brackets."""
+    if not row.changed:
+        return f"does not arrive: another {row.vary} changes no number of any action"
+    share = "" if row.share is None else f", by {row.share:.2f} of what all inputs do"
+    return {
+        "decides": f"decides: the action follows the {row.vary}{share}",
+        "moves": f"moves: the {row.vary} shifts the action without deciding it{share}",
+        "no effect": f"no effect: another {row.vary} leaves the action where it is",
+        "open": f"open: the items do not tell whether the {row.vary} matters",
+    }[row.finding]
+
+
 def describe_input(row: InputEffect) -> str:
     """Return the finding of one input, as the end of a sentence."""
     if not row.changed:

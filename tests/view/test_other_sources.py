@@ -82,7 +82,7 @@ def test_what_is_stored_is_shown_as_the_tables_of_the_commands(catalogue: Catalo
     ]  # fmt: skip
     swap = kinds["intervention image-swap"]
     assert [cell["text"] for cell in swap["rows"][0]][:2] == ["all", "picture"]
-    assert "the picture decides the action (0.50 of the full exchange)" in swap["findings"][0]
+    assert swap["findings"] == ["All  decides: the action follows the picture, by 0.50 of what all inputs do."]
     assert kinds["diagnosis of the inputs"]["rows"][0][2]["text"] == "decides"
     assert [row[0]["text"] for row in kinds["predicted actions"]["rows"]] == ["dx", "grip"]
 

@@ -16,7 +16,6 @@ from probe_kit.intervene.kinds.base import (
     Measurement,
     TableContext,
     by_category,
-    category_sentences,
     effect_table,
     flips_seed,
     interval_text,
@@ -36,6 +35,7 @@ from probe_kit.intervene.patching.attribution import (
     estimate_patches,
     kind_of_place,
     order_cells,
+    worst_anchor,
 )
 from probe_kit.intervene.patching.patch import Cell, sites_of_cells
 from probe_kit.intervene.patching.sets import pooled_share
@@ -237,11 +237,20 @@ class AttributionPatching(Intervention):
             lambda row: row.is_anchor,
         )
 
+    sentence = staticmethod(describe_screen)
+
     @staticmethod
-    def sentences(rows: Sequence[AttributionEffect], context: TableContext) -> list[str]:
-        """Return one per category: whether the screen holds, and what it puts first."""
+    def finding(rows: Sequence[AttributionEffect], context: TableContext) -> str:
+        """Return whether the screen holds, and what it puts first."""
         del context
-        return category_sentences(by_category(rows), describe_screen)
+        worst = worst_anchor(rows)
+        if worst is None:
+            return "no order: no anchor carries the effect, so that nothing tests the estimates"
+        if worst.finding == "void":
+            return f"void: gradients miss the effect at {worst.name} by more than a factor of 3; patch instead"
+        first = max((row for row in rows if row.rank == 1), key=lambda row: abs(row.estimate or 0.0))
+        share = f"{first.estimate or 0.0:.2f} of the effect"
+        return f"ordered: gradients agree with patches; {first.name} comes first with {share}"
 
 
 KIND = AttributionPatching

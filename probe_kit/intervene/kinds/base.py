@@ -232,16 +232,32 @@ class Intervention(ABC):
     def table(rows: Sequence[Any], context: TableContext) -> "Table":
         """Return the rows as a table for a terminal."""
 
-    @staticmethod
-    def sentences(rows: Sequence[Any], context: TableContext) -> list[str]:
-        """Return the finding, a sentence per category; none of a kind that only describes."""
-        del rows, context
-        return []
+    @classmethod
+    def sentences(cls, rows: Sequence[Any], context: TableContext) -> list[str]:
+        """Return what was found with its numbers, a sentence per category; none of a kind that only describes."""
+        parts = [(name, cls.sentence(part)) for name, part in edits_by_category(rows).items()]
+        return [f"{category_of(name).title}: {context.in_words(text)}." for name, text in parts if text]
 
     @classmethod
     def findings(cls, rows: Sequence[Any], context: TableContext) -> list[str]:
-        """Return the last lines of a command: a short sentence per category, by default `sentences`."""
-        return cls.sentences(rows, context)
+        """Return the last lines of a command, `CATEGORY  verdict: what was found.`: short, one per category."""
+        parts = [
+            (category_of(name).title, cls.finding(part, context)) for name, part in edits_by_category(rows).items()
+        ]
+        width = max((len(title) for title, _ in parts), default=0)
+        return [f"{title.ljust(width)}  {context.in_words(text)}." for title, text in parts if text]
+
+    @staticmethod
+    def sentence(rows: Sequence[Any]) -> str:
+        """Return what was found in one category with its numbers. rows: without controls."""
+        del rows
+        return ""
+
+    @staticmethod
+    def finding(rows: Sequence[Any], context: TableContext) -> str:
+        """Return a verdict, a colon and what was found, in few words without brackets. rows: as of `sentence`."""
+        del rows, context
+        return ""
 
     @staticmethod
     def notes(rows: Sequence[Any], measurement: Measurement) -> list[str]:
@@ -450,9 +466,9 @@ def by_category[Row: Effect](rows: Iterable[Row]) -> dict[str, list[Row]]:
     return parts
 
 
-def edits_by_category[Row: EffectRow](rows: Iterable[Row]) -> dict[str, list[Row]]:
-    """Return rows of edits by category, without controls."""
-    return by_category(row for row in rows if not row.is_control)
+def edits_by_category[Row: Effect](rows: Iterable[Row]) -> dict[str, list[Row]]:
+    """Return rows by category, without controls of edits."""
+    return by_category(row for row in rows if not (isinstance(row, EffectRow) and row.is_control))
 
 
 def frame_of(rows: Sequence[Effect]) -> "pd.DataFrame":
@@ -531,8 +547,7 @@ def count_edits(names: Sequence[str], tried: int, most: int = 3) -> str:
     )
 
 
-def category_sentences[Row: Effect](
-    parts: Mapping[str, Sequence[Row]], finding: Callable[[Sequence[Row]], str]
-) -> list[str]:
-    """Return one sentence per category."""
-    return [f"{category_of(name).title}: {finding(rows)}." for name, rows in parts.items()]
+def share_of_edits(rows: Sequence[EffectRow], tried: int, subject: str = "edits") -> str:
+    """Return `2 of 3 edits, most at backbone.01 image`. rows: with the largest effect first, at least one."""
+    first = f"{rows[0].place} {rows[0].role}".rstrip()
+    return f"{len(rows)} of {tried} {subject}, {'most ' * (len(rows) > 1)}at {first}"

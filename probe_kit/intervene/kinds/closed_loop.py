@@ -28,14 +28,13 @@ from probe_kit.intervene.kinds.base import (
     Measurement,
     TableContext,
     capabilities_for,
-    category_sentences,
     common_columns,
     count_edits,
-    edits_by_category,
     effect_table,
     interval_text,
     lines_of,
     mean_of,
+    share_of_edits,
     test_against_controls,
     text_of,
 )
@@ -218,10 +217,28 @@ class ClosedLoop(AlongDirection):
         )
 
     @staticmethod
-    def sentences(rows: "Sequence[ClosedLoopEffect]", context: TableContext) -> list[str]:
-        """Return one per category: at which places the cube turns to the other picture."""
+    def sentence(rows: "Sequence[ClosedLoopEffect]") -> str:
+        """Return at which places the cube turns to the other picture."""
+        edits = [row for row in rows if row.place != CLEAN]
+        confirmed = [f"{row.name} {row.net:+.2f}" for row in edits if row.finding == "confirmed"]
+        disrupted = [row.name for row in edits if row.finding == "task disrupted"]
+        turned = (
+            "edits that turn the cube to the other picture beyond their controls: "
+            f"{count_edits(confirmed, len(edits))}"
+        )
+        return turned + (f"; that disrupt the task: {count_edits(disrupted, len(edits))}" if disrupted else "")
+
+    @staticmethod
+    def finding(rows: "Sequence[ClosedLoopEffect]", context: TableContext) -> str:
+        """Return whether an edit turns the cube to the other picture, and where."""
         del context
-        return category_sentences(edits_by_category(rows), _finding)
+        edits = [row for row in rows if row.place != CLEAN]
+        confirmed = sorted((row for row in edits if row.finding == "confirmed"), key=lambda row: -row.net)
+        if confirmed:
+            return f"confirmed: the cube turns to the other picture after {share_of_edits(confirmed, len(edits))}"
+        if edits and all(row.disrupted for row in edits):
+            return "task disrupted: after every edit the cube stays away from both pictures"
+        return f"not confirmed: no edit of {len(edits)} turns the cube to the other picture beyond its controls"
 
     @staticmethod
     def notes(rows: "Sequence[ClosedLoopEffect]", measurement: Measurement) -> list[str]:
@@ -330,17 +347,6 @@ def _of_category(outcomes: ConditionOutcomes, category: str, seed_text: str, key
             )
         )
     return rows
-
-
-def _finding(rows: Sequence[ClosedLoopEffect]) -> str:
-    edits = [row for row in rows if row.place != CLEAN]
-    confirmed = [f"{row.name} {row.net:+.2f}" for row in edits if row.finding == "confirmed"]
-    disrupted = [row.name for row in edits if row.finding == "task disrupted"]
-    turned = (
-        "edits that turn the cube to the other picture beyond their controls: "
-        f"{count_edits(confirmed, len(edits))}"
-    )
-    return turned + (f"; that disrupt the task: {count_edits(disrupted, len(edits))}" if disrupted else "")
 
 
 def _edited(row: ClosedLoopEffect, text: str) -> str:

@@ -25,13 +25,12 @@ from probe_kit.intervene.kinds.base import (
     Intervention,
     Measurement,
     TableContext,
-    category_sentences,
     common_columns,
     count_edits,
-    edits_by_category,
     effect_table,
     lines_of,
     mean_of,
+    share_of_edits,
     test_against_controls,
     text_of,
 )
@@ -191,10 +190,26 @@ class ConceptErasure(Intervention):
         )
 
     @staticmethod
-    def sentences(rows: "Sequence[ErasureEffect]", context: TableContext) -> list[str]:
-        """Return one per category: which erasures take the answer from the action."""
+    def sentence(rows: "Sequence[ErasureEffect]") -> str:
+        """Return which erasures take the answer from the action."""
+        tried = [row for row in rows if row.finding != "identity patch"]
+        if tried and all(row.finding == "no baseline effect" for row in tried):
+            return "the unedited action does not go to the correct picture, so that nothing can be lost"
+        losses = [f"{row.name} keeps {row.kept:.2f}" for row in tried if row.finding == "effect"]
+        counts = count_edits(losses, len(tried))
+        return f"erasures that take the answer from the action beyond their controls: {counts}"
+
+    @staticmethod
+    def finding(rows: "Sequence[ErasureEffect]", context: TableContext) -> str:
+        """Return whether an erasure takes the answer from the action, and where."""
         del context
-        return category_sentences(edits_by_category(rows), _finding)
+        tried = [row for row in rows if row.finding != "identity patch"]
+        if tried and all(row.finding == "no baseline effect" for row in tried):
+            return "nothing to lose: the unedited action does not go to the correct picture"
+        lost = sorted((row for row in tried if row.finding == "effect"), key=lambda row: row.kept or 0.0)
+        if not lost:
+            return f"not lost: no erasure of {len(tried)} takes the answer from the action beyond its controls"
+        return f"lost: the action leaves the answer after {share_of_edits(lost, len(tried), 'erasures')}"
 
     @staticmethod
     def notes(rows: "Sequence[ErasureEffect]", measurement: Measurement) -> list[str]:
@@ -397,15 +412,6 @@ def _of_category(
             )
         )
     return rows
-
-
-def _finding(rows: Sequence[ErasureEffect]) -> str:
-    tried = [row for row in rows if row.finding != "identity patch"]
-    if tried and all(row.finding == "no baseline effect" for row in tried):
-        return "the unedited action does not go to the correct picture, so that nothing can be lost"
-    losses = [f"{row.name} keeps {row.kept:.2f}" for row in tried if row.finding == "effect"]
-    counts = count_edits(losses, len(tried))
-    return f"erasures that take the answer from the action beyond their controls: {counts}"
 
 
 def _percent(share: float | None) -> str:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from probe_kit._system.counting import counted
 from probe_kit.hooks.contract.interventions import InterventionKind, Readout
-from probe_kit.intervene.inputs import INPUT_LEGEND, InputEffect, describe_input, input_effects
+from probe_kit.intervene.inputs import INPUT_LEGEND, InputEffect, describe_input, find_input, input_effects
 from probe_kit.intervene.kinds.base import (
     TILES_APART,
     Intervention,
@@ -319,8 +319,8 @@ class ImageSwap(Intervention):
             },
         )
 
-    @staticmethod
-    def sentences(rows: Sequence[ImageSwapEffect], context: TableContext) -> list[str]:
+    @classmethod
+    def sentences(cls, rows: Sequence[ImageSwapEffect], context: TableContext) -> list[str]:
         """Return one per category, with its verdict."""
         if context.lacks_sides:
             return input_sentences(rows)
@@ -331,20 +331,16 @@ class ImageSwap(Intervention):
             for row in rows
         ]
 
-    @classmethod
-    def findings(cls, rows: Sequence[ImageSwapEffect], context: TableContext) -> list[str]:
-        """Return one short sentence per category: the verdict, and how often a swap turns the action."""
+    @staticmethod
+    def finding(rows: Sequence[ImageSwapEffect], context: TableContext) -> str:
+        """Return the verdict, and how often a swap turns the action."""
         if context.lacks_sides:
-            return input_sentences(rows)
-        names = [category_of(row.category).title for row in rows]
-        width = max(map(len, names), default=0)
-        lines = []
-        for row, name in zip(rows, names, strict=True):
-            turned = f"a swap turns it in {100 * row.follow_rate:.0f} % of the episodes"
-            use = context.verdicts.get(row.category)
-            verdict, what = ("swapped", "") if use is None else use.finding
-            lines.append(f"{name.ljust(width)}  {verdict}: {'; '.join(filter(None, (what, turned)))}.")
-        return lines
+            return input_finding(rows)
+        (row,) = rows
+        turned = f"a swap turns it in {100 * row.follow_rate:.0f} % of the episodes"
+        use = context.verdicts.get(row.category)
+        verdict, what = ("swapped", "") if use is None else use.finding
+        return f"{verdict}: {'; '.join(filter(None, (what, turned)))}"
 
     @staticmethod
     def keys_in_use(run: RunReader) -> set[str]:
@@ -396,6 +392,12 @@ def input_table(rows: Sequence[Any], context: TableContext) -> "Table":
 def input_sentences(rows: Sequence[Any]) -> list[str]:
     """Return one per category and input."""
     return [f"{row.n_episodes} frames of {row.n_items} episodes: {describe_input(row)}." for row in rows]
+
+
+def input_finding(rows: Sequence[Any]) -> str:
+    """Return the finding of the input that one category's frames were shown of another."""
+    (row,) = rows
+    return find_input(row)
 
 
 class Swapped(Protocol):

@@ -21,6 +21,7 @@ from probe_kit.intervene.kinds.image_swap import (
     Reach,
     begin_sentence,
     exchanged_effects,
+    input_finding,
     input_sentences,
     input_table,
     swap_columns,
@@ -37,6 +38,7 @@ from probe_kit.intervene.replay import (
     SourceRun,
 )
 from probe_kit.intervene.settings import has_sides
+from probe_kit.statistics.significance import SIGNIFICANCE
 
 if TYPE_CHECKING:
     from probe_kit._tables.table import Table
@@ -178,12 +180,25 @@ class InstructionSwap(Intervention):
             {"Does the action follow the instruction?": SWAP_COLUMNS, "What one step owes to": _STEP_COLUMNS},
         )
 
-    @staticmethod
-    def sentences(rows: Sequence[InstructionSwapEffect], context: TableContext) -> list[str]:
+    @classmethod
+    def sentences(cls, rows: Sequence[InstructionSwapEffect], context: TableContext) -> list[str]:
         """Return one per category; a swap of the instruction enters no verdict."""
         if context.lacks_sides:
             return input_sentences(rows)
         return [f"{begin_sentence(row)}: {swap_rates(row, 'instruction')}" for row in rows]
+
+    @staticmethod
+    def finding(rows: Sequence[InstructionSwapEffect], context: TableContext) -> str:
+        """Return whether the action follows a swap of the instruction."""
+        if context.lacks_sides:
+            return input_finding(rows)
+        (row,) = rows
+        follows = "followed" if row.follow_p < SIGNIFICANCE else "not shown"
+        verdict = "reversed" if row.reversal_p < SIGNIFICANCE else follows
+        return (
+            f"{verdict}: another instruction turns the action in {100 * row.follow_rate:.0f} % of the episodes, "
+            f"and the other way in {100 * row.reversal_rate:.0f} %"
+        )
 
 
 KIND = InstructionSwap

@@ -16,12 +16,11 @@ from probe_kit.intervene.kinds.base import (
     ConditionName,
     Measurement,
     TableContext,
-    category_sentences,
     count_edits,
-    edits_by_category,
     effect_table,
     interval_text,
     lines_of,
+    share_of_edits,
     text_of,
 )
 from probe_kit.intervene.kinds.image_swap import SMALLEST_REACH
@@ -163,9 +162,38 @@ class Interchange(AlongDirection):
         )
 
     @staticmethod
-    def sentences(rows: Sequence[PatchEffect], context: TableContext) -> list[str]:
-        """Return one per category: which edits carry half of the swap, or move the action at all."""
-        return [context.in_words(text) for text in category_sentences(edits_by_category(rows), _finding)]
+    def sentence(rows: Sequence[PatchEffect]) -> str:
+        """Return which edits carry half of the swap, or move the action at all."""
+        edits, localised, apart = _carriers(rows)
+        if all(row.effect is None for row in edits):
+            names = [f"{row.name} {100 * row.mean_displacement:+.1f} cm" for row in _moving(edits)]
+            return (
+                f"edits that move the action at least {100 * SMALLEST_REACH:g} cm to the target side, beyond "
+                f"their controls: {count_edits(names, len(edits))}"
+            )
+        names = [f"{row.name} {row.effect:.2f}" for row in localised]
+        verb = "have" if any(row.is_dose for row in edits) else "carry"
+        by_construction = f"; {apart} more {verb} it by construction and locate nothing (*)" * (apart > 0)
+        count = count_edits(names, len(edits) - apart)
+        return f"edits that {verb} half of the image swap's effect: {count}{by_construction}"
+
+    @staticmethod
+    def finding(rows: Sequence[PatchEffect], context: TableContext) -> str:
+        """Return where half of the swap's effect was found, or that no edit has it."""
+        del context
+        edits, localised, apart = _carriers(rows)
+        tried, steered = len(edits) - apart, any(row.is_dose for row in edits)
+        if all(row.effect is None for row in edits):
+            moving = _moving(edits)
+            nothing = "not moved: neither the image swap nor any edit moves the action beyond chance"
+            return f"moved: to the target side by {share_of_edits(moving, tried)}" if moving else nothing
+        if localised:
+            what = "steered: half of the image swap's effect by" if steered else "located: half of it passes in"
+            return f"{what} {share_of_edits(localised, tried)}"
+        if not tried:
+            return "not located: all edits carry the effect by construction, which locates nothing"
+        verdict = "not steered" if steered else "not located"
+        return f"{verdict}: no edit of {tried} has half of the image swap's effect"
 
     @staticmethod
     def keys_in_use(run: RunReader) -> set[str]:
@@ -200,21 +228,17 @@ def _cm(metres: float | None) -> float | None:
     return None if metres is None else 100 * metres
 
 
-def _finding(rows: Sequence[PatchEffect]) -> str:
+def _carriers(rows: Sequence[PatchEffect]) -> tuple[list[PatchEffect], list[PatchEffect], int]:
+    """Return edits, those with half of the effect, the largest first, and how many have it by construction.
+
+    What carries the swap in every policy locates nothing (`*` in the table), so that it counts apart.
+    """
     edits = [row for row in rows if row.coefficient != "0"]
-    if all(row.effect is None for row in edits):
-        moved = sorted((row for row in edits if row.moves_action), key=lambda row: -row.mean_displacement)
-        names = [f"{row.name} {100 * row.mean_displacement:+.1f} cm" for row in moved]
-        return (
-            f"edits that move the action at least {100 * SMALLEST_REACH:g} cm to the target side, beyond their "
-            f"controls: {count_edits(names, len(edits))}"
-        )
-    # Of what carries the swap in every policy, the sentence says so apart: it locates nothing (`*` in the table).
-    open_ = [row for row in edits if not (row.is_localised and row.is_by_construction)]
-    localised = sorted((row for row in open_ if row.is_localised), key=lambda row: -(row.effect or 0.0))
-    names = [f"{row.name} {row.effect:.2f}" for row in localised]
-    verb = "have" if any(row.is_dose for row in edits) else "carry"
-    apart = len(edits) - len(open_)
-    by_construction = f"; {apart} more {verb} it by construction and locate nothing (*)" * (apart > 0)
-    count = count_edits(names, len(open_))
-    return f"edits that {verb} half of the image swap's effect: {count}{by_construction}"
+    by_construction = [row for row in edits if row.is_localised and row.is_by_construction]
+    localised = [row for row in edits if row.is_localised and not row.is_by_construction]
+    return edits, sorted(localised, key=lambda row: -(row.effect or 0.0)), len(by_construction)
+
+
+def _moving(edits: Sequence[PatchEffect]) -> list[PatchEffect]:
+    """Return the edits that move the action beyond chance, the farthest first."""
+    return sorted((row for row in edits if row.moves_action), key=lambda row: -row.mean_displacement)

@@ -17,8 +17,6 @@ from probe_kit.intervene.kinds.base import (
     Intervention,
     Measurement,
     TableContext,
-    by_category,
-    category_sentences,
     effect_table,
     flips_seed,
     interval_text,
@@ -225,10 +223,24 @@ class JointPlaces(Intervention):
         )
 
     @staticmethod
-    def sentences(rows: "Sequence[JointEffect]", context: TableContext) -> list[str]:
-        """Return one per category: which cells carry the answer, alone or together."""
+    def sentence(rows: "Sequence[JointEffect]") -> str:
+        """Return which cells carry the answer, alone or together."""
+        places = describe_joint_places(rows) or "where the answer is read remains open"
+        return "; ".join(filter(None, (places, describe_remainder(rows))))
+
+    @staticmethod
+    def finding(rows: "Sequence[JointEffect]", context: TableContext) -> str:
+        """Return where the answer is read, alone or jointly, in few words."""
         del context
-        return category_sentences(by_category(rows), _finding)
+        places = describe_joint_places(rows).removeprefix("no single place: ").partition(" (")[0]
+        if not places:
+            return "open: no place was found at which the answer is read"
+        if places.startswith("past"):
+            return f"{places}: the answer reaches the action without passing there"
+        verdict, _, names = places.partition(" at ")
+        places_read = names.split(", ")
+        more = f" and {len(places_read) - MOST_PLACES} more" * (len(places_read) > MOST_PLACES)
+        return f"{verdict}: at {', '.join(places_read[:MOST_PLACES])}{more}"
 
     @staticmethod
     def notes(rows: "Sequence[JointEffect]", measurement: Measurement) -> list[str]:
@@ -257,10 +269,8 @@ _COLUMNS: Mapping[str, Any] = {
     "finding": lambda row: row.finding,
 }
 
-
-def _finding(rows: "Sequence[JointEffect]") -> str:
-    places = describe_joint_places(rows) or "where the answer is read remains open"
-    return "; ".join(filter(None, (places, describe_remainder(rows))))
+MOST_PLACES = 3
+"""Places that a short sentence names."""
 
 
 # -- effects -------------------------------------------------------------------------------------------------

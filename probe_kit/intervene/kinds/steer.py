@@ -165,7 +165,8 @@ class Steering(AlongDirection):
 
     effects = staticmethod(Interchange.effects)
     table = staticmethod(Interchange.table)
-    sentences = staticmethod(Interchange.sentences)
+    sentence = staticmethod(Interchange.sentence)
+    finding = staticmethod(Interchange.finding)
     keys_in_use = staticmethod(Interchange.keys_in_use)
 
 

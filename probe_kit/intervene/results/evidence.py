@@ -34,7 +34,6 @@ from probe_kit.intervene.places import ALL, list_places, unread_places
 from probe_kit.intervene.results.verdict import Places, UseVerdict, classify_behaviour, control_for
 from probe_kit.intervene.settings import FIRST_CHUNK, PER_STEP
 from probe_kit.runs.reader import RunReader
-from probe_kit.suite.categories import category_of
 
 if TYPE_CHECKING:
     from probe_kit.train.results.probe_results import ProbeResults
@@ -265,8 +264,10 @@ def which_layer(
     results: "ProbeResults | None",
     places: Mapping[str, Places],
     categories: Sequence[str],
-) -> dict[str, str]:
-    """Return by category where the answer passes, where it is read, and whether the probes' best site is read.
+) -> dict[str, list[str]]:
+    """Return by category where the answer passes and where to steer, and, as later parts, what else is known.
+
+    The later parts say where it is read, and whether the probes' best site is read.
 
     results: the newest probes, None without any. places: as `stored_places` gives them. Of stored interchanges and
     joint places; what was not tested is named with the command that tests it.
@@ -276,22 +277,23 @@ def which_layer(
     for name in categories:
         rows, category_places = maps.get(name, []), places.get(name)
         cell = best_cell(rows)
+        passes = _passes(
+            rows, () if category_places is None or category_places.located is None else category_places.located
+        )
+        if cell is not None and is_backbone_layer(cell):
+            passes += f"; steer at {cell.place} {cell.role} with --direction {ALONG}"
         parts = [
-            _passes(
-                rows, () if category_places is None or category_places.located is None else category_places.located
-            ),
+            passes,
             _read(run, "" if category_places is None else str(category_places)),
             _best_site(run, results, name, rows, along.get(name, [])),
         ]
-        if cell is not None and is_backbone_layer(cell):
-            parts.append(f"steer at {cell.place} {cell.role} (--direction {ALONG})")
-        lines[name] = f"Which layer, {category_of(name).title}: {'; '.join(filter(None, parts))}."
+        lines[name] = [part for part in parts if part]
     return lines
 
 
 def _passes(rows: Sequence[PatchEffect], located: Sequence[str]) -> str:
     if not any(row.role == ALL and is_backbone_layer(row) for row in rows):
-        return "where the answer passes was not tested (--kind interchange)"
+        return "--kind interchange tests where the answer passes"
     passes = [site for site in located if site.partition(".")[0] == BACKBONE]
     return f"passes at {list_places(passes)}" if passes else "no layer of the backbone carries half of it"
 
@@ -301,7 +303,7 @@ def _read(run: RunReader, places: str) -> str:
     if family is None or not family.interventions.supports("kv"):
         return ""
     read = [part for part in places.split("; ") if part.startswith("read ") or KV_STREAM in part]
-    return "; ".join(read) or "where it is read is open (--kind joint tests it)"
+    return "; ".join(read) or "--kind joint tests where it is read"
 
 
 def _best_site(
@@ -312,7 +314,7 @@ def _best_site(
     along: Sequence[PatchEffect],
 ) -> str:
     if results is None:
-        return "no probes (probe-kit train)"
+        return "there are no probes, which probe-kit train makes"
     view, scores = results.settings.views[0], results.scores
     site_scores = scores[
         (scores["stream"] == BACKBONE) & (scores["view"] == view) & (scores["category"] == category)

@@ -28,6 +28,7 @@ from probe_kit.intervene.settings import PER_STEP
 from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.paired_tests import smallest_flip_p
 from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.suite.categories import category_of
 from probe_kit.train.results.store import load_results
 
 if TYPE_CHECKING:
@@ -45,8 +46,8 @@ class InterventionResult:
     """One intervention: its settings, what it gave, and what that means.
 
     label: of the run. suite: its identity. measurement: what effects are computed from. verdicts: by
-    category, from this and what else is stored with the run. layers: by category a line about the layer, of a kind
-    that edits places.
+    category, from this and what else is stored with the run. layers: by category what is known of the layer, of a
+    kind that edits places; see `which_layer`.
     """
 
     label: str
@@ -54,7 +55,7 @@ class InterventionResult:
     suite: str
     measurement: Measurement = field(repr=False)
     verdicts: dict[str, UseVerdict] = field(default_factory=dict)
-    layers: dict[str, str] = field(default_factory=dict)
+    layers: dict[str, list[str]] = field(default_factory=dict)
 
     @property
     def key(self) -> str:
@@ -179,12 +180,18 @@ class InterventionResult:
     @property
     def findings(self) -> tuple[str, ...]:
         """The last lines of the command: a short sentence per category, and one that says which layer matters."""
-        return *self._kind.findings(self.effects, self._context), *self.layers.values()
+        return *self._kind.findings(self.effects, self._context), *self._which_layer(1)
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """The finding, a sentence per category, and a line about the layer; none of a kind that only describes."""
-        return *self._kind.sentences(self.effects, self._context), *self.layers.values()
+        """The same with numbers, reasons, and all that is known of the layer."""
+        return *self._kind.sentences(self.effects, self._context), *self._which_layer(None)
+
+    def _which_layer(self, most: int | None) -> list[str]:
+        return [
+            f"Which layer, {category_of(name).title}: {'; '.join(parts[:most])}."
+            for name, parts in self.layers.items()
+        ]
 
     def to_rich(self, details: bool = True) -> "Table":
         """The table for a terminal. details: split it where it is wide, else leave columns out by name."""

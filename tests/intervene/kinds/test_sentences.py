@@ -1,5 +1,6 @@
 """The sentence of each kind of intervention about a category."""
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -7,7 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from probe_kit.intervene.inputs import Finding, InputEffect
 from probe_kit.intervene.kinds import every_kind
+from probe_kit.intervene.kinds.attribution import AttributionPatching
 from probe_kit.intervene.kinds.base import Intervention, Measurement, TableContext
 from probe_kit.intervene.kinds.closed_loop import ClosedLoop, ClosedLoopEffect
 from probe_kit.intervene.kinds.erase import ConceptErasure, ErasureEffect
@@ -16,8 +19,11 @@ from probe_kit.intervene.kinds.instruction_swap import InstructionSwap
 from probe_kit.intervene.kinds.interchange import Interchange
 from probe_kit.intervene.kinds.joint import EVERY, MINIMAL, JointEffect, JointPlaces
 from probe_kit.intervene.kinds.site_maps import PatchEffect
+from probe_kit.intervene.kinds.steer import Steering
 from probe_kit.intervene.outcomes import CLEAN, ConditionOutcomes
+from probe_kit.intervene.patching.attribution import AttributionEffect
 from probe_kit.intervene.results.verdict import UseVerdict, classify_use
+from probe_kit.retention.columns.findings import MOST_NUMBERS, MOST_WORDS, count_words
 
 SWAPS = {
     "follows": (0.92, 0.02, (0.6, 1.0), 0.001, 1.0, 0.9, (0.8, 1.0)),
@@ -201,6 +207,176 @@ def test_joint_places_say_where_the_answer_is_read_or_that_this_is_open() -> Non
     assert JointPlaces.sentences([every], context(None)) == ["Color: where the answer is read remains open."]
 
 
+def input_row(changed: float, share: float | None, finding: Finding) -> InputEffect:
+    return InputEffect(
+        category="public-info", vary="picture.wrist", n_episodes=12, n_items=6, n_groups=6, changed=changed,
+        size=1.0, control_size=0.1, full_size=1.0, share=share, share_ci=None, p=0.01, finding=finding,
+    )  # fmt: skip
+
+
+def anchor(estimate: float, finding: str, exact: float = 1.0) -> AttributionEffect:
+    return AttributionEffect(
+        category="public-info", place="kv.*", role="all", is_anchor=True, is_drawn=False, n_episodes=48,
+        n_groups=12, estimate=estimate, estimate_ci=None, exact=exact, exact_ci=None, p_fwe=0.01, finding=finding,
+    )  # fmt: skip
+
+
+EVERY_CELL = joint(EVERY, "kv.00 + kv.01", "carries it")
+FINDINGS: list[tuple[type[Intervention], Sequence[Any], str]] = [
+    (ImageSwap, [swap("follows")], "swapped: a swap turns it in 92 % of the episodes."),
+    (
+        InstructionSwap,
+        [swap("reverses")],
+        "reversed: another instruction turns the action in 0 % of the episodes, and the other way in 90 %.",
+    ),
+    (
+        InstructionSwap,
+        [swap("open")],
+        "not shown: another instruction turns the action in 20 % of the episodes, and the other way in 10 %.",
+    ),
+    (
+        Interchange,
+        [patch("backbone.01", 0.97, 0.001), patch("backbone.02", 0.6, 0.01), patch("backbone.03", 0.9, 0.4)],
+        "located: half of it passes in 2 of 3 edits, most at backbone.01 image.",
+    ),
+    (
+        Interchange,
+        [patch("backbone.01", 0.2, 0.001)],
+        "not located: no edit of 1 has half of the image swap's effect.",
+    ),
+    (
+        Interchange,
+        [patch("expert.01", 1.0, 0.001)],
+        "not located: all edits carry the effect by construction, which locates nothing.",
+    ),
+    (
+        Interchange,
+        [patch("backbone.01", None, 0.001)],
+        "moved: to the target side by 1 of 1 edits, at backbone.01 image.",
+    ),
+    (
+        Interchange,
+        [patch("backbone.01", None, 0.5)],
+        "not moved: neither the image swap nor any edit moves the action beyond chance.",
+    ),
+    (
+        Steering,
+        [replace(patch("backbone.02", 0.9, 0.001), coefficient="2")],
+        "steered: half of the image swap's effect by 1 of 1 edits, at backbone.02 image.",
+    ),
+    (
+        Steering,
+        [replace(patch("backbone.02", 0.1, 0.001), coefficient="2")],
+        "not steered: no edit of 1 has half of the image swap's effect.",
+    ),
+    (
+        ClosedLoop,
+        [closed_loop(CLEAN, 0.0, None), closed_loop("backbone.02", 0.8, 0.001)],
+        "confirmed: the cube turns to the other picture after 1 of 1 edits, at backbone.02 image.",
+    ),
+    (
+        ClosedLoop,
+        [closed_loop("backbone.02", 0.1, 0.5)],
+        "not confirmed: no edit of 1 turns the cube to the other picture beyond its controls.",
+    ),
+    (
+        ClosedLoop,
+        [closed_loop("backbone.02", 0.8, None, disrupted=True)],
+        "task disrupted: after every edit the cube stays away from both pictures.",
+    ),
+    (
+        ConceptErasure,
+        [erasure(0.1, 0.001)],
+        "lost: the action leaves the answer after 1 of 1 erasures, at backbone.02 image.",
+    ),
+    (
+        ConceptErasure,
+        [erasure(0.8, 0.3)],
+        "not lost: no erasure of 1 takes the answer from the action beyond its controls.",
+    ),
+    (
+        ConceptErasure,
+        [erasure(None, 0.3)],
+        "nothing to lose: the unedited action does not go to the correct picture.",
+    ),
+    (JointPlaces, [EVERY_CELL, joint("cell", "kv.01 image", "read here")], "read: at kv.01 image."),
+    (
+        JointPlaces,
+        [EVERY_CELL, joint(MINIMAL, "kv.00 + kv.01", "read jointly")],
+        "read jointly: at kv.00 + kv.01.",
+    ),
+    (JointPlaces, [EVERY_CELL], "open: no place was found at which the answer is read."),
+    (
+        JointPlaces,
+        [joint(EVERY, "kv", "past it")],
+        "past kv: the answer reaches the action without passing there.",
+    ),
+    (
+        JointPlaces,
+        [EVERY_CELL, *(joint("cell", f"kv.{2 * at:02d} image", "read here") for at in range(5))],
+        "read: at kv.00 image, kv.02 image, kv.04 image and 2 more.",
+    ),
+    (
+        AttributionPatching,
+        [anchor(0.1, "void")],
+        "void: gradients miss the effect at kv.* all by more than a factor of 3; patch instead.",
+    ),
+    (
+        AttributionPatching,
+        [anchor(0.1, "n/a", exact=0.1)],
+        "no order: no anchor carries the effect, so that nothing tests the estimates.",
+    ),
+    (
+        AttributionPatching,
+        [anchor(0.9, "anchored"), replace(anchor(0.7, "anchored"), place="kv.01", is_anchor=False, rank=1)],
+        "ordered: gradients agree with patches; kv.01 all comes first with 0.70 of the effect.",
+    ),
+]
+INPUTS = [
+    (input_row(0.0, 0.0, "no effect"), "does not arrive: another picture.wrist changes no number of any action."),
+    (
+        input_row(1.0, 0.8, "decides"),
+        "decides: the action follows the picture.wrist, by 0.80 of what all inputs do.",
+    ),
+    (
+        input_row(1.0, 0.2, "moves"),
+        "moves: the picture.wrist shifts the action without deciding it, by 0.20 of what all inputs do.",
+    ),
+    (input_row(1.0, 0.0, "no effect"), "no effect: another picture.wrist leaves the action where it is."),
+    (input_row(1.0, None, "open"), "open: the items do not tell whether the picture.wrist matters."),
+]
+
+
+def check_short(line: str) -> None:
+    """At most 25 words and two numbers besides names of places, and no brackets."""
+    assert count_words(line) <= MOST_WORDS, line
+    assert len(re.findall(r"\d[\d.]*", re.sub(r"\b(kv|backbone|expert)\.[\d*]+", "", line))) <= MOST_NUMBERS, line
+    assert not re.search(r"[][()]|None|nan|\.\.$", line), line
+
+
+@pytest.mark.parametrize(("kind", "rows", "said"), FINDINGS)
+def test_the_last_line_of_each_kind_is_short_and_without_brackets(
+    kind: type[Intervention], rows: Sequence[Any], said: str
+) -> None:
+    (line,) = kind.findings(rows, context(None))
+    assert line.partition("  ")[2] == said
+    check_short(line)
+
+
+@pytest.mark.parametrize(("row", "said"), INPUTS)
+@pytest.mark.parametrize("kind", [ImageSwap, InstructionSwap])
+def test_the_last_line_about_an_input_of_a_run_without_sides_is_short(
+    kind: type[Intervention], row: InputEffect, said: str
+) -> None:
+    described = context(None)
+    measured = replace(
+        described.measurement, outcomes=replace(described.measurement.outcomes, sides=np.array([""]))
+    )
+    (line,) = kind.findings([row], replace(described, measurement=measured))
+    assert line == f"Public Info  {said}"
+    check_short(line)
+
+
 def test_every_kind_that_tests_something_says_what_it_found() -> None:
     for kind in every_kind():
-        assert (kind.sentences is not Intervention.sentences) != kind.is_descriptive, kind.kind
+        assert (kind.finding is not Intervention.finding) != kind.is_descriptive, kind.kind

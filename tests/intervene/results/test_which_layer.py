@@ -17,8 +17,8 @@ from tests.intervene.answers import follower, outcomes_of, store_outcomes
 
 EPISODES = 24
 ANSWERS = outcomes_of({"color": follower(EPISODES)})
-UNTESTED = "where the answer passes was not tested (--kind interchange)"
-OPEN = "where it is read is open (--kind joint tests it)"
+UNTESTED = "--kind interchange tests where the answer passes"
+OPEN = "--kind joint tests where it is read"
 UNREAD = "the probes' best site backbone.03 is unread: nothing that acts reads the end of the backbone"
 PASSES = {
     **{f"backbone.{layer:02d}|{role}": 1.0 for layer in (0, 1, 2) for role in ("all", "image")},
@@ -73,10 +73,10 @@ def store(run: ArrayRun, moves: Mapping[str, float], kind: str = "interchange", 
 def line(run: ArrayRun) -> str:
     """The line below the newest intervention's table."""
     result = load_effects(run)
-    (text,) = result.layers.values()
-    assert result.findings[-1] == result.sentences[-1] == text
-    assert text.startswith("Which layer, Color: ")
-    return text.removeprefix("Which layer, Color: ").removesuffix(".")
+    text, (parts,) = result.sentences[-1].removeprefix("Which layer, Color: "), result.layers.values()
+    assert text == f"{'; '.join(parts)}."
+    assert result.findings[-1] == f"Which layer, Color: {parts[0]}."
+    return text.removesuffix(".")
 
 
 def test_after_an_interchange_it_names_where_the_answer_passes_and_where_to_steer(run: ArrayRun) -> None:
@@ -84,9 +84,9 @@ def test_after_an_interchange_it_names_where_the_answer_passes_and_where_to_stee
     store(run, PASSES)
     assert line(run).split("; ") == [
         "passes at backbone.01, backbone.02",
+        "steer at backbone.02 image with --direction mean-difference:1",
         OPEN,
         UNREAD,
-        "steer at backbone.02 image (--direction mean-difference:1)",
     ]
 
 
@@ -106,7 +106,7 @@ def test_where_no_layer_carries_it_no_place_to_steer_is_named(run: ArrayRun) -> 
 def test_without_an_interchange_and_probes_it_names_the_commands_that_are_missing(run: ArrayRun) -> None:
     steered = {"backbone.01|image|mean-difference|2": 0.0}
     store(run, steered, "steer", direction="mean-difference", target_side="wrong", seed=0)
-    assert line(run).split("; ") == [UNTESTED, OPEN, "no probes (probe-kit train)"]
+    assert line(run).split("; ") == [UNTESTED, OPEN, "there are no probes, which probe-kit train makes"]
 
 
 @pytest.mark.parametrize(
