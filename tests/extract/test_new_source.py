@@ -31,19 +31,33 @@ def package(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_source_is_one_file_from_its_option_to_its_run(package: Path, tmp_path: Path) -> None:
-    line = ["extract", "--model", "pi0-tiny", "--noise", "3", "--env-workers", "0", "--out", str(tmp_path / "run")]
+def typed(package: Path, *line: str) -> None:
+    """Type a line of probe-kit where the package is installed."""
     path = os.pathsep.join([str(package), *sys.path])
     ended = subprocess.run(
         [sys.executable, "-m", "probe_kit", *line],
         capture_output=True, encoding="utf-8", check=False, env={**os.environ, "PYTHONPATH": path},
     )  # fmt: skip
     assert ended.returncode == 0, ended.stderr
+
+
+def test_a_source_is_one_file_from_its_option_to_its_run(package: Path, tmp_path: Path) -> None:
+    line = ("extract", "--model", "pi0-tiny", "--noise", "3", "--env-workers", "0")
+    typed(package, *line, "--out", str(tmp_path / "run"))
     run = pk.open_run(tmp_path / "run")
     assert len(run.episodes) == 3
     column = run.column(pk.Site("backbone", 3), "mean")
     assert np.isfinite(column).all()
     assert len(np.unique(column, axis=0)) == 3
+
+
+@pytest.mark.slow
+def test_a_model_that_answers_is_asked_about_the_same_source(package: Path, tmp_path: Path) -> None:
+    """It predicts no actions, so that the run declares none."""
+    typed(
+        package, "ask", "--model", "vlm-tiny", "--noise", "3", "--tokens", "pooled", "--out", str(tmp_path / "run")
+    )
+    assert len(pk.open_run(tmp_path / "run" / "instruction").episodes) == 3
 
 
 @pytest.mark.parametrize(

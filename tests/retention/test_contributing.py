@@ -92,6 +92,46 @@ from probe_kit.retention.command_options import Style
     assert "| %%Color%% |" in printed
 
 
+def test_a_rule_is_a_class_and_its_name_from_the_option_to_the_verdict(use: Callable[[str, str], str]) -> None:
+    code = """
+import numpy as np
+from typer.testing import CliRunner
+from probe_kit.cli import app
+from probe_kit.env.scoring.rules import RULES, rule_of
+from probe_kit.env.scoring.trajectory import CHANNELS, Trajectory
+from probe_kit.env.spec import SceneSpec
+
+frames = np.zeros((2, len(CHANNELS)), np.float32)
+frames[:, [CHANNELS.index("tile_left.y"), CHANNELS.index("tile_right.y")]] = 0.0, -0.3
+rule = rule_of("released-disc", SceneSpec().to_json())
+for held in (False, True):
+    frames[:, [name.startswith("held") for name in CHANNELS]] = held
+    episode = Trajectory.of_frames(frames)
+    print(held, episode.held.tolist(), rule.inside(episode, "left").tolist(), rule.inside(episode, "right").tolist())
+print(rule.name in RULES, rule.words)
+print(CliRunner().invoke(app, ["retention", "--help-all"]).output)
+"""
+    printed = use("To add an outcome rule", code)
+    assert "False [False, False] [True, True] [False, False]" in printed
+    assert "True [True, True] [False, False] [False, False]" in printed
+    assert "True within 6.5 cm" in printed
+    assert "released-disc" in printed.partition("seen from above")[2]
+
+
+def test_a_control_is_its_features_and_its_words(use: Callable[[str, str], str]) -> None:
+    code = """
+from types import SimpleNamespace
+from probe_kit.train import CONTROLS
+from probe_kit.train.controls.features import ControlInputs
+
+run = SimpleNamespace(episodes=episodes.assign(instruction="put the cube"), control_features={}, location="run")
+samples = SimpleNamespace(rows=np.arange(3))
+print(CONTROLS["length"], ControlInputs(run, samples, False, None).features("length").ravel().tolist())
+"""
+    printed = use("To add a control", "import numpy as np" + code)
+    assert "the number of words of the instruction [3.0, 3.0, 3.0]" in printed
+
+
 def test_a_comparison_is_one_call(tmp_path: Path, outcome_table: Callable[..., pd.DataFrame]) -> None:
     runs: dict[str, Any] = {
         name: ArrayRun(tmp_path / name, name, "suite@1#0123456789ab", outcome_table(right, 24 - right, 0), {})
