@@ -107,7 +107,8 @@ rule = rule_of("released-disc", SceneSpec().to_json())
 for held in (False, True):
     frames[:, [name.startswith("held") for name in CHANNELS]] = held
     episode = Trajectory.of_frames(frames)
-    print(held, episode.held.tolist(), rule.inside(episode, "left").tolist(), rule.inside(episode, "right").tolist())
+    inside = [rule.inside(episode, side).tolist() for side in ("left", "right")]
+    print(held, episode.held.tolist(), *inside)
 print(rule.name in RULES, rule.words)
 print(CliRunner().invoke(app, ["retention", "--help-all"]).output)
 """
