@@ -19,7 +19,7 @@ from zarr.abc.store import Store
 from zarr.core.array_spec import ArrayConfigLike
 
 from probe_kit.runs.arrays import ROOM, codecs, open_array
-from probe_kit.runs.layout import INPUTS, TRUTHS
+from probe_kit.runs.layout import CLASSES, INPUTS, TRUTHS
 from probe_kit.runs.rows import Rows
 
 _TYPES = {"columns": "float64", "pixels": "uint8"}
@@ -57,7 +57,8 @@ class StoredInputs:
     """The inputs of the committed rows of a run, in their order.
 
     kinds: that are stored. columns: names of the numbers of `columns`. names: of those of `state` and `action`.
-    truths: columns that are truth values, stored as 0 and 1.
+    truths: columns that are truth values, stored as 0 and 1. classes: by column of texts, the texts of which it
+    stores the position.
     """
 
     def __init__(self, store: Store, numbers: list[int], dataset: Mapping[str, Any]) -> None:
@@ -66,6 +67,9 @@ class StoredInputs:
         self.columns: tuple[str, ...] = tuple(dataset["columns"])
         self.names: dict[str, tuple[str, ...]] = {name: tuple(names) for name, names in dataset["names"].items()}
         self.truths: tuple[str, ...] = self.names.pop(TRUTHS, ())
+        self.classes: dict[str, tuple[str, ...]] = {
+            name: self.names.pop(CLASSES + name) for name in self.columns if CLASSES + name in self.names
+        }
 
     def read(self, kind: str) -> NDArray[Any]:
         """(E, C, …) of one kind. Raises KeyError for one that is not stored, RunDamagedError."""

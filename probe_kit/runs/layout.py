@@ -44,6 +44,8 @@ TRAJECTORY, TRAJECTORY_AXES = "trajectory", 3
 """The array of what happened in episodes, beside those of streams; an episode that did not act has no object."""
 TRUTHS = "truth"
 """Among the names of inputs: columns that are truth values."""
+CLASSES = "classes."
+"""Among the names of inputs, in front of a column's name: the texts whose positions the column holds."""
 INPUTS = "inputs"
 """The group of arrays that hold what a run on recordings showed: state, actions, small pictures."""
 ILLUSTRATIONS = (FRAMES, VIDEOS)

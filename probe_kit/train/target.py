@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._system.column_cells import Cell
+from probe_kit._tables.label_table import LabelTable
 from probe_kit._terminal.plain_text import terminal_safe
 from probe_kit.errors import UsageError
 from probe_kit.hashing import derive_seed, sha256_json
@@ -21,8 +23,7 @@ from probe_kit.runs.reader import RunReader, check_sides
 from probe_kit.statistics.label_permutations import flip_items
 from probe_kit.train.choices import SIDES, Task
 from probe_kit.train.columns.builtin import BuiltinColumn, builtin_column
-from probe_kit.train.columns.cells import Cell
-from probe_kit.train.columns.table import EPISODE, FRAME, INFERENCE, SOURCE, LabelTable, read_table
+from probe_kit.train.columns.table import EPISODE, FRAME, INFERENCE, SOURCE, read_table
 from probe_kit.train.columns.values import LabelValues, code_labels
 
 if TYPE_CHECKING:
@@ -37,6 +38,7 @@ exchange_groups: groups exchange their labels layout by layout; of the chosen si
 exchange_blocks: groups exchange their labels as blocks, inference by inference; of every other target.
 """
 _MOST_CLASSES = 20
+_CLASSES = "; or say that the texts are classes with --task classes or --task binary (task=…)"
 _COUNTED = {INFERENCE: "a captured inference", FRAME: "a frame", SOURCE: "an episode"}
 
 
@@ -105,7 +107,7 @@ class Target:
             episodes = tuple(map(str, _numbers(label_table, episode_key) or ()))
         else:
             episodes = tuple(label_table.texts(episode_key))
-        cells = label_table.values(name, task)
+        cells = label_table.values(name, task in ("classes", "binary"), _CLASSES)
         groups, strata = _names(label_table, group_by), _names(label_table, exchange_within)
         at = _once(label_table, episodes, inferences, [cells, *filter(None, (groups, strata))])
         return cls(

@@ -1,4 +1,4 @@
-"""A folder of pictures with a table: one inference about each line, its numbers as labels."""
+"""A folder of pictures with a table: one inference about each line, its other columns as labels."""
 
 import csv
 import json
@@ -25,6 +25,7 @@ from probe_kit.intervene.sessions.observed import ObservedSession
 from probe_kit.intervene.sessions.opening import open_session
 from probe_kit.retention.displays import attention_on_picture
 from probe_kit.runs import open_run, verify_run
+from probe_kit.train.columns.builtin import label_frame
 from probe_kit.view.catalogue import Catalogue
 from tests.view.payload_reader import floats, read_payload
 
@@ -34,7 +35,7 @@ TEXTS = ("Put the cube on the red shape", "Put the cube on the gray shape")
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Twelve pictures; `red` says on which side the red square is."""
+    """Twelve pictures; `red` and `side` say on which side the red square is, of all but the last one."""
     home = tmp_path_factory.mktemp("pictures")
     lines: list[dict[str, Any]] = []
     for number in range(COUNT):
@@ -42,7 +43,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
         picture[10:30, slice(4, 24) if number % 2 else slice(40, 60)] = (200, 20, 20)
         Image.fromarray(picture).save(home / f"{number}.png")
         text = TEXTS[number // 2 % 2]
-        lines.append({"picture": f"{number}.png", "instruction": text, "red": number % 2, "group": f"g{number}"})
+        labels = {"red": number % 2, "side": ["", "right", "left"][(number < COUNT - 1) * (1 + number % 2)]}
+        lines.append({"picture": f"{number}.png", "instruction": text, "group": f"g{number}", **labels})
     with (home / "table.csv").open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, list(lines[0]))
         writer.writeheader()
@@ -78,6 +80,23 @@ def test_every_line_is_a_row_with_the_models_own_prediction_bit_for_bit(
     assert np.isfinite(run.column(pk.Site("backbone", 3), "mean")).all()
 
 
+def test_columns_of_texts_and_of_true_and_false_are_labels_as_they_were_written(
+    run: pk.Run, tmp_path: Path
+) -> None:
+    table = label_frame(run)
+    sides = ["left" if number % 2 else "right" for number in range(COUNT - 1)]
+    assert table["picture"].tolist() == [f"{number}.png" for number in range(COUNT)]
+    assert table["dataset.side"].tolist() == [*sides, None], "an empty cell is no class"
+    target = pk.Target.of_run(run, "dataset.side")
+    assert (target.coded.task, target.coded.classes) == ("binary", ("left", "right"))
+    Image.new("RGB", (64, 48)).save(tmp_path / "0.png")
+    lines = "".join(f"0.png,{TEXTS[0]},{word}\n" for word in ("true", "false", "true"))
+    (tmp_path / "table.csv").write_text(f"picture,instruction,open\n{lines}", encoding="utf-8")
+    opened = source(tmp_path).open()
+    assert opened.identity(0)["dataset"]["names"] == {"truth": ["open"]}
+    assert [row.content.numbers for row in opened.rows(0)] == [(1.0,), (0.0,), (1.0,)]
+
+
 def test_another_picture_is_another_row(folder: Path, tmp_path: Path) -> None:
     Image.new("RGB", (64, 48)).save(tmp_path / "0.png")
     (tmp_path / "table.csv").write_text(f"picture,instruction\n0.png,{TEXTS[0]}\n", encoding="utf-8")
@@ -93,7 +112,11 @@ def test_another_picture_is_another_row(folder: Path, tmp_path: Path) -> None:
         ("picture,instruction\nnone.png,go\n", "none.png cannot be read"),
         ("picture,instruction\n../0.png,go\n", "expected a file in the folder"),
         ("picture,instruction\n0.png,\n", "line 2 has the instruction ''"),
-        ("picture,instruction,red\n0.png,go,left\n", "has 'left' as red; expected a number"),
+        ("picture,instruction,red\n0.png,go,5 cm\n", "line 2, column 'red': '5 cm' looks like a quantity"),
+        (
+            "picture,instruction,red\n0.png,go,left\n0.png,go,2\n",
+            "line 3, column 'red': 2 is a number, and line 2",
+        ),
         ("picture,instruction,id\n0.png,go,a\n0.png,go,a\n", "the id 'a' twice"),
         ("picture,instruction\ntable.csv,go\n", "table.csv"),
     ],
@@ -116,7 +139,7 @@ def test_a_table_of_a_spreadsheet_is_read_by_the_rules_of_all_tables(folder: Pat
     with pytest.raises(UsageError, match="expected one spelling"):
         source(tmp_path).open()
     table.write_text("picture,instruction,red\n0.png,go,1e999\n", encoding="utf-8")
-    with pytest.raises(RecordingError, match="expected a number"):
+    with pytest.raises(UsageError, match="expected a finite number"):
         source(tmp_path).open()
 
 
@@ -200,7 +223,7 @@ def test_the_next_step_is_a_target_that_can_be_probed_and_one_of_few_integers_ha
     run: pk.Run, folder: Path, tmp_path: Path
 ) -> None:
     lines = (folder / "table.csv").read_text(encoding="utf-8").splitlines()
-    counts = [line.rsplit(",", 2)[0] + f",{number % 3}" for number, line in enumerate(lines[1:])]
+    counts = [line.rsplit(",", 3)[0] + f",{number % 3}" for number, line in enumerate(lines[1:])]
     (tmp_path / "counts.csv").write_text("\n".join(["picture,instruction,objects", *counts]), encoding="utf-8")
     settings = ExtractSettings("pi0-tiny", source=PictureFolder(folder, tmp_path / "counts.csv"), env_workers=0)
     counted = extract_run(settings, tmp_path / "run")

@@ -1,6 +1,5 @@
 """A folder of pictures with a table of instructions as a source: one inference about each line of the table."""
 
-import sys
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,8 +14,10 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator
 
 from probe_kit._system.bounded_files import read_regular
-from probe_kit._system.table_cells import group_names, number_of
+from probe_kit._system.column_cells import Cell
+from probe_kit._system.table_cells import group_names
 from probe_kit._system.text_tables import MOST_BYTES, TextTable, open_table
+from probe_kit._tables.label_table import LabelTable
 from probe_kit._terminal.plain_text import UNSAFE, terminal_safe
 from probe_kit.errors import RecordingError, UsageError
 from probe_kit.extract.plan import Row
@@ -27,14 +28,14 @@ from probe_kit.extract.sources.units import predicted_once
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.state_layout import ARM_NUMBERS
-from probe_kit.runs.layout import CAPTURE_ONLY, DATASET, OTHER_ACTIONS, RECORDED_EPISODES
+from probe_kit.runs.layout import CAPTURE_ONLY, CLASSES, DATASET, OTHER_ACTIONS, RECORDED_EPISODES, TRUTHS
 from probe_kit.suite.pictures import decode_bytes
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
 
 PICTURE, INSTRUCTION, ID, GROUP = "picture", "instruction", "id", "group"
-"""Columns of the table; the first two are required, and all others hold numbers that become labels."""
+"""Columns of the table; the first two are required, and all others become labels."""
 Cells = dict[str, str | None]
 """A line of the table by heading; None for a missing cell."""
 _DIGITS = 16
@@ -45,8 +46,8 @@ class PictureFolder(SourceSettings):
     """Pictures in place of a scene: the model predicts once about each, and nothing moves.
 
     folder: of the pictures. table: a CSV file with the columns `picture` (a file in the folder) and `instruction`;
-    `id` and `group` name a line and what folds keep together; every other column holds numbers. pixels: whether
-    pictures at 32 × 32 are stored for controls.
+    `id` and `group` name a line and what folds keep together; every other column holds numbers, truth values or
+    texts, and becomes a label. pixels: whether pictures at 32 × 32 are stored for controls.
     """
 
     kind: Literal["pictures"] = "pictures"
@@ -97,11 +98,50 @@ class PictureFolder(SourceSettings):
 
 @dataclass(frozen=True)
 class Line:
-    """A line of the table: file, text and numbers. content: hash of the picture's bytes."""
+    """A line of the table. content: hash of the picture's bytes. numbers: its cells as `Labels` codes them."""
 
     picture: Path
     content: str
     numbers: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Labels:
+    """The columns of a table that become labels, as numbers.
+
+    values: by column, a number per line; NaN where the cell is empty. truths: columns of true and false, as 1 and
+    0. classes: by column of texts, the texts in alphabetical order; a number is the position of one.
+    """
+
+    values: dict[str, list[float]]
+    truths: list[str]
+    classes: dict[str, list[str]]
+
+    @classmethod
+    def of(cls, table: TextTable, lines: Sequence[tuple[int, Cells]], names: Sequence[str]) -> Self:
+        """Read the columns by the rules of all labels. Raises UsageError for a cell that breaks one."""
+        columns: dict[str, list[Cell]] = {name: [text[name] for _, text in lines] for name in names}
+        read = LabelTable(
+            str(table.path), "line", table.names, columns, [number for number, _ in lines], table.separator == ";"
+        )
+        values: dict[str, list[float]] = {}
+        truths: list[str] = []
+        classes: dict[str, list[str]] = {}
+        for name in names:
+            cells = read.values(name)
+            if texts := sorted({cell for cell in cells if isinstance(cell, str)}):
+                classes[name] = texts
+            elif any(isinstance(cell, bool) for cell in cells):
+                truths.append(name)
+            values[name] = [
+                np.nan if cell is None else float(texts.index(cell) if isinstance(cell, str) else cell)
+                for cell in cells
+            ]
+        return cls(values, truths, classes)
+
+    def of_line(self, row: int) -> tuple[float, ...]:
+        """Return the numbers of a line."""
+        return tuple(column[row] for column in self.values.values())
 
 
 class PictureSource(Source[PictureFolder]):
@@ -111,9 +151,10 @@ class PictureSource(Source[PictureFolder]):
     groups = "groups of pictures"
 
     def __init__(
-        self, settings: PictureFolder, names: Sequence[str], lines: Sequence[tuple[Cells, Line]], digest: str
+        self, settings: PictureFolder, labels: Labels, lines: Sequence[tuple[Cells, Line]], digest: str
     ) -> None:
-        self.settings, self.columns, self.lines = settings, tuple(names), list(lines)
+        self.settings, self.labels, self.lines = settings, labels, list(lines)
+        self.columns = tuple(labels.values)
         self._digest = digest
         self.cameras: list[str] = []
         self.prediction: tuple[int, int] = (0, 0)
@@ -132,16 +173,18 @@ class PictureSource(Source[PictureFolder]):
             columns = ", ".join(read.names) or "no line"
             raise UsageError(f"--table {table} has {columns}; expected the columns {PICTURE} and {INSTRUCTION}")
         names = [name for name in read.names if name and name not in (PICTURE, INSTRUCTION, ID, GROUP)]
+        texts = _with_groups(read, list(read.rows()))
+        labels = Labels.of(read, texts, names)
         lines = [
-            (text, _line(text, names, folder, read.where(number)))
-            for number, text in _with_groups(read, list(read.rows()))
+            (text, _line(text, folder, read.where(number), labels.of_line(row)))
+            for row, (number, text) in enumerate(texts)
         ]
         if not lines:
             raise UsageError(f"--table {table} has no line below its heading; expected one per picture")
         ids = [_id(text, number) for number, (text, _) in enumerate(lines)]
         if twice := [name for name, count in Counter(ids).items() if count > 1]:
             raise RecordingError(f"{table.name} has the id {twice[0]!r} twice; give each line its own")
-        return cls(settings, names, lines, digest)
+        return cls(settings, labels, lines, digest)
 
     def decided(self) -> Mapping[str, Any]:
         """Return that the only inference of a picture is captured and nothing acts."""
@@ -168,6 +211,7 @@ class PictureSource(Source[PictureFolder]):
                 "category": "all",
                 "group_id": text.get(GROUP) or name,
                 "instruction": text[INSTRUCTION],
+                PICTURE: text[PICTURE],
                 "source_episode": number,
                 "first_frame": 0,
                 "frame_step": 1,
@@ -226,7 +270,10 @@ class PictureSource(Source[PictureFolder]):
             "instruction": None,
             "inputs": shapes,
             "columns": list(self.columns),
-            "names": {},
+            "names": {
+                **({TRUTHS: self.labels.truths} if self.labels.truths else {}),
+                **{CLASSES + name: texts for name, texts in self.labels.classes.items()},
+            },
         }
         return {DATASET: data_set}
 
@@ -236,7 +283,7 @@ class PictureSource(Source[PictureFolder]):
         return {"recording": {**selected, OTHER_ACTIONS: "pictures have no actions"}}
 
     def targets(self) -> tuple[str, ...]:
-        """The numbers of the table."""
+        """The columns of the table that become labels."""
         return tuple(f"dataset.{name}" for name in self.columns)
 
     def describe(self, rows: Sequence[Row]) -> dict[str, str]:
@@ -244,7 +291,7 @@ class PictureSource(Source[PictureFolder]):
         return {
             "pictures": f"{len(rows)} of {terminal_safe(self.name)}",
             "camera": terminal_safe(", ".join(self.cameras)) or "the first of the model",
-            "numbers": terminal_safe(", ".join(self.columns)) or "none",
+            "labels": terminal_safe(", ".join(self.columns)) or "none",
         }
 
 
@@ -289,7 +336,7 @@ def _with_groups(table: TextTable, lines: list[tuple[int, Cells]]) -> list[tuple
     return [(number, text | {GROUP: names.get(number)}) for number, text in lines]
 
 
-def _line(text: Cells, names: Sequence[str], folder: Path, where: str) -> Line:
+def _line(text: Cells, folder: Path, where: str, numbers: tuple[float, ...]) -> Line:
     """A line of the table. Raises RecordingError naming what is wrong with it."""
     for name in (PICTURE, INSTRUCTION):
         if not text[name] or UNSAFE.search(text[name] or ""):
@@ -297,16 +344,7 @@ def _line(text: Cells, names: Sequence[str], folder: Path, where: str) -> Line:
     path = Path(text[PICTURE] or "")
     if path.is_absolute() or ".." in path.parts:
         raise RecordingError(f"{where} names {path}; expected a file in the folder of --pictures")
-    return Line(
-        folder / path, _digest(_read(folder / path)), tuple(_number(text[name], name, where) for name in names)
-    )
-
-
-def _number(cell: str | None, name: str, where: str) -> float:
-    number = number_of(cell or "")
-    if number is None or abs(number) > sys.float_info.max:
-        raise RecordingError(f"{where} has {cell or ''!r} as {name}; expected a number")
-    return float(number)
+    return Line(folder / path, _digest(_read(folder / path)), numbers)
 
 
 def _id(text: Cells, number: int) -> str:

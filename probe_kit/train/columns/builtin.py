@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._system.column_cells import Cell
 from probe_kit.errors import UsageError
 from probe_kit.runs.action_errors import compare_actions, why_not_compared
 from probe_kit.runs.reader import RunReader, reached_calls
 from probe_kit.train.choices import Task
-from probe_kit.train.columns.cells import Cell
 from probe_kit.train.columns.table import EPISODE, INFERENCE
 
 if TYPE_CHECKING:
@@ -152,9 +152,13 @@ def _of_source(run: RunReader, name: str) -> BuiltinColumn:
 
 
 def _cells(run: RunReader, name: str, values: NDArray[np.float64]) -> tuple[Cell, ...]:
-    """The values (n,) of a column of a run's own source: numbers, or truth values where the source says so."""
+    """The values (n,) of a column of a run's own source: numbers; truth values or texts where that says so."""
     cells = [_finite(float(value)) for value in values]
-    if run.inputs is None or name not in run.inputs.truths:
+    if run.inputs is None:
+        return tuple(cells)
+    if texts := run.inputs.classes.get(name):
+        return tuple(None if cell is None else texts[int(cell)] for cell in cells)
+    if name not in run.inputs.truths:
         return tuple(cells)
     return tuple(bool(cell) if cell in (0, 1) else cell for cell in cells)
 
@@ -211,8 +215,8 @@ def label_frame(run: RunReader) -> "pd.DataFrame":
 
     Besides the keys `episode_id` and `inference` there are `control_step`, `group_id`, `category` and the built-in
     columns that the run has; one without trajectories or control steps has no `sim.*`, see `why_no_sim`. Of
-    recordings there are `source_episode`, `frame`, `instruction` and the columns `dataset.*` instead, of an
-    environment of one's own `instruction` and `env.*`.
+    recordings there are `source_episode`, `frame`, `instruction` and the columns `dataset.*` instead, of pictures
+    the file as `picture` too, of an environment of one's own `instruction` and `env.*`.
     """
     import pandas as pd
 
@@ -231,7 +235,9 @@ def label_frame(run: RunReader) -> "pd.DataFrame":
     if run.in_own_environment:
         table["control_step"] = run.control_steps[rows, list(inferences)].tolist()
     if run.inputs is not None:
-        table["instruction"] = run.episodes["instruction"].iloc[rows].tolist()
+        for name in ("picture", "instruction"):
+            if name in run.episodes:
+                table[name] = run.episodes[name].iloc[rows].tolist()
         sim = {
             prefix_of(run) + name: list(_cells(run, name, read()[rows, list(inferences)]))
             for name, read in recorded_columns(run).items()

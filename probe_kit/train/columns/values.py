@@ -7,9 +7,9 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._system.column_cells import Cell
 from probe_kit.errors import UsageError
 from probe_kit.train.choices import TASKS, Task
-from probe_kit.train.columns.cells import Cell
 
 MOST_DOUBTFUL = 20
 """Integers of 3 to so many values can be classes or quantities; only the user knows."""

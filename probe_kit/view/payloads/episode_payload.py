@@ -138,7 +138,10 @@ def _inputs(viewed: ViewedRun, position: int) -> list[dict[str, Any]]:
     if "state" in rows:
         groups.append(("state", {"state": rows["state"]}, inputs.names.get("state", ())))
     if "columns" in rows:
-        groups.append(("columns", {"value": rows["columns"]}, inputs.columns))
+        # A text is stored as a position among the texts, which makes no chart.
+        numbers = [at for at, name in enumerate(inputs.columns) if name not in inputs.classes]
+        names = tuple(inputs.columns[at] for at in numbers)
+        groups.append(("columns", {"value": rows["columns"][:, numbers]}, names))
     return [{"title": title, "series": _series(lines, names)} for title, lines, names in groups if lines and count]
 
 

@@ -1,11 +1,10 @@
-"""Cells of a label column as values: numbers, true and false, classes, or missing."""
+"""Cells of a column that people wrote as values: numbers, true and false, classes, or missing."""
 
 import re
 from collections.abc import Callable, Sequence
 
 from probe_kit._system.table_cells import check_spellings, name_of, number_of, problem_of, with_minus
 from probe_kit.errors import UsageError
-from probe_kit.train.choices import Task
 
 Cell = str | int | float | bool | None
 Where = Callable[[int], str]
@@ -31,14 +30,17 @@ _DECIMAL_AND_WORD = re.compile(r"[+-]?(?:\d+[.,]\d+|[.,]\d+)\s*[^\W\d].*")
 _NUMBER_AND_WORD = re.compile(r"[+-]?\d+\s*([^\W\d_].*)")
 
 
-def values_of(cells: Sequence[Cell], where: Where, task: Task | None, semicolons: bool = False) -> list[Cell]:
+def values_of(
+    cells: Sequence[Cell], where: Where, semicolons: bool = False, as_names: bool = False, otherwise: str = ""
+) -> list[Cell]:
     """The values of a column whose texts spell numbers, true and false, classes, or nothing.
 
     cells: texts as `cell_of` gives them, or typed values of a data frame. where: the place of a row, for messages.
     semicolons: whether they separate the cells: where a comma is the decimal sign, `1.000` may be a thousand.
+    as_names: whether texts such as `10 cm` are names of classes. otherwise: how the caller says so, for a message.
     Numbers may have a decimal comma or a percent sign where the whole column has it. A column with yes or no has
     the classes `yes` and `no`. Raises UsageError for a text that looks like a quantity and is not a plain number
-    (unless `task` is `classes` or `binary`), for a cell that may mean a missing value, and for two spellings of
+    (unless they are `as_names`), for a cell that may mean a missing value, and for two spellings of
     one class.
     """
     texts: list[Cell] = [name_of(cell) if isinstance(cell, str) else cell for cell in cells]
@@ -48,9 +50,9 @@ def values_of(cells: Sequence[Cell], where: Where, task: Task | None, semicolons
     answers = _answers(texts, where)
     if answers is not None:
         return answers
-    numbers = _numbers(texts, where, task, semicolons)
-    if task in (None, "continuous"):
-        _check_quantities(numbers, where)
+    numbers = _numbers(texts, where, semicolons, as_names)
+    if not as_names:
+        _check_quantities(numbers, where, otherwise)
     check_spellings(texts, where, UsageError)
     return numbers
 
@@ -79,11 +81,11 @@ def _word[Value: (bool, str)](cell: Cell, words: dict[str, Value]) -> Value | No
     return None if cell is None else words[str(cell).lower()]
 
 
-def _numbers(cells: Sequence[Cell], where: Where, task: Task | None, semicolons: bool) -> list[Cell]:
+def _numbers(cells: Sequence[Cell], where: Where, semicolons: bool, as_names: bool) -> list[Cell]:
     """The cells with numbers in place of the texts that spell them."""
     texts = {row: with_minus(cell) for row, cell in enumerate(cells) if isinstance(cell, str)}
     numbers = [_number_or_text(cell) for cell in cells]
-    if task in ("classes", "binary"):
+    if as_names:
         return numbers
     percents = {row: match[1] for row, text in texts.items() if (match := _PERCENT.fullmatch(text))}
     percents = {
@@ -135,7 +137,7 @@ def _check_all_percent(cells: Sequence[Cell], percents: dict[int, str], where: W
             )
 
 
-def _check_quantities(cells: Sequence[Cell], where: Where) -> None:
+def _check_quantities(cells: Sequence[Cell], where: Where, otherwise: str) -> None:
     """Raise UsageError for a text that looks like a quantity, because it would be decoded as a class."""
     texts = {row: cell for row, cell in enumerate(cells) if isinstance(cell, str)}
     counted = {row: match[1] for row, text in texts.items() if (match := _NUMBER_AND_WORD.fullmatch(text))}
@@ -146,6 +148,5 @@ def _check_quantities(cells: Sequence[Cell], where: Where) -> None:
         if alike or any(matches):
             raise UsageError(
                 f"{where(row)}: {text!r} looks like a quantity, and is not a plain number. Write the number "
-                "alone, such as -0.5 or 1200, and its unit in the heading; or say that the texts are classes "
-                "with --task classes or --task binary (task=…)"
+                f"alone, such as -0.5 or 1200, and its unit in the heading{otherwise}"
             )

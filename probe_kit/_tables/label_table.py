@@ -1,0 +1,133 @@
+"""Columns of labels that people wrote or a program gave, as values of one type, with the place of every cell."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import isinf
+from typing import Literal
+
+from probe_kit._system.column_cells import Cell, values_of
+from probe_kit._system.table_cells import group_names, number_of
+from probe_kit._terminal.plain_text import UNSAFE, terminal_safe
+from probe_kit.errors import UsageError
+
+Kind = Literal["text", "boolean", "integer", "number"]
+
+EXACT = 2**53
+"""Integers beyond it have no exact float64."""
+_ARTICLE = {"text": "text", "boolean": "true or false", "integer": "a number", "number": "a number"}
+
+
+@dataclass(frozen=True)
+class LabelTable:
+    """Some columns of a table of labels, as cells of Python types.
+
+    source: the file, or `DataFrame`. unit: `line` of a file, or `row` where there are no lines. names: all columns
+    of the table. columns: cells of those that were asked for: texts of a CSV file, texts and typed values of a
+    data frame, None where missing. lines: number of every row in its file. semicolons: whether they separate
+    the cells.
+    """
+
+    source: str
+    unit: str
+    names: tuple[str, ...]
+    columns: dict[str, list[Cell]]
+    lines: list[int]
+    semicolons: bool = False
+
+    def where(self, row: int, column: str | None = None) -> str:
+        """The place of a cell, as errors name it."""
+        line = f"{self.source}, {self.unit} {self.lines[row]}"
+        return line if column is None else f"{line}, column {terminal_safe(column)!r}"
+
+    def at(self, rows: Sequence[int]) -> "LabelTable":
+        """The table of some rows."""
+        columns = {name: [cells[row] for row in rows] for name, cells in self.columns.items()}
+        return replace(self, columns=columns, lines=[self.lines[row] for row in rows])
+
+    def values(self, column: str, as_names: bool = False, otherwise: str = "") -> list[Cell]:
+        """The cells of one column as `values_of` reads them, of one kind. Raises UsageError."""
+        cells = self.columns[column]
+        for row, cell in enumerate(cells):
+            if isinstance(cell, str):
+                self._kind(row, column, cell)
+        values = values_of(cells, lambda row: self.where(row, column), self.semicolons, as_names, otherwise)
+        return self._of_one_kind(column, values)
+
+    def typed(self, column: str) -> list[Cell]:
+        """The cells of one column as they are, of one kind. Raises UsageError for others."""
+        return self._of_one_kind(column, self.columns[column])
+
+    def _of_one_kind(self, column: str, cells: list[Cell]) -> list[Cell]:
+        first: tuple[Kind, int] | None = None
+        for row, cell in enumerate(cells):
+            if cell is None:
+                continue
+            kind = self._kind(row, column, cell)
+            if first is None:
+                first = kind, row
+            elif _ARTICLE[kind] != _ARTICLE[first[0]]:
+                raise UsageError(
+                    f"{self.where(row, column)}: {cell!r} is {_ARTICLE[kind]}, and {self.unit} "
+                    f"{self.lines[first[1]]} has {_ARTICLE[first[0]]}; expected one type. Correct one of the two, "
+                    "or leave the cell empty"
+                )
+        self._check_exact(column, cells)
+        return cells
+
+    def _check_exact(self, column: str, cells: Sequence[Cell]) -> None:
+        """Raise UsageError for decimals that are all whole, one beyond 2^53: they may be rounded integers.
+
+        A table with empty cells stores integers as decimals.
+        """
+        numbers = {row: cell for row, cell in enumerate(cells) if isinstance(cell, float)}
+        beyond = [row for row, cell in numbers.items() if abs(cell) > EXACT]
+        if beyond and all(cell.is_integer() for cell in numbers.values()):
+            raise UsageError(
+                f"{self.where(beyond[0], column)}: the whole number {numbers[beyond[0]]:g} is beyond 2^53, so it "
+                "may be a rounded integer. Put a letter in front if it is a name, or give a larger unit"
+            )
+
+    def texts(self, column: str) -> list[str]:
+        """The cells of one column as they are written, none of them missing. Raises UsageError."""
+        cells = self.columns[column]
+        for row, cell in enumerate(cells):
+            if cell is None:
+                raise UsageError(f"{self.where(row, column)} is empty; expected a name in every {self.unit}")
+            self._kind(row, column, cell)
+        return [str(cell) for cell in cells]
+
+    def group_names(self, column: str) -> list[str]:
+        """The cells of one column as names of groups, none of them missing. Raises UsageError."""
+        self.texts(column)
+        return group_names(self.columns[column], lambda row: self.where(row, column), UsageError)
+
+    def numbers(self, column: str) -> list[Cell]:
+        """The cells of one column, with numbers in place of the texts that spell them."""
+        spelled = ((cell, number_of(cell) if isinstance(cell, str) else None) for cell in self.columns[column])
+        return [cell if number is None else number for cell, number in spelled]
+
+    def _kind(self, row: int, column: str, cell: Cell) -> Kind:
+        if isinstance(cell, bool):
+            return "boolean"
+        if isinstance(cell, int):
+            if abs(cell) > EXACT:
+                raise UsageError(
+                    f"{self.where(row, column)}: the integer {_short(cell)} is beyond 2^53, so it has no exact "
+                    "float64. Put a letter in front if it is a name, or subtract an offset"
+                )
+            return "integer"
+        if isinstance(cell, float):
+            if isinf(cell):
+                raise UsageError(f"{self.where(row, column)} is infinite; expected a finite number or no entry")
+            return "number"
+        if unsafe := UNSAFE.search(str(cell)):
+            raise UsageError(
+                f"{self.where(row, column)} holds the control or direction character U+{ord(unsafe[0]):04X}; "
+                "expected plain text. Remove it"
+            )
+        return "text"
+
+
+def _short(number: int) -> str:
+    digits = str(number)
+    return digits if len(digits) <= 40 else f"{digits[:12]}… of {len(digits)} digits or more"
