@@ -21,6 +21,7 @@ from probe_kit._system.bounded_arrays import UNREADABLE, open_arrays
 from probe_kit._system.bounded_json import parse_json, read_json_object
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import Site
+from probe_kit.hooks.contract.views import role_of_view
 
 ENTRY = "directions"
 SUFFIXES = (".safetensors", ".npz")
@@ -115,7 +116,7 @@ def write_directions(
 def about_direction(category: str, view: str, site: Site, weights: str | None) -> tuple[str, dict[str, str]]:
     """Return the name of a direction of a category, view and site, and its entry in a file."""
     name = _place_name(str(site))
-    role = view.removeprefix("mean").removeprefix(":") or "all"
+    role = role_of_view(view) or ""  # the last token plays no role of its own
     return f"{category}.{view}.{name}", {"site": name, "role": role, "space": "raw", "weights": weights or ""}
 
 

@@ -19,7 +19,7 @@ from probe_kit.intervene.patching import run_with_hooks
 from probe_kit.intervene.replay import ConditionContext, replay
 from probe_kit.intervene.sessions.scene import SceneSession
 from probe_kit.runs import export_run
-from probe_kit.runs.direction_files import names_file, read_direction, write_directions
+from probe_kit.runs.direction_files import about_direction, names_file, read_direction, write_directions
 from probe_kit.train.results.probe_directions import Direction, write_direction_file
 
 SITE, WIDTH = "backbone.02", 96
@@ -85,6 +85,8 @@ def test_probes_directions_are_written_for_the_sites_and_weights_that_they_are_o
     assert (direction.site, direction.role, direction.weights) == (SITE, "image", session.run.weights_sha256)
     np.testing.assert_allclose(direction.vectors[0], 2 * probes[place].unit, rtol=1e-5)
     assert Interchange(sites=(SITE,), direction=str(path)).conditions(session)
+    for view, role in (("mean", "all"), ("last", "")):
+        assert about_direction("color", view, Site("backbone", 2), None)[1]["role"] == role
     write_direction_file(probes, path, "0" * 64)
     with pytest.raises(UsageError, match="was found in the weights"):
         Interchange(sites=(SITE,), direction=str(path)).conditions(session)

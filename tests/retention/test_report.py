@@ -38,6 +38,7 @@ from probe_kit.train import ArrayRun, load_results
 from probe_kit.train.results.control_scores import Controls
 from probe_kit.train.results.store import save_results
 from tests.intervene.answers import follower, outcomes_of, store_outcomes
+from tests.support.recorded_run import write_recorded_run
 
 ProbedRun = Callable[..., ArrayRun]
 SIGNAL = ([0.5, 0.9, 0.7], [[0.6, 0.7], [0.5, 0.65]])
@@ -252,6 +253,13 @@ def test_the_citation_names_weights_and_suite(probed_run: ProbedRun) -> None:
     sentence, bibtex = citation([probed_run({"color": SIGNAL})])
     assert "suite@1#0123456789ab" in sentence
     assert "2606.19297" in bibtex
+
+
+def test_the_citation_of_recordings_names_neither_the_scene_nor_its_protocol(tmp_path: Path) -> None:
+    sentence, bibtex = citation([write_recorded_run(tmp_path / "run")])
+    assert "probe_kit" in sentence
+    for text in (sentence, bibtex):
+        assert not re.search("Act2Answer|PyBullet|2606", text, re.IGNORECASE)
 
 
 def test_every_word_has_a_sentence() -> None:

@@ -34,3 +34,9 @@ def resolve_view(view: str, stored: Sequence[str]) -> str:
         return view
     parts = [name for name in stored if name.startswith(f"{view}.")]
     return parts[0] if len(parts) == 1 else view
+
+
+def role_of_view(view: str) -> str | None:
+    """Return the role whose tokens a view averages, `all` for `mean`; None for another view."""
+    kind, _, role = view.partition(":")
+    return (role or "all") if kind == "mean" else None

@@ -6,6 +6,7 @@ from itertools import starmap
 from typing import TYPE_CHECKING, Literal
 
 from probe_kit.hooks.contract.sites import KV_STREAM
+from probe_kit.hooks.contract.views import role_of_view
 from probe_kit.hooks.registry import get_family
 from probe_kit.intervene.directions import DIRECTIONS, MEAN_DIFFERENCE
 from probe_kit.intervene.kinds.image_swap import ImageSwapEffect, stored_image_swaps
@@ -230,12 +231,6 @@ def _is_pooled_carrier(row: PatchEffect) -> bool:
 
 def _is_read_along(row: PatchEffect) -> bool:
     return row.is_localised and row.control_displacement is not None and _low(row) > NOTHING
-
-
-def role_of_view(view: str) -> str | None:
-    """The role whose tokens a view averages, all of them for `mean`; None for another view."""
-    kind, _, role = view.partition(":")
-    return (role or ALL) if kind == "mean" else None
 
 
 def _at(rows: Iterable[PatchEffect], site: str, role: str) -> list[PatchEffect]:

@@ -7,7 +7,7 @@ from typing import Any
 
 from probe_kit.retention.behaviour.vlm_answers import ask_of
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
-from probe_kit.runs.reader import RunReader
+from probe_kit.runs.reader import SIDE, RunReader
 from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.version import __version__
 
@@ -76,26 +76,27 @@ def _listed(pairs: dict[str, list[str | None]], between: str) -> str:
 
 
 def citation(runs: Sequence[RunReader]) -> tuple[str, str]:
-    """A sentence for a methods section, and BibTeX."""
+    """A sentence for a methods section, and BibTeX; of the protocol only for runs of its scene."""
     lines = "; ".join(ProvenanceLine.of_run(run).line.replace(" · ", ", ") for run in runs)
-    shares = (
-        "Accuracies of answers about" if all(ask_of(run) is not None for run in runs) else "Success rates from"
-    )
-    sentence = (
-        f"Evaluated with probe_kit {__version__} under the Act2Answer protocol ({PAPER}): {lines}. {shares} "
-        "a PyBullet scene are comparable with each other, not with those of other simulators."
-    )
-    bibtex = (
+    of_scene = any(SIDE in run.episodes for run in runs)
+    protocol = f" under the Act2Answer protocol ({PAPER})" if of_scene else ""
+    asked_alone = all(ask_of(run) is not None for run in runs)
+    shares = "Accuracies of answers about" if asked_alone else "Success rates from"
+    limits = f" {shares} a PyBullet scene are comparable with each other, not with those of other simulators."
+    sentence = f"Evaluated with probe_kit {__version__}{protocol}: {lines}.{limits if of_scene else ''}"
+    software = (
         "@software{probe_kit,\n"
         "  title   = {probe\\_kit: where a Vision-Language-Action model knows the answer, and where it is lost},\n"
         f"  version = {{{__version__}}},\n"
-        "  license = {Apache-2.0}\n}\n\n"
-        "@misc{act2answer,\n"
+        "  license = {Apache-2.0}\n}"
+    )
+    paper = (
+        "\n\n@misc{act2answer,\n"
         "  title         = {Does {VLA} Even Know the Basics?},\n"
         "  eprint        = {2606.19297},\n"
         "  archivePrefix = {arXiv}\n}"
     )
-    return sentence, bibtex
+    return sentence, software + (paper if of_scene else "")
 
 
 def _stream(run: RunReader, name: str) -> str:
