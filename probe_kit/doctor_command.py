@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from probe_kit._terminal.console import err, marked, out, print_json, say
+from probe_kit._terminal.console import err, out, print_json, say
 from probe_kit._terminal.options import AsJson
 
 if TYPE_CHECKING:
@@ -30,16 +30,14 @@ def doctor(
 
 
 def _print_findings(findings: "list[Finding]") -> None:
-    from rich.table import Table
-    from rich.text import Text
+    from probe_kit._tables.table import Cell, Table
 
-    colours = {"ok": "green", "note": "yellow", "missing": "red"}
-    table = Table(show_header=False, box=None, pad_edge=False)
-    table.add_column(no_wrap=True)
-    table.add_column(no_wrap=True)
-    table.add_column(overflow="fold")
-    for finding in findings:
-        advice = marked("\n[dim]{}[/]", finding.advice) if finding.advice else ""
-        mark = marked(f"[{colours[finding.state]}]{{}}[/]", finding.state)
-        table.add_row(mark, finding.subject, Text.assemble(finding.result, advice))
-    out.print(table)
+    rows = [
+        (
+            Cell(finding.state, alarm=finding.state == "missing", strong=finding.state == "note"),
+            finding.subject,
+            "\n".join(filter(None, (finding.result, finding.advice))),
+        )
+        for finding in findings
+    ]
+    out.print(Table.of("the installation", ("state", "subject", "result"), rows, overflow="wrap"))

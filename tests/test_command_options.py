@@ -12,7 +12,8 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from probe_kit._terminal.options import Format, read_categories
+from probe_kit._tables.printing import STYLES
+from probe_kit._terminal.options import read_categories
 from probe_kit._terminal.panelled_help import HELP_ALL
 from probe_kit.cli import app, commands_of
 from probe_kit.env.robot.arm_models import ARMS
@@ -27,7 +28,6 @@ from probe_kit.hooks.family import Dtype
 from probe_kit.intervene.kinds import kind_names
 from probe_kit.retention.behaviour.vlm_answers import SCORES
 from probe_kit.retention.choices import AnswerScore, Family, Section
-from probe_kit.retention.command_options import STYLES
 from probe_kit.runs.export.export import FORMATS
 from probe_kit.runs.layout import (
     AskTokens,
@@ -73,7 +73,8 @@ CLOSED: dict[tuple[str, str], Collection[object]] = {
     ("train", "--controls"): CONTROLS,
     ("intervene", "--kind"): kind_names(),
     ("intervene", "--readout"): get_args(Readout),
-    ("intervene", "--format"): get_args(get_args(Format)[0]),
+    ("intervene", "--format"): STYLES,
+    ("targets", "--format"): STYLES,
     ("run export", "--dtype"): get_args(SaeDtype),
     ("run export", "--format"): FORMATS,
     ("retention", "--format"): STYLES,
@@ -89,6 +90,7 @@ REQUIRED = {
     "ask": ["--model", "vlm-tiny"],
     "train": ["RUN"],
     "intervene": ["RUN"],
+    "targets": ["RUN"],
     "run export": ["RUN", "--format", "sae"],
     "retention": ["RUN"],
     "suite build": ["FOLDER"],

@@ -76,8 +76,8 @@ class Content:
 
     names: how many of the first columns name the rows. notes: sentences below it, which need no capital letter and
     no stop. numbers: an object per row or per number, shares in [0, 1], None where unknown. overflow: of a
-    terminal, what is done with columns that do not fit: `split` into further tables, `leave out` by name, or
-    first `fold` intervals below their values.
+    terminal, what is done with columns that do not fit: `split` into further tables, `leave out` by name, first
+    `fold` intervals below their values, or `wrap` text, for columns of words.
     """
 
     title: str
@@ -86,7 +86,7 @@ class Content:
     names: int = 1
     notes: tuple[str, ...] = ()
     numbers: tuple[Mapping[str, Any], ...] = ()
-    overflow: Literal["split", "leave out", "fold"] = "split"
+    overflow: Literal["split", "leave out", "fold", "wrap"] = "split"
 
     @classmethod
     def of(

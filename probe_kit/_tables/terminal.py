@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from itertools import groupby, pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from probe_kit._tables.content import Cell, Content, Row
 
@@ -28,11 +28,28 @@ def lines(table: Content, width: int) -> "Iterator[RenderableType]":
     elif table.overflow == "fold" and width_of(table) > width:
         table = _folded(table)
     yield Text(table.title, style="italic")
-    yield from _tables(table, width)
+    yield from [_wrapped(table)] if table.overflow == "wrap" else _tables(table, width)
     notes = [*table.sentences, *[f"With --details or more room: {', '.join(left_out)}."] * bool(left_out)]
     if notes:
         yield Text(" ".join(notes), style="dim")
     yield Text()
+
+
+def _wrapped(table: Content) -> "RichTable":
+    """Return one table whose texts are broken where they do not fit, but neither names nor numbers."""
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table as RichTable
+    from rich.text import Text
+
+    wrapped = RichTable(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), show_edge=False)
+    for at, heading in enumerate(table.headings):
+        is_number = table.are_numeric[at] and not any(map(str.isalpha, "".join(text[at] for text in table.texts)))
+        justify: Literal["left", "right"] = "right" if is_number else "left"
+        no_wrap = is_number or at < table.names
+        wrapped.add_column(Text(heading.text), no_wrap=no_wrap, overflow="fold", justify=justify)
+    for row in table.rows:
+        wrapped.add_row(*map(_text, row.cells), style=_style(row))
+    return wrapped
 
 
 def width_of(table: Content) -> int:

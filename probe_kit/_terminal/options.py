@@ -8,7 +8,7 @@ do the same for comma-separated values and for the names of a registry.
 from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Self
 
 import typer
 
@@ -184,4 +184,3 @@ AllowMixed = Annotated[
 Force = Annotated[bool, _resuming_option("--force", help="Start even if disk space seems insufficient.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 WholeTable = Annotated[bool, typer.Option("--details", help="Print every column, in several tables if need be.")]
-Format = Annotated[Literal["table", "json", "csv"], typer.Option("--format", help="Format of the printed result.")]

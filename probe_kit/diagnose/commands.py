@@ -2,12 +2,13 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from probe_kit._tables.printing import Format, print_table
 from probe_kit._terminal import options as common
-from probe_kit._terminal.console import counter, err, marked, out, print_json, progress, say
+from probe_kit._terminal.console import counter, err, marked, print_json, progress, say
 from probe_kit._terminal.field_options import command_with
 from probe_kit._terminal.options import further_option
 from probe_kit.diagnose.choices import FRAMES, ITEMS_PER_FRAME
@@ -58,9 +59,6 @@ Base = Annotated[
 ]
 Inside = Annotated[
     bool, further_option("--inside/--no-inside", help="Patch every site, to find where an input is lost.")
-]
-Format = Annotated[
-    Literal["table", "markdown", "json", "csv"], further_option("--format", help="Format of the output.")
 ]
 Html = Annotated[Path | None, typer.Option("--html", help="Also write a page with a figure.")]
 
@@ -215,12 +213,8 @@ def _say_cost(planned: Planned, frames: int, inside: bool, base: bool) -> None:
 
 def _print(diagnosis: "Diagnosis", output_format: str) -> None:
     from probe_kit.diagnose.sentences import diagnosis_table
-    from probe_kit.retention.output import print_text_of
 
-    table = diagnosis_table(diagnosis)
     if output_format == "json":
         print_json(diagnosis.to_json())
-    elif output_format == "table":
-        out.print(table)
     else:
-        print_text_of(table, output_format)
+        print_table(diagnosis_table(diagnosis), output_format)

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from probe_kit._terminal.console import err, marked, out, print_json
+from probe_kit._terminal.console import err, out, print_json
 from probe_kit._terminal.options import AsJson
 from probe_kit.errors import UsageError
 
@@ -61,14 +61,12 @@ def new_adapter(
 
 
 def _print_verification(verification: "Verification") -> None:
-    from rich.table import Table
+    from probe_kit._tables.table import Cell, Table
 
-    colours = {"ok": "green", "over": "red", "not compared": "yellow"}
-    table = Table("output", "max abs error", "tolerance", "", "note", title=f"{verification.family}")
-    for column in table.columns:
-        column.overflow = "fold"
+    rows = []
     for c in verification.comparisons:
-        error = "-" if c.error is None else f"{c.error:.2e}"
-        status = marked(f"[{colours[c.status]}]{{}}[/]", c.status)
-        table.add_row(c.output, error, f"{c.tolerance:.0e}", status, c.note)
-    out.print(table)
+        error = "–" if c.error is None else f"{c.error:.2e}"
+        status = Cell(c.status, alarm=c.status == "over", strong=c.status == "not compared")
+        rows.append((c.output, error, f"{c.tolerance:.0e}", status, c.note))
+    columns = ("output", "max abs error", "tolerance", "", "note")
+    out.print(Table.of(verification.family, columns, rows, overflow="wrap"))

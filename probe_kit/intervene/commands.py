@@ -10,8 +10,9 @@ from rich.console import Console
 from rich.panel import Panel
 from rich.text import Text
 
+from probe_kit._tables.printing import Format, print_table
 from probe_kit._terminal import options as common
-from probe_kit._terminal.console import counter, marked, out, print_json_text, print_text, progress, say, split
+from probe_kit._terminal.console import counter, marked, out, progress, say, split
 from probe_kit._terminal.options import LISTED, Names, choices, further_option, one_of
 from probe_kit._terminal.panelled_help import PanelledHelp
 from probe_kit.errors import UsageError
@@ -196,7 +197,7 @@ def intervene(
     env_options: EnvOptions = None,
     wording: common.Wording = None,
     device: common.Device = "cpu",
-    style: common.Format = "table",
+    style: Format = "table",
     partial: common.Partial = False,
     details: common.WholeTable = False,
 ) -> None:
@@ -281,16 +282,10 @@ def _run(run: "Run", intervention: "Intervention", source: "ReplaySource") -> "I
     return result
 
 
-def print_result(result: "InterventionResult", style: common.Format = "table", details: bool = False) -> None:
+def print_result(result: "InterventionResult", style: str = "table", details: bool = False) -> None:
     """Its table, the notes, and last the finding. details: print every column."""
-    if style == "json":
-        print_json_text(result.to_json())
-    elif style == "csv":
-        print_text(result.to_csv())
-    else:
-        out.print(result.to_rich(details))
-    for note in result.notes:
-        say(marked("[yellow]note:[/] {}", note))
+    # JSON and CSV hold the numbers of all rows, the other formats the table.
+    print_table(result if style in ("json", "csv") else result.to_rich(details), style, result.notes)
     if style == "table":
         for sentence in result.sentences if details else result.findings:
             out.print(sentence)

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from probe_kit._system.counting import counted
-from probe_kit._terminal.console import out, print_json
+from probe_kit._tables.printing import Format, print_table
+from probe_kit._tables.table import Table
+from probe_kit._terminal.console import marked, out, print_json, say
 from probe_kit._terminal.options import AsJson, Partial, RunFolder
-from probe_kit._terminal.plain_text import terminal_safe
 from probe_kit.errors import UsageError
 
 if TYPE_CHECKING:
@@ -18,12 +19,16 @@ if TYPE_CHECKING:
     from probe_kit.runs import Run
 
 
-_COLUMNS = ("run", "model", "suite", "episodes", "correct %", "probes", "interventions")
+_COLUMNS = {
+    name: "correct %" if name == "correct" else name
+    for name in ("run", "model", "suite", "episodes", "correct", "probes", "interventions")
+}
+"""Headings by the name of a fact."""
 
 
 def list_runs(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="A folder that holds runs, at any depth.")],
-    as_json: AsJson = False,
+    style: Format = "table",
 ) -> None:
     """List the runs below a folder: model, suite, episodes, and how many probes and interventions each has.
 
@@ -40,10 +45,10 @@ def list_runs(
             lines.append({"run": name, **_facts(open_run(path, allow_partial=True))})
         except ProbeKitError as error:
             lines.append({"run": name, "error": f"{type(error).__name__}: {error}"})
-    if as_json:
-        print_json(lines)
-        return
-    _print(lines)
+    print_table(_table(lines, folder), style)
+    for line in lines:
+        if "error" in line:
+            say(marked("[yellow]{} cannot be read: {}[/]", line["run"], line["error"]))
 
 
 def _facts(run: "Run") -> dict[str, Any]:
@@ -62,31 +67,14 @@ def _facts(run: "Run") -> dict[str, Any]:
     }
 
 
-def _print(lines: list[dict[str, Any]]) -> None:
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(box=None, pad_edge=False)
-    for column in _COLUMNS:
-        table.add_column(column, overflow="fold", justify="left" if column in _COLUMNS[:3] else "right")
+def _table(lines: list[dict[str, Any]], folder: Path) -> Table:
+    """The runs that can be read, a line each; the numbers name the others too."""
+    rows = []
     for line in lines:
-        if "error" in line:
-            continue
-        correct = "–" if line["correct"] is None else f"{100 * line['correct']:.0f}"
-        cells = (
-            line["run"],
-            line["model"],
-            line["suite"],
-            line["episodes"],
-            correct,
-            line["probes"],
-            line["interventions"],
-        )
-        table.add_row(*(Text(terminal_safe(str(cell))) for cell in cells))
-    out.print(table)
-    for line in lines:
-        if "error" in line:
-            out.print(Text(terminal_safe(f"{line['run']} cannot be read: {line['error']}"), style="yellow"))
+        if "error" not in line:
+            correct = "–" if line["correct"] is None else f"{100 * line['correct']:.0f}"
+            rows.append([correct if name == "correct" else str(line[name]) for name in _COLUMNS])
+    return Table.of(f"runs below {folder}", tuple(_COLUMNS.values()), rows, numbers=tuple(lines), overflow="wrap")
 
 
 def show(

@@ -9,8 +9,6 @@ Section = Literal["success", "rules", "answers", "probes", "retention", "control
 """Groups of tables that `retention --details` shows."""
 Family = Literal["label", "table"]
 """Tests of labels that are corrected together: a stream's sites, or those of every label of the table (Holm)."""
-TableFormat = str
-"""`table`, `json`, `csv` or a format of `probe_kit._tables.formats`."""
 Iterations = Literal["all", "best", "last"] | int
 """Which iterations of the expert, or which action tokens, take part: all, the last one, or one by number.
 

@@ -6,11 +6,10 @@ from typing import TYPE_CHECKING, Annotated, cast, get_args
 
 import typer
 
-from probe_kit._tables import formats
 from probe_kit._terminal.console import split, whole_number
-from probe_kit._terminal.options import Names, choices, one_of, some_of
+from probe_kit._terminal.options import Names, choices, some_of
 from probe_kit.errors import UsageError
-from probe_kit.retention.choices import AnswerScore, Family, Section, TableFormat
+from probe_kit.retention.choices import AnswerScore, Family, Section
 from probe_kit.scene_names import RuleName
 
 if TYPE_CHECKING:
@@ -209,11 +208,6 @@ AsPaper = Annotated[
         help="Print the paper's own numbers by its own formulas: regimes by Δ over episodes alone, retention of "
         "maxima with ε over all categories. No intervals, no controls.",
     ),
-]
-STYLES = ("table", "json", "csv", *formats.names())
-Style = Annotated[
-    TableFormat,
-    typer.Option("--format", parser=one_of(STYLES), metavar=choices(STYLES), help="Format of the result."),
 ]
 Html = Annotated[
     Path | None,

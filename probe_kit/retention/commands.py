@@ -5,15 +5,15 @@ from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, cast
 
+from probe_kit._tables.printing import Format, print_table
 from probe_kit._terminal import options as common
 from probe_kit._terminal.console import err, marked, out, print_text, say, split
 from probe_kit.errors import UsageError
 from probe_kit.retention import command_options as own
-from probe_kit.retention.output import print_text_of, save_all, say_report
+from probe_kit.retention.output import save_all, say_report
 
 if TYPE_CHECKING:
-    from probe_kit._tables.table import Table
-    from probe_kit.retention.choices import Section, TableFormat
+    from probe_kit.retention.choices import Section
     from probe_kit.retention.table import RetentionTable
     from probe_kit.runs.reader import RunReader
 
@@ -50,7 +50,7 @@ def retention(
     with_side_words: own.SideWords = False,
     details: own.Details = own.NO_DETAILS,
     as_paper: own.AsPaper = False,
-    style: own.Style = "table",
+    style: Format = "table",
     html: own.Html = None,
     figures: own.Figures = None,
 ) -> None:
@@ -114,23 +114,13 @@ def retention(
         against=runs_compared if kind in ("run", "groups") else None, target=target or None, family=family,
     )  # fmt: skip
     if as_paper:
-        _print(table.as_paper, style, table.notes)
+        print_table(table.as_paper, style, table.notes)
     elif kind == "steps":
         _show_steps(table, training, style, figures)
     else:
         scored_runs = listed if target else [scored(run, score, with_side_words) for run in listed]
         _write_files(scored_runs, table, figures, html, "all" in details)
         _print_sections(table, style, details)
-
-
-def _print(table: "RetentionTable | Table", style: "TableFormat", notes: Sequence[str]) -> None:
-    """Print a table in a format, and its notes beside it, where a program does not read them."""
-    if style == "table":
-        out.print(table)
-    else:
-        print_text_of(table, style)
-    for note in notes:
-        say(marked("[yellow]note:[/] {}", note))
 
 
 def _write_files(
@@ -153,23 +143,21 @@ def _write_files(
         say_report(written)
 
 
-def _print_sections(table: "RetentionTable", style: "TableFormat", details: Sequence[str]) -> None:
+def _print_sections(table: "RetentionTable", style: str, details: Sequence[str]) -> None:
     """Print the table in a format, with the sections that are asked for where the format has any."""
     sections: Collection[Section] | Literal["all"]
     sections = "all" if "all" in details else cast("tuple[Section, ...]", details)
     if style == "table":
         out.print(table.to_rich(sections))
     elif style in ("json", "csv", "markdown"):  # Markdown has every table
-        _print(table, style, table.notes)
+        print_table(table, style, table.notes)
     else:
         print_text(table.to_latex(sections) if style == "latex" else table.to_text(style, sections))
         for note in table.notes:
             say(marked("[yellow]note:[/] {}", note))
 
 
-def _show_steps(
-    table: "RetentionTable", training: Mapping[str, int], style: "TableFormat", figures: Path | None
-) -> None:
+def _show_steps(table: "RetentionTable", training: Mapping[str, int], style: str, figures: Path | None) -> None:
     """Print the table over training steps, and draw its figure. training: steps by the location of a run."""
     from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
     from probe_kit.retention.displays.training_steps import training_step_figure
@@ -179,7 +167,7 @@ def _show_steps(
     if figures is not None:
         lines = [ProvenanceLine.of_row(mean) for mean in table.means]
         save_all([training_step_figure(by_step, lines)], figures)
-    _print(by_step, style, (*table.unpaired, *table.notes))
+    print_table(by_step, style, (*table.unpaired, *table.notes))
 
 
 def _check_only(values: Mapping[str, object], allowed: Collection[str], option: str, table: str) -> None:

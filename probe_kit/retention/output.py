@@ -1,23 +1,14 @@
-"""The output of retention commands: a table in a format, figures in a folder, and where a report is."""
+"""The output of retention commands beside tables: figures in a folder, and where a report is."""
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from probe_kit._system.counting import counted
-from probe_kit._terminal.console import print_json_text, print_text, say
+from probe_kit._terminal.console import say
 
 if TYPE_CHECKING:
     from probe_kit.retention.displays.base.report_figure import ReportFigure
-
-
-def print_text_of(table: Any, style: str) -> None:
-    """Print a table as JSON, as CSV or in a format of text."""
-    if style == "json":
-        print_json_text(table.to_json())
-    else:
-        formats = {"csv": table.to_csv, "markdown": table.to_markdown, "latex": table.to_latex}
-        print_text(formats[style]() if style in formats else table.to_text(style))
 
 
 def save_all(exhibits: "Sequence[ReportFigure]", folder: Path, details: bool = False) -> None:

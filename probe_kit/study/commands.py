@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from probe_kit._system.counting import counted
-from probe_kit._tables import formats
+from probe_kit._tables.printing import Format, print_table
 from probe_kit._terminal.console import counter, err, marked, out, print_json, print_text, progress, say
 from probe_kit._terminal.options import (
     AsJson,
@@ -15,8 +15,6 @@ from probe_kit._terminal.options import (
     Partial,
     RayAddress,
     check_no_others,
-    choices,
-    one_of,
     speed_option,
 )
 from probe_kit.errors import UsageError
@@ -47,7 +45,6 @@ File = Annotated[
 Only = Annotated[
     str | None, typer.Option("--only", metavar="NAME", help="Take the runs of this block or this model only.")
 ]
-STYLES = ("table", "json", "csv", *formats.names())
 
 
 @app.command("run")
@@ -135,21 +132,19 @@ def run(
 
 def _print(plan: "StudyPlan", as_json: bool) -> None:
     """Print a line per run with its state, then what all of them take."""
-    from rich.table import Table
+    from probe_kit._tables.table import Table
 
     if as_json:
         print_json(plan.to_json())
         return
     columns = ("model", "run", "blocks", "episodes", "inferences", "state")
-    rows = Table(*columns, title=f"study {plan.study.study.name}", box=None)
-    for column in rows.columns[3:5]:
-        column.justify = "right"
+    rows = []
     for planned in plan.cells:
         cell = planned.cell
         inferences = "–" if cell.asks else f"{cell.inferences:,}"
         texts = (cell.model, planned.run_text, ", ".join(cell.selections), f"{cell.episodes:,}", inferences)
-        rows.add_row(*(marked("{}", text) for text in (*texts, planned.words)))
-    out.print(rows)
+        rows.append((*texts, planned.words))
+    out.print(Table.of(f"study {plan.study.study.name}", columns, rows, overflow="wrap"))
     for line in plan.lines():
         _print_plain(line)
 
@@ -226,10 +221,7 @@ def table(
     name: Annotated[
         str | None, typer.Argument(metavar="[NAME]", help="Table of the file; all of them by default.")
     ] = None,
-    style: Annotated[
-        str,
-        typer.Option("--format", parser=one_of(STYLES), metavar=choices(STYLES), help="Output format."),
-    ] = "table",
+    style: Format = "table",
     html: Annotated[
         Path | None,
         typer.Option("--html", metavar="FILE", help="Write state, all tables and all figures as one HTML file."),
@@ -275,14 +267,11 @@ def _print_tables(tables: "dict[str, NamedTable]", style: str, single: bool) -> 
     if style == "json":
         records = {name: table_json(printed) for name, printed in tables.items()}
         print_json(next(iter(records.values())) if single else records)
-    elif style == "csv":
-        for printed in tables.values():
-            print_text(printed.to_csv().rstrip("\n"))
-    elif style == "table":
-        for printed in tables.values():
-            out.print(printed)
-    else:
-        print_text("\n\n".join(printed.to_text(style).rstrip("\n") for printed in tables.values()))
+        return
+    for at, printed in enumerate(tables.values()):
+        if at and style not in ("table", "csv"):
+            print_text("")
+        print_table(printed, style)
 
 
 def _write_report(study: "LoadedStudy", html: Path, partial: bool) -> None:

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from probe_kit._system.counting import counted
+from probe_kit._tables.printing import Format, print_table
+from probe_kit._tables.table import Table
 from probe_kit._terminal import options as common
 from probe_kit._terminal.console import marked, out, say
 from probe_kit.errors import ProbeKitError, UsageError
@@ -18,21 +20,25 @@ if TYPE_CHECKING:
     from probe_kit.train.columns.builtin import BuiltinColumn
 
 
-def targets(run: common.RunFolder, wording: common.Wording = None, partial: common.Partial = False) -> None:
+def targets(
+    run: common.RunFolder,
+    wording: common.Wording = None,
+    style: Format = "table",
+    partial: common.Partial = False,
+) -> None:
     """List what can be probed in a run: sides and built-in columns, with their classes or range.
 
     Decode one with `probe-kit train RUN --target NAME`. Tables of your own give further ones, see `probe-kit
     labels`.
     """
-    from rich.table import Table
-    from rich.text import Text
-
     opened = _open(run, partial, wording)
-    table, every = Table("target", "task", "per", "values"), list(listed_targets(opened))
+    every, columns = list(listed_targets(opened)), ("target", "task", "per", "values")
     listed = [row for row in every if row[1] != CONSTANT]
-    for row in listed:
-        table.add_row(*map(Text, row))
-    out.print(table)
+    numbers = [dict(zip(columns, row, strict=True)) for row in every]
+    print_table(
+        Table.of(f"{opened.label}: what can be decoded", columns, listed, numbers=tuple(numbers), overflow="wrap"),
+        style,
+    )
     if constant := [name for name, task, *_ in every if task == CONSTANT]:
         say(marked("one value only, so that there is nothing to decode: {}", ", ".join(constant)))
     # Those that need no further option come first, and what is not possible is never the next step.

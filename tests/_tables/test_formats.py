@@ -281,3 +281,14 @@ def test_a_mark_that_no_cell_has_is_not_explained() -> None:
         legend = ["*: by construction", "net rate: flips"]
         table = Table.of("Edits", ("edit", "net rate"), [("a", cell)], notes=legend)
         assert table.sentences == (*notes, "Net rate: flips.")
+
+
+def test_a_table_of_words_wraps_its_texts_and_neither_names_nor_numbers() -> None:
+    rows = [("a.long.name.of.a.target", "120,000", "48 words " * 12), ("short", "7", "none")]
+    table = Table.of("words", ("target", "count", "values"), rows, overflow="wrap")
+    file = io.StringIO()
+    Console(file=file, width=60).print(table)
+    lines = file.getvalue().splitlines()
+    assert max(map(len, lines)) <= 60
+    assert any(line.startswith("a.long.name.of.a.target  120,000") for line in lines)
+    assert file.getvalue().count("words") == 1 + 12

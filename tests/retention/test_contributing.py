@@ -84,7 +84,7 @@ def test_a_format_is_one_file(use: Callable[[str, str], str]) -> None:
     code = """
 from probe_kit._tables import formats
 print(formats.names(), table.to_text("dokuwiki", "all"))
-from probe_kit.retention.command_options import Style
+from probe_kit._tables.printing import Format
 """
     printed = use("To add a format of tables", code)
     assert "('dokuwiki', 'latex', 'markdown')" in printed

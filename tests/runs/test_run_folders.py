@@ -37,14 +37,15 @@ def test_a_folder_without_a_run_is_refused(folder: Path) -> None:
 def test_the_list_names_every_run_and_the_one_that_cannot_be_read(folder: Path) -> None:
     (folder / "broken").mkdir()
     (folder / "broken" / "run.json").write_text("{", encoding="utf-8")
-    done = CliRunner().invoke(app, ["run", "list", str(folder), "--json"])
+    done = CliRunner().invoke(app, ["run", "list", str(folder), "--format", "json"])
     assert done.exit_code == 0, done.output
     lines = json.loads(done.stdout)
     assert [line["run"] for line in lines] == ["b", "broken", "deep/a"]
     assert "error" in lines[1]
     assert lines[0]["episodes"] == lines[2]["episodes"] > 0
-    printed = CliRunner().invoke(app, ["run", "list", str(folder)]).stdout
-    assert "broken cannot be read" in printed
+    printed = CliRunner().invoke(app, ["run", "list", str(folder)])
+    assert "deep/a" in printed.stdout
+    assert "broken cannot be read" in printed.stderr
 
 
 def test_the_viewer_opens_all_runs_of_a_folder(folder: Path) -> None:

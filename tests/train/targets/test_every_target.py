@@ -192,7 +192,7 @@ def test_a_label_of_whole_episodes_is_decoded_from_each_captured_inference(store
 def test_the_command_lists_every_target_with_its_values_or_the_reason_why_not(stored: Run) -> None:
     done = CliRunner().invoke(app, ["targets", str(stored.path)], env={"COLUMNS": "250"})
     assert done.exit_code == 0, done.output
-    lines = {line.split("│")[1].strip(): line for line in done.stdout.splitlines() if line.startswith("│")}
+    lines = {line.split()[0]: line for line in done.stdout.splitlines() if line.strip()}
     assert {"side.correct", "side.chosen", "sim.tool_y", "item.category"} <= set(lines)
     counts = stored.episodes["side_correct"].value_counts()
     assert f"2 classes: right {counts['right']}, left {counts['left']}" in lines["side.correct"]

@@ -1,0 +1,28 @@
+"""The option `--format` of commands that print a table, and the table in each of its formats."""
+
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+import typer
+
+from probe_kit._tables import formats
+from probe_kit._terminal.console import marked, out, print_json_text, print_text, say
+from probe_kit._terminal.options import choices, one_of
+
+STYLES = ("table", "json", "csv", *formats.names())
+Format = Annotated[
+    str, typer.Option("--format", parser=one_of(STYLES), metavar=choices(STYLES), help="Format of the result.")
+]
+
+
+def print_table(table: Any, style: str, notes: Sequence[str] = ()) -> None:
+    """Print a table, or what has its methods, on stdout in a format of `STYLES`. notes: for people, on stderr."""
+    if style == "table":
+        out.print(table)
+    elif style == "json":
+        print_json_text(table.to_json())
+    else:
+        written = {"csv": table.to_csv, "markdown": table.to_markdown, "latex": table.to_latex}
+        print_text((written[style]() if style in written else table.to_text(style)).rstrip("\n"))
+    for note in notes:
+        say(marked("[yellow]note:[/] {}", note))
