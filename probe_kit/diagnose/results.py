@@ -114,10 +114,10 @@ class InputDiagnosis:
     @property
     def where(self) -> str:
         """The place of the loss, or the sites that carry it; the note where nothing was measured inside."""
-        return describe_passage(self.passage, self.matters) or self.note
+        return describe_passage(self.passage, self.verdict) or self.note
 
 
-def describe_passage(passage: Sequence[SitePassage], matters: bool | None) -> str:
+def describe_passage(passage: Sequence[SitePassage], verdict: Verdict) -> str:
     """Return where the input is lost, or which sites carry it, as a sentence without its stop; else empty."""
     if not passage:
         return ""
@@ -127,15 +127,16 @@ def describe_passage(passage: Sequence[SitePassage], matters: bool | None) -> st
     if passage[-1] is not reached[-1]:
         following = passage[passage.index(reached[-1]) + 1]
         return f"the difference ends behind {reached[-1].name}; {following.name} is bit-equal"
-    if matters:
+    if verdict in MATTERS:
         carriers = [site for site in passage if site.carried >= CARRIES]
         spans = [_span([site for site in carriers if site.stream == stream]) for stream in _streams(carriers)]
         return f"carried by {', '.join(spans)}" if spans else "no site alone carries half of it"
     strongest = max(passage, key=lambda site: site.difference)
     last = passage[-1]
+    loss = ": the loss is in the action part itself" if verdict == "no effect" else ""
     return (
         f"it is strongest at {strongest.name} (relative difference {strongest.difference:.2g}) and reaches "
-        f"{last.name} ({last.difference:.2g}): the loss is in the action part itself"
+        f"{last.name} ({last.difference:.2g}){loss}"
     )
 
 

@@ -58,7 +58,7 @@ def _facts(run: "Run") -> dict[str, Any]:
     outcomes = run.episodes.get("outcome")
     judged = outcomes is not None and len(outcomes) > 0 and set(outcomes) <= {"correct", "wrong", "oob"}
     return {
-        "model": run.label,
+        "model": run.label + " (random weights)" * run.random_weights,
         "suite": run.suite,
         "episodes": len(run.episodes),
         "correct": float((outcomes == "correct").mean()) if judged and outcomes is not None else None,
@@ -73,7 +73,9 @@ def _table(lines: list[dict[str, Any]], folder: Path) -> Table:
     for line in lines:
         if "error" not in line:
             correct = "–" if line["correct"] is None else f"{100 * line['correct']:.0f}"
-            rows.append([correct if name == "correct" else str(line[name]) for name in _COLUMNS])
+            # Hashes stay in the numbers: they would take the room of names.
+            texts = {**line, "correct": correct, "suite": line["suite"].partition("#")[0]}
+            rows.append([str(texts[name]) for name in _COLUMNS])
     return Table.of(f"runs below {folder}", tuple(_COLUMNS.values()), rows, numbers=tuple(lines), overflow="wrap")
 
 

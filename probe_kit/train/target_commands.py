@@ -1,6 +1,7 @@
 """`probe-kit targets` and `probe-kit labels`: what can be probed in a run, and a table to add to."""
 
 from collections.abc import Iterator
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -34,20 +35,25 @@ def targets(
     opened = _open(run, partial, wording)
     every, columns = list(listed_targets(opened)), ("target", "task", "per", "values")
     listed = [row for row in every if row[1] != CONSTANT]
-    numbers = [dict(zip(columns, row, strict=True)) for row in every]
+    numbers = [dict(zip((*columns, "too_few_groups"), row, strict=True)) for row in every]
+    rows = [(*cells[:-1], "; ".join(filter(None, (cells[-1], few)))) for *cells, few in listed]
     print_table(
-        Table.of(f"{opened.label}: what can be decoded", columns, listed, numbers=tuple(numbers), overflow="wrap"),
+        Table.of(f"{opened.label}: what can be decoded", columns, rows, numbers=tuple(numbers), overflow="wrap"),
         style,
     )
     if constant := [name for name, task, *_ in every if task == CONSTANT]:
         say(marked("one value only, so that there is nothing to decode: {}", ", ".join(constant)))
     # Those that need no further option come first, and what is not possible is never the next step.
-    possible = sorted((row for row in listed if row[1] != "–"), key=lambda row: row[1] == DOUBTFUL)
+    possible = sorted(
+        (row for row in listed if row[1] == DOUBTFUL or (row[1] != "–" and not row[-1])),
+        key=lambda row: row[1] == DOUBTFUL,
+    )
     if not possible:
         say(marked("next: [bold]probe-kit labels {}[/] writes a table to which you add labels of your own", run))
         return
-    name, task, *_ = possible[0]
-    options = "" if name == CORRECT else f" --target {name}{' --task classes' * (task == DOUBTFUL)}"
+    name, task, *_, few = possible[0]
+    as_task = f" --task {'continuous' if few else 'classes'}" * (task == DOUBTFUL)
+    options = "" if name == CORRECT else f" --target {name}{as_task}"
     say(marked("next: [bold]probe-kit train {}{}[/]", run, options))
 
 
@@ -65,10 +71,10 @@ def _names(run: "RunReader") -> list[str]:
     return [*(prefix_of(run) + name for name in recorded_columns(run)), *outcome_column(run)]
 
 
-def listed_targets(run: "RunReader") -> Iterator[tuple[str, str, str, str]]:
-    """Yield name, task, `episode` or `inference`, and classes with counts or range of every target of a run.
+def listed_targets(run: "RunReader") -> Iterator[tuple[str, str, str, str, str]]:
+    """Yield name, task, `episode` or `inference`, classes or range, and groups that are too few, of every target.
 
-    One that the run cannot give has the reason in the last place, one of a single value the task `CONSTANT`.
+    One that the run cannot give has the reason in place of the classes, one of a single value the task `CONSTANT`.
     """
     from probe_kit.train.columns.builtin import builtin_column
     from probe_kit.train.target import Target
@@ -78,14 +84,31 @@ def listed_targets(run: "RunReader") -> Iterator[tuple[str, str, str, str]]:
             if name in SIDES:
                 target, task = Target.of_run(run, name), "binary"
             elif (column := builtin_column(run, name)).is_constant:
-                yield name, CONSTANT, "–", "–"
+                yield name, CONSTANT, "–", "–", ""
                 continue
             else:
                 target, task = _target_and_task(name, column)
         except ProbeKitError as error:
-            yield name, "–", "–", str(error)
+            yield name, "–", "–", str(error), ""
         else:
-            yield name, task, "inference" if target.per_step else "episode", target.values_in_words
+            per, few = "inference" if target.per_step else "episode", _too_few_groups(run, target)
+            yield name, task, per, target.values_in_words, few
+
+
+def _too_few_groups(run: "RunReader", target: "Target") -> str:
+    """Return the groups of the rarest class, where `train` refuses a target with so few; empty for others."""
+    from probe_kit.statistics.sufficiency import GROUPS_FOR_PROBES
+
+    group_of = dict(zip(run.episodes["episode_id"].astype(str), run.episodes["group_id"], strict=True))
+    groups: dict[float, set[str]] = {}
+    for episode, value in zip(target.episodes, target.coded.values, strict=True):
+        if isfinite(value) and episode in group_of:
+            groups.setdefault(value if target.coded.classes else 0.0, set()).add(str(group_of[episode]))
+    rarest = min(groups, key=lambda value: len(groups[value]), default=None)
+    if rarest is None or len(groups[rarest]) >= GROUPS_FOR_PROBES:
+        return ""
+    subject = f"{target.coded.classes[int(rarest)]} in " if target.coded.classes else ""
+    return f"{subject}{counted(len(groups[rarest]), 'group')}, {GROUPS_FOR_PROBES} needed"
 
 
 def _target_and_task(name: str, column: "BuiltinColumn") -> "tuple[Target, str]":

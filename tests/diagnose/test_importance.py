@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from probe_kit.diagnose.importance import Exchanges, importance_of
 from probe_kit.diagnose.inputs import PICTURE, STATE
 from probe_kit.diagnose.measure import InputExchange, count_inferences
-from probe_kit.diagnose.results import exit_code
+from probe_kit.diagnose.results import SitePassage, Verdict, describe_passage, exit_code
 from probe_kit.errors import InstructionError, UsageError
 from probe_kit.extract.sources.donors import Frame
 from probe_kit.hooks.contract.observation import Observation
@@ -286,3 +286,13 @@ def test_a_tokenizer_of_one_spelling_is_given_another_control_and_without_any_on
     (moves,) = InputExchange(knowing(other_spelling, [0.5, 1.0, 0.0]), frames()).measure(["instruction"])
     assert moves.verdict == "open"
     assert "--paraphrases" in moves.reason
+
+
+@pytest.mark.parametrize(("verdict", "is_loss"), [("no effect", True), ("open", False)])
+def test_a_loss_is_named_where_the_input_is_shown_to_have_no_effect_and_not_where_that_is_open(
+    verdict: Verdict, is_loss: bool
+) -> None:
+    passage = [SitePassage("backbone.00", 0.8, 0.0), SitePassage("expert.03", 0.2, 0.0)]
+    text = describe_passage(passage, verdict)
+    assert text.startswith("it is strongest at backbone.00 (relative difference 0.8) and reaches expert.03")
+    assert ("the loss is in the action part" in text) == is_loss

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 import probe_kit as pk
 from probe_kit.cli import app
 from probe_kit.diagnose.diagnosis import diagnose_run
-from probe_kit.errors import ProbeKitError, RecordingError, UsageError
+from probe_kit.errors import ProbeKitError, RecordingError, TooFewGroupsError, UsageError
 from probe_kit.extract import ExtractSettings, PictureFolder, extract_run, prepare
 from probe_kit.extract.rollout.worker import torch_threads
 from probe_kit.extract.sources.pictures import PictureSource
@@ -229,9 +229,24 @@ def test_the_next_step_is_a_target_that_can_be_probed_and_one_of_few_integers_ha
     counted = extract_run(settings, tmp_path / "run")
     for where, options in (
         (run.location, "--target dataset.red"),
-        (counted.location, "--target dataset.objects --task classes"),
+        (counted.location, "--target dataset.objects --task continuous"),
     ):
         listed = CliRunner().invoke(app, ["targets", str(where)])
         assert f"next: probe-kit train {where} {options}\n" in listed.stderr.replace("\n ", " "), listed.stderr
     with pytest.raises(UsageError, match=r"shows pictures .* `probe-kit targets "):
         pk.train_probes(counted)
+
+
+def test_a_target_that_train_would_refuse_is_no_next_step(folder: Path, tmp_path: Path) -> None:
+    lines = (folder / "table.csv").read_text(encoding="utf-8").splitlines()
+    rare = [
+        f"{line.rsplit(',', 3)[0]},{'rare' if number < 3 else 'often'}" for number, line in enumerate(lines[1:])
+    ]
+    (tmp_path / "rare.csv").write_text("\n".join(["picture,instruction,kind", *rare]), encoding="utf-8")
+    settings = ExtractSettings("pi0-tiny", source=PictureFolder(folder, tmp_path / "rare.csv"), env_workers=0)
+    few = extract_run(settings, tmp_path / "run")
+    listed = CliRunner().invoke(app, ["targets", str(few.location)])
+    assert "rare in 3 groups, 5 needed" in " ".join(listed.stdout.replace("│", " ").split())
+    assert "next: probe-kit labels" in listed.stderr.replace("\n", " ")
+    with pytest.raises(TooFewGroupsError, match="is in 3 of 12 groups"):
+        pk.train_probes(few, target=pk.Target.of_run(few, "dataset.kind"))

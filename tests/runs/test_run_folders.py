@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from probe_kit._terminal import console
 from probe_kit.cli import app
 from probe_kit.errors import UsageError
 from probe_kit.runs.run_folders import find_runs, runs_in
@@ -46,6 +47,14 @@ def test_the_list_names_every_run_and_the_one_that_cannot_be_read(folder: Path) 
     printed = CliRunner().invoke(app, ["run", "list", str(folder)])
     assert "deep/a" in printed.stdout
     assert "broken cannot be read" in printed.stderr
+
+
+def test_names_of_runs_can_be_copied_from_a_narrow_terminal(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    name = "light/base/plain-0123456789"
+    (folder / name).parent.mkdir(parents=True)
+    (folder / "b").rename(folder / name)
+    monkeypatch.setattr(console.out, "_width", 60)
+    assert name in CliRunner().invoke(app, ["run", "list", str(folder)]).stdout
 
 
 def test_the_viewer_opens_all_runs_of_a_folder(folder: Path) -> None:
