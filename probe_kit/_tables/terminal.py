@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 GAP = 2
 """Blanks between columns."""
+LEAST_TEXT = 12
+"""Columns of a console that a text is broken into at least."""
 _INDENT = "  "
 """Of a row's name below that of its section."""
 
@@ -28,11 +30,25 @@ def lines(table: Content, width: int) -> "Iterator[RenderableType]":
     elif table.overflow == "fold" and width_of(table) > width:
         table = _folded(table)
     yield Text(table.title, style="italic")
-    yield from [_wrapped(table)] if table.overflow == "wrap" else _tables(table, width)
+    yield from [_wrapped(table)] if table.overflow == "wrap" and _can_wrap(table, width) else _tables(table, width)
     notes = [*table.sentences, *[f"With --details or more room: {', '.join(left_out)}."] * bool(left_out)]
     if notes:
         yield Text(" ".join(notes), style="dim")
     yield Text()
+
+
+def _is_unbroken(table: Content, at: int) -> bool:
+    """Return whether the texts of a column are names or numbers, which are never broken."""
+    has_letters = any(map(str.isalpha, "".join(text[at] for text in table.texts)))
+    return at < table.names or (table.are_numeric[at] and not has_letters)
+
+
+def _can_wrap(table: Content, width: int) -> bool:
+    """Return whether texts have room beside names and numbers, which rich would cut off without a sign."""
+    needed = _column_widths(table)
+    unbroken = [_is_unbroken(table, at) for at in range(len(needed))]
+    least = (full if keep else min(full, GAP + LEAST_TEXT) for full, keep in zip(needed, unbroken, strict=True))
+    return sum(least) - GAP <= width
 
 
 def _wrapped(table: Content) -> "RichTable":
@@ -43,10 +59,9 @@ def _wrapped(table: Content) -> "RichTable":
 
     wrapped = RichTable(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), show_edge=False)
     for at, heading in enumerate(table.headings):
-        is_number = table.are_numeric[at] and not any(map(str.isalpha, "".join(text[at] for text in table.texts)))
-        justify: Literal["left", "right"] = "right" if is_number else "left"
-        no_wrap = is_number or at < table.names
-        wrapped.add_column(Text(heading.text), no_wrap=no_wrap, overflow="fold", justify=justify)
+        unbroken = _is_unbroken(table, at)
+        justify: Literal["left", "right"] = "right" if unbroken and at >= table.names else "left"
+        wrapped.add_column(Text(heading.text), no_wrap=unbroken, overflow="fold", justify=justify)
     for row in table.rows:
         wrapped.add_row(*map(_text, row.cells), style=_style(row))
     return wrapped
