@@ -177,6 +177,18 @@ def test_the_viewer_shows_a_pictures_run_with_its_attention_over_each_picture(
     assert attention_on_picture(copy).axes
 
 
+def test_the_viewer_names_a_picture_and_says_its_labels_in_words(run: pk.Run) -> None:
+    catalogue = Catalogue([run])
+    _, episodes = read_payload(catalogue.script("run/episodes"))
+    assert [episodes["item"]["words"][code] for code in episodes["item"]["codes"]][3] == "3.png"
+    _, episode = read_payload(catalogue.script("run/e/00003"))
+    assert episode["words"] == {"picture": "3.png", "side": "left"}
+    (columns,) = (group for group in episode["inputs"] if group["title"] == "columns")
+    assert [series["name"] for series in columns["series"]] == ["red"], "a text is no chart"
+    _, last = read_payload(catalogue.script(f"run/e/{COUNT - 1:05d}"))
+    assert last["words"] == {"picture": f"{COUNT - 1}.png"}, "an empty cell is no label"
+
+
 def test_a_picture_that_changes_after_the_plan_is_not_shown(
     folder: Path, pi0_tiny: Policy, tmp_path: Path
 ) -> None:

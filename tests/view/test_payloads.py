@@ -320,7 +320,7 @@ def test_a_model_that_was_asked_is_shown_with_question_and_answers_in_words(
         said = {**asked, **outcomes, **sides, **measured, **marks}
         writer.write(replace(record, outcome={**record.outcome, **said}))
     catalogue = Catalogue([open_run(tmp_path / "run", allow_partial=True)])
-    assert payload(catalogue, "run/e/00000")["answers"] == {
+    assert payload(catalogue, "run/e/00000")["words"] == {
         "question": asked["question"], "text": "Neither <b>", "option read": "none", "parsing rule": "none",
         "outcome, text": "unread", "outcome, logits": "correct", "outcome, order-balanced": "wrong",
     }  # fmt: skip

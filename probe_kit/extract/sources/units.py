@@ -40,9 +40,12 @@ def check_units(
     """
     if accepted or not (shares > MOST_UNUSUAL).any():
         return
-    worst = ", ".join(f"{names[number]} {shares[number]:.0%}" for number in np.flatnonzero(shares > MOST_UNUSUAL))
+    worst = ", ".join(
+        f"{'number ' * names[at].isdecimal()}{names[at]} in {shares[at]:.0%}"
+        for at in np.flatnonzero(shares > MOST_UNUSUAL)
+    )
     raise UnitsError(
-        f"{where}: of the states many values lie outside the statistics of {policy.card.checkpoint} ({worst}); "
+        f"{where}: many states lie outside the statistics of {policy.card.checkpoint} ({worst}); "
         f"expected at most {MOST_UNUSUAL:.0%} of each number. The units or the robot differ: take a checkpoint "
         "that was trained on such states, or accept it with --accept-units"
     )

@@ -177,7 +177,7 @@ def _findings(results: ProbeResults, rows: "Sequence[pd.Series]") -> Iterator[st
         elif missed:
             open_.setdefault(f"not shown in {{}} beyond {enumerated(missed)}", []).append(stream)
         else:
-            decodable.append(f"{stream}, {score}" if len(decodable) < 2 else stream)
+            decodable.append(f"{stream} at {score}" if len(decodable) < 2 else stream)
     if decodable:
         yield f"decodable in {enumerated(decodable)}"
     for words, streams in open_.items():

@@ -173,7 +173,7 @@ function Episode({ run, one, place, near }) {
       ${map && episode.log_odds && html`<${NetworkNow} run=${run} one=${one} episode=${episode} map=${map} now=${now} place=${place} />`}</div>
     ${episode.trajectory ? html`<${Charts} run=${run} one=${one} episode=${episode} map=${map} now=${now} last=${last} step=${step} place=${place} />`
       : episode.inputs.length ? html`<${Inputs} episode=${episode} now=${now} last=${last} step=${step} />` : html`<p class="empty">${run.answers ? "The model was asked and did not act: nothing moves." : "This run keeps no trajectories: it was made before they were stored, or its model did not act."}</p>`}
-    ${Object.keys(episode.answers).length > 0 && html`<dl class="readout answers">${Object.entries(episode.answers).map(([name, value]) => html`<dt>${name}</dt><dd><${Text}>${value}<//></dd>`)}</dl>`}
+    ${Object.keys(episode.words).length > 0 && html`<dl class="readout answers">${Object.entries(episode.words).map(([name, value]) => html`<dt>${name}</dt><dd><${Text}>${value}<//></dd>`)}</dl>`}
   </article>`;
 }
 /* An instruction; words at its end that did not reach the network are struck out. */

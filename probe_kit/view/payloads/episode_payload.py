@@ -56,7 +56,7 @@ def episode_payload(viewed: ViewedRun, number: int) -> dict[str, Any]:
         "outcomes": {} if trajectory is None else _outcomes(viewed, trajectory, row),
         "lost_words": _lost_words(row),
         "instruction_tokens": len(run.instruction_ids(position) or ()),
-        "answers": _answers(viewed, row),
+        "words": _answers(viewed, row) | _label_words(viewed, row, position),
         "inputs": _inputs(viewed, position),
         "attention": _attention(viewed, row, position, 1 if frames is None else frames.cameras),
     }
@@ -66,6 +66,16 @@ def _answers(viewed: ViewedRun, row: dict[str, Any]) -> dict[str, str]:
     """Return by heading the question to a VLM and its answer; none of a policy."""
     answers = {heading: row.get(column) for heading, column in _ANSWERS.items()} if viewed.answers else {}
     return {heading: str(viewed.outcome_word(value)) for heading, value in answers.items() if value is not None}
+
+
+def _label_words(viewed: ViewedRun, row: dict[str, Any], position: int) -> dict[str, str]:
+    """Return the file of a picture and its labels that are texts, by their names; none of other runs."""
+    inputs = viewed.run.inputs
+    if inputs is None or not inputs.classes:
+        return {}
+    first = dict(zip(inputs.columns, inputs.row("columns", position)[0], strict=True))
+    texts = {name: texts[int(first[name])] for name, texts in inputs.classes.items() if first[name] == first[name]}
+    return {name: str(row[name]) for name in ("picture",) if name in row} | texts
 
 
 def _lost_words(row: dict[str, Any]) -> int:
@@ -138,10 +148,10 @@ def _inputs(viewed: ViewedRun, position: int) -> list[dict[str, Any]]:
     if "state" in rows:
         groups.append(("state", {"state": rows["state"]}, inputs.names.get("state", ())))
     if "columns" in rows:
-        # A text is stored as a position among the texts, which makes no chart.
+        # A text is stored as a position among the texts, which makes no chart; see `_label_words`.
         numbers = [at for at, name in enumerate(inputs.columns) if name not in inputs.classes]
         names = tuple(inputs.columns[at] for at in numbers)
-        groups.append(("columns", {"value": rows["columns"][:, numbers]}, names))
+        groups += [("columns", {"value": rows["columns"][:, numbers]}, names)] * bool(numbers)
     return [{"title": title, "series": _series(lines, names)} for title, lines, names in groups if lines and count]
 
 

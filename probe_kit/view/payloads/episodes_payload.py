@@ -34,13 +34,14 @@ def episodes_payload(viewed: ViewedRun) -> dict[str, Any]:
     else 0; None without any. `seeds`: equal where scene and policy seed are equal, by which runs are paired.
     """
     episodes = viewed.run.episodes
+    words = _WORDS | ({"item": "picture"} if "picture" in episodes else {})
     none, zeros = [None] * len(episodes), [0] * len(episodes)
     return {
         "number": [int(number) for number in episodes["episode"]],
         "id": [str(name) for name in episodes["episode_id"]],
         **{
             name: code_words([_word(value) for value in episodes[column]] if column in episodes else none)
-            for name, column in _WORDS.items()
+            for name, column in words.items()
         },
         "outcome": code_words([viewed.outcome_word(_word(value)) for value in episodes["outcome"]]),
         "steps": [None if value is None else int(value) for value in episodes.get("steps", none)],
