@@ -91,13 +91,12 @@ def activations_have_the_shape_of_their_stream(subject: Subject) -> None:
     "Tap `attention` and `mlp` where they are added, or declare the stream with sums=False.",
 )
 def what_blocks_add_makes_the_next_residual(subject: Subject) -> None:
-    """Compare the sum in every stream that declares all three quantities."""
+    """Compare the sum in every stream that declares all three quantities, those of vision towers too."""
     subject.require_float32()
     observations, roles = subject.batch, subject.roles_of(subject.batch)
+    streams = {**subject.model.streams, **subject.model.further_streams}
     summing = {
-        name: stream
-        for name, stream in subject.model.streams.items()
-        if stream.sums and set(_SUM) <= set(stream.quantities)
+        name: stream for name, stream in streams.items() if stream.sums and set(_SUM) <= set(stream.quantities)
     }
     sites = [site for stream in summing.values() for quantity in _SUM for site in stream.sites(quantity)]
     if not sites:
@@ -105,7 +104,8 @@ def what_blocks_add_makes_the_next_residual(subject: Subject) -> None:
     with capture(subject.model, sites) as tape:
         subject.run(observations)
     for name, stream in summing.items():
-        valid = torch.from_numpy(np.stack([row.valid for row in roles[name]]))
+        # A tower has no roles: all of its positions are of pictures.
+        valid = torch.from_numpy(np.stack([row.valid for row in roles[name]])) if name in roles else ...
         for site in stream.sites("attention"):
             parts = [tape[replace(site, quantity=quantity)].double().cpu() for quantity in _SUM]
             following = tape[replace(site, layer=site.layer + 1, quantity="residual")].double().cpu()

@@ -7,13 +7,9 @@ Capture and actions are in its adapter in `probe_kit.hooks`.
 from probe_kit.models.magma.config import MagmaConfig, VisionConfig, shipped_statistics
 from probe_kit.models.magma.network import (
     UNUSED_WEIGHTS,
-    Choose,
-    Decoded,
-    Decoding,
     MagmaNetwork,
     build_magma,
     full_size_magma,
-    greedy,
 )
 from probe_kit.models.magma.packing import PictureSpan
 from probe_kit.models.magma.pictures import (
@@ -29,9 +25,6 @@ from probe_kit.models.magma.prompt import ACTION_QUESTION, Message, chat_text, c
 __all__ = [
     "ACTION_QUESTION",
     "UNUSED_WEIGHTS",
-    "Choose",
-    "Decoded",
-    "Decoding",
     "Grid",
     "MagmaConfig",
     "MagmaNetwork",
@@ -45,7 +38,6 @@ __all__ = [
     "choose_grid",
     "conversation",
     "full_size_magma",
-    "greedy",
     "picture_question",
     "prepare_picture",
     "shipped_statistics",

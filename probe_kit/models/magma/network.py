@@ -3,23 +3,21 @@
 B batch, S positions, D width of the language model, V its vocabulary.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from typing import Any
 
 import torch
-from torch import Tensor, nn
-from transformers import DynamicCache, LlamaForCausalLM
+from torch import Tensor
+from transformers import LlamaForCausalLM
 
 from probe_kit.models.building import build_empty
+from probe_kit.models.decoding import Choose, Decoded, TokenNetwork, fill_decoder_rotary, greedy
 from probe_kit.models.magma.config import MagmaConfig
-from probe_kit.models.magma.packing import Packed, PictureSpan, needed, placeholder, positions
+from probe_kit.models.magma.packing import PictureSpan, placeholder
 from probe_kit.models.magma.pictures import Grid, Picture
 from probe_kit.models.magma.vision import Projector, VisionTower, map_size, stitched, whole_picture
+from probe_kit.models.packing import packed
 from probe_kit.models.prompt_kv import PromptKV
-
-Choose = Callable[[Tensor], Tensor]
-"""Ids (B,) from logits (B, V)."""
 
 # In the released files and never read: the contrastive head that the trunk was trained with.
 UNUSED_WEIGHTS = (
@@ -29,21 +27,7 @@ UNUSED_WEIGHTS = (
 )
 
 
-def greedy(logits: Tensor) -> Tensor:
-    """(B,) the likeliest ids."""
-    return logits.argmax(dim=-1)
-
-
-@dataclass(frozen=True)
-class Decoded:
-    """The output of decoding: ids (B, N) int64, the logits (B, N, V) that chose them, and the cache."""
-
-    ids: Tensor
-    logits: Tensor
-    decoding: "Decoding"
-
-
-class MagmaNetwork(nn.Module):
+class MagmaNetwork(TokenNetwork):
     """Magma under the parameter names of its released files."""
 
     def __init__(self, config: MagmaConfig) -> None:
@@ -85,32 +69,25 @@ class MagmaNetwork(nn.Module):
 
     # -- text --------------------------------------------------------------------------------------------
 
-    def embed(self, prompts: Sequence[Sequence[int]], pictures: Sequence[Picture] | None) -> Packed:
-        """Prompts of ids, each with one placeholder where it has a picture. Raises CheckpointError."""
+    def embed(self, prompts: Sequence[Sequence[int]], pictures: Sequence[Picture] | None) -> tuple[Tensor, Tensor]:
+        """Embeddings (B, S, D) and mask (B, S) of prompts, each with one placeholder where it has a picture.
+
+        Raises CheckpointError.
+        """
         embedding = self.language_model.get_input_embeddings()
         device = embedding.weight.device
         if pictures is None:
-            return Packed.of([embedding(torch.tensor(ids, device=device)) for ids in prompts])
+            return packed([embedding(torch.tensor(ids, device=device)) for ids in prompts])
         rows = []
         for ids, tokens in zip(prompts, self.look(pictures), strict=True):
             position = placeholder(ids, self.config.image_token)
             before, behind = (torch.tensor(part, device=device) for part in (ids[:position], ids[position + 1 :]))
             rows.append(torch.cat([embedding(before.long()), tokens, embedding(behind.long())]))
-        return Packed.of(rows)
+        return packed(rows)
 
     def forward(self, prompts: Sequence[Sequence[int]], pictures: Sequence[Picture] | None) -> Any:
         """transformers' output of one pass, with logits (B, S, V) and all hidden states."""
-        packed = self.embed(prompts, pictures)
-        return self.language_model(
-            inputs_embeds=packed.embeddings,
-            position_ids=positions(packed.mask),
-            attention_mask=needed(packed.mask),
-            output_hidden_states=True,
-        )
-
-    def read(self, prompts: Sequence[Sequence[int]], pictures: Sequence[Picture] | None) -> "Decoding":
-        """One pass over the prompts, from which decoding continues token by token."""
-        return Decoding(self.language_model, self.embed(prompts, pictures), self.prompt_kv)
+        return self.whole_pass(*self.embed(prompts, pictures))
 
     def decode(
         self,
@@ -119,16 +96,8 @@ class MagmaNetwork(nn.Module):
         steps: int,
         choose: Choose = greedy,
     ) -> Decoded:
-        """Exactly `steps` tokens behind the prompts, whatever they are.
-
-        The language model is called once with the prompts and `steps - 1` times with one token.
-        """
-        decoding = self.read(prompts, pictures)
-        logits, ids = [decoding.logits], [choose(decoding.logits)]
-        while len(ids) < steps:
-            logits.append(decoding.feed(ids[-1]))
-            ids.append(choose(logits[-1]))
-        return Decoded(torch.stack(ids, dim=1), torch.stack(logits, dim=1), decoding)
+        """Exactly `steps` tokens behind the prompts; see `decode_behind`."""
+        return self.decode_behind(*self.embed(prompts, pictures), steps, choose)
 
     def unhooked(self) -> Any:
         """A second language model with the same weights and without hooks, so that nothing is captured."""
@@ -139,43 +108,6 @@ class MagmaNetwork(nn.Module):
         return twin.eval()
 
 
-class Decoding:
-    """Prompts that were read, and the tokens fed behind them; `logits` (B, V) choose the next ones.
-
-    prompt_kv: where what is kept of the prompts passes once.
-    """
-
-    def __init__(self, language_model: Any, packed: Packed, prompt_kv: PromptKV) -> None:
-        self.language_model, self._mask = language_model, packed.mask
-        self._cache = DynamicCache(config=language_model.config)
-        self._positions = positions(packed.mask)
-        self.logits = self._run(language_model, packed.embeddings)
-        prompt_kv(self._cache.layers)
-
-    def feed(self, ids: Tensor, through: Any = None) -> Tensor:
-        """(B, V) logits behind one more token (B,) per row.
-
-        through: another language model with the same weights, see `MagmaNetwork.unhooked`.
-        """
-        language_model = self.language_model if through is None else through
-        self._positions = self._positions[:, -1:] + 1
-        self._mask = torch.cat([self._mask, torch.ones_like(self._mask[:, :1])], dim=1)
-        self.logits = self._run(language_model, language_model.get_input_embeddings()(ids[:, None]))
-        return self.logits
-
-    def _run(self, language_model: Any, embeddings: Tensor) -> Tensor:
-        output = language_model(
-            inputs_embeds=embeddings,
-            position_ids=self._positions,
-            attention_mask=needed(self._mask),
-            past_key_values=self._cache,
-            use_cache=True,
-            logits_to_keep=1,
-        )
-        logits: Tensor = output.logits[:, -1]
-        return logits
-
-
 def build_magma(config: MagmaConfig, dtype: torch.dtype, device: str = "meta") -> MagmaNetwork:
     """The network in eval mode.
 
@@ -184,9 +116,7 @@ def build_magma(config: MagmaConfig, dtype: torch.dtype, device: str = "meta") -
     Raises CheckpointError if the parts do not fit together.
     """
     network = build_empty(lambda: MagmaNetwork(config), dtype, device)
-    # Rotary frequencies are buffers that no checkpoint holds; they are float32 whatever the weights are.
-    decoder = network.language_model.model
-    decoder.rotary_emb = type(decoder.rotary_emb)(config=network.language_model.config)
+    fill_decoder_rotary(network.language_model)
     network.language_model.tie_weights()
     return network.eval()
 

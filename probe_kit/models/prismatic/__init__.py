@@ -6,7 +6,6 @@ Capture and actions are in the adapters `prismatic` and `openvla` in `probe_kit.
 
 from probe_kit.models.prismatic.config import PrismaticConfig, TowerConfig
 from probe_kit.models.prismatic.network import (
-    Decoded,
     PrismaticNetwork,
     build_prismatic,
     full_size_openvla,
@@ -16,7 +15,6 @@ from probe_kit.models.prismatic.pictures import CROP_AREA, PictureSettings, cent
 
 __all__ = [
     "CROP_AREA",
-    "Decoded",
     "PictureSettings",
     "PrismaticConfig",
     "PrismaticNetwork",

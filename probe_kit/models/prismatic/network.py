@@ -3,15 +3,14 @@
 B batch, P patches, T text tokens, S = P + T positions, D width of the language model, V its vocabulary.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor, nn
-from transformers import AutoModelForCausalLM, DynamicCache
+from transformers import AutoModelForCausalLM
 
 from probe_kit.models.building import build_empty
+from probe_kit.models.decoding import Choose, Decoded, TokenNetwork, fill_decoder_rotary, greedy
 from probe_kit.models.prismatic.config import PrismaticConfig
 from probe_kit.models.prismatic.vision import VisionBackbone
 from probe_kit.models.prompt_kv import PromptKV
@@ -33,30 +32,7 @@ class Projector(nn.Module):
         return projected if self.fc3 is None else self.fc3(nn.functional.gelu(projected))
 
 
-Choose = Callable[[Tensor], Tensor]
-"""(B,) ids of the next tokens from their logits (B, V)."""
-
-
-def likeliest(logits: Tensor) -> Tensor:
-    """Greedy decoding."""
-    return logits.argmax(dim=-1)
-
-
-@dataclass(frozen=True)
-class Decoded:
-    """The output of greedy decoding: ids (B, N) int64, and the logits (B, N, V) that chose them.
-
-    Before the last of them is fed: mask (B, S + N - 1), positions (B, 1) of the last tokens, keys and values.
-    """
-
-    ids: Tensor
-    logits: Tensor
-    mask: Tensor
-    last: Tensor
-    cache: Any
-
-
-class PrismaticNetwork(nn.Module):
+class PrismaticNetwork(TokenNetwork):
     """A Prismatic model under the parameter names of its released files."""
 
     def __init__(self, config: PrismaticConfig) -> None:
@@ -88,56 +64,17 @@ class PrismaticNetwork(nn.Module):
 
         ids: (B, T). mask: (B, T) bool, False at padding, which may stand anywhere behind the first token.
         """
-        embeddings, mask = self.embed(ids, mask, pixel_values)
-        return self.language_model(
-            inputs_embeds=embeddings,
-            position_ids=_positions(mask),
-            attention_mask=_needed(mask),
-            output_hidden_states=True,
-        )
+        return self.whole_pass(*self.embed(ids, mask, pixel_values))
 
     def decode(
-        self, ids: Tensor, mask: Tensor, pixel_values: Tensor | None, steps: int, choose: Choose = likeliest
+        self, ids: Tensor, mask: Tensor, pixel_values: Tensor | None, steps: int, choose: Choose = greedy
     ) -> Decoded:
-        """Exactly `steps` tokens behind the prompt, whatever they are.
+        """Exactly `steps` tokens behind the prompt; see `decode_behind`.
 
         ids, mask: as for `forward`, with a token, not padding, at the end of every row. choose: the next ids; the
-        likeliest by default. The language model is called once with the prompt and `steps - 1` times with a token.
+        likeliest by default.
         """
-        embeddings, mask = self.embed(ids, mask, pixel_values)
-        cache = DynamicCache(config=self.language_model.config)
-        positions = _positions(mask)
-        tokens: list[Tensor] = []
-        logits: list[Tensor] = []
-        while True:
-            output = self.language_model(
-                inputs_embeds=embeddings,
-                position_ids=positions,
-                attention_mask=_needed(mask),
-                past_key_values=cache,
-                use_cache=True,
-                logits_to_keep=1,
-            )
-            if not tokens:  # the prompt is read; the tokens behind it read what is kept of it
-                self.prompt_kv(cache.layers)
-            logits.append(output.logits[:, -1])
-            tokens.append(choose(logits[-1]))
-            if len(tokens) == steps:
-                break
-            embeddings = self.language_model.get_input_embeddings()(tokens[-1][:, None])
-            positions = positions[:, -1:] + 1
-            mask = torch.cat([mask, torch.ones_like(mask[:, :1])], dim=1)
-        return Decoded(torch.stack(tokens, dim=1), torch.stack(logits, dim=1), mask, positions[:, -1:], cache)
-
-
-def _positions(mask: Tensor) -> Tensor:
-    """(B, S) positions that count tokens, not padding."""
-    return (mask.long().cumsum(dim=1) - 1).clamp(min=0)
-
-
-def _needed(mask: Tensor) -> Tensor | None:
-    """The mask where there is padding: without one, attention takes its exact causal path."""
-    return None if bool(mask.all()) else mask
+        return self.decode_behind(*self.embed(ids, mask, pixel_values), steps, choose)
 
 
 def build_prismatic(config: PrismaticConfig, dtype: torch.dtype, device: str = "meta") -> PrismaticNetwork:
@@ -147,9 +84,7 @@ def build_prismatic(config: PrismaticConfig, dtype: torch.dtype, device: str = "
     `load_weights(…, assign=True)`; `cpu` for one with uninitialised weights.
     """
     network = build_empty(lambda: PrismaticNetwork(config), dtype, device)
-    # Rotary frequencies are buffers that no checkpoint holds; they are float32 whatever the weights are.
-    decoder = network.language_model.model
-    decoder.rotary_emb = type(decoder.rotary_emb)(config=network.language_model.config)
+    fill_decoder_rotary(network.language_model)
     network.language_model.tie_weights()
     return network.eval()
 

@@ -8,14 +8,13 @@ from probe_kit.models.spatialvla.actions import STEP_TOKENS, ActionBins, equal_m
 from probe_kit.models.spatialvla.config import SpatialVLAConfig
 from probe_kit.models.spatialvla.depth import Depth, depth_input, estimate_depth
 from probe_kit.models.spatialvla.full_size import full_size_spatialvla
-from probe_kit.models.spatialvla.network import Decoded, Sight, SpatialVLANetwork, build_spatialvla
+from probe_kit.models.spatialvla.network import Sight, SpatialVLANetwork, build_spatialvla
 from probe_kit.models.spatialvla.pictures import Intrinsics, PictureSettings, known_cameras, prepare_picture
 from probe_kit.models.spatialvla.space import PositionEmbedding3D, back_project, point_places
 
 __all__ = [
     "STEP_TOKENS",
     "ActionBins",
-    "Decoded",
     "Depth",
     "Intrinsics",
     "PictureSettings",

@@ -13,6 +13,7 @@ from transformers import DynamicCache, Gemma2ForCausalLM, SiglipVisionModel, Zoe
 
 from probe_kit.errors import UsageError, WeightsError
 from probe_kit.models.building import build_empty
+from probe_kit.models.decoding import Decoded, TokenNetwork, fill_decoder_rotary, greedy
 from probe_kit.models.prompt_kv import PromptKV
 from probe_kit.models.sizes_only import builds_sizes_only
 from probe_kit.models.spatialvla.config import SpatialVLAConfig
@@ -51,15 +52,7 @@ class Sight:
     features: Tensor
 
 
-@dataclass(frozen=True)
-class Decoded:
-    """The output of greedy decoding: ids (B, N) int64, and the logits (B, N, V) that chose them."""
-
-    ids: Tensor
-    logits: Tensor
-
-
-class SpatialVLANetwork(nn.Module):
+class SpatialVLANetwork(TokenNetwork):
     """A SpatialVLA under the parameter names of its released files."""
 
     def __init__(self, config: SpatialVLAConfig) -> None:
@@ -145,6 +138,14 @@ class SpatialVLANetwork(nn.Module):
             output_hidden_states=past is None,
         )
 
+    def next_logits(
+        self, embeddings: Tensor, mask: Tensor, cache: DynamicCache, language_model: Any = None
+    ) -> Tensor:
+        """See the base: in one pass through its own language model, whose mask is another one."""
+        assert language_model is None
+        logits: Tensor = self(embeddings, mask, cache, keep=1).logits[:, -1]
+        return logits
+
     def decode(
         self,
         ids: Tensor,
@@ -154,31 +155,18 @@ class SpatialVLANetwork(nn.Module):
         slots: Sequence[range] | None = None,
         fed: Tensor | None = None,
     ) -> Decoded:
-        """Exactly `steps` greedy tokens behind the prompt, whatever they are.
+        """Exactly `steps` greedy tokens behind the prompt; see `decode_behind`.
 
         ids, mask: (B, T), with a token, not padding, at the end of every row. slots: per step the only ids that
-        may be chosen. fed: (B, steps - 1) ids to feed back instead of those chosen. The language model is called
-        once with the prompt and `steps - 1` times with one token.
+        may be chosen.
         """
-        cache = DynamicCache(config=self.language_model.config)
-        embeddings = self.embed(ids, features)
-        tokens: list[Tensor] = []
-        logits: list[Tensor] = []
-        for step in range(steps):
-            logits.append(self(embeddings, mask, cache, keep=1).logits[:, -1])
-            if step == 0:  # the prompt is read; the tokens behind it read what is kept of it
-                self.prompt_kv(cache.layers)
-            tokens.append(_best(logits[-1], None if slots is None else slots[step]))
-            following = tokens[-1] if fed is None or step == steps - 1 else fed[:, step]
-            embeddings = self.embed(following[:, None])
-            mask = torch.cat([mask, torch.ones_like(mask[:, :1])], dim=1)
-        return Decoded(torch.stack(tokens, dim=1), torch.stack(logits, dim=1))
+        turns = iter(slots or ())
+        choose = greedy if slots is None else lambda logits: _best(logits, next(turns))
+        return self.decode_behind(self.embed(ids, features), mask, steps, choose, fed)
 
 
-def _best(logits: Tensor, allowed: range | None) -> Tensor:
-    """(B,) the id of the largest logit of (B, V), among `allowed` ones."""
-    if allowed is None:
-        return logits.argmax(dim=-1)
+def _best(logits: Tensor, allowed: range) -> Tensor:
+    """(B,) the id of the largest logit of (B, V) among `allowed` ones."""
     return logits[:, allowed.start : allowed.stop].argmax(dim=-1) + allowed.start
 
 
@@ -210,9 +198,9 @@ def build_spatialvla(config: SpatialVLAConfig, dtype: torch.dtype, device: str =
 
 
 def _fill_buffers(network: SpatialVLANetwork) -> None:
-    """Constants that no file holds; the rotary frequencies are float32 whatever the weights are."""
+    """Fill in constants that no file holds."""
     decoder, tower = network.language_model.model, network.vision_tower.vision_model.embeddings
-    decoder.rotary_emb = type(decoder.rotary_emb)(config=network.config.text)
+    fill_decoder_rotary(network.language_model)
     decoder.embed_tokens.embed_scale = torch.tensor(decoder.embed_tokens.scalar_embed_scale)
     tower.position_ids = torch.arange(tower.num_positions)[None]
     if network.config.depth is not None:

@@ -75,7 +75,7 @@ def test_a_batch_of_other_lengths_and_other_grids_changes_nothing() -> None:
 def test_decoding_goes_on_where_it_stopped() -> None:
     network, view = small_network(), picture(50, 50)
     decoded = network.decode([SHORT], [view], steps=3)
-    logits = decoded.decoding.feed(decoded.ids[:, -1])
+    logits = network.logits_behind(decoded, network.unhooked())
     longer = network.decode([SHORT], [view], steps=4)
     torch.testing.assert_close(logits, longer.logits[:, 3], rtol=0, atol=1e-6)
 

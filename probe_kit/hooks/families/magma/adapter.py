@@ -6,6 +6,7 @@ assistant's turn. Seven tokens follow, one per dimension, then the end of the tu
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,6 @@ from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import Site, Stream
 from probe_kit.hooks.contract.views import IMAGE_ROLE
-from probe_kit.hooks.families.magma.answer import Answer
 from probe_kit.hooks.families.magma.checkpoint import (
     LoadedMagma,
     load_checkpoint,
@@ -38,17 +38,16 @@ from probe_kit.hooks.families.shared.capabilities import MAPS
 from probe_kit.hooks.families.shared.prompt_kv import kept_prompt
 from probe_kit.hooks.families.shared.sampling import CHECKPOINT, TOP, chooser, top_of
 from probe_kit.hooks.families.shared.token_decoder import TokenDecoder
+from probe_kit.hooks.families.shared.vlm.decoding import Prefill
+from probe_kit.models.decoding import Choose, Decoded, greedy
 from probe_kit.models.magma import (
     ACTION_QUESTION,
-    Choose,
-    Decoded,
     MagmaConfig,
     MagmaNetwork,
     Picture,
     PictureSettings,
     PictureSpan,
     choose_grid,
-    greedy,
     prepare_picture,
     shrink_picture,
 )
@@ -218,7 +217,7 @@ class Magma(TokenDecoder, Policy, AnswerModel):
     def _behind(self, decoded: Decoded) -> Tensor:
         """(B, V) logits behind the seven tokens, from modules without hooks."""
         with torch.inference_mode():
-            return decoded.decoding.feed(decoded.ids[:, -1], self._unhooked)
+            return self.network.logits_behind(decoded, self._unhooked)
 
     @cached_property
     def _unhooked(self) -> Any:
@@ -241,21 +240,20 @@ class Magma(TokenDecoder, Policy, AnswerModel):
         pictured = self.shows_pictures(questions)
         pictures = [self.picture(question.observation.image) for question in questions] if pictured else None
         decoded = self.generate(prompts, pictures)
-        return Reading.of(decoded.logits[:, 0].float().cpu().numpy(), options, Answer(decoded))
+        prefill = Prefill.of_decoded(self.network.language_model, decoded)
+        return Reading.of(prefill.logits.float().cpu().numpy(), options, prefill)
 
     def _question(self, question: Prompt) -> TokenPrompt:
         return self.text.prompt(question.text, question.begun, question.pictured)
 
     def speak(self, reading: Reading, tokens: int) -> list[str]:
         """Greedy text up to the end of the turn; see the contract. Raises UsageError for another's reading."""
-        answer = reading.state
-        if not isinstance(answer, Answer):
-            raise UsageError("this reading does not come from Magma; pass what its read() returned")
-        while len(answer.ids) < tokens and not answer.over(self.text.ends):
-            with torch.inference_mode():
-                answer.advance(self._unhooked)
-        rows = torch.stack(answer.ids[:tokens], dim=1).tolist() if tokens else [[]] * len(answer.ids[0])
-        return [self.text.decode(row) for row in rows]
+        state = reading.state
+        if not isinstance(state, Prefill) or state.network is not self.network.language_model:
+            raise UsageError("this reading does not come from this model; pass what its read() returned")
+        with torch.inference_mode():  # without hooks: the inference that is captured ended with the reading
+            ids = replace(state, network=self._unhooked).speak(tokens, self.text.ends)
+        return [self.text.decode(row) for row in ids.tolist()]
 
     # -- capture -----------------------------------------------------------------------------------------
 

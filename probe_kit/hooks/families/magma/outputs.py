@@ -28,7 +28,8 @@ from probe_kit.hooks.verification.outputs import (
     numpy_of,
     watch,
 )
-from probe_kit.models.magma import Choose, Decoded, Grid, Picture, PictureSettings, choose_grid
+from probe_kit.models.decoding import Choose, Decoded
+from probe_kit.models.magma import Grid, Picture, PictureSettings, choose_grid
 
 TOLERANCE = 2e-5
 _CLIENT = "action_config.json"

@@ -28,11 +28,11 @@ from probe_kit.hooks.contract.views import IMAGE_ROLE
 from probe_kit.hooks.families.prismatic.checkpoint import LoadedPrismatic, load_checkpoint
 from probe_kit.hooks.families.prismatic.frames import TextFrame, frame_of
 from probe_kit.hooks.families.prismatic.tokenizer import ByteTokenizer, TextTokenizer, find_tokenizer, id_behind
-from probe_kit.hooks.families.shared.sampling import Choose, greedy
 from probe_kit.hooks.families.shared.token_decoder import TokenDecoder
 from probe_kit.hooks.families.shared.vlm.decoding import Prefill
+from probe_kit.models.decoding import Choose, Decoded, greedy
 from probe_kit.models.packing import Packed
-from probe_kit.models.prismatic import Decoded, PictureSettings, PrismaticNetwork, prepare_picture
+from probe_kit.models.prismatic import PictureSettings, PrismaticNetwork, prepare_picture
 
 DEFAULT_CHECKPOINT = "TRI-ML/prismatic-vlms/prism-dinosiglip-224px+7b"
 _TOKENIZER_FILES = ("tokenizer.json", "tokenizer_config.json")
@@ -190,9 +190,7 @@ class Prismatic(PrismaticModel, AnswerModel):
         if self.shows_pictures(questions):
             pixels = self.pixel_values(question.observation.image for question in questions)
         decoded = self.generate(pixels, [self.tokenizer.encode(self._framed(question)) for question in questions])
-        return Prefill(
-            self.network.language_model, decoded.mask.long(), decoded.last, decoded.logits[:, 0], decoded.cache
-        )
+        return Prefill.of_decoded(self.network.language_model, decoded)
 
     def _framed(self, question: Prompt) -> str:
         return self.frame.around(question.text) + question.begun

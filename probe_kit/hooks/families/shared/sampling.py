@@ -1,6 +1,6 @@
 """The draws from fixed seeds: output tokens, greedy or sampled as evaluations do, and the noise of flows."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -8,9 +8,8 @@ from torch import Tensor
 
 from probe_kit._system.bounded_json import read_json_object
 from probe_kit.errors import CheckpointError, UsageError
+from probe_kit.models.decoding import Choose, greedy
 
-Choose = Callable[[Tensor], Tensor]
-"""(B,) ids of the next tokens from their logits (B, V)."""
 # What `generate` of transformers 4 keeps of the distribution by default.
 TOP = 50
 ALL, CHECKPOINT = "all", "checkpoint"
@@ -20,11 +19,6 @@ _NEUTRAL = {
     "top_p": 1, "min_p": 0, "typical_p": 1, "epsilon_cutoff": 0, "eta_cutoff": 0, "repetition_penalty": 1,
     "no_repeat_ngram_size": 0, "num_beams": 1,
 }  # fmt: skip
-
-
-def greedy(logits: Tensor) -> Tensor:
-    """The likeliest."""
-    return logits.argmax(dim=-1)
 
 
 def chooser(temperature: float, seeds: Sequence[int], top: int | None = TOP, among: range | None = None) -> Choose:

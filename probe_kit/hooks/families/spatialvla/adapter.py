@@ -40,11 +40,11 @@ from probe_kit.hooks.families.spatialvla.checkpoint import (
     read_processor,
 )
 from probe_kit.hooks.families.spatialvla.speech import Speech
+from probe_kit.models.decoding import Decoded
 from probe_kit.models.packing import Packed
 from probe_kit.models.spatialvla import (
     STEP_TOKENS,
     ActionBins,
-    Decoded,
     Intrinsics,
     PictureSettings,
     SpatialVLAConfig,

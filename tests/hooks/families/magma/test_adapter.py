@@ -240,7 +240,7 @@ def test_an_answer_ends_with_the_turn(loaded: Magma) -> None:
 
 def test_a_reading_of_another_model_is_refused(unsteered: Magma) -> None:
     reading = unsteered.read(questions())
-    with pytest.raises(UsageError, match="Magma"):
+    with pytest.raises(UsageError, match="does not come from this model"):
         unsteered.speak(type(reading)(reading.option_logits, reading.option_mass, None), 3)
 
 

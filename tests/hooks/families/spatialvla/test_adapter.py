@@ -1,6 +1,7 @@
 import warnings
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,6 @@ from probe_kit.errors import CheckpointError, InstructionError, ObservationError
 from probe_kit.hooks import Observation, Site, capture, load_policy
 from probe_kit.hooks.families.spatialvla.adapter import SpatialVLA, load_spatialvla
 from probe_kit.hooks.testing import example_observations
-from probe_kit.models.spatialvla import Decoded
 from tests.support.spatialvla_checkpoints import (
     SIDE,
     edges,
@@ -64,20 +64,6 @@ def seen() -> list[Observation]:
 
 
 # -- capture ---------------------------------------------------------------------------------------------------
-
-
-def test_what_a_block_adds_is_what_the_residual_stream_gains(plain: SpatialVLA, seen: list[Observation]) -> None:
-    """Of every stream: Gemma-2 norms what it adds, SigLIP does not."""
-    streams = [*plain.streams.values(), *plain.further_streams.values()]
-    sites = [site for s in streams for quantity in ("residual", "attention", "mlp") for site in s.sites(quantity)]
-    with capture(plain, sites) as tape:
-        plain.act(seen, [0, 1])
-    for stream in streams:
-        for site in stream.sites("mlp"):
-            before = tape[replace(site, quantity="residual")]
-            after = tape[replace(site, quantity="residual", layer=site.layer + 1)]
-            gained = tape[replace(site, quantity="attention")] + tape[site]
-            torch.testing.assert_close(before + gained, after, rtol=0, atol=1e-5)
 
 
 def test_the_first_step_of_a_chunk_is_the_same_whether_the_rest_is_captured(
@@ -183,7 +169,7 @@ def test_an_executed_step_that_names_no_action_is_flagged_and_said(
 ) -> None:
     ids = torch.tensor([[slot.start for slot in plain.bins.slots] * 4] * 2)
     ids[0, 5] = 7  # in a step that is planned and not executed
-    monkeypatch.setattr(plain, "generate", lambda *_: Decoded(ids, torch.empty(0)))
+    monkeypatch.setattr(plain, "generate", lambda *_: SimpleNamespace(ids=ids))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         plain.act(seen, [0, 1])

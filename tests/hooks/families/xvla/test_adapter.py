@@ -194,17 +194,6 @@ def test_the_expert_reads_the_end_of_the_backbone_as_tokens_of_its_own(
         assert roles["backbone"][0].mask(name).sum() == roles["expert"][0].mask(name).sum() > 0
 
 
-def test_what_a_block_adds_makes_the_next_residual_of_the_expert(xvla: Xvla, seen: list[Observation]) -> None:
-    stream = xvla.streams["expert"]
-    parts = [site for name in stream.quantities for site in stream.sites(name)]
-    with capture(xvla, parts) as cache:
-        xvla.act(seen, [0])
-    for site in stream.sites("mlp"):
-        added = sum(cache[replace(site, quantity=name)] for name in stream.quantities)
-        behind = cache[replace(site, layer=site.layer + 1, quantity="residual")]
-        torch.testing.assert_close(added, behind, rtol=0, atol=1e-5)
-
-
 def test_each_layer_of_the_backbone_norms_what_it_adds(xvla: Xvla, seen: list[Observation]) -> None:
     """As BART: the norm of the normed sum and the MLP's part."""
     stream = xvla.streams["backbone"]

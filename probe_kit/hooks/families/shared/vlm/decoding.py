@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from probe_kit.models.decoding import Decoded, positions
 from probe_kit.models.packing import LeftPacked
 
 
@@ -30,19 +31,26 @@ class Prefill:
 
     @classmethod
     def of(
-        cls, network: Any, packed: LeftPacked, positions: Tensor, picture_inputs: Mapping[str, Tensor]
+        cls, network: Any, packed: LeftPacked, counted: Tensor, picture_inputs: Mapping[str, Tensor]
     ) -> "Prefill":
-        """Read prompts once. positions: (…, B, T). picture_inputs: further keywords, such as pictures."""
+        """Read prompts once. counted: (…, B, T) positions. picture_inputs: further keywords, such as pictures."""
         output = network(
             input_ids=packed.ids,
             attention_mask=packed.mask,
-            position_ids=positions,
+            position_ids=counted,
             use_cache=True,
             logits_to_keep=1,
             **picture_inputs,
         )
-        last = positions.amax(dim=-1, keepdim=True)
+        last = counted.amax(dim=-1, keepdim=True)
         return cls(network, packed.mask, last, output.logits[:, -1], output.past_key_values)
+
+    @classmethod
+    def of_decoded(cls, network: Any, decoded: Decoded) -> "Prefill":
+        """Return what came before the first of decoded tokens. network: the language model that continues."""
+        decoded.cache.crop(decoded.mask.shape[1])
+        last = positions(decoded.mask)[:, -1:]
+        return cls(network, decoded.mask.long(), last, decoded.logits[:, 0], decoded.cache)
 
     def speak(self, tokens: int, ends: Collection[int]) -> Tensor:
         """(B, at most `tokens`) greedy ids, up to where every row has put out one of `ends`.

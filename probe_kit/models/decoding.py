@@ -1,0 +1,118 @@
+"""Token-by-token decoding behind a prompt of embeddings, and the positions and masks that it needs.
+
+B batch, S positions of the prompt, D width of the language model, V its vocabulary.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from transformers import DynamicCache
+
+from probe_kit.models.prompt_kv import PromptKV
+
+Choose = Callable[[Tensor], Tensor]
+"""(B,) ids of the next tokens from their logits (B, V)."""
+
+
+def greedy(logits: Tensor) -> Tensor:
+    """(B,) the likeliest ids."""
+    return logits.argmax(dim=-1)
+
+
+def positions(mask: Tensor) -> Tensor:
+    """(B, S) positions that count tokens, not padding."""
+    return (mask.long().cumsum(dim=1) - 1).clamp(min=0)
+
+
+def needed(mask: Tensor) -> Tensor | None:
+    """The mask where there is padding: without one, attention takes its exact causal path."""
+    return None if bool(mask.all()) else mask
+
+
+def fill_decoder_rotary(language_model: Any) -> None:
+    """Compute the rotary frequencies, buffers that no checkpoint holds: float32 whatever the weights are."""
+    decoder = language_model.model
+    decoder.rotary_emb = type(decoder.rotary_emb)(config=language_model.config)
+
+
+@dataclass(frozen=True)
+class Decoded:
+    """Tokens behind a prompt: ids (B, N) int64, and the logits (B, N, V) that chose them.
+
+    mask: (B, S) bool of the prompt. cache: keys and values of the prompt and of all ids but the last.
+    """
+
+    ids: Tensor
+    logits: Tensor
+    mask: Tensor
+    cache: DynamicCache
+
+
+class TokenNetwork(nn.Module):
+    """A network whose language model reads a prompt of embeddings and chooses tokens behind it."""
+
+    language_model: Any
+    prompt_kv: PromptKV
+    """Where what is kept of the prompt passes once."""
+
+    def whole_pass(self, embeddings: Tensor, mask: Tensor) -> Any:
+        """transformers' output of one pass over (B, S, D), with logits (B, S, V) and all hidden states."""
+        return self.language_model(
+            inputs_embeds=embeddings,
+            position_ids=positions(mask),
+            attention_mask=needed(mask),
+            output_hidden_states=True,
+        )
+
+    def next_logits(
+        self, embeddings: Tensor, mask: Tensor, cache: DynamicCache, language_model: Any = None
+    ) -> Tensor:
+        """(B, V) logits behind the last position.
+
+        embeddings: (B, T, D) of what is new. mask: (B, past + T) bool, False at padding. language_model: another
+        one with the same weights, through which the pass goes.
+        """
+        output = (self.language_model if language_model is None else language_model)(
+            inputs_embeds=embeddings,
+            position_ids=positions(mask)[:, -embeddings.shape[1] :],
+            attention_mask=needed(mask),
+            past_key_values=cache,
+            use_cache=True,
+            logits_to_keep=1,
+        )
+        logits: Tensor = output.logits[:, -1]
+        return logits
+
+    def decode_behind(
+        self, embeddings: Tensor, mask: Tensor, steps: int, choose: Choose = greedy, fed: Tensor | None = None
+    ) -> Decoded:
+        """Exactly `steps` tokens behind the prompt, whatever they are.
+
+        mask: (B, S) bool, True at the end of every row. fed: (B, steps - 1) ids to feed back instead of those
+        chosen. The language model is called once with the prompt and `steps - 1` times with one token.
+        """
+        prompt, cache = mask, DynamicCache(config=self.language_model.config)
+        ids: list[Tensor] = []
+        logits: list[Tensor] = []
+        while True:
+            logits.append(self.next_logits(embeddings, mask, cache))
+            if not ids:  # the prompt is read; the tokens behind it read what is kept of it
+                self.prompt_kv(cache.layers)
+            ids.append(choose(logits[-1]))
+            if len(ids) == steps:
+                return Decoded(torch.stack(ids, dim=1), torch.stack(logits, dim=1), prompt, cache)
+            following = ids[-1] if fed is None else fed[:, len(ids) - 1]
+            embeddings = self.language_model.get_input_embeddings()(following[:, None])
+            mask = torch.cat([mask, torch.ones_like(mask[:, :1])], dim=1)
+
+    def logits_behind(self, decoded: Decoded, language_model: Any) -> Tensor:
+        """(B, V) logits behind the last id, through another language model with the same weights.
+
+        `decoded` cannot be continued afterwards: its cache has grown.
+        """
+        more = decoded.mask.new_ones(decoded.ids.shape)
+        embeddings = language_model.get_input_embeddings()(decoded.ids[:, -1:])
+        return self.next_logits(embeddings, torch.cat([decoded.mask, more], dim=1), decoded.cache, language_model)
