@@ -10,6 +10,8 @@ from typing import Any, Literal, Self
 
 from probe_kit._tables.numbers import NONE
 
+Number = Mapping[str, Any]
+"""A number behind a table with what it is of, or the numbers of a row."""
 _LIMITS = re.compile(r"(?<!^) ?(\[[^\]]*\])")
 """An interval behind its value."""
 _UNITS = re.compile(r"(,? (%|cm|points))?( \[[^\]]*\])?$")
@@ -77,7 +79,8 @@ class Content:
     names: how many of the first columns name the rows. notes: sentences below it, which need no capital letter and
     no stop. numbers: an object per row or per number, shares in [0, 1], None where unknown. overflow: of a
     terminal, what is done with columns that do not fit: `split` into further tables, `leave out` by name, first
-    `fold` intervals below their values, or `wrap` text, for columns of words.
+    `fold` intervals below their values, or `wrap` text, for columns of words. is_partial: whether runs are missing
+    that could be played; a note names them.
     """
 
     title: str
@@ -85,7 +88,8 @@ class Content:
     rows: tuple[Row, ...]
     names: int = 1
     notes: tuple[str, ...] = ()
-    numbers: tuple[Mapping[str, Any], ...] = ()
+    numbers: tuple[Number, ...] = ()
+    is_partial: bool = False
     overflow: Literal["split", "leave out", "fold", "wrap"] = "split"
 
     @classmethod
@@ -105,6 +109,10 @@ class Content:
         lines = [Row(row, mean is not None and mean in [cell.text for cell in row[:names]]) for row in cells]
         heads = tuple(heading if isinstance(heading, Heading) else Heading(heading) for heading in headings)
         return cls(title, heads, tuple(lines), notes=tuple(filter(None, notes)), **more)
+
+    def with_notes(self, sentences: Sequence[str]) -> Self:
+        """Return the table with more sentences below it."""
+        return replace(self, notes=(*self.notes, *sentences))
 
     @property
     def columns(self) -> tuple[str, ...]:

@@ -30,9 +30,9 @@ from probe_kit.hooks.checkpoints.checkpoint import (
     pinned,
     without_revision,
 )
-from probe_kit.hooks.checkpoints.commits import recorded_commits
 from probe_kit.hooks.checkpoints.file_checks import check_files
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
+from probe_kit.hooks.checkpoints.hub import recorded_commits
 from probe_kit.hooks.checkpoints.third_party import naming_checkpoint, while_loading
 from probe_kit.hooks.contract.card import ModelCard, SourceWeights
 from probe_kit.hooks.contract.declared import DeclaredStream

@@ -10,7 +10,6 @@ if TYPE_CHECKING:
     from probe_kit.study.failures import Failure
     from probe_kit.study.figures import make_figures
     from probe_kit.study.mistakes import Mistake, StudyFileError
-    from probe_kit.study.named_table import NamedTable
     from probe_kit.study.pack import pack_study
     from probe_kit.study.plan import StudyPlan, plan_study
     from probe_kit.study.playing import Made, Moved, conduct_study, fit_probes
@@ -25,7 +24,6 @@ __all__ = [
     "Made",
     "Mistake",
     "Moved",
-    "NamedTable",
     "StudyFileError",
     "StudyPlan",
     "conduct_study",
@@ -62,7 +60,6 @@ __getattr__, __dir__ = lazy_names(
         "Moved": "playing",
         "conduct_study": "playing",
         "fit_probes": "playing",
-        "NamedTable": "named_table",
         "make_table": "tables",
     },
 )

@@ -30,6 +30,8 @@ from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, ValidationErr
 from probe_kit._system.bounded_files import read_regular
 from probe_kit._system.bounded_json import parse_json
 from probe_kit._system.complaints import in_words
+from probe_kit._tables.content import Cell, Heading, Row
+from probe_kit._tables.table import Table
 from probe_kit.errors import DiskSpaceError, RunDamagedError, UsageError
 
 PACK_FILE, STUDY_FILE, SUMS_FILE = "pack.json", "study.toml", "SHA256SUMS"
@@ -277,3 +279,32 @@ def _read_sums(file: Path) -> dict[str, str]:
 def _digest(file: Path) -> str:
     with file.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+# -- tables as plain values ---------------------------------------------------------------------------------------
+
+
+def table_record(table: Table) -> dict[str, Any]:
+    """All of a table as plain values, from which `table_of_record` makes it again."""
+    return {
+        "title": table.title,
+        "notes": list(table.notes),
+        "names": table.names,
+        "headings": [[heading.group, heading.text] for heading in table.headings],
+        "rows": [
+            {"cells": cells, "is_mean": row.is_mean} for cells, row in zip(table.texts, table.rows, strict=True)
+        ],
+        "numbers": list(table.numbers),
+    }
+
+
+def table_of_record(record: dict[str, Any]) -> Table:
+    """The table of a record. Raises KeyError, TypeError or ValueError for what is none."""
+    return Table(
+        title=str(record["title"]),
+        headings=tuple(Heading(str(text), group=str(group)) for group, text in record["headings"]),
+        rows=tuple(Row(tuple(map(Cell, map(str, row["cells"]))), bool(row["is_mean"])) for row in record["rows"]),
+        names=int(record["names"]),
+        notes=tuple(map(str, record["notes"])),
+        numbers=tuple(record["numbers"]),
+    )

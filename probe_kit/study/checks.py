@@ -11,7 +11,7 @@ from probe_kit.hooks.registry import find_family, get_family
 from probe_kit.runs.store import SCHEMES
 from probe_kit.statistics.label_permutations import permutations_for, smallest_p
 from probe_kit.statistics.significance import SIGNIFICANCE
-from probe_kit.study.expansion import SCRIPTED, Member, acts, answers, excludes, members
+from probe_kit.study.expansion import SCRIPTED, Member, acts, answers, excludes, members, of_side
 from probe_kit.study.failures import FOLDER
 from probe_kit.study.mistakes import Mistake, Place
 from probe_kit.study.planned_suite import PlannedSuite, slug, slugs
@@ -299,7 +299,7 @@ def _drift(study: Study, _: PlannedSuite) -> Iterator[Mistake]:
         path = ("drift", name)
         for side in dict.fromkeys(side for pair in table.pairs for side in pair):
             model, _slash, way = side.partition("/")
-            runs = _side_members(every, side)
+            runs = of_side(every, side)
             if way and not runs:
                 yield Mistake((*path, "pairs"), f"no block makes the run {side!r}")
             elif not runs:
@@ -312,17 +312,6 @@ def _drift(study: Study, _: PlannedSuite) -> Iterator[Mistake]:
                 yield from _other_view(study, runs, table.view, side, path)
         for side, second in table.pairs:
             yield from _other_streams(study, side, second, (*path, "pairs"))
-
-
-def _side_members(every: list[Member], side: str) -> list[Member]:
-    """Return the runs that a side of a pair of drift names: of a model's first condition, or of the named one."""
-    model, _, way = side.partition("/")
-    of_model = [
-        member
-        for member in every
-        if member.model == model and (member.way == way if way else member.block.conditions)
-    ]
-    return [member for member in of_model if member.way == of_model[0].way]
 
 
 def _other_view(study: Study, runs: list[Member], view: str, side: str, path: Place) -> Iterator[Mistake]:

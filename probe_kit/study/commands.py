@@ -21,8 +21,8 @@ from probe_kit.errors import UsageError
 from probe_kit.train.command_options import Jobs
 
 if TYPE_CHECKING:
+    from probe_kit._tables.table import Table
     from probe_kit.study import Failure, LoadedStudy, StudyPlan
-    from probe_kit.study.named_table import NamedTable
     from probe_kit.study.playing import Event
 
 HELP = """Run a whole study from one file: models × conditions × categories.
@@ -252,7 +252,8 @@ def table(
         say(marked("[red]no table {}: {}[/]", table_name, why))
     _print_tables(tables, style, single=name is not None)
     if not name and style not in ("json", "csv"):
-        tests = sum(printed.n_tests for printed in tables.values())
+        numbers = [number for printed in tables.values() for number in printed.numbers]
+        tests = sum(number.get("p") is not None or number.get("p_over_models") is not None for number in numbers)
         say(
             f"{counted(len(tables), 'table')} with {counted(tests, 'test')}; "
             "each is corrected within its own comparison."
@@ -261,11 +262,12 @@ def table(
         raise typer.Exit(UNFINISHED)
 
 
-def _print_tables(tables: "dict[str, NamedTable]", style: str, single: bool) -> None:
-    from probe_kit.study.named_table import table_json
-
+def _print_tables(tables: "dict[str, Table]", style: str, single: bool) -> None:
     if style == "json":
-        records = {name: table_json(printed) for name, printed in tables.items()}
+        records = {
+            name: {"table": printed.title, "note": "; ".join(printed.notes), "numbers": list(printed.numbers)}
+            for name, printed in tables.items()
+        }
         print_json(next(iter(records.values())) if single else records)
         return
     for at, printed in enumerate(tables.values()):

@@ -3,14 +3,16 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
+from probe_kit._tables.content import Number
 from probe_kit._tables.numbers import p_text, percent, points, with_limits
+from probe_kit._tables.table import Table
 from probe_kit.retention.columns.text import P_DECIDES, difference_test, models_test
 from probe_kit.retention.compare.common_items import MANY
 from probe_kit.retention.compare.compare import Difference, with_holm
 from probe_kit.retention.compare.known_used import OVERALL, CategoryCounts, KnownUsedTable, without_signal
 from probe_kit.retention.rows.row import MEAN
 from probe_kit.retention.table import RetentionTable
-from probe_kit.study.named_table import NamedTable, Number, caption
+from probe_kit.study.rates import caption
 from probe_kit.suite.categories import category_of
 
 _TEST = (
@@ -22,7 +24,7 @@ FEWEST_GROUPS = 10
 _FEW = "!"
 
 
-def difference_table(table: RetentionTable, title: str) -> NamedTable:
+def difference_table(table: RetentionTable, title: str) -> Table:
     """Differences of success rates, a row per pair and category; the whole comparison is one family of tests."""
     rows = _tested(_once(table.differences))
     cells = [
@@ -38,7 +40,7 @@ def difference_table(table: RetentionTable, title: str) -> NamedTable:
     columns = ("systems", "category", "difference, points [95 %]", "p (Holm)", "items")
     numbers = tuple(map(_number, rows))
     printed = _of_pairs(title, columns, cells, caption(table, [_TEST]), numbers)
-    return printed.with_note([*_remarks(rows), *(sentence.removesuffix(".") for sentence in table.unpaired)])
+    return printed.with_notes([*_remarks(rows), *(sentence.removesuffix(".") for sentence in table.unpaired)])
 
 
 def _of_pairs(
@@ -48,8 +50,8 @@ def _of_pairs(
     note: str,
     numbers: tuple[Number, ...],
     mean: str = MEAN,
-) -> NamedTable:
-    return NamedTable.of(title, columns, cells, names=2, mean=mean, notes=[note], numbers=numbers)
+) -> Table:
+    return Table.of(title, columns, cells, names=2, mean=mean, notes=[note], numbers=numbers)
 
 
 def _tested(rows: Sequence[Difference]) -> list[Difference]:
@@ -74,7 +76,7 @@ def _remarks(rows: Sequence[Difference]) -> list[str]:
     return remarks + ([f"no p with fewer than {FEWEST_GROUPS} independent groups of items"] if few else [])
 
 
-def group_table(table: RetentionTable, title: str) -> NamedTable:
+def group_table(table: RetentionTable, title: str) -> Table:
     """Groups of models: the exact p over models first, the interval of these models apart."""
     rows = _once(table.differences)
     cells = [
@@ -95,7 +97,7 @@ def group_table(table: RetentionTable, title: str) -> NamedTable:
     return _of_pairs(title, columns, cells, caption(table, [note]), numbers)
 
 
-def vlm_vla_table(differences: Sequence[Difference]) -> NamedTable:
+def vlm_vla_table(differences: Sequence[Difference]) -> Table:
     """Share right of VLMs minus success rate of policies, where the file names the VLM of a policy."""
     rows = _tested(differences)
     cells = [
@@ -132,10 +134,10 @@ def vlm_vla_table(differences: Sequence[Difference]) -> NamedTable:
     other = "; some pairs began with OTHER first frames" if any(row.same_frames is False for row in rows) else ""
     note = f"{_TEST.replace('this comparison', 'the table')}{other}"
     columns = ("systems", "category", "VLM %", "VLA %", "VLM − VLA [95 %]", "p (Holm)", "items")
-    return _of_pairs("VLM − VLA", columns, cells, note, tuple(numbers)).with_note(_remarks(rows))
+    return _of_pairs("VLM − VLA", columns, cells, note, tuple(numbers)).with_notes(_remarks(rows))
 
 
-def stages_table(joins: Sequence[KnownUsedTable]) -> NamedTable:
+def stages_table(joins: Sequence[KnownUsedTable]) -> Table:
     """Return items with the VLM's answer, the probe and success right, each in both layouts.
 
     Items with the probe right are counted where the answer is shown.
@@ -186,7 +188,7 @@ def stages_table(joins: Sequence[KnownUsedTable]) -> NamedTable:
     notes = [text for join in joins for text in join.notes if text not in without_signal(join.rows)]
     dull = any(row.has_signal is False for _, row in pairs)
     remark = ["not shown: probes are not shown to exceed chance and every control"] if dull else []
-    return printed.with_note([*remark, *dict.fromkeys(text.removesuffix(".") for text in notes)])
+    return printed.with_notes([*remark, *dict.fromkeys(text.removesuffix(".") for text in notes)])
 
 
 def _encoded(join: KnownUsedTable, row: CategoryCounts) -> int | None:

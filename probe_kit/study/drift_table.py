@@ -2,11 +2,11 @@
 
 from collections.abc import Mapping, Sequence
 
+from probe_kit._tables.content import Number, grouped
 from probe_kit._tables.numbers import number, p_text, percent, points, with_limits
-from probe_kit._tables.table import grouped
+from probe_kit._tables.table import Table
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.study.drift import VERDICTS, CategoryDrift, SiteDrift
-from probe_kit.study.named_table import NamedTable, Number
 from probe_kit.suite.categories import category_of
 
 _COLUMNS = (
@@ -32,7 +32,7 @@ _LENS_NOTE = (
 )
 
 
-def drift_table(pairs: Mapping[tuple[str, str], Sequence[CategoryDrift]], title: str, view: str) -> NamedTable:
+def drift_table(pairs: Mapping[tuple[str, str], Sequence[CategoryDrift]], title: str, view: str) -> Table:
     """Verdicts with their numbers. pairs: by the labels of both runs, the first one before the second."""
     drifts = [(names, drift) for names, of_pair in pairs.items() for drift in of_pair]
     has_lens = any(site.lens for _, drift in drifts for site in drift.sites)
@@ -53,7 +53,7 @@ def drift_table(pairs: Mapping[tuple[str, str], Sequence[CategoryDrift]], title:
     heading = f"Drift: {title}" + (f" ({', '.join(dict.fromkeys(alone.values()))})" if alone else "")
     numbers = tuple(number for names, drift in drifts for number in _numbers(names, drift, view))
     groups = (*_COLUMNS, *[_LENS][:has_lens])
-    return NamedTable.of(heading, grouped(*groups), cells, names=2, notes=note, numbers=numbers)
+    return Table.of(heading, grouped(*groups), cells, names=2, notes=note, numbers=numbers)
 
 
 def _cells(drift: CategoryDrift) -> tuple[str, ...]:

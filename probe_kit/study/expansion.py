@@ -41,6 +41,11 @@ class Member:
     seed: int
 
     @property
+    def asks(self) -> bool:
+        """Whether a VLM is asked."""
+        return self.block.asks is not None
+
+    @property
     def run(self) -> tuple[str, str, int]:
         """Model, condition or ask, and seed, which tell runs apart."""
         return self.model, self.way, self.seed
@@ -58,6 +63,13 @@ def members(study: Study) -> Iterator[Member]:
             for way in block.conditions or block.asks or ():
                 if not any(excludes(rule.model_dump(exclude_none=True), model, way) for rule in block.exclude):
                     yield from (Member(block, position, model, way, seed) for seed in block.seeds)
+
+
+def of_side[Run: (Member, Cell)](runs: Sequence[Run], side: str) -> list[Run]:
+    """The runs that a side of a pair of drift names: of a model's first condition, or of that behind the slash."""
+    model, _, way = side.partition("/")
+    of_model = [run for run in runs if run.model == model and (run.way == way if way else not run.asks)]
+    return [run for run in of_model if run.way == of_model[0].way]
 
 
 def excludes(rule: dict[str, str], model: str, way: str) -> bool:

@@ -24,10 +24,10 @@ from probe_kit.study.archive import (
     Pack,
     PackedRun,
     PackedSuite,
+    table_record,
     write_sums,
     write_zip,
 )
-from probe_kit.study.named_table import table_record
 from probe_kit.study.reading import LoadedStudy
 from probe_kit.study.stored import open_stored
 from probe_kit.study.tables import make_each, make_table

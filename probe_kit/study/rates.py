@@ -1,18 +1,18 @@
 """Tables with a row per system and a column per category: success rates, sides, scores and probes."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from itertools import groupby
 from statistics import fmean
 
+from probe_kit._tables.content import Heading, Number
 from probe_kit._tables.numbers import number, percent, with_limits
-from probe_kit._tables.table import Heading
+from probe_kit._tables.table import Table
 from probe_kit.retention.behaviour.success_rate import Regime, normalised_score
 from probe_kit.retention.columns.text import published_value, retention_value
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.retention.table import RetentionTable
-from probe_kit.study.named_table import NamedTable, Number, caption, ordered, titles
-from probe_kit.suite.categories import OWN_DOMAIN, category_of
+from probe_kit.suite.categories import OWN_DOMAIN, category_of, in_order
 
 MARKS = {Regime.KNOWLEDGE: " ↑", Regime.FAILURE: " ↓"}
 DISAGREES = "*"
@@ -32,7 +32,7 @@ class _Column:
     cell: Callable[[OfSystem], str]
 
 
-def success_table(table: RetentionTable) -> NamedTable:
+def success_table(table: RetentionTable) -> Table:
     """Success rates of policies, and shares right of VLMs, by system and category; means and score last.
 
     A domain of several categories has a mean of its own, of the category means.
@@ -42,7 +42,7 @@ def success_table(table: RetentionTable) -> NamedTable:
     return replace(printed, numbers=(*printed.numbers, *_domain_numbers(table)))
 
 
-def vlm_table(table: RetentionTable) -> NamedTable:
+def vlm_table(table: RetentionTable) -> Table:
     """Shares right of VLMs by prompt, size of the picture and category."""
     of_prompt = [
         _Column("prompt", "", lambda rows: rows[MEAN].answers.prompt or "–"),
@@ -87,7 +87,7 @@ def _is_unmarked(row: RetentionRow) -> bool:
     return abs(success.sr - 0.5) > success.chance_margin
 
 
-def sides_table(table: RetentionTable) -> NamedTable:
+def sides_table(table: RetentionTable) -> Table:
     """Success rates where the correct picture lay on the left and on the right, then by layout of the pictures."""
     by_side = _Column("half", "", lambda _: "left / right")
     by_layout = _Column("half", "", lambda _: "original / swapped")
@@ -116,7 +116,7 @@ _SCORE = _Column("score", "", lambda rows: number(rows[MEAN].success.normalised_
 
 def score_table(
     table: RetentionTable, title: str = "", source: str = "", elsewhere: Mapping[str, float] | None = None
-) -> NamedTable:
+) -> Table:
     """The normalised score of every system with its interval: 0 for guessing, 100 for perfection.
 
     title, source, elsewhere: a further column of numbers that were not measured here, by location of the run.
@@ -153,7 +153,7 @@ def score_table(
     note += [f"{title}: not measured here, from {source}"] if elsewhere is not None else []
     columns = ("system", "score [95 %]", "mean %", "categories", *([] if elsewhere is None else [title]))
     notes = [caption(table, note)]
-    return NamedTable.of("Normalised score", columns, cells, notes=notes, numbers=tuple(numbers))
+    return Table.of("Normalised score", columns, cells, notes=notes, numbers=tuple(numbers))
 
 
 def _score_limits(row: RetentionRow) -> tuple[float | None, float | None] | None:
@@ -164,7 +164,7 @@ def _score_limits(row: RetentionRow) -> tuple[float | None, float | None] | None
     return low, high
 
 
-def probing_table(table: RetentionTable) -> NamedTable:
+def probing_table(table: RetentionTable) -> Table:
     """Best accuracy in the backbone and where the action is made, and retention, by category and as a mean."""
     rows = [row for row in table.all_rows if row.view is not None]
     cells = tuple(
@@ -203,13 +203,7 @@ def probing_table(table: RetentionTable) -> NamedTable:
     ]
     columns = ("system", "view", "category", "backbone %", "action %", "retention [95 %]", "published")
     notes = [caption(table, note)]
-    return NamedTable.of("Probes", columns, cells, names=3, mean=MEAN, notes=notes, numbers=tuple(numbers))
-
-
-def as_paper_table(table: RetentionTable) -> NamedTable:
-    """Return the paper's own numbers by its own formulas, see `probe_kit.retention.formats.as_paper`."""
-    paper = table.as_paper
-    return NamedTable(**{field.name: getattr(paper, field.name) for field in fields(paper)})
+    return Table.of("Probes", columns, cells, names=3, mean=MEAN, notes=notes, numbers=tuple(numbers))
 
 
 def once_per_run(rows: Sequence[RetentionRow]) -> list[RetentionRow]:
@@ -228,6 +222,19 @@ def domain_scores(table: RetentionTable) -> dict[str, dict[str, float]]:
     return scores
 
 
+def caption(table: RetentionTable, sentences: Sequence[str]) -> str:
+    """Return a caption: sentences, the outcome rule, the captured inference, and episodes per category."""
+    acted = any(row.run.mode == "acts" and row.success.sr is not None for row in table.rows)
+    calls = sorted({row.run.call for row in table.rows if row.run.call is not None})
+    counts = sorted({row.success.n_episodes for row in table.rows})
+    parts = [*sentences]
+    parts += [f"outcome rule {table.rule}"] if acted else []
+    parts += [f"captured inference {', '.join(map(str, calls))}"] if calls and calls != [0] else []
+    if counts:
+        parts.append(f"{counts[0] if len(counts) == 1 else f'{counts[0]} to {counts[-1]}'} episodes per category")
+    return "; ".join(parts)
+
+
 # -- columns by category -----------------------------------------------------------------------------------------
 
 
@@ -240,8 +247,8 @@ def _by_category(
         return lambda rows: cell(rows[category]) if category in rows else "–"
 
     for domain, members in _domains(table):
-        for name, title in zip(members, titles(members), strict=True):
-            yield _Column(title, domain, of(name))
+        for name in members:
+            yield _Column(category_of(name).title, domain, of(name))
         if domain_means and domain and len(members) > 1:
             yield _Column(domain, domain, lambda rows, inside=tuple(members): percent(_mean_of(rows, inside)))  # type: ignore[misc]
     yield _Column(MEAN, "", of(MEAN))
@@ -249,7 +256,7 @@ def _by_category(
 
 def _domains(table: RetentionTable) -> list[tuple[str, list[str]]]:
     """Categories of a table in the order of the paper, by domain; those of a suite's own have none."""
-    categories = ordered([row.category for row in table.rows])
+    categories = in_order([row.category for row in table.rows])
     by_domain = groupby(categories, key=lambda name: category_of(name).domain)
     return [("" if domain == OWN_DOMAIN else domain, list(members)) for domain, members in by_domain]
 
@@ -269,13 +276,13 @@ def _systems(table: RetentionTable) -> dict[str, OfSystem]:
     return dict(systems)
 
 
-def _pivot(table: RetentionTable, title: str, note: Sequence[str], columns: Sequence[_Column]) -> NamedTable:
+def _pivot(table: RetentionTable, title: str, note: Sequence[str], columns: Sequence[_Column]) -> Table:
     cells = tuple(
         (name, *(column.cell(of_system) for column in columns)) for name, of_system in _systems(table).items()
     )
     headings = [Heading("system"), *(Heading(column.heading, group=column.domain) for column in columns)]
     rows = once_per_run([*table.rows, *table.means])
-    return NamedTable.of(
+    return Table.of(
         title, headings, cells, notes=[caption(table, note)], numbers=tuple(_number(row) for row in rows)
     )
 

@@ -4,26 +4,28 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import product
 from math import isfinite
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
 from probe_kit._system.bounded_json import load_json
+from probe_kit._tables.content import Number
+from probe_kit._tables.table import Table
 from probe_kit.errors import ProbeKitError, RunDamagedError, UsageError
 from probe_kit.retention import retention_table
 from probe_kit.retention.behaviour.vlm_answers import scored
 from probe_kit.retention.compare.known_used import KnownUsedTable, correct_joins, match_runs
 from probe_kit.retention.table import RetentionTable
 from probe_kit.runs.provenance import differences
-from probe_kit.study.archive import TABLES, Pack
+from probe_kit.study.archive import TABLES, Pack, table_of_record
 from probe_kit.study.cells import Cell, Selection
 from probe_kit.study.compared import difference_table, group_table, stages_table, vlm_vla_table
 from probe_kit.study.drift import CategoryDrift, measure_drift
 from probe_kit.study.drift_table import drift_table
+from probe_kit.study.expansion import of_side
 from probe_kit.study.mistakes import unknown
-from probe_kit.study.named_table import NamedTable, Number, table_of_record
 from probe_kit.study.planned_suite import slugs
 from probe_kit.study.rates import (
-    as_paper_table,
     probing_table,
     score_table,
     sides_table,
@@ -40,18 +42,18 @@ from probe_kit.study.stored import (
     study_probes,
 )
 
-_OF_RUNS: Mapping[str, Callable[[RetentionTable], NamedTable]] = {
+_OF_RUNS: Mapping[str, Callable[[RetentionTable], Table]] = {
     "success": success_table,
     "vlms": vlm_table,
     "sides": sides_table,
 }
-_OF_PROBED_RUNS: Mapping[str, Callable[[RetentionTable], NamedTable]] = {
+_OF_PROBED_RUNS: Mapping[str, Callable[[RetentionTable], Table]] = {
     "probing": probing_table,
-    "as-paper": as_paper_table,
+    "as-paper": attrgetter("as_paper"),
 }
 
 
-def make_table(study: LoadedStudy, name: str, partial: bool = False) -> NamedTable:
+def make_table(study: LoadedStudy, name: str, partial: bool = False) -> Table:
     """Make a table of a study file from stored runs alone: no model and no simulator.
 
     partial: accept runs that are missing or unfinished; the note names them. Raises UsageError for an unknown
@@ -65,7 +67,7 @@ def make_table(study: LoadedStudy, name: str, partial: bool = False) -> NamedTab
     subject = f"the table {name!r}"
     stored = stored_runs(study, _selection(study, table), subject, partial, _categories(table))
     printed = _of_kind(study, table, stored, name, partial)
-    printed = printed.with_note([*stored.missing, *stored.unfinished, *_versions(stored)])
+    printed = printed.with_notes([*stored.missing, *stored.unfinished, *_versions(stored)])
     return replace(printed, is_partial=bool(stored.unfinished), numbers=_numbers(printed.numbers, stored))
 
 
@@ -109,7 +111,7 @@ def _categories(table: TableTable) -> tuple[str, ...] | None:
     return None if table.categories is None else slugs(table.categories)
 
 
-def _packed(archive: Path, pack: Pack, name: str) -> NamedTable:
+def _packed(archive: Path, pack: Pack, name: str) -> Table:
     """Return a table as it was packed, because it is made of activations."""
     file = archive / TABLES / f"{name}.json"
     try:
@@ -128,7 +130,7 @@ def _versions(stored: StoredRuns) -> list[str]:
     return [f"runs were made with different {different}"] if different else []
 
 
-def _of_kind(study: LoadedStudy, table: TableTable, stored: StoredRuns, name: str, partial: bool) -> NamedTable:
+def _of_kind(study: LoadedStudy, table: TableTable, stored: StoredRuns, name: str, partial: bool) -> Table:
     labels, opened = stored.labels(study), [run.run for run in stored.runs]
     no_keys = [""] * len(opened)
     if table.kind in _OF_RUNS:
@@ -178,7 +180,7 @@ def _selection(study: LoadedStudy, table: TableTable) -> Callable[[Cell], Select
     """Return a function that gives what a table prints of each cell."""
     if table.kind == "drift":
         pairs = study.study.drift[table.drift or ""].pairs
-        names = {cell.name for pair in pairs for side in pair for cell in _side(study.cells, side)}
+        names = {cell.name for pair in pairs for side in pair for cell in of_side(study.cells, side)}
         return lambda cell: cell.selection if cell.name in names else None
     comparison = study.study.comparisons.get(table.comparison or "")
     if comparison is None:
@@ -246,11 +248,11 @@ def _drift(
     labels: Mapping[str, str],
     name: str,
     partial: bool,
-) -> NamedTable:
+) -> Table:
     """Make the table of every pair of the file whose runs are both stored."""
     by_name = {run.cell.name: run for run in stored.runs}
     drifts: dict[tuple[str, str], list[CategoryDrift]] = {}
-    for cells in ([_side(study.cells, side) for side in pair] for pair in table.pairs):
+    for cells in ([of_side(study.cells, side) for side in pair] for pair in table.pairs):
         for pair in product(*cells):
             before, after = (by_name.get(cell.name) for cell in pair)
             if before is None or after is None or before.cell.seed != after.cell.seed:
@@ -268,13 +270,6 @@ def _drift(
                 drift for drift in of_pair if drift.category in printed
             ]
     return drift_table(drifts, name, table.view)
-
-
-def _side(cells: Sequence[Cell], side: str) -> list[Cell]:
-    """Return the runs that a side of a pair names: of a model's first condition, or of that behind the slash."""
-    model, _, way = side.partition("/")
-    of_model = [cell for cell in cells if cell.model == model and (cell.way == way if way else not cell.asks)]
-    return [cell for cell in of_model if cell.way == of_model[0].way]
 
 
 def _joins(

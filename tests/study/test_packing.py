@@ -13,7 +13,7 @@ from probe_kit.errors import NoTrajectoryError, RunDamagedError, UsageError
 from probe_kit.retention import retention_table
 from probe_kit.runs import copy_run, open_run, verify_run
 from probe_kit.study import LoadedStudy, load_study, make_table, pack_study, plan_study
-from probe_kit.study.named_table import table_of_record, table_record
+from probe_kit.study.archive import table_of_record, table_record
 
 
 @pytest.fixture(scope="module")

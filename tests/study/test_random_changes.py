@@ -19,7 +19,7 @@ from probe_kit.study import (
     pack_study,
     plan_study,
 )
-from probe_kit.study.named_table import table_record
+from probe_kit.study.archive import table_record
 from probe_kit.suite import Suite
 from tests.study.small_study import small_study
 

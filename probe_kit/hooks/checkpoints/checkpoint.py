@@ -8,8 +8,14 @@ from typing import Any, NamedTuple
 from probe_kit._system.bounded_files import MOST_BYTES, check_regular, load_yaml, read_regular, read_regular_text
 from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import CheckpointError, UsageError, WeightsError
-from probe_kit.hooks.checkpoints.commits import pinned_commit, record_commit
-from probe_kit.hooks.checkpoints.hub import OFFLINE_WAY_OUT, hub_reason, unreachable, way_out
+from probe_kit.hooks.checkpoints.hub import (
+    OFFLINE_WAY_OUT,
+    hub_reason,
+    pinned_commit,
+    record_commit,
+    unreachable,
+    way_out,
+)
 from probe_kit.models.bounds import check_sizes
 
 CONFIG_FILE, ADAPTER_FILE = "config.json", "adapter_config.json"

@@ -30,15 +30,15 @@ def test_a_picture_takes_its_placeholders_place_row_by_row_with_a_separator_behi
     assert (wide.grid.rows, wide.grid.columns) == (1, 2)
     span = network.span(LONG, wide.grid, 64)
     assert (span.start, span.rows, span.columns, span.length) == (4, 2, 4, 10)
-    packed = network.embed([LONG], [wide])
-    assert packed.embeddings.shape == (1, len(LONG) - 1 + span.length, 64)
-    block = packed.embeddings[0, 4:14].reshape(2, 5, 64)
+    embeddings, _ = network.embed([LONG], [wide])
+    assert embeddings.shape == (1, len(LONG) - 1 + span.length, 64)
+    block = embeddings[0, 4:14].reshape(2, 5, 64)
     separator = network.multi_modal_projector.row_seperator[0, 0]
     assert torch.equal(block[:, 4], torch.stack([separator, separator]))
     left, right = network.multi_modal_projector(network.vision_tower(wide.crops).permute(0, 2, 3, 1))
     assert torch.equal(block[:, :4], torch.cat([left, right], dim=1))
     text = network.language_model.model.embed_tokens(torch.tensor([51, 52, 9]))
-    assert torch.equal(packed.embeddings[0, 14:], text)
+    assert torch.equal(embeddings[0, 14:], text)
 
 
 @torch.no_grad()

@@ -3,8 +3,7 @@
 from probe_kit.hooks.contract.declared import backbone, expert
 from probe_kit.hooks.contract.interventions import Interventions
 from probe_kit.hooks.contract.sites import QUANTITIES
-from probe_kit.hooks.families.shared.capabilities import MERGED
-from probe_kit.hooks.families.shared.kinds import lerobot_family
+from probe_kit.hooks.families.shared.kinds import MERGED, lerobot_family
 
 INTERVENTIONS = Interventions(
     edits={"backbone": QUANTITIES, "expert": QUANTITIES},

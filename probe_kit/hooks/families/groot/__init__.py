@@ -4,8 +4,7 @@ from probe_kit.hooks.contract.declared import TEXT, DeclaredStream, backbone, ex
 from probe_kit.hooks.contract.interventions import Interventions
 from probe_kit.hooks.contract.options import Option
 from probe_kit.hooks.contract.sites import QUANTITIES, Stream
-from probe_kit.hooks.families.shared.capabilities import MERGED
-from probe_kit.hooks.families.shared.kinds import lerobot_family
+from probe_kit.hooks.families.shared.kinds import MERGED, lerobot_family
 
 RESIZES = ("nvidia", "lerobot")
 """Code that brings pictures to their size in two ways."""

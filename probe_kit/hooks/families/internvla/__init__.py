@@ -6,7 +6,7 @@ from probe_kit.hooks.contract.interventions import Interventions
 from probe_kit.hooks.contract.options import Option
 from probe_kit.hooks.contract.protocol import ACT2ANSWER, OWN_SEEDS, ProtocolRow
 from probe_kit.hooks.contract.sites import QUANTITIES, Stream
-from probe_kit.hooks.families.shared.capabilities import MERGED
+from probe_kit.hooks.families.shared.kinds import MERGED
 from probe_kit.hooks.family import Family
 
 _UNCONDITIONAL = "action expert without condition"

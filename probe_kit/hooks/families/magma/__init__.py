@@ -3,7 +3,7 @@
 from probe_kit.hooks.contract.declared import backbone, chosen_tokens
 from probe_kit.hooks.contract.options import Option
 from probe_kit.hooks.contract.protocol import ACT2ANSWER, OWN_SEEDS, ProtocolRow
-from probe_kit.hooks.families.shared.capabilities import MAPS
+from probe_kit.hooks.families.shared.kinds import MAPS
 from probe_kit.hooks.family import Family
 
 FAMILIES = (

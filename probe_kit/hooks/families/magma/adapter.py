@@ -34,7 +34,7 @@ from probe_kit.hooks.families.magma.checkpoint import (
 from probe_kit.hooks.families.magma.text import ChatText, TokenPrompt
 from probe_kit.hooks.families.openvla.actions import ActionTokens
 from probe_kit.hooks.families.shared.action_statistics import GRIPPER_OPEN, ActionStatistics, open_or_closed
-from probe_kit.hooks.families.shared.capabilities import MAPS
+from probe_kit.hooks.families.shared.kinds import MAPS
 from probe_kit.hooks.families.shared.prompt_kv import kept_prompt
 from probe_kit.hooks.families.shared.sampling import CHECKPOINT, TOP, chooser, top_of
 from probe_kit.hooks.families.shared.token_decoder import TokenDecoder

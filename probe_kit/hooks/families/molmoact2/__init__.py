@@ -4,8 +4,7 @@ from dataclasses import replace
 
 from probe_kit.hooks.contract.declared import backbone, expert
 from probe_kit.hooks.contract.sites import QUANTITIES
-from probe_kit.hooks.families.shared.capabilities import FLOW, MERGED
-from probe_kit.hooks.families.shared.kinds import lerobot_family
+from probe_kit.hooks.families.shared.kinds import FLOW, MERGED, lerobot_family
 
 EXPERT = ("residual", "attention", "cross_attention", "mlp", "final_norm")
 LAYERWISE = replace(

@@ -4,7 +4,7 @@ from probe_kit.hooks.contract.declared import backbone, chosen_tokens
 from probe_kit.hooks.contract.options import Option
 from probe_kit.hooks.contract.protocol import ACT2ANSWER, OWN_SEEDS, ProtocolRow
 from probe_kit.hooks.families.prismatic import BITS, TOKENIZER
-from probe_kit.hooks.families.shared.capabilities import TOKENS
+from probe_kit.hooks.families.shared.kinds import TOKENS
 from probe_kit.hooks.family import Family
 
 BRIDGE = "bridge_orig"

@@ -28,7 +28,7 @@ from probe_kit.hooks.families.prismatic.checkpoint import (
 )
 from probe_kit.hooks.families.prismatic.tokenizer import BYTES, find_tokenizer
 from probe_kit.hooks.families.shared.action_statistics import DIMENSIONS, ActionStatistics, open_or_closed
-from probe_kit.hooks.families.shared.capabilities import TOKENS
+from probe_kit.hooks.families.shared.kinds import TOKENS
 from probe_kit.hooks.families.shared.prompt_kv import kept_prompt
 from probe_kit.hooks.families.shared.sampling import ALL, chooser, top_of
 from probe_kit.hooks.families.shared.token_decoder import warn_of_unknown

@@ -5,8 +5,7 @@ from probe_kit.hooks.contract.declared import backbone, expert
 from probe_kit.hooks.contract.default_scene import EMBEDDED
 from probe_kit.hooks.contract.options import Option
 from probe_kit.hooks.contract.protocol import ACT2ANSWER, OWN_SEEDS, ProtocolRow
-from probe_kit.hooks.families.shared.capabilities import FLOW
-from probe_kit.hooks.families.shared.kinds import lerobot_family
+from probe_kit.hooks.families.shared.kinds import FLOW, lerobot_family
 from probe_kit.hooks.families.shared.lerobot.evaluation import EVALUATION_OPTIONS
 from probe_kit.hooks.family import Family
 

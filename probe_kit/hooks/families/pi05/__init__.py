@@ -2,8 +2,7 @@
 
 from probe_kit.hooks.contract.card import SourceWeights
 from probe_kit.hooks.contract.declared import backbone, expert
-from probe_kit.hooks.families.shared.capabilities import FLOW
-from probe_kit.hooks.families.shared.kinds import lerobot_family
+from probe_kit.hooks.families.shared.kinds import FLOW, lerobot_family
 from probe_kit.hooks.families.shared.lerobot.evaluation import EVALUATION_OPTIONS
 
 FAMILIES = (

@@ -5,8 +5,7 @@ from dataclasses import replace
 from probe_kit.hooks.contract.card import SourceWeights
 from probe_kit.hooks.contract.declared import backbone, chosen_tokens
 from probe_kit.hooks.contract.options import Option
-from probe_kit.hooks.families.shared.capabilities import TOKENS
-from probe_kit.hooks.families.shared.kinds import lerobot_family
+from probe_kit.hooks.families.shared.kinds import TOKENS, lerobot_family
 
 CAPTURED = 10
 """Action tokens whose positions are sites: "Action: ", and the lowest frequency of about seven dimensions."""

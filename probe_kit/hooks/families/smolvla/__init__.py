@@ -1,8 +1,7 @@
 """SmolVLA through lerobot."""
 
 from probe_kit.hooks.contract.declared import backbone, expert
-from probe_kit.hooks.families.shared.capabilities import FLOW
-from probe_kit.hooks.families.shared.kinds import lerobot_family
+from probe_kit.hooks.families.shared.kinds import FLOW, lerobot_family
 
 FAMILIES = (
     lerobot_family(

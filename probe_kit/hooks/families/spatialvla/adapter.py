@@ -30,7 +30,7 @@ from probe_kit.hooks.contract.views import IMAGE_ROLE
 from probe_kit.hooks.families.prismatic.tokenizer import BYTES
 from probe_kit.hooks.families.shared.action_statistics import ActionStatistics, open_or_closed
 from probe_kit.hooks.families.shared.attention_weights import Note, of_decoder
-from probe_kit.hooks.families.shared.capabilities import TOKENS
+from probe_kit.hooks.families.shared.kinds import TOKENS
 from probe_kit.hooks.families.shared.prompt_kv import kept_prompt
 from probe_kit.hooks.families.shared.token_decoder import TokenDecoder, warn_of_unknown
 from probe_kit.hooks.families.spatialvla.checkpoint import (

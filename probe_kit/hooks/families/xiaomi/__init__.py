@@ -7,7 +7,7 @@ from probe_kit.hooks.contract.options import Option
 from probe_kit.hooks.contract.protocol import ACT2ANSWER, ProtocolRow
 from probe_kit.hooks.contract.sites import QUANTITIES
 from probe_kit.hooks.contract.state_layout import OPENNESS
-from probe_kit.hooks.families.shared.capabilities import MERGED
+from probe_kit.hooks.families.shared.kinds import MERGED
 from probe_kit.hooks.family import Family
 
 _EXPERT = ("residual", "attention", "middle", "mlp")

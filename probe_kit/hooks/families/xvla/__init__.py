@@ -4,8 +4,7 @@ from probe_kit.hooks.contract.declared import TEXT, DeclaredStream, expert
 from probe_kit.hooks.contract.interventions import Interventions
 from probe_kit.hooks.contract.options import Option
 from probe_kit.hooks.contract.sites import Stream
-from probe_kit.hooks.families.shared.capabilities import MERGED
-from probe_kit.hooks.families.shared.kinds import lerobot_family
+from probe_kit.hooks.families.shared.kinds import MERGED, lerobot_family
 
 PICTURES = ("padded", "squashed")
 """As lerobot, and as the authors."""

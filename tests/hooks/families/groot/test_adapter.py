@@ -15,7 +15,7 @@ from lerobot.policies.groot.configuration_groot import GrootConfig
 from lerobot.policies.groot.modeling_groot import GrootPolicy
 from safetensors.torch import load_file, save_file
 
-from probe_kit.errors import CheckpointError, InstructionError, ObservationError, UsageError, WeightsError
+from probe_kit.errors import CheckpointError, InstructionError, UsageError, WeightsError
 from probe_kit.hooks import Observation, Site, capture, edit
 from probe_kit.hooks.conformance.subject import examples_for
 from probe_kit.hooks.families.groot.adapter import Groot
@@ -218,12 +218,6 @@ def test_units_are_the_quantiles_clamped_and_libero_closes_by_sign(groot: Groot)
     slopes = groot.own_units("action", "ACTION").slopes(np.array([[0.5, 0.5, 2, 0, 0, 0, 0.5]], np.float32))[0]
     np.testing.assert_allclose(slopes[:2], (MOST - LEAST)[:2] / 2, atol=1e-6)
     assert (slopes[[2, 6]] == 0).all()
-
-
-def test_one_observation_at_a_time_because_the_bridge_reads_padding(groot: Groot, seen: list[Observation]) -> None:
-    assert groot.card.batch == 1
-    with pytest.raises(ObservationError, match="batch"):
-        groot.act([seen[0], seen[0]], [0, 0])
 
 
 def test_actions_relative_to_the_state_are_captured_and_not_carried_out(

@@ -8,7 +8,7 @@ import pytest
 import torch
 from PIL import Image
 
-from probe_kit.errors import CheckpointError, ObservationError, UsageError
+from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.hooks import Observation, Site, capture, load_policy
 from probe_kit.hooks.capturing.capture_context import edit
 from probe_kit.hooks.contract.sites import first_of
@@ -136,11 +136,6 @@ def test_actions_are_in_the_units_of_the_data_set(loaded: InternVLA, observation
     assert set(np.unique(actions[..., 6])) <= {0.0, 1.0}
     assert ((actions[..., :6] >= -0.04 - 1e-6) & (actions[..., :6] <= 0.05 + 1e-6)).all()
     assert (loaded.card.chunk, loaded.card.execute, loaded.card.batch) == (4, 1, 1)
-
-
-def test_two_at_a_time_are_refused(loaded: InternVLA, observation: Observation) -> None:
-    with pytest.raises(ObservationError, match="at most 1"):
-        loaded.act([observation, observation], [0, 1])
 
 
 def test_options_are_part_of_the_identity(run: Path, loaded: InternVLA) -> None:

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from probe_kit.hooks.capturing.gradients import frozen
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.sites import Site, kv_stream
-from probe_kit.hooks.families.shared.capabilities import FLOW
+from probe_kit.hooks.families.shared.kinds import FLOW
 from probe_kit.hooks.families.shared.lerobot.policy import LerobotPolicy, checked_steps
 from probe_kit.hooks.families.shared.prompt_kv import attach_prompt_kv
 from probe_kit.hooks.families.shared.sampling import seeded_noise
