@@ -6,21 +6,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from tokenizers import Tokenizer
-
 from probe_kit._system.bounded_files import read_regular_text
 from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import CheckpointError
-from probe_kit.hooks.families.shared.vlm.text import (
-    check_marks,
-    check_vocabulary,
-    first_behind,
-    positions_of,
-    words_of,
-)
+from probe_kit.hooks.families.shared.tokenizer_file import TokenizerFile, first_behind, positions_of
 from probe_kit.models.magma import MagmaConfig, chat_text, conversation, picture_question
-
-_FILE = "tokenizer.json"
 
 
 @dataclass(frozen=True)
@@ -32,42 +22,28 @@ class TokenPrompt:
 
 
 @dataclass(frozen=True)
-class ChatText:
+class ChatText(TokenizerFile):
     """Magma's chat template: header tokens, image placeholder, question.
 
     user_first: the user's turn stands before the system's, as Act2Answer's release has it.
     """
 
-    folder: Path
     config: MagmaConfig
     user_first: bool = False
 
     @classmethod
     def of(cls, folder: Path, config: MagmaConfig, user_first: bool = False) -> "ChatText":
         """Read the tokenizer in `folder`. Raises CheckpointError for missing files and another model's."""
-        if not (folder / _FILE).is_file():
-            raise CheckpointError(
-                f"{_FILE} and tokenizer_config.json are missing in {folder}. They come with the checkpoint: copy "
-                "them from the model's page, or name their folder with -M tokenizer=DIR"
-            )
+        TokenizerFile(folder).check_present()
         text = cls(folder, config, user_first)
         text.check()
         return text
 
     @cached_property
-    def _tokenizer(self) -> Any:
-        return Tokenizer.from_file(str(self.folder / _FILE))
-
-    @cached_property
-    def _settings(self) -> dict[str, Any]:
-        file = self.folder / "tokenizer_config.json"
-        return dict(load_json(file)) if file.is_file() else {}
-
-    @cached_property
     def _template(self) -> str | None:
         """The checkpoint's chat template in Jinja, None if it has none."""
         file = self.folder / "chat_template.jinja"
-        stored = read_regular_text(file) if file.is_file() else self._settings.get("chat_template")
+        stored = read_regular_text(file) if file.is_file() else self.settings.get("chat_template")
         if stored is not None and not isinstance(stored, str):
             raise CheckpointError(
                 f"{self.folder} has {len(stored)} chat templates; expected one. Keep the one the model was "
@@ -77,8 +53,7 @@ class ChatText:
 
     @cached_property
     def _beginning(self) -> dict[str, str]:
-        bos_token = self._settings.get("bos_token")
-        token = bos_token.get("content") if isinstance(bos_token, dict) else bos_token
+        token = self.token_of("bos_token")
         return {"beginning": token} if token else {}
 
     def check(self) -> None:
@@ -86,22 +61,22 @@ class ChatText:
         counts = self.vocabulary, self.config.base_vocabulary
         if counts[1] not in (None, counts[0]):
             raise CheckpointError(
-                f"{self.folder / _FILE} has {counts[0]} ids before the added ones, config.json says {counts[1]} "
+                f"{self.file} has {counts[0]} ids before the added ones, config.json says {counts[1]} "
                 "(tokenizer_vocab_size): every action would be decoded wrongly. Take the checkpoint's tokenizer"
             )
-        check_vocabulary(self._tokenizer, self.folder / _FILE, int(self.config.text.vocab_size))
+        self.check_vocabulary(int(self.config.text.vocab_size))
 
     @property
     def vocabulary(self) -> int:
         """Number of ids before the added tokens; the last of them name action bins."""
-        return int(self._tokenizer.get_vocab_size(with_added_tokens=False))
+        return int(self.tokenizer.get_vocab_size(with_added_tokens=False))
 
     @cached_property
     def ends(self) -> frozenset[int]:
         """Ids that end the assistant's turn."""
         file = self.folder / "generation_config.json"
         stored = load_json(file).get("eos_token_id") if file.is_file() else None
-        stored_ends: list[Any] = [self.config.text.eos_token_id, stored, self._tokenizer.token_to_id("<|eot_id|>")]
+        stored_ends: list[Any] = [self.config.text.eos_token_id, stored, self.tokenizer.token_to_id("<|eot_id|>")]
         flat = [number for entry in stored_ends for number in (entry if isinstance(entry, list) else [entry])]
         return frozenset(int(number) for number in flat if number is not None)
 
@@ -111,13 +86,13 @@ class ChatText:
         begun: how the answer has begun already.
         Raises InstructionError for a question that holds a token of the frames.
         """
-        check_marks(self._tokenizer, question + begun)
+        self.check_marks(question + begun)
         before = picture_question("", self.config.image_start_end) if pictured else ""
         turn = before + question
         frames = chat_text(conversation(turn, self.user_first), self._template, **self._beginning)
         start, stop = self._question_span(turn, frames)
         start += len(before)
-        encoding = self._tokenizer.encode(frames + begun)
+        encoding = self.tokenizer.encode(frames + begun)
         return TokenPrompt(tuple(encoding.ids), positions_of(encoding, start, stop))
 
     def _question_span(self, turn: str, frames: str) -> tuple[int, int]:
@@ -138,4 +113,4 @@ class ChatText:
 
     def decode(self, ids: Sequence[int]) -> str:
         """The text of ids up to the end of the turn, without special tokens."""
-        return words_of(self._tokenizer, ids, self.ends)
+        return self.words(ids, self.ends)

@@ -1,19 +1,13 @@
-"""Text to ids with the checkpoint's `tokenizer.json`.
-
-Read by the `tokenizers` library itself: transformers 5 rebuilds Llama's tokenizer by rules of its own, while the
-released models were trained with what the file says.
-"""
+"""Text to ids with the checkpoint's `tokenizer.json`, or with bytes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
-from tokenizers import Tokenizer
-
-from probe_kit._system.bounded_json import load_json
-from probe_kit.errors import CheckpointError, InstructionError, UsageError
+from probe_kit.errors import CheckpointError
+from probe_kit.hooks.families.shared.tokenizer_file import TokenizerFile, first_behind, positions_of
 
 BYTES = "bytes"
 """Asks for `ByteTokenizer`."""
@@ -37,74 +31,42 @@ class TextTokenizer(Protocol):
 
 
 def id_behind(tokenizer: TextTokenizer, prompt: str, answer: str) -> int:
-    """The first id of `answer` where it stands behind `prompt`.
-
-    Raises UsageError if the answer changes the prompt's own ids: its logit would be that of another prompt.
-    """
-    before, extended = tokenizer.encode(prompt), tokenizer.encode(prompt + answer)
-    if extended[: len(before)] != before or len(extended) == len(before):
-        raise UsageError(
-            f"the answer {answer!r} merges with the end of the prompt: {extended[len(before) - 2 :]} instead of "
-            f"{before[len(before) - 2 :]} and more. Give the option as it stands behind the prompt, such as ' A'"
-        )
-    return extended[len(before)]
+    """The first id of `answer` behind `prompt`. Raises UsageError if it changes the prompt's own ids."""
+    return first_behind(tokenizer.encode(prompt), tokenizer.encode(prompt + answer), answer)
 
 
 @dataclass(frozen=True)
-class FileTokenizer:
-    """A `tokenizer.json`, with the names of special tokens from the `tokenizer_config.json` beside it, if any."""
+class FileTokenizer(TokenizerFile):
+    """A tokenizer that begins every text. beginning: the id of the model's configuration."""
 
-    file: Path
     beginning: int | None
-
-    @cached_property
-    def _tokenizer(self) -> Any:
-        return Tokenizer.from_file(str(self.file))
 
     @cached_property
     def _beginning(self) -> int | None:
         """The beginning-of-sequence id, from the tokenizer's own files before the model's configuration."""
-        bos_token = self._config.get("bos_token")
-        content = bos_token.get("content") if isinstance(bos_token, dict) else bos_token
-        number: int | None = self._tokenizer.token_to_id(content) if content else None
+        content = self.token_of("bos_token")
+        number: int | None = self.tokenizer.token_to_id(content) if content else None
         return self.beginning if number is None else number
-
-    @cached_property
-    def _config(self) -> dict[str, Any]:
-        file = self.file.with_name("tokenizer_config.json")
-        return dict(load_json(file)) if file.is_file() else {}
 
     @cached_property
     def special(self) -> frozenset[int]:
         """Ids that the file declares special."""
-        added = self._tokenizer.get_added_tokens_decoder()
-        return frozenset(number for number, token in added.items() if token.special) | {self._beginning or 0}
+        return super().special | {self._beginning or 0}
 
     def encode(self, text: str) -> list[int]:
         """Ids, the beginning-of-sequence token first, also where the file does not add it."""
-        ids: list[int] = self._tokenizer.encode(text).ids
-        if self._beginning is not None and ids[:1] != [self._beginning]:
-            ids = [self._beginning, *ids]
-        unknown = getattr(self._tokenizer.model, "unk_token", None)
-        if unknown is not None and self._tokenizer.token_to_id(unknown) in ids:
-            raise InstructionError(
-                f"{text!r} has a word this checkpoint's tokenizer does not know; the model would act without "
-                f"reading it. Tokens: {self._tokenizer.encode(text).tokens}"
-            )
-        return ids
+        ids: list[int] = self.encoding(text, special=True).ids
+        begins = self._beginning is None or ids[:1] == [self._beginning]
+        return ids if begins else [self._beginning, *ids]  # type: ignore[list-item]
 
     def inside(self, text: str, start: int, stop: int) -> list[bool]:
         """Per id whether it holds any of these characters, by the offsets that the tokenizer gives."""
-        encoding = self._tokenizer.encode(text)
-        flags = [
-            first < stop and last > start and not special
-            for (first, last), special in zip(encoding.offsets, encoding.special_tokens_mask, strict=True)
-        ]
-        return [False] * (len(self.encode(text)) - len(flags)) + flags
+        flags = positions_of(self.encoding(text, special=True), start, stop)
+        return [False] * (len(self.encode(text)) - len(flags)) + list(flags)
 
     def decode(self, ids: Sequence[int]) -> str:
         """The text of ids, without special tokens."""
-        return str(self._tokenizer.decode(list(ids), skip_special_tokens=True)).strip()
+        return self.words(ids)
 
 
 @dataclass(frozen=True)
@@ -149,7 +111,7 @@ def find_tokenizer(
     places = list(folders) if tokenizer is None else [Path(tokenizer).expanduser()]
     for folder in places:
         if (folder / "tokenizer.json").is_file():
-            return FileTokenizer(folder / "tokenizer.json", beginning)
+            return FileTokenizer(folder, beginning)
     raise CheckpointError(
         f"tokenizer.json and tokenizer_config.json are missing in {' and '.join(map(str, places))}. The tokenizer "
         "comes with the checkpoint: copy these files from the model's page, or from the model it was fine-tuned "

@@ -10,7 +10,7 @@ from tests.support.prismatic_checkpoints import write_tokenizer
 def test_the_first_folder_that_has_a_tokenizer_wins(tmp_path: Path) -> None:
     write_tokenizer(tmp_path / "base")
     found = find_tokenizer([tmp_path / "adapter", tmp_path / "base"], None, 1, 320)
-    assert found == FileTokenizer(tmp_path / "base" / "tokenizer.json", 1)
+    assert found == FileTokenizer(tmp_path / "base", 1)
 
 
 def test_a_folder_that_was_asked_for_is_the_only_place(tmp_path: Path) -> None:
@@ -21,21 +21,21 @@ def test_a_folder_that_was_asked_for_is_the_only_place(tmp_path: Path) -> None:
 
 def test_the_beginning_comes_from_the_tokenizers_files_before_the_models(tmp_path: Path) -> None:
     write_tokenizer(tmp_path)
-    assert FileTokenizer(tmp_path / "tokenizer.json", 2).encode("put the cube")[0] == 1
+    assert FileTokenizer(tmp_path, 2).encode("put the cube")[0] == 1
     (tmp_path / "tokenizer_config.json").unlink()
-    assert FileTokenizer(tmp_path / "tokenizer.json", 2).encode("put the cube")[0] == 2
-    assert FileTokenizer(tmp_path / "tokenizer.json", None).encode("<s> put")[0] == 1
+    assert FileTokenizer(tmp_path, 2).encode("put the cube")[0] == 2
+    assert FileTokenizer(tmp_path, None).encode("<s> put")[0] == 1
 
 
 def test_special_tokens_are_those_the_file_declares(tmp_path: Path) -> None:
     write_tokenizer(tmp_path)
-    assert FileTokenizer(tmp_path / "tokenizer.json", 1).special == {0, 1, 2}
+    assert FileTokenizer(tmp_path, 1).special == {0, 1, 2}
 
 
 def test_an_unknown_word_is_an_error_that_shows_the_tokens(tmp_path: Path) -> None:
     write_tokenizer(tmp_path)
     with pytest.raises(InstructionError, match="<unk>"):
-        FileTokenizer(tmp_path / "tokenizer.json", 1).encode("put the zebra")
+        FileTokenizer(tmp_path, 1).encode("put the zebra")
 
 
 def test_bytes_know_every_text_and_need_room_for_256_of_them() -> None:

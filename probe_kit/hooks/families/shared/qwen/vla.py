@@ -17,8 +17,8 @@ from probe_kit.hooks.contract.sites import Site, Stream
 from probe_kit.hooks.contract.views import IMAGE_ROLE, PADDING
 from probe_kit.hooks.families.shared.decoder_tap import decoder_tap
 from probe_kit.hooks.families.shared.prompt_kv import kept_prompt
-from probe_kit.hooks.families.shared.qwen.text import QwenTokenizer
 from probe_kit.hooks.families.shared.qwen.tower import by_picture, tower_tap
+from probe_kit.hooks.families.shared.tokenizer_file import TokenizerFile
 from probe_kit.hooks.verification.outputs import Arrays
 from probe_kit.models.qwen import QwenInputs, QwenPictures, image_slots, merged_tokens, pack_inputs
 
@@ -95,9 +95,12 @@ class QwenVLA(Policy):
     # -- inputs ------------------------------------------------------------------------------------------
 
     @cached_property
-    def tokenizer(self) -> QwenTokenizer:
-        """The checkpoint's. Raises CheckpointError naming the missing file."""
-        return QwenTokenizer.find(self._tokenizer_folder)
+    def tokenizer(self) -> TokenizerFile:
+        """The checkpoint's. Raises CheckpointError for a missing file, and for one of another model."""
+        tokenizer = TokenizerFile(self._tokenizer_folder)
+        tokenizer.check_present()
+        tokenizer.check_vocabulary(int(self.vlm.config.text_config.vocab_size))
+        return tokenizer
 
     @cached_property
     def pictures(self) -> QwenPictures:
@@ -108,7 +111,8 @@ class QwenVLA(Policy):
 
     def prompt(self, instruction: str) -> list[int]:
         """Ids of the whole prompt, one for the picture."""
-        return self.tokenizer.encode(self.text(instruction), int(self.vlm.config.text_config.vocab_size))
+        ids: list[int] = self.tokenizer.encoding(self.text(instruction)).ids
+        return ids
 
     def token_ids(self, instructions: Sequence[str]) -> list[tuple[int, ...]]:
         """The ids of each whole prompt, one for the picture."""

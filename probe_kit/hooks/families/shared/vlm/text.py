@@ -1,25 +1,15 @@
-"""Prompts to ids, with the template strings that a vision-language model was trained with.
+"""Prompts to ids, with the template strings that a vision-language model was trained with; none is rendered."""
 
-Read by the `tokenizers` library from the checkpoint's own `tokenizer.json`; no template is rendered.
-"""
-
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
-from tokenizers import Tokenizer
+from probe_kit.errors import CheckpointError
+from probe_kit.hooks.families.shared.tokenizer_file import TokenizerFile, first_behind, positions_of, values_of
 
-from probe_kit._system.bounded_json import load_json
-from probe_kit.errors import CheckpointError, InstructionError, UsageError
-
-TOKENIZER_FILE, SETTINGS_FILE, GENERATION_FILE = (
-    "tokenizer.json",
-    "tokenizer_config.json",
-    "generation_config.json",
-)
+GENERATION_FILE = "generation_config.json"
 
 
 @dataclass(frozen=True)
@@ -54,10 +44,9 @@ class TokenPrompt:
 
 
 @dataclass(frozen=True)
-class FramedText:
-    """A model's tokenizer. folder: of its files. vocabulary: ids the model has. ends: end tokens of an answer."""
+class FramedText(TokenizerFile):
+    """A model's tokenizer and frame. vocabulary: ids the model has. ends: end tokens of an answer."""
 
-    folder: Path
     frame: Frame
     vocabulary: int
     ends: frozenset[int]
@@ -69,33 +58,23 @@ class FramedText:
         config: of the language model. generation: folder that may hold generation_config.json.
         Raises CheckpointError for missing files and for a tokenizer of another model.
         """
-        if not (folder / TOKENIZER_FILE).is_file():
-            raise CheckpointError(
-                f"{folder / TOKENIZER_FILE} is missing. The tokenizer comes with the checkpoint: copy it from the "
-                "model's page, or name a folder that has it with -M tokenizer=DIR"
-            )
+        TokenizerFile(folder).check_present()
         text = cls(folder, frame, int(config.vocab_size), _ends(generation, config))
-        check_vocabulary(text._tokenizer, folder / TOKENIZER_FILE, text.vocabulary)
+        text.check_vocabulary(text.vocabulary)
         return text
-
-    @cached_property
-    def _tokenizer(self) -> Any:
-        return Tokenizer.from_file(str(self.folder / TOKENIZER_FILE))
 
     @cached_property
     def padding(self) -> int:
         """The id that pads; it is masked."""
-        file = self.folder / SETTINGS_FILE
-        pad_token = _read(file).get("pad_token")
-        content = pad_token.get("content") if isinstance(pad_token, dict) else pad_token
-        number = self._tokenizer.token_to_id(content) if content else None
+        content = self.token_of("pad_token")
+        number = self.tokenizer.token_to_id(content) if content else None
         return 0 if number is None else int(number)
 
     def check_token(self, token: str, number: int) -> None:
         """Raise CheckpointError unless the tokenizer knows `token` by the id that the model expects."""
-        if (tokenizer_id := self._tokenizer.token_to_id(token)) != number:
+        if (tokenizer_id := self.tokenizer.token_to_id(token)) != number:
             raise CheckpointError(
-                f"{self.folder / TOKENIZER_FILE} has {token} as id {tokenizer_id}, config.json says {number}. "
+                f"{self.file} has {token} as id {tokenizer_id}, config.json says {number}. "
                 "The tokenizer belongs to another checkpoint"
             )
 
@@ -108,85 +87,28 @@ class FramedText:
         `marks` of them at either end are no picture but say where it begins and ends.
         Raises InstructionError for text that holds a token of the frames or one the tokenizer does not know.
         """
-        check_marks(self._tokenizer, question + begun)
+        self.check_marks(question + begun)
         lead = self.frame.bare if picture is None else self.frame.behind
         text = lead + question + self.frame.end + begun
-        before = [] if picture is None else [*self._encode(self.frame.before).ids, *picture]
-        behind = self._encode(text)
+        before = [] if picture is None else [*self.encoding(self.frame.before).ids, *picture]
+        behind = self.encoding(text)
         start, stop = len(lead), len(lead) + len(question)
         is_question = positions_of(behind, start, stop)
         picture_span = (len(before) - len(picture or ()) + marks, len(before) - marks) if picture else (0, 0)
         return TokenPrompt(text, (*before, *behind.ids), (*[False] * len(before), *is_question), picture_span)
 
-    def _encode(self, text: str) -> Any:
-        encoding = self._tokenizer.encode(text, add_special_tokens=False)
-        unknown = getattr(self._tokenizer.model, "unk_token", None)
-        if unknown is not None and self._tokenizer.token_to_id(unknown) in encoding.ids:
-            raise InstructionError(
-                f"{text!r} has a word this checkpoint's tokenizer does not know; the model would answer without "
-                f"reading it. Tokens: {encoding.tokens}"
-            )
-        return encoding
-
     def option(self, prompt: TokenPrompt, option: str) -> int:
         """The first id of `option` behind a prompt. Raises UsageError if it changes the prompt's own ids."""
-        return first_behind(self._encode(prompt.text).ids, self._encode(prompt.text + option).ids, option)
+        return first_behind(self.encoding(prompt.text).ids, self.encoding(prompt.text + option).ids, option)
 
     def decode(self, ids: Sequence[int]) -> str:
         """The text of ids up to an end, without special tokens."""
-        return words_of(self._tokenizer, ids, self.ends)
-
-
-def check_vocabulary(tokenizer: Any, file: Path, vocabulary: int) -> None:
-    """Raise CheckpointError for a tokenizer with ids that the model does not have."""
-    if (highest := max(tokenizer.get_vocab(with_added_tokens=True).values())) >= vocabulary:
-        raise CheckpointError(
-            f"{file} has ids up to {highest}; this model has {vocabulary}. The tokenizer belongs to another "
-            "checkpoint"
-        )
-
-
-def check_marks(tokenizer: Any, text: str) -> None:
-    """Raise InstructionError for a text that holds a token of the frames."""
-    for token in tokenizer.get_added_tokens_decoder().values():
-        if token.special and token.content in text:
-            raise InstructionError(
-                f"the text {text!r} holds {token.content!r}, which stands for something else in the prompt; "
-                "write it without"
-            )
-
-
-def positions_of(encoding: Any, start: int, stop: int) -> tuple[bool, ...]:
-    """True for ids, special ones left out, that hold characters from `start` up to `stop` of the text."""
-    return tuple(
-        first < stop and last > start and not special
-        for (first, last), special in zip(encoding.offsets, encoding.special_tokens_mask, strict=True)
-    )
-
-
-def first_behind(before: Sequence[int], extended: Sequence[int], option: str) -> int:
-    """The first id of an option. before, extended: the ids of a prompt without it and with it behind.
-
-    Raises UsageError for an option that changes the prompt's own ids.
-    """
-    count = len(before)
-    if len(extended) == count or extended[:count] != before:
-        raise UsageError(
-            f"the option {option!r} merges with the end of the prompt: {list(extended[count - 2 :])} instead of "
-            f"{list(before[-2:])} and more. Give it as it stands behind the prompt"
-        )
-    return int(extended[count])
-
-
-def words_of(tokenizer: Any, ids: Sequence[int], ends: Collection[int]) -> str:
-    """The text of ids up to one of `ends`, without special tokens."""
-    answer = list(takewhile(lambda number: number not in ends, ids))
-    return str(tokenizer.decode(answer, skip_special_tokens=True)).strip()
+        return self.words(ids, self.ends)
 
 
 def _ends(folder: Path, config: Any) -> frozenset[int]:
     """The end tokens in generation_config.json, or else in the configuration. Raises CheckpointError for none."""
-    stored = _read(folder / GENERATION_FILE).get("eos_token_id", getattr(config, "eos_token_id", None))
+    stored = values_of(folder / GENERATION_FILE).get("eos_token_id", getattr(config, "eos_token_id", None))
     numbers = stored if isinstance(stored, list) else [stored]
     if None in numbers or not numbers:
         raise CheckpointError(
@@ -194,13 +116,3 @@ def _ends(folder: Path, config: Any) -> frozenset[int]:
             "Copy the file from the model's page"
         )
     return frozenset(map(int, numbers))
-
-
-def _read(file: Path) -> dict[str, Any]:
-    """A file's values; none without it. Raises CheckpointError for one that is not JSON."""
-    if not file.is_file():
-        return {}
-    try:
-        return dict(load_json(file))
-    except ValueError as error:
-        raise CheckpointError(f"{file} is not JSON ({error}); download the checkpoint again") from error

@@ -1,0 +1,128 @@
+"""A checkpoint's `tokenizer.json`, read by the `tokenizers` library itself.
+
+transformers 5 rebuilds Llama's tokenizer by rules of its own, while the released models were trained with what the
+file says.
+"""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import takewhile
+from pathlib import Path
+from typing import Any
+
+from tokenizers import Tokenizer
+
+from probe_kit._system.bounded_json import load_json
+from probe_kit.errors import CheckpointError, InstructionError, UsageError
+
+TOKENIZER_FILE, SETTINGS_FILE = "tokenizer.json", "tokenizer_config.json"
+
+
+@dataclass(frozen=True)
+class TokenizerFile:
+    """The tokenizer of a folder, with the names of special tokens from the file beside it, if any."""
+
+    folder: Path
+
+    @property
+    def file(self) -> Path:
+        """The file of the tokenizer."""
+        return self.folder / TOKENIZER_FILE
+
+    def check_present(self) -> None:
+        """Raise CheckpointError where the file is missing."""
+        if not self.file.is_file():
+            raise CheckpointError(
+                f"{self.file} is missing. The tokenizer comes with the checkpoint or with the model it was made "
+                "of: copy it from that model's page, or name a folder that has it with -M tokenizer=DIR"
+            )
+
+    def check_vocabulary(self, vocabulary: int) -> None:
+        """Raise CheckpointError for ids that a model of so many does not have."""
+        if (highest := max(self.tokenizer.get_vocab(with_added_tokens=True).values())) >= vocabulary:
+            raise CheckpointError(
+                f"{self.file} has ids up to {highest}; this model has {vocabulary}. The tokenizer belongs to "
+                "another checkpoint"
+            )
+
+    @cached_property
+    def tokenizer(self) -> Any:
+        """The library's tokenizer."""
+        return Tokenizer.from_file(str(self.file))
+
+    @cached_property
+    def settings(self) -> dict[str, Any]:
+        """The settings beside it; none without the file. Raises CheckpointError for one that is not JSON."""
+        return values_of(self.folder / SETTINGS_FILE)
+
+    def token_of(self, kind: str) -> str | None:
+        """The text of a special token such as `pad_token`, None where the settings name none."""
+        token = self.settings.get(kind)
+        return (token.get("content") if isinstance(token, dict) else token) or None
+
+    @cached_property
+    def special(self) -> frozenset[int]:
+        """Ids that stand for no text, such as the ends of a chat's turns."""
+        added = self.tokenizer.get_added_tokens_decoder()
+        return frozenset(number for number, token in added.items() if token.special)
+
+    def encoding(self, text: str, special: bool = False) -> Any:
+        """The library's encoding. special: with the tokens that the file puts around a text.
+
+        Raises InstructionError for a word that the tokenizer does not know.
+        """
+        encoding = self.tokenizer.encode(text, add_special_tokens=special)
+        unknown = getattr(self.tokenizer.model, "unk_token", None)
+        if unknown is not None and self.tokenizer.token_to_id(unknown) in encoding.ids:
+            raise InstructionError(
+                f"{text!r} has a word this checkpoint's tokenizer does not know; the model would not read it. "
+                f"Tokens: {encoding.tokens}"
+            )
+        return encoding
+
+    def check_marks(self, text: str) -> None:
+        """Raise InstructionError for a text that holds a special token."""
+        for token in self.tokenizer.get_added_tokens_decoder().values():
+            if token.special and token.content in text:
+                raise InstructionError(
+                    f"the text {text!r} holds {token.content!r}, which stands for something else in the prompt; "
+                    "write it without"
+                )
+
+    def words(self, ids: Sequence[int], ends: Collection[int] = ()) -> str:
+        """The text of ids up to one of `ends`, without special tokens."""
+        answer = list(takewhile(lambda number: number not in ends, ids))
+        return str(self.tokenizer.decode(answer, skip_special_tokens=True)).strip()
+
+
+def positions_of(encoding: Any, start: int, stop: int) -> tuple[bool, ...]:
+    """True for ids, special ones left out, that hold characters from `start` up to `stop` of the text."""
+    return tuple(
+        first < stop and last > start and not special
+        for (first, last), special in zip(encoding.offsets, encoding.special_tokens_mask, strict=True)
+    )
+
+
+def first_behind(before: Sequence[int], extended: Sequence[int], option: str) -> int:
+    """The first id of an option. before, extended: the ids of a prompt without it and with it behind.
+
+    Raises UsageError for an option that changes the prompt's own ids: its logit would be that of another prompt.
+    """
+    count = len(before)
+    if len(extended) == count or extended[:count] != before:
+        raise UsageError(
+            f"the option {option!r} merges with the end of the prompt: {list(extended[count - 2 :])} instead of "
+            f"{list(before[-2:])} and more. Give it as it stands behind the prompt, such as ' A'"
+        )
+    return int(extended[count])
+
+
+def values_of(file: Path) -> dict[str, Any]:
+    """A file's values; none without it. Raises CheckpointError for one that is not JSON."""
+    if not file.is_file():
+        return {}
+    try:
+        return dict(load_json(file))
+    except ValueError as error:
+        raise CheckpointError(f"{file} is not JSON ({error}); download the checkpoint again") from error
