@@ -122,7 +122,7 @@ def _model_rows(name: str | None) -> list[dict[str, Any]]:
             "model": family.name,
             "description": family.description,
             "checkpoint": family.default_checkpoint or ("your own" if family.needs_checkpoint else EMBEDDED),
-            "streams": family.streams,
+            "streams": family.streams_text(),
             "embodiment": family.embodiment,
             "scene": str(family.home),
             "ready": _ready(family),

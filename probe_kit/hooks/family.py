@@ -56,7 +56,8 @@ SIZE = "size"
 class Family:
     """A model family by name.
 
-    default_checkpoint: hub id, or None for the embedded one. streams: layers and iterations at full size.
+    default_checkpoint: hub id, or None for the embedded one. streams: layers and iterations in words, of a family
+    that declares none.
     loader, outputs, full_size: `module:function`, imported only when used. loader(checkpoint, device, dtype,
     random_weights) gives a Model, and takes `weights_seed` if its untrained networks can differ; outputs(loader,
     folder, recorded arrays) gives the `Outputs` that a golden reference is compared with; full_size() gives the
@@ -268,6 +269,11 @@ class Family:
         """The streams of the size that `options` choose; None for a family that declares none."""
         size = check_options(self.name, self.options, options).get(SIZE)
         return self.declared.get(size or next(iter(self.declared), ""))
+
+    def streams_text(self) -> str:
+        """The streams of the default size in words."""
+        declared = next(iter(self.declared.values()), ())
+        return ", ".join(str(each) for each in declared) or self.streams
 
     def weights_bytes(
         self, options: Mapping[str, Any], dtype: Dtype = "float32", parameters: int | None = None

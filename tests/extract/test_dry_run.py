@@ -232,17 +232,6 @@ def test_every_family_of_the_hub_declares_its_sizes() -> None:
         assert family.sizes == () or [size for size, _ in family.sizes] == list(family.declared)
 
 
-@pytest.mark.parametrize(("name", "size"), RELEASED)
-def test_declared_streams_are_those_of_the_models_line(name: str, size: str) -> None:
-    text = own_families()[name].streams
-    for one in own_families()[name].declared[size]:
-        shown = one.stream.name.removesuffix("_unconditional")
-        if f"({size})" in text or not size:
-            assert f"{shown} {one.stream.layers} layers" in text
-        if one.stream.iterations and one.stream.name != "answer":
-            assert f"layers x {one.stream.iterations}" in text
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "size"), RELEASED)
 def test_declared_sizes_are_those_of_the_released_network(name: str, size: str) -> None:

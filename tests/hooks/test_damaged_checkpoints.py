@@ -17,39 +17,31 @@ from probe_kit.hooks.checkpoints.third_party import while_acting
 from probe_kit.hooks.registry import find_family
 from probe_kit.hooks.testing import example_observations
 from probe_kit.models.embedded.folder import embedded_checkpoint
-from tests.support.internvla_checkpoints import write_checkpoint as write_internvla
-from tests.support.magma_checkpoints import write_checkpoint as write_magma
-from tests.support.prismatic_checkpoints import write_checkpoint as write_openvla
-from tests.support.prismatic_checkpoints import write_tokenizer
-from tests.support.spatialvla_checkpoints import write_checkpoint as write_spatialvla
-from tests.support.xiaomi_checkpoints import write_checkpoint as write_xiaomi
+from tests.support.every_checkpoint import WRITERS
 
 GOLDEN = Path(__file__).parents[1] / "golden"
-FOLDERS = {
-    "pi0-tiny": embedded_checkpoint("pi0-tiny"),
-    "pi0": GOLDEN / "pi0" / "checkpoint",
-    "pi05": GOLDEN / "pi05" / "checkpoint",
-    "pi0-fast": GOLDEN / "pi0_fast" / "checkpoint",
-    "molmoact2": GOLDEN / "molmoact2" / "checkpoint",
-    "groot": GOLDEN / "groot" / "checkpoint",
-    "xvla": GOLDEN / "xvla" / "checkpoint",
-    "eo1": GOLDEN / "eo1" / "checkpoint",
-    "smolvla": GOLDEN / "smolvla" / "checkpoint",
-    "openvla": GOLDEN / "openvla" / "checkpoint",
-    "magma": GOLDEN / "magma" / "checkpoint",
-    "spatialvla": GOLDEN / "spatialvla" / "checkpoint",
-    "xiaomi-r0": GOLDEN / "xiaomi_r0" / "checkpoint",
-    "internvla-m1": GOLDEN / "internvla_m1" / "checkpoint",
-}
 REFUSALS = (CheckpointError, WeightsError)
-COPIED = ("pi0-tiny", "pi0", "pi05", "pi0-fast", "molmoact2", "groot", "xvla", "eo1", "smolvla")
-"""Act as they lie there. To the others' golden references a tokenizer or units are missing: they are made here."""
-MADE = {
-    "openvla": write_openvla,
-    "magma": write_magma,
-    "spatialvla": write_spatialvla,
-    "xiaomi-r0": write_xiaomi,
-    "internvla-m1": write_internvla,
+
+
+def copy_of(folder: Path) -> Callable[[Path], Path]:
+    """A writer that copies a checkpoint with what lies beside it: sizes and tokenizers of golden references do."""
+
+    def write(place: Path) -> Path:
+        if not folder.is_dir():
+            pytest.skip(f"no golden reference at {folder}")
+        if folder.name != "checkpoint":
+            return Path(shutil.copytree(folder, place / "checkpoint"))
+        shutil.copytree(folder.parent, place, ignore=shutil.ignore_patterns("*.npz", "*.gz"))
+        return place / "checkpoint"
+
+    return write
+
+
+FAMILIES = {
+    **{name: pair for name, pair in WRITERS.items() if find_family(name).acts},
+    "pi0-tiny": (copy_of(embedded_checkpoint("pi0-tiny")), {}),
+    "pi0": (copy_of(GOLDEN / "pi0" / "checkpoint"), {}),  # with the statistics that others leave to an evaluation
+    "groot": (copy_of(GOLDEN / "groot" / "checkpoint"), {}),  # without the base's weights, which nothing reads
 }
 INSTRUCTIONS = {"pi0": "the cube on the red", "smolvla": "the cube on the red"}
 """The words that the golden tokenizers know."""
@@ -70,7 +62,7 @@ def _bounded_memory() -> Iterator[None]:
     resource.setrlimit(resource.RLIMIT_AS, before)
 
 
-@pytest.fixture(params=FOLDERS)
+@pytest.fixture(params=FAMILIES)
 def family(request: pytest.FixtureRequest) -> str:
     name: str = request.param
     return name
@@ -78,27 +70,14 @@ def family(request: pytest.FixtureRequest) -> str:
 
 @pytest.fixture
 def checkpoint(family: str, tmp_path: Path) -> Path:
-    """A copy that a test may damage."""
-    if not FOLDERS[family].is_dir():
-        pytest.skip(f"no golden reference at {FOLDERS[family]}")
-    return copied(family, tmp_path / "whole")
-
-
-def copied(family: str, place: Path) -> Path:
-    """A copy with what lies beside it: sizes and tokenizers of golden references do."""
-    original = FOLDERS[family]
-    if original.name != "checkpoint":
-        return Path(shutil.copytree(original, place / "checkpoint"))
-    return (
-        Path(shutil.copytree(original.parent, place, ignore=shutil.ignore_patterns("*.npz", "*.gz")))
-        / "checkpoint"
-    )
+    """A checkpoint that acts, in a folder of its own with all that it needs, which a test may damage."""
+    write, _ = FAMILIES[family]
+    return write(tmp_path / "whole")
 
 
 def load(family: str, checkpoint: Path) -> Any:
     try:
-        options = {"unnorm_key": "bridge_orig"} if family == "openvla" else {}
-        return find_family(family).load(str(checkpoint), options=options)
+        return find_family(family).load(str(checkpoint), options=FAMILIES[family][1])
     except MissingExtraError as error:
         pytest.skip(str(error))
 
@@ -153,9 +132,8 @@ def edit_tensors(
 def test_every_family_of_ours_is_looked_at() -> None:
     from probe_kit.hooks.registry import own_families
 
-    untouched = {"pi0-tiny-early", "pi0-tiny-state", "prismatic"}
-    while_acting = {name for name, one in own_families().items() if one.acts}
-    assert while_acting - untouched <= FOLDERS.keys()
+    acting = {name for name, one in own_families().items() if one.acts}
+    assert acting - {"pi0-tiny-early", "pi0-tiny-state"} == FAMILIES.keys()
 
 
 @pytest.mark.parametrize("kind", [torch.int8, torch.float8_e4m3fn, torch.complex64], ids=str)
@@ -269,20 +247,6 @@ def damage(checkpoint: Path, random: Random) -> str:
     return f"{kind} {file.name}"
 
 
-@pytest.fixture
-def whole(family: str, tmp_path: Path) -> Path:
-    """A checkpoint that acts, in a folder of its own with all that it needs."""
-    if family in COPIED:
-        if not FOLDERS[family].is_dir():
-            pytest.skip(f"no golden reference at {FOLDERS[family]}")
-        return copied(family, tmp_path / "whole")
-    made: Path = MADE[family](tmp_path / "whole")
-    if family == "openvla":
-        write_tokenizer(made)
-    assert np.isfinite(act(family, made)).all()
-    return made
-
-
 def check(family: str, whole: Path, place: Path, seed: int) -> bool:
     """Whether a damaged copy was refused.
 
@@ -306,12 +270,15 @@ def check(family: str, whole: Path, place: Path, seed: int) -> bool:
 
 @pytest.mark.slow  # a family whose sizes were damaged may build a large network before it is refused
 @pytest.mark.parametrize("seed", [1, 2])
-def test_any_accident_is_refused_by_name_or_harmless(family: str, whole: Path, tmp_path: Path, seed: int) -> None:
-    check(family, whole, tmp_path, seed)
+def test_any_accident_is_refused_by_name_or_harmless(
+    family: str, checkpoint: Path, tmp_path: Path, seed: int
+) -> None:
+    check(family, checkpoint, tmp_path, seed)
 
 
 @pytest.mark.slow
-def test_a_hundred_accidents_of_each_family(family: str, whole: Path, tmp_path: Path) -> None:
-    refused = sum(check(family, whole, tmp_path, seed) for seed in range(100, 200))
+def test_a_hundred_accidents_of_each_family(family: str, checkpoint: Path, tmp_path: Path) -> None:
+    assert np.isfinite(act(family, checkpoint)).all()
+    refused = sum(check(family, checkpoint, tmp_path, seed) for seed in range(100, 200))
     print(f"{family}: {refused} of 100 refused, the others acted with finite numbers")
     assert 0 < refused < 100, "a checkpoint that never acts, or never cannot, shows nothing"

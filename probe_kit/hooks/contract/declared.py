@@ -19,6 +19,12 @@ class DeclaredStream:
     tokens: int
     roles: tuple[str, ...]
 
+    def __str__(self) -> str:
+        """The stream in words, such as `expert 19 layers x 10 iterations`."""
+        stream = self.stream
+        times = "" if stream.iterations in (None, 1) else f" x {stream.iterations} iterations"
+        return f"{stream.name} {stream.layers} layers{times}"
+
 
 def backbone(
     layers: int, width: int, tokens: int, *more: str, camera: str = "primary", sums: bool = True

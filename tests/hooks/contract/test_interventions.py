@@ -49,7 +49,7 @@ def test_a_family_that_says_nothing_is_told_how_to_say_it() -> None:
 
 def test_another_adapter_over_the_same_network_keeps_its_memory(pi0_tiny: Pi0, observation: Observation) -> None:
     """The prompt passes once, however often an adapter is put around it."""
-    again = type(pi0_tiny)(pi0_tiny.network, pi0_tiny.folder)
+    again = type(pi0_tiny)(pi0_tiny.network, pi0_tiny.folder, pi0_tiny.checkpoint)
     again.card = pi0_tiny.card
     assert again.passages is pi0_tiny.passages
     site = Site("kv", 0, "keys")

@@ -24,7 +24,6 @@ FAMILIES = (
         "EO-1 (Qwen2.5-VL 3B whose decoder denoises actions) through lerobot",
         None,
         "eo1.adapter:Eo1",
-        streams="backbone 37 layers, expert 37 layers x 10 steps",
         embodiment="as the checkpoint's data set",
         notes=(
             "A checkpoint in lerobot's layout, with the configuration of its Qwen2.5-VL in config.json; the "

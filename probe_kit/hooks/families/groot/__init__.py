@@ -28,7 +28,6 @@ FAMILIES = (
         "GR00T N1.7 (Qwen3-VL cut behind layer 16, bridge, diffusion transformer) through lerobot",
         "nvidia/GR00T-N1.7-3B",
         "groot.adapter:Groot",
-        streams="backbone 17 layers, bridge 5 layers, expert 33 layers x 4 steps",
         embodiment="as the checkpoint's statistics",
         hub=(("nvidia/Cosmos-Reason2-2B", "tokenizer.json"),),
         notes=(

@@ -10,7 +10,6 @@ FAMILIES = (
         "InternVL3.5 (InternViT, Qwen3 decoder; pictures as tiles), on transformers' own network",
         "OpenGVLab/InternVL3_5-8B-HF",
         "internvl.adapter:InternVL.load",
-        streams="backbone 37 layers, answer 37 layers (8B)",
         notes="the repositories that end in -HF; 8B 17 GB, 38B 77 GB in bfloat16",
         config_types=("internvl",),
         instead=(

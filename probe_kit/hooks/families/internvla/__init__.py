@@ -31,7 +31,6 @@ FAMILIES = (
         "InternVLA-M1 (Qwen2.5-VL 3B, DINOv2, querying transformer, guided diffusion head), native",
         "InternRobotics/InternVLA-M1-Pretrain-RT-1-Bridge",
         "probe_kit.hooks.families.internvla.adapter:load_internvla",
-        streams="backbone 37 layers, bridge 2 layers, expert 13 layers x 10 iterations, twice under guidance",
         embodiment="as the data set of -M unnorm_key; bridge_dataset: WidowX end-effector delta at 5 Hz",
         notes="MIT, Qwen research licence; a .pt file; tokenizer and configuration of Qwen/Qwen2.5-VL-3B-Instruct",
         outputs="probe_kit.hooks.families.internvla.outputs:internvla_outputs",

@@ -12,7 +12,6 @@ FAMILIES = (
         "Magma (ConvNeXt-XXLarge, Llama 3 8B, actions as tokens, answers in text), native",
         "microsoft/Magma-8B",
         "probe_kit.hooks.families.magma.adapter:load_magma",
-        streams="backbone 33 layers, action 33 layers x 7 action tokens; no action expert",
         embodiment="as the data set of -M unnorm_key; bridge_orig: WidowX end-effector delta at 5 Hz",
         packages=(("timm", "magma"),),
         notes="MIT, Llama 3 licence; extra magma; about 18 GB in bfloat16",

@@ -6,7 +6,6 @@ assistant's turn. Seven tokens follow, one per dimension, then the end of the tu
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.contract.card import ARM
-from probe_kit.hooks.contract.model import AnswerModel, Policy, Prompt, Reading, Tap
+from probe_kit.hooks.contract.model import Policy, Prompt, Reading, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import Site, Stream
@@ -38,7 +37,7 @@ from probe_kit.hooks.families.shared.kinds import MAPS
 from probe_kit.hooks.families.shared.prompt_kv import kept_prompt
 from probe_kit.hooks.families.shared.sampling import CHECKPOINT, TOP, chooser, top_of
 from probe_kit.hooks.families.shared.token_decoder import TokenDecoder
-from probe_kit.hooks.families.shared.vlm.decoding import Prefill
+from probe_kit.hooks.families.shared.vlm.decoding import Prefill, SpeakingModel
 from probe_kit.models.decoding import Choose, Decoded, greedy
 from probe_kit.models.magma import (
     ACTION_QUESTION,
@@ -60,7 +59,7 @@ PROMPTS = ("magma", "act2answer")
 _SHRINK = 256
 
 
-class Magma(TokenDecoder, Policy, AnswerModel):
+class Magma(TokenDecoder, Policy, SpeakingModel):
     """A loaded Magma: acts, and answers questions in text."""
 
     interventions = MAPS
@@ -217,10 +216,10 @@ class Magma(TokenDecoder, Policy, AnswerModel):
     def _behind(self, decoded: Decoded) -> Tensor:
         """(B, V) logits behind the seven tokens, from modules without hooks."""
         with torch.inference_mode():
-            return self.network.logits_behind(decoded, self._unhooked)
+            return self.network.logits_behind(decoded, self.speaker)
 
     @cached_property
-    def _unhooked(self) -> Any:
+    def speaker(self) -> Any:
         """The language model's weights in modules of their own, so that what runs there fires no tap."""
         return self.network.unhooked()
 
@@ -240,20 +239,20 @@ class Magma(TokenDecoder, Policy, AnswerModel):
         pictured = self.shows_pictures(questions)
         pictures = [self.picture(question.observation.image) for question in questions] if pictured else None
         decoded = self.generate(prompts, pictures)
-        prefill = Prefill.of_decoded(self.network.language_model, decoded)
+        prefill = Prefill.of_decoded(self.speaker, decoded)
         return Reading.of(prefill.logits.float().cpu().numpy(), options, prefill)
 
     def _question(self, question: Prompt) -> TokenPrompt:
         return self.text.prompt(question.text, question.begun, question.pictured)
 
-    def speak(self, reading: Reading, tokens: int) -> list[str]:
-        """Greedy text up to the end of the turn; see the contract. Raises UsageError for another's reading."""
-        state = reading.state
-        if not isinstance(state, Prefill) or state.network is not self.network.language_model:
-            raise UsageError("this reading does not come from this model; pass what its read() returned")
-        with torch.inference_mode():  # without hooks: the inference that is captured ended with the reading
-            ids = replace(state, network=self._unhooked).speak(tokens, self.text.ends)
-        return [self.text.decode(row) for row in ids.tolist()]
+    @property
+    def ends(self) -> frozenset[int]:
+        """Ids that end the turn."""
+        return self.text.ends
+
+    def words(self, ids: Sequence[int]) -> str:
+        """The text of an answer's ids, up to the end of the turn."""
+        return self.text.decode(ids)
 
     # -- capture -----------------------------------------------------------------------------------------
 

@@ -21,7 +21,6 @@ FAMILIES = (
         "MolmoAct2 (Molmo2-ER, flow-matching expert on the keys and values of each layer) through lerobot",
         "allenai/MolmoAct2-LIBERO-LeRobot",
         "molmoact2.adapter:MolmoAct2",
-        streams="backbone 37 layers, expert 37 layers x 10 flow steps",
         embodiment="LIBERO end-effector delta; other fine-tunes in lerobot's layout as --checkpoint",
         hub=(("allenai/MolmoAct2-LIBERO", "tokenizer.json"),),
         notes=(

@@ -31,7 +31,6 @@ FAMILIES = (
         "OpenVLA (DINOv2 + SigLIP, Llama 2 7B, actions as tokens), native; fine-tunes and LoRA as --checkpoint",
         "openvla/openvla-7b",
         "probe_kit.hooks.families.openvla.adapter:load_openvla",
-        streams="backbone 33 layers, action 33 layers x 7 action tokens; no action expert",
         embodiment="as the data set of -M unnorm_key; bridge_orig: WidowX end-effector delta at 5 Hz",
         packages=(("timm", "openvla"),),
         notes="MIT, Llama 2 licence; extra openvla; about 16 GB in bfloat16",

@@ -10,7 +10,6 @@ FAMILIES = (
         "Ovis2.5 (SigLIP 2 at any resolution, visual words, Qwen3 decoder), native",
         "AIDC-AI/Ovis2.5-9B",
         "ovis2_5.adapter:Ovis25.load",
-        streams="backbone 37 layers, answer 37 layers",
         notes="asked without its thought; 18 GB in bfloat16",
         config_types=("ovis2_5",),
         declared={"": answering(37, 4096, 240)},

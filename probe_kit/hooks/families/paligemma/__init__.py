@@ -22,7 +22,6 @@ FAMILIES = (
         "PaliGemma 3B (SigLIP, Gemma 2B; the prompt attends both ways), pi0's source",
         "google/paligemma-3b-pt-224",
         "paligemma.adapter:PaliGemma.load",
-        streams="backbone 19 layers, answer 19 layers",
         notes="Gemma licence, gated; pt, not mix: it was not trained to follow instructions; 5.9 GB in bfloat16",
         config_types=("paligemma",),
         declared={"": answering(19, 2048, 290)},

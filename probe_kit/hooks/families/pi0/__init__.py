@@ -54,7 +54,6 @@ FAMILIES = (
         "pi0 (PaliGemma 3B + 300M flow-matching expert) through lerobot",
         "juexzz/INTACT-pi0-finetune-bridge",
         "pi0.adapter:Pi0",
-        streams="backbone 19 layers, expert 19 layers x 10 iterations",
         embodiment="WidowX end-effector delta at 5 Hz; other fine-tunes as --checkpoint",
         hub=(("google/paligemma-3b-pt-224", "tokenizer.json"),),
         notes=(

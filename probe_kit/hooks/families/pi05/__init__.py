@@ -11,7 +11,6 @@ FAMILIES = (
         "pi0.5 (PaliGemma 3B + 300M flow-matching expert with adaptive norms) through lerobot",
         "lerobot/pi05_base",
         "pi05.adapter:Pi05",
-        streams="backbone 19 layers, expert 19 layers x 10 iterations",
         embodiment="as fine-tuned; the base model acts in 32 unnamed dimensions",
         hub=(("google/paligemma-3b-pt-224", "tokenizer.json"),),
         notes=(

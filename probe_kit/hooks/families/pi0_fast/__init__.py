@@ -18,7 +18,6 @@ FAMILIES = (
         "pi0-FAST (PaliGemma 3B, actions as compressed tokens) through lerobot",
         "lerobot/pi0fast-base",
         "pi0_fast.adapter:Pi0Fast",
-        streams=f"backbone 19 layers, action 19 layers x {CAPTURED} action tokens of a variable number",
         embodiment="as fine-tuned; the base model acts in 32 unnamed dimensions",
         hub=(
             ("google/paligemma-3b-pt-224", "tokenizer.json"),

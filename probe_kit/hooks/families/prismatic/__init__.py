@@ -20,7 +20,6 @@ FAMILIES = (
         "Prismatic vision-language models, OpenVLA's source (one or two towers; Llama 2, Vicuna, Mistral, Phi-2)",
         "TRI-ML/prismatic-vlms/prism-dinosiglip-224px+7b",
         "prismatic.adapter:load_prismatic",
-        streams="backbone 33 layers, answer 33 layers (7B)",
         packages=(("timm", "openvla"),),
         notes=(
             "MIT, Llama 2 licence; extra openvla; one .pt file, towers of timm, tokenizer of openvla/openvla-7b; "

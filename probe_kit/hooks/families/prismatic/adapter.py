@@ -20,7 +20,7 @@ from torch import Tensor
 from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.hooks.checkpoints.checkpoint import side_files
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
-from probe_kit.hooks.contract.model import AnswerModel, Prompt, Reading, Tap
+from probe_kit.hooks.contract.model import Prompt, Reading, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import Site, Stream
@@ -29,7 +29,7 @@ from probe_kit.hooks.families.prismatic.checkpoint import LoadedPrismatic, load_
 from probe_kit.hooks.families.prismatic.frames import TextFrame, frame_of
 from probe_kit.hooks.families.prismatic.tokenizer import ByteTokenizer, TextTokenizer, find_tokenizer, id_behind
 from probe_kit.hooks.families.shared.token_decoder import TokenDecoder
-from probe_kit.hooks.families.shared.vlm.decoding import Prefill
+from probe_kit.hooks.families.shared.vlm.decoding import Prefill, SpeakingModel
 from probe_kit.models.decoding import Choose, Decoded, greedy
 from probe_kit.models.packing import Packed
 from probe_kit.models.prismatic import PictureSettings, PrismaticNetwork, prepare_picture
@@ -146,7 +146,7 @@ class PrismaticModel(TokenDecoder):
         return dict(zip(("vision", "vision_fused"), self.network.vision_backbone.towers, strict=False))
 
 
-class Prismatic(PrismaticModel, AnswerModel):
+class Prismatic(PrismaticModel, SpeakingModel):
     """A loaded Prismatic vision-language model: answers in text."""
 
     family: ClassVar[str] = "prismatic"
@@ -190,7 +190,7 @@ class Prismatic(PrismaticModel, AnswerModel):
         if self.shows_pictures(questions):
             pixels = self.pixel_values(question.observation.image for question in questions)
         decoded = self.generate(pixels, [self.tokenizer.encode(self._framed(question)) for question in questions])
-        return Prefill.of_decoded(self.network.language_model, decoded)
+        return Prefill.of_decoded(self.speaker, decoded)
 
     def _framed(self, question: Prompt) -> str:
         return self.frame.around(question.text) + question.begun
@@ -210,14 +210,14 @@ class Prismatic(PrismaticModel, AnswerModel):
             rows.append([*labels[:1], *image, *labels[1:-1]])
         return self.roles_of(rows)
 
-    def speak(self, reading: Reading, tokens: int) -> list[str]:
-        """Greedy text from the keys and values of the prompt on; see the contract. Raises UsageError."""
-        if not isinstance(reading.state, Prefill) or reading.state.network is not self.network.language_model:
-            raise UsageError("this reading does not come from this model; pass what its read() returned")
-        with torch.inference_mode():
-            ids = reading.state.speak(tokens, self.ends)
-        answers = [list(takewhile(lambda number: number not in self.ends, row)) for row in ids.tolist()]
-        return [self.tokenizer.decode(row) for row in answers]
+    @property
+    def speaker(self) -> Any:
+        """The language model."""
+        return self.network.language_model
+
+    def words(self, ids: Sequence[int]) -> str:
+        """The text of an answer's ids, up to its end."""
+        return self.tokenizer.decode(list(takewhile(lambda number: number not in self.ends, ids)))
 
     @cached_property
     def ends(self) -> frozenset[int]:

@@ -10,7 +10,6 @@ FAMILIES = (
         "Qwen2.5-VL (vision tower with windows, Qwen2 decoder), on transformers' own network",
         "Qwen/Qwen2.5-VL-7B-Instruct",
         "qwen2_5_vl.adapter:Qwen25VL.load",
-        streams="backbone 29 layers, answer 29 layers (7B)",
         notes="7B 17 GB, 32B 67 GB in bfloat16; 3B is InternVLA-M1's source",
         config_types=("qwen2_5_vl",),
         declared={

@@ -10,7 +10,6 @@ FAMILIES = (
         "Qwen3-VL (vision tower with DeepStack, Qwen3 decoder), on transformers' own network",
         "Qwen/Qwen3-VL-8B-Instruct",
         "qwen3_vl.adapter:Qwen3VL.load",
-        streams="backbone 37 layers, answer 37 layers (8B)",
         notes="8B 18 GB, 32B 67 GB in bfloat16; 4B is Xiaomi-R0's source",
         config_types=("qwen3_vl",),
         declared={

@@ -9,7 +9,6 @@ FAMILIES = (
         "SmolVLA (SmolVLM2 500M, 16 layers, + flow-matching expert) through lerobot",
         "lerobot/smolvla_base",
         "smolvla.adapter:SmolVLA",
-        streams="backbone 17 layers, expert 17 layers x 10 iterations",
         embodiment="as fine-tuned; the base model acts in SO-100 joint positions",
         hub=(("HuggingFaceTB/SmolVLM2-500M-Video-Instruct", "tokenizer.json"),),
         notes=(

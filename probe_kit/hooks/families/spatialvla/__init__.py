@@ -13,7 +13,6 @@ FAMILIES = (
         "SpatialVLA (SigLIP + ZoeDepth, Gemma 2 2B, three action tokens per step), native; sees depth",
         "IPEC-COMMUNITY/spatialvla-4b-224-pt",
         "probe_kit.hooks.families.spatialvla.adapter:load_spatialvla",
-        streams="backbone 27 layers, action 27 layers x 3 action tokens; no action expert",
         embodiment="as the data set of -M unnorm_key; bridge_orig/1.0.0: WidowX end-effector delta at 5 Hz",
         notes="MIT, Gemma licence; weights 8.1 GB in bfloat16; also …-mix-224-pt, …-sft-bridge, …-sft-fractal",
         outputs="probe_kit.hooks.families.spatialvla.outputs:spatialvla_outputs",

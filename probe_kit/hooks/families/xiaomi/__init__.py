@@ -26,7 +26,6 @@ FAMILIES = (
         "Xiaomi-Robotics-R0 (Qwen3-VL 4B + flow transformer on its keys and values), native",
         "XiaomiRobotics/Xiaomi-Robotics-0-SimplerEnv-WidowX",
         "probe_kit.hooks.families.xiaomi.adapter:load_xiaomi",
-        streams="backbone 37 layers, expert 17 layers x 5 iterations (renormalised within layers)",
         embodiment="as the robot of -M robot; bridge: WidowX end-effector delta at 5 Hz",
         notes="Apache-2.0; 9.4 GB in bfloat16",
         outputs="probe_kit.hooks.families.xiaomi.outputs:xiaomi_outputs",

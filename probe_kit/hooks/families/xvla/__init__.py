@@ -28,7 +28,6 @@ FAMILIES = (
         "X-VLA (Florence-2 encoder, soft-prompted transformer) through lerobot",
         "lerobot/xvla-base",
         "xvla.adapter:Xvla",
-        streams="backbone 13 layers, expert 25 layers x 10 steps",
         embodiment="as the checkpoint's action space; the released ones are absolute poses",
         hub=(("facebook/bart-large", "tokenizer.json"),),
         notes=(

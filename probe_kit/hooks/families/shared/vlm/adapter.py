@@ -15,8 +15,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from probe_kit.errors import InstructionError, UsageError
-from probe_kit.hooks.contract.model import AnswerModel, Prompt, Reading, Tap
+from probe_kit.errors import InstructionError
+from probe_kit.hooks.contract.model import Prompt, Reading, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import Site, Stream
@@ -25,7 +25,7 @@ from probe_kit.hooks.contract.views import IMAGE_ROLE, PADDING
 from probe_kit.hooks.families.shared.decoder_tap import decoder_tap
 from probe_kit.hooks.families.shared.network_loading import Loaded
 from probe_kit.hooks.families.shared.prompt_kv import ALL_BUT_LAST, ALL_TOKENS, LAST
-from probe_kit.hooks.families.shared.vlm.decoding import Prefill
+from probe_kit.hooks.families.shared.vlm.decoding import Prefill, SpeakingModel
 from probe_kit.hooks.families.shared.vlm.loading import Recipe, load_vlm
 from probe_kit.hooks.families.shared.vlm.text import Frame, FramedText, TokenPrompt
 from probe_kit.hooks.verification.outputs import Produce
@@ -35,7 +35,7 @@ ANSWER = "answer"
 Pictures = list[NDArray[np.uint8]]
 
 
-class VisionLanguageModel(AnswerModel):
+class VisionLanguageModel(SpeakingModel):
     """A loaded vision-language model. Subclasses say how it is spoken to and how a picture becomes positions.
 
     recipe: how its network is made of files. stream_tolerance: of activations in golden references, absolute.
@@ -200,13 +200,19 @@ class VisionLanguageModel(AnswerModel):
         prefill = self.prefill(questions)
         return Reading.of(prefill.logits.float().cpu().numpy(), options, prefill)
 
-    def speak(self, reading: Reading, tokens: int) -> list[str]:
-        """Greedy text from the keys and values of the prompt on; see the contract. Raises UsageError."""
-        if not isinstance(reading.state, Prefill) or reading.state.network is not self.network:
-            raise UsageError("this reading does not come from this model; pass what its read() returned")
-        with torch.inference_mode():
-            ids = reading.state.speak(tokens, self.text.ends)
-        return [self.text.decode(row) for row in ids.tolist()]
+    @property
+    def speaker(self) -> Any:
+        """The network itself."""
+        return self.network
+
+    @property
+    def ends(self) -> frozenset[int]:
+        """Ids that end an answer."""
+        return self.text.ends
+
+    def words(self, ids: Sequence[int]) -> str:
+        """The text of an answer's ids, up to its end."""
+        return self.text.decode(ids)
 
     # -- capture -----------------------------------------------------------------------------------------
 

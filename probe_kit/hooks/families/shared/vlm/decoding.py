@@ -3,7 +3,8 @@
 B batch, T positions of the prompts, V vocabulary.
 """
 
-from collections.abc import Collection, Mapping
+from abc import abstractmethod
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from probe_kit.errors import UsageError
+from probe_kit.hooks.contract.model import AnswerModel, Reading
 from probe_kit.models.decoding import Decoded, positions
 from probe_kit.models.packing import LeftPacked
 
@@ -83,3 +86,29 @@ class Prefill:
 def _all_over(tokens_out: list[Tensor], ends: Collection[int]) -> bool:
     spoken = torch.stack(tokens_out, dim=1).cpu().numpy()
     return bool(np.isin(spoken, list(ends)).any(axis=1).all())
+
+
+class SpeakingModel(AnswerModel):
+    """A model whose answers continue from a `Prefill`."""
+
+    @property
+    @abstractmethod
+    def speaker(self) -> Any:
+        """The network that continues a prompt."""
+
+    @property
+    @abstractmethod
+    def ends(self) -> frozenset[int]:
+        """Ids that end an answer."""
+
+    @abstractmethod
+    def words(self, ids: Sequence[int]) -> str:
+        """The text of an answer's ids, up to its end."""
+
+    def speak(self, reading: Reading, tokens: int) -> list[str]:
+        """Greedy text from the keys and values of the prompt on; see the contract. Raises UsageError."""
+        if not isinstance(reading.state, Prefill) or reading.state.network is not self.speaker:
+            raise UsageError("this reading does not come from this model; pass what its read() returned")
+        with torch.inference_mode():
+            ids = reading.state.speak(tokens, self.ends)
+        return [self.words(row) for row in ids.tolist()]
