@@ -14,12 +14,13 @@ from probe_kit.errors import IgnoredInputsError, InstructionError
 from probe_kit.extract import AskSettings, ExtractSettings, LeRobotSource, ask_run, prepare
 from probe_kit.extract.rollout.input_check import varied
 from probe_kit.extract.sources.inputs import PICTURE, same_input
-from probe_kit.hooks import Observation, Policy, Site, Tap
+from probe_kit.hooks import Edit, Observation, Policy, Site, Tap
 from probe_kit.hooks.families.pi0.adapter import load_pi0_tiny
 from probe_kit.runs import Run
 from probe_kit.runs.certificates import input_notes
 from tests.support.lerobot_recordings import CAMERA, write_recording
-from tests.support.pi0_organisms import Edit, make_blind, make_deaf
+from tests.support.pi0_organisms import Edit as WeightEdit
+from tests.support.pi0_organisms import make_blind, make_deaf
 from tests.support.position_models import Liking, PositionModel, always, likes
 from tests.support.prismatic_checkpoints import write_checkpoint
 
@@ -29,7 +30,7 @@ SETTINGS = ExtractSettings(
 BOTH = {"picture": "output", "instruction": "output"}
 
 
-def edited(*edits: Edit) -> Policy:
+def edited(*edits: WeightEdit) -> Policy:
     """The embedded policy with edited weights."""
     policy = load_pi0_tiny()
     with torch.no_grad():
@@ -50,7 +51,7 @@ def test_a_sound_policy_is_certified_without_a_note(tmp_path: Path, pi0_tiny: Po
 
 
 @pytest.mark.parametrize(("edit", "lost"), [(make_blind, "picture"), (make_deaf, "instruction")])
-def test_a_blind_and_a_deaf_policy_are_noted(edit: Edit, lost: str, tmp_path: Path) -> None:
+def test_a_blind_and_a_deaf_policy_are_noted(edit: WeightEdit, lost: str, tmp_path: Path) -> None:
     run = extracted(tmp_path / "run", edited(edit))
     assert run.certificate["input_check"] == {**BOTH, lost: "nothing"}
     output = " ".join(CliRunner().invoke(app, ["run", "show", str(run.path)]).output.split())
@@ -63,6 +64,13 @@ def test_a_policy_that_is_blind_and_deaf_stops_before_anything_is_committed(tmp_
         extracted(tmp_path / "run", policy)
     run = extracted(tmp_path / "run", policy, SETTINGS.changed(accept_ignored_inputs=True))
     assert len(input_notes(run.certificate)) == 2
+
+
+def test_a_run_with_edits_is_checked_with_them(tmp_path: Path, pi0_tiny: Policy) -> None:
+    silenced = Edit("zero", tuple(site for site in pi0_tiny.sites() if site.stream == "backbone"))
+    settings = SETTINGS.changed(edits=(silenced,), accept_ignored_inputs=True)
+    run = extracted(tmp_path / "run", pi0_tiny, settings)
+    assert run.certificate["input_check"] == {"picture": "nothing", "instruction": "nothing"}
 
 
 def test_an_input_that_a_family_declares_absent_is_not_tested(tmp_path: Path) -> None:

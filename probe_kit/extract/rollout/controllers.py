@@ -3,7 +3,7 @@
 import warnings
 from abc import ABC
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
@@ -196,11 +196,12 @@ class ModelController[Loaded: "Model", Question](ABC):
         infer: Callable[[Question], NDArray[np.float32]],
         clean: Question,
         variants: Mapping[str, Iterable[Question]],
+        around: Callable[[Question], AbstractContextManager[None]] = lambda _: nullcontext(),
     ) -> None:
         """Note how far changes of an inference's inputs come. Raises IgnoredInputsError if none comes anywhere."""
         # A run that stores nothing hooks nothing: its model may have no layer that can be captured.
         last = self.model.sites()[-1] if self.streams else None
-        self._input_check = check_inputs(self.model, infer, clean, variants, last)
+        self._input_check = check_inputs(self.model, infer, clean, variants, last, around)
         if not self._machine.accept_ignored_inputs:
             check_not_ignored(self._input_check, self.identity["model"])
 
@@ -285,7 +286,7 @@ class PolicyController(ModelController["Policy", Observation]):
 
         (observation,) = copied([turn.observation])
         variants = varied(observation, self._source.instructions, self._ids_of, self.model.absent_inputs)
-        self._check_inputs(infer, observation, variants)
+        self._check_inputs(infer, observation, variants, lambda changed: self._edited([changed]))
 
     def run_preflight(self, observations: Sequence[Observation], seeds: Sequence[int]) -> None:
         """One inference of which nothing is kept: what another one will take."""

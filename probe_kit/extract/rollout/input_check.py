@@ -4,7 +4,9 @@ It decides only that an input is dead: one inference cannot show that a model us
 """
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
+from functools import partial
 from itertools import islice
 from typing import TYPE_CHECKING, Literal
 
@@ -33,26 +35,41 @@ def check_inputs[Question](
     clean: Question,
     variants: Mapping[str, Iterable[Question]],
     last: "Site | None",
+    around: Callable[[Question], AbstractContextManager[None]] = lambda _: nullcontext(),
 ) -> dict[str, Reach]:
     """Return, by input, how far a change of it came.
 
     infer: one inference, always with the same seed. variants: by input, observations or prompts that differ from
     the clean one in it alone; the first that the model takes is used, and none leaves the input untested.
-    last: the last residual before the output; None where no site may be captured.
+    last: the last residual before the output; None where no site may be captured. around: what the run does to
+    the model at every inference.
     """
     if not variants:
         return {}
-    output = infer(clean)
-    return {name: _reach(model, infer, clean, output, changed, last) for name, changed in variants.items()}
+
+    def infer_as_run(question: Question) -> NDArray[np.float32]:
+        with around(question):
+            return infer(question)
+
+    def residual(site: "Site", question: Question) -> "Tensor":
+        from probe_kit.hooks import capture
+
+        # The capture is entered last, so that it reads what edits left.
+        with around(question), capture(model, [site]) as cache:
+            infer(question)
+        return cache[site]
+
+    output = infer_as_run(clean)
+    layer = None if last is None else partial(residual, last)
+    return {name: _reach(infer_as_run, layer, clean, output, changed) for name, changed in variants.items()}
 
 
 def _reach[Question](
-    model: "Model",
     infer: Callable[[Question], NDArray[np.float32]],
+    residual: "Callable[[Question], Tensor] | None",
     clean: Question,
     output: NDArray[np.float32],
     variants: Iterable[Question],
-    last: "Site | None",
 ) -> Reach:
     for variant in variants:
         try:
@@ -61,22 +78,11 @@ def _reach[Question](
             continue
         if not np.array_equal(changed, output, equal_nan=True):
             return "output"
-        if last is None:
+        if residual is None:
             return "not the output"
         # Actions that are chosen among bins stay the same under small changes; the layer before them does not.
-        layers = [_residual(model, last, infer, question) for question in (clean, variant)]
-        return "nothing" if _same(*layers) else "last layer"
+        return "nothing" if _same(residual(clean), residual(variant)) else "last layer"
     return "not tested"
-
-
-def _residual[Question](
-    model: "Model", site: "Site", infer: Callable[[Question], NDArray[np.float32]], question: Question
-) -> "Tensor":
-    from probe_kit.hooks import capture
-
-    with capture(model, [site]) as cache:
-        infer(question)
-    return cache[site]
 
 
 def _same(first: "Tensor", second: "Tensor") -> bool:
