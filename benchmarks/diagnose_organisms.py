@@ -12,7 +12,7 @@ import argparse
 from collections import Counter
 from pathlib import Path
 
-from probe_kit.diagnose.choices import ITEMS_PER_FRAME
+from probe_kit.diagnose.choices import count_groups
 from probe_kit.diagnose.diagnosis import diagnose_run
 from probe_kit.extract import ExtractSettings, extract_run
 from probe_kit.runs import Run
@@ -22,11 +22,11 @@ TALLY = ("right", "open", "wrong")
 
 
 def run_of(folder: Path, category: str, draw: int, frames: int) -> Run:
-    """Return the run of one draw: captured only, two items for every frame."""
+    """Return the run of one draw: captured only, both items of every group."""
     settings = ExtractSettings(
         "pi0-tiny",
         categories=(category,),
-        items=ITEMS_PER_FRAME * frames,
+        items=2 * count_groups(frames),
         capture_only=True,
         env_workers=0,
         seed=draw,

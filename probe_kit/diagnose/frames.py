@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
+from probe_kit.diagnose.choices import LEAST_GROUPS, count_groups
 from probe_kit.errors import UsageError
 from probe_kit.extract.sources.donors import Frame
 from probe_kit.hooks.contract.observation import Observation
@@ -17,14 +18,12 @@ from probe_kit.intervene.sessions.observed import ObservedSession
 if TYPE_CHECKING:
     from probe_kit.intervene.sessions.session import ReplaySession
 
-LEAST_GROUPS = 6
-"""Fewer groups cannot show at p < 0.05 that anything matters, by sign flips of whole groups: 2⁻⁵ is 0.03."""
-
-
 def frames_of(
     session: "ReplaySession", count: int, paraphrases: Mapping[str, str] = MappingProxyType({})
 ) -> list[Frame]:
-    """The first frames of `count` episodes, from as many groups as possible; all where the run has fewer.
+    """The frames of `count` episodes; all where the run has fewer.
+
+    Of the scene, two first frames of each group; of other sources, frames of as many groups as possible.
 
     paraphrases: by instruction, other words of the same meaning. Raises UsageError for a run with too few groups.
     """
@@ -54,15 +53,29 @@ def _observed(session: ObservedSession, count: int) -> Iterator[Frame]:
 
 
 def _drawn(session: "ReplaySession", count: int) -> Iterator[Frame]:
-    """First frames of the scene: one episode of one item of every group, then of another item."""
+    """First frames of the scene: of every group one of each item, in the same layout; see `count_groups`."""
     episodes = session.run.episodes
-    turn = episodes.groupby("group_id", sort=False).cumcount()
-    # Of every group another episode in its turn, so that not all are the first layout of their item.
-    order = pd.DataFrame({"turn": turn, "group": pd.factorize(episodes["group_id"])[0]})
-    order["mixed"] = (order["turn"] + order["group"]) % order.groupby("group")["turn"].transform("size")
-    rows = order.sort_values(["mixed", "group"], kind="stable").index[:count]
-    for row in rows:
+    for row in order_of_first_frames(episodes, count_groups(count))[:count]:
         for pair in session.pairs(str(episodes.loc[row, "item_id"])):
             if pair.row == episodes.index.get_loc(row):
                 assert isinstance(pair.clean, Observation), "runs of policies hold observations"
                 yield Frame.of(pair.episode, pair.clean, pair.group or pair.episode, pair.seed)
+
+
+def order_of_first_frames(episodes: pd.DataFrame, groups: int) -> pd.Index:
+    """Return the rows of the scene's episodes in the order in which their first frames are taken.
+
+    groups: that are taken first, with two frames each; then come further groups, then further frames.
+    """
+    by_item = episodes.groupby("item_id", sort=False)
+    order = pd.DataFrame({"group": pd.factorize(episodes["group_id"])[0], "layout": by_item.cumcount()})
+    order["item"] = order.assign(item=by_item.ngroup()).groupby("group")["item"].rank("dense").astype(int) - 1
+    of_group = order.groupby("group")
+    items, layouts = (of_group[name].transform("max") + 1 for name in ("item", "layout"))
+    # Another item and another layout begin in every group: else all would ask for the first side of the first layout.
+    order["item"] = (order["item"] + order["group"]) % items
+    order["layout"] = (order["layout"] + order["group"] // items) % layouts
+    order = order.sort_values(["group", "layout", "item"], kind="stable")
+    turn = order.groupby("group").cumcount()
+    order = order.assign(turn=turn, couple=turn // 2, block=order["group"] // groups)
+    return order.sort_values(["couple", "block", "turn", "group"], kind="stable").index

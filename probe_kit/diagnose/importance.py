@@ -113,10 +113,10 @@ def compare_with_base(
     tuned: InputDiagnosis, base: InputDiagnosis, of_tuned: Exchanges, of_base: Exchanges
 ) -> BaseComparison:
     """Return what fine-tuning did to one input that was exchanged in the same pairs of both checkpoints."""
-    difference, groups, first = of_tuned.exchanged - of_base.exchanged, of_tuned.groups, of_tuned.first
+    difference, groups = of_tuned.exchanged - of_base.exchanged, of_tuned.groups
     seed = derive_seed(tuned.name, "base", *np.unique(groups).tolist())
-    signed = np.stack([difference[first], -difference[first]])
-    _, sides, _ = max_t(signed, _pairs_of(groups[first]), groups[first], seed)
+    frames = np.cumsum(of_tuned.first)
+    _, sides, _ = max_t(np.stack([difference, -difference]), frames, groups, seed)
     p = min(1.0, 2 * float(sides.min()))
     mean = float(difference.mean())
     change = _change(tuned.verdict, base.verdict, mean, p)
@@ -133,11 +133,6 @@ def _change(tuned: Verdict, base: Verdict, difference: float, p: float) -> Chang
     if p < SIGNIFICANCE and base in MATTERS and difference < 0:
         return "lost in fine-tuning"
     return "gained" if p < SIGNIFICANCE and tuned in MATTERS and difference > 0 else "open"
-
-
-def _pairs_of(groups: NDArray[np.str_]) -> NDArray[np.str_]:
-    """A name for every pair: each is a unit of its own before groups are formed."""
-    return np.array([f"{group} {index}" for index, group in enumerate(groups)])
 
 
 def _verdict(exchanges: Exchanges, p: float) -> tuple[Verdict, str]:

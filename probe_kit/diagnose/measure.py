@@ -20,7 +20,7 @@ from probe_kit.hashing import derive_seed
 if TYPE_CHECKING:
     from probe_kit.hooks.contract.observation import Observation
 
-DONORS = 3
+DONORS = 6
 """For each frame: one donor alone often asks for the same action by chance."""
 Actions = NDArray[np.float32]
 Infer = Callable[[Sequence["Observation"], Sequence[int]], Actions]
