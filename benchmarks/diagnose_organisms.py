@@ -3,26 +3,39 @@
     PYTHONPATH=. python benchmarks/diagnose_organisms.py FOLDER [--draws 20] [--first 0]
         [--frames 24] [--organisms deaf,blind]
 
-A draw is a run of its own seed, whose frames and donors are fresh. Organisms are edits of the embedded policy, see
-`tests/support/pi0_organisms.py`. A verdict is right, open, or wrong. Finished draws in FOLDER are read. Exits
-with 1 if any verdict is wrong.
+A draw is a run of its own seed, whose frames and donors are fresh. Organisms are edits of the embedded policy, and of
+a SmolVLA with random weights for the second camera; see `tests/support/organisms.py`. A verdict is right, open, or
+wrong. Finished draws in FOLDER are read. Exits with 1 if any verdict is wrong.
 """
 
 import argparse
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
+
+import torch
 
 from probe_kit.diagnose.choices import count_groups
 from probe_kit.diagnose.diagnosis import diagnose_run
-from probe_kit.extract import ExtractSettings, extract_run
+from probe_kit.diagnose.frames import frames_of
+from probe_kit.extract import EnvSource, ExtractSettings, extract_run
+from probe_kit.hooks.families.pi0.adapter import load_pi0_tiny
+from probe_kit.intervene.sessions.opening import open_session
+from probe_kit.intervene.sessions.session import ReplaySource
 from probe_kit.runs import Run
-from tests.support.pi0_organisms import ORGANISMS, Organism, edited
+from probe_kit.suite import build_suite
+from tests.support.acting_checkpoints import GOLDEN, knowing
+from tests.support.organisms import FORGOT, ORGANISMS, TWO_CAMERAS, Edit, Organism, edited, forget_words
 
 TALLY = ("right", "open", "wrong")
+TUNING_SEED = 1_000_000
+"""Of the scenes in which one organism forgets words: of no draw."""
 
 
 def run_of(folder: Path, category: str, draw: int, frames: int) -> Run:
-    """Return the run of one draw: captured only, both items of every group."""
+    """Return the run of one draw: captured only, both items of every group; or played in an environment."""
+    if category == TWO_CAMERAS:
+        return run_of_two_cameras(folder, draw, frames)
     settings = ExtractSettings(
         "pi0-tiny",
         categories=(category,),
@@ -34,24 +47,55 @@ def run_of(folder: Path, category: str, draw: int, frames: int) -> Run:
     return extract_run(settings, folder / f"{category}-{draw}")
 
 
-def judged(verdict: str, truth: tuple[str, ...]) -> str:
-    """Return whether a verdict is the truth; one that shows less is open, neither right nor wrong."""
-    if verdict in truth:
+def run_of_two_cameras(folder: Path, draw: int, frames: int) -> Run:
+    """Return the run of a SmolVLA with random weights, which is shown two cameras."""
+    reference = folder / "smolvla"
+    if not reference.exists():
+        knowing(GOLDEN / "smolvla", build_suite(folder / "suite", ["color"], 24), reference)
+    options = {"count": frames, "first": draw * frames}
+    source = EnvSource("tests.support.reach_env:TwoCameras", options, max_steps=1)
+    checkpoint = str(reference / "checkpoint")
+    settings = ExtractSettings(
+        "smolvla", checkpoint, source=source, execute=1, env_workers=0, accept_units=True, seed=draw
+    )
+    return extract_run(settings, folder / f"two-cameras-{draw}")
+
+
+def edit_of(organism: Organism, folder: Path, frames: int) -> Edit:
+    """Return the edit of an organism; of the one that is trained, the edit that loads its weights."""
+    if organism is not ORGANISMS[FORGOT]:
+        return organism.edit
+    file = folder / "forgot.pt"
+    if not file.exists():
+        tuned = load_pi0_tiny()
+        with (
+            open_session(run_of(folder, "color", TUNING_SEED, frames), ReplaySource()) as session,
+            session.ready(),
+        ):
+            forget_words(tuned, [frame.observation for frame in frames_of(session, 4 * frames)])
+        torch.save(tuned.network.state_dict(), file)
+    return lambda policy: policy.network.load_state_dict(torch.load(file))
+
+
+def judged(answer: str, truth: Sequence[str]) -> str:
+    """Return whether a verdict or a change is the truth; one that shows less is open, neither right nor wrong."""
+    if answer in truth:
         return "right"
-    return "open" if verdict == "open" or (verdict, *truth) == ("moves", "decides") else "wrong"
+    return "open" if answer == "open" or (answer, *truth) == ("moves", "decides") else "wrong"
 
 
-def diagnose(organism: Organism, folder: Path, draw: int, frames: int, inside: bool) -> dict[str, str]:
-    """Return the judgement of every input, and of where it is lost on the first draw."""
-    number = list(ORGANISMS.values()).index(organism)
+def diagnose(name: str, folder: Path, draw: int, frames: int, inside: bool) -> dict[str, str]:
+    """Return the judgement of every input, of where it is lost on the first draw, and of its change."""
+    organism = ORGANISMS[name]
     diagnosis = diagnose_run(
         run_of(folder, organism.category, draw, frames),
         frames=frames,
         inputs=tuple(organism.truth),
         inside=inside,
-        load=edited(organism.edit),
+        load=edited(edit_of(organism, folder, frames)),
+        base="as shipped" if organism.changes else None,
         # The weights that a diagnosis is stored under are those before the edit: the seed keeps organisms apart.
-        seed=draw * len(ORGANISMS) + number,
+        seed=draw * len(ORGANISMS) + list(ORGANISMS).index(name),
     )
     judgements = {}
     for diagnosed in diagnosis.inputs:
@@ -59,6 +103,12 @@ def diagnose(organism: Organism, folder: Path, draw: int, frames: int, inside: b
         judgements[diagnosed.name] = judged(diagnosed.verdict, organism.truth[diagnosed.name])
         if inside and (words := organism.where.get(diagnosed.name)):
             judgements[f"{diagnosed.name}, where"] = "right" if words in diagnosed.where else "wrong"
+        if diagnosed.base is not None:
+            print(
+                f"    {diagnosed.base.change}: {100 * diagnosed.base.difference:.0f} %, p {diagnosed.base.p:.2g}"
+            )
+            truth = organism.changes[diagnosed.name]
+            judgements[f"{diagnosed.name}, change"] = judged(diagnosed.base.change, truth)
     return judgements
 
 
@@ -76,7 +126,7 @@ def main() -> None:
         for name in options.organisms.split(","):
             inside = draw == 0 and bool(ORGANISMS[name].where)
             print(name, flush=True)
-            judgements = diagnose(ORGANISMS[name], options.folder, draw, options.frames, inside)
+            judgements = diagnose(name, options.folder, draw, options.frames, inside)
             for claim, judgement in judgements.items():
                 counts.setdefault((name, claim), Counter())[judgement] += 1
     print(f"{'organism':14} {'claim':22}" + "".join(f"{word:>8}" for word in TALLY))

@@ -18,6 +18,7 @@ from probe_kit.intervene.sessions.observed import ObservedSession
 if TYPE_CHECKING:
     from probe_kit.intervene.sessions.session import ReplaySession
 
+
 def frames_of(
     session: "ReplaySession", count: int, paraphrases: Mapping[str, str] = MappingProxyType({})
 ) -> list[Frame]:

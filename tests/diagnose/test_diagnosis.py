@@ -23,11 +23,11 @@ from probe_kit.extract import ExtractSettings, LeRobotSource, extract_run
 from probe_kit.hooks import Policy
 from probe_kit.hooks.families.pi0.adapter import load_pi0_tiny
 from probe_kit.intervene.sessions.opening import open_session
-from probe_kit.intervene.sessions.session import LoadPolicy, ReplaySource, load_policy_of
+from probe_kit.intervene.sessions.session import ReplaySource
 from probe_kit.runs import Run, verify_run
 from tests.support.lerobot_recordings import CAMERA, write_recording
 from tests.support.made_once import made_once
-from tests.support.pi0_organisms import ORGANISMS, edited, make_deaf
+from tests.support.organisms import ORGANISMS, edited, make_deaf
 
 FRAMES = ("--frames", "8")
 
@@ -201,21 +201,10 @@ def test_a_table_without_a_target_is_refused(folder: Path) -> None:
     assert (answer.exit_code, "name the column" in answer.output) == (2, True)
 
 
-def deaf_since(checkpoint: str | None) -> LoadPolicy:
-    """The run's policy as it is, deaf where it is loaded from this checkpoint."""
-
-    def load(run: Run, source: ReplaySource) -> Policy:
-        sound = replace(source, checkpoint=None)
-        deaf = source.checkpoint == checkpoint
-        return edited(make_deaf)(run, sound) if deaf else load_policy_of(run, sound)
-
-    return load
-
-
 @pytest.mark.slow
 def test_what_fine_tuning_lost_is_found_in_the_same_pairs_of_the_base(run_of_many: Run) -> None:
     compared = diagnose_run(
-        run_of_many, frames=12, inputs=["instruction"], inside=False, base="before", load=deaf_since(None), seed=3
+        run_of_many, frames=12, inputs=["instruction"], inside=False, base="before", load=edited(make_deaf), seed=3
     )
     (words,) = compared.inputs
     assert words.base is not None

@@ -19,8 +19,8 @@ from probe_kit.hooks.families.pi0.adapter import load_pi0_tiny
 from probe_kit.runs import Run
 from probe_kit.runs.certificates import input_notes
 from tests.support.lerobot_recordings import CAMERA, write_recording
-from tests.support.pi0_organisms import Edit as WeightEdit
-from tests.support.pi0_organisms import make_blind, make_deaf
+from tests.support.organisms import Edit as WeightEdit
+from tests.support.organisms import make_blind, make_deaf
 from tests.support.position_models import Liking, PositionModel, always, likes
 from tests.support.prismatic_checkpoints import write_checkpoint
 

@@ -1,6 +1,7 @@
 """A small Gymnasium environment, and its 30 lines behind the contract of `extract --env`."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -77,6 +78,24 @@ class ReachEnv:
         observation = Observation(seen["pixels"], seen["agent_pos"], self._episode.instruction)
         facts = {"block": self._env.block, "left": self._env.block < 0, "success": success}
         return Step(observation, done, facts)
+
+
+class TwoCameras(ReachEnv):
+    """A second camera looks at the table from the other end; hand and block lie elsewhere for every `first`."""
+
+    def __init__(self, count: int | str = 12, first: int | str = 0) -> None:
+        super().__init__(count)
+        self._first = int(first)
+
+    def reset(self, episode: EnvEpisode) -> Step:
+        """The beginning, of a seed that is `first` seeds on."""
+        self._episode = episode
+        return self._as_step(self._env.reset(seed=self._first + episode.seed)[0])
+
+    def _as_step(self, seen: dict[str, Any], done: bool = False, success: bool = False) -> Step:
+        step = super()._as_step(seen, done, success)
+        turned = np.ascontiguousarray(step.observation.image[::-1, ::-1])
+        return replace(step, observation=replace(step.observation, cameras={"wrist": turned}))
 
 
 class Drifting(ReachEnv):
