@@ -3,8 +3,8 @@
     PYTHONPATH=. python benchmarks/diagnose_organisms.py FOLDER [--draws 20] [--first 0]
         [--frames 24] [--organisms deaf,blind]
 
-A draw is a run of its own seed, whose frames and donors are fresh. Organisms are edits of the embedded policy, and of
-a SmolVLA with random weights for the second camera; see `tests/support/organisms.py`. A verdict is right, open, or
+A draw is a run of its own seed, whose frames and donors are fresh. Organisms are edits of the embedded policy; for
+the second camera, of a SmolVLA with random weights. See `tests/support/organisms.py`. A verdict is right, open, or
 wrong. Finished draws in FOLDER are read. Exits with 1 if any verdict is wrong.
 """
 
@@ -67,11 +67,8 @@ def edit_of(organism: Organism, folder: Path, frames: int) -> Edit:
         return organism.edit
     file = folder / "forgot.pt"
     if not file.exists():
-        tuned = load_pi0_tiny()
-        with (
-            open_session(run_of(folder, "color", TUNING_SEED, frames), ReplaySource()) as session,
-            session.ready(),
-        ):
+        run, tuned = run_of(folder, "color", TUNING_SEED, frames), load_pi0_tiny()
+        with open_session(run, ReplaySource()) as session, session.ready():
             forget_words(tuned, [frame.observation for frame in frames_of(session, 4 * frames)])
         torch.save(tuned.network.state_dict(), file)
     return lambda policy: policy.network.load_state_dict(torch.load(file))
@@ -104,11 +101,9 @@ def diagnose(name: str, folder: Path, draw: int, frames: int, inside: bool) -> d
         if inside and (words := organism.where.get(diagnosed.name)):
             judgements[f"{diagnosed.name}, where"] = "right" if words in diagnosed.where else "wrong"
         if diagnosed.base is not None:
-            print(
-                f"    {diagnosed.base.change}: {100 * diagnosed.base.difference:.0f} %, p {diagnosed.base.p:.2g}"
-            )
-            truth = organism.changes[diagnosed.name]
-            judgements[f"{diagnosed.name}, change"] = judged(diagnosed.base.change, truth)
+            base, truth = diagnosed.base, organism.changes[diagnosed.name]
+            print(f"    {base.change}: {100 * base.difference:.0f} %, p {base.p:.2g}")
+            judgements[f"{diagnosed.name}, change"] = judged(base.change, truth)
     return judgements
 
 

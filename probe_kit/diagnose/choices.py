@@ -8,8 +8,8 @@ LEAST_GROUPS = 6
 def count_groups(frames: int) -> int:
     """Return of how many groups of the scene so many frames are drawn: two frames of each.
 
-    The two items of a group ask for one side each, before the same pictures. A policy that goes to one side where it
-    does not understand is moved by other words in one of both, whichever side that is. The mean of both varies half
-    as much between groups as one frame does.
+    The two items of a group ask for one side each, before the same pictures. A policy that goes to one side where
+    it does not understand is moved by other words in one of both, whichever side that is. The mean of both varies
+    half as much between groups as one frame does.
     """
     return max(LEAST_GROUPS, -(-frames // 2))
