@@ -73,7 +73,7 @@ def order_of_first_frames(episodes: pd.DataFrame, groups: int) -> pd.Index:
     order["item"] = order.assign(item=by_item.ngroup()).groupby("group")["item"].rank("dense").astype(int) - 1
     of_group = order.groupby("group")
     items, layouts = (of_group[name].transform("max") + 1 for name in ("item", "layout"))
-    # Another item and another layout begin in every group: else all would ask for the first side of the first layout.
+    # Another item and another layout begin in every group: else all would ask for the same side of one layout.
     order["item"] = (order["item"] + order["group"]) % items
     order["layout"] = (order["layout"] + order["group"] // items) % layouts
     order = order.sort_values(["group", "layout", "item"], kind="stable")

@@ -64,7 +64,7 @@ class Exchanges:
 
     exchanged, control, every: (P,) shares of the variance, see `ActionScale.shares`: with the donor's input, with
     the control of the input (None where the model takes none), and with all inputs of the donor. groups: (P,).
-    first: (P,) whether it is the first of its frame. largest: (P,) the largest change of any number of the action
+    frames: (P,) ascending. repeated: (P,) whether an earlier donor of the frame holds the same value. largest: (P,) the largest change of any number of the action
     under the donor's input. blanked: (F,) the same of every frame under the blank.
     """
 
@@ -72,7 +72,8 @@ class Exchanges:
     control: NDArray[np.float64] | None
     every: NDArray[np.float64]
     groups: NDArray[np.str_]
-    first: NDArray[np.bool_]
+    frames: NDArray[np.intp]
+    repeated: NDArray[np.bool_]
     largest: NDArray[np.float64]
     blanked: NDArray[np.float64]
 
@@ -99,13 +100,16 @@ def importance_of(name: str, exchanges: Exchanges) -> InputDiagnosis:
 
 def _more_than_control_p(name: str, exchanges: Exchanges) -> float:
     """Chance that an input which matters no more than its control changes the action as much more than it."""
-    starts = np.flatnonzero(exchanges.first)
-    donors = int(np.diff([*starts, exchanges.first.size]).min())
-    exchanged = exchanges.exchanged[starts[:, None] + np.arange(donors)]
-    control = np.zeros(len(starts)) if exchanges.control is None else exchanges.control[starts]
+    # The same value again is the same change: as a column of its own it would make the others look alike.
+    fresh = np.flatnonzero(~exchanges.repeated)
+    starts = np.unique(exchanges.frames[fresh], return_index=True)[1]
+    donors = int(np.diff([*starts, fresh.size]).min())
+    exchanged = exchanges.exchanged[fresh[starts[:, None] + np.arange(donors)]]
+    of_frames = fresh[starts]
+    control = np.zeros(len(starts)) if exchanges.control is None else exchanges.control[of_frames]
     # One change in ten turns the action around: without the logarithm, the few large ones are all that counts.
     sizes = np.log1p(np.column_stack([control, exchanged]) / TRACE)
-    groups = exchanges.groups[starts]
+    groups = exchanges.groups[of_frames]
     return least_column_p(sizes, groups, derive_seed(name, "control", *np.unique(groups).tolist()))
 
 
@@ -115,8 +119,7 @@ def compare_with_base(
     """Return what fine-tuning did to one input that was exchanged in the same pairs of both checkpoints."""
     difference, groups = of_tuned.exchanged - of_base.exchanged, of_tuned.groups
     seed = derive_seed(tuned.name, "base", *np.unique(groups).tolist())
-    frames = np.cumsum(of_tuned.first)
-    _, sides, _ = max_t(np.stack([difference, -difference]), frames, groups, seed)
+    _, sides, _ = max_t(np.stack([difference, -difference]), of_tuned.frames, groups, seed)
     p = min(1.0, 2 * float(sides.min()))
     mean = float(difference.mean())
     change = _change(tuned.verdict, base.verdict, mean, p)

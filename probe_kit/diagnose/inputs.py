@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from hashlib import sha256
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +13,8 @@ from probe_kit.extract.sources.inputs import (
     INSTRUCTION,
     PICTURE,
     STATE,
+    content_of,
     hardly_changed,
-    same_input,
     with_other_stop,
 )
 from probe_kit.hooks.contract.observation import Observation
@@ -31,10 +32,10 @@ def inputs_of(frames: Sequence[Frame], camera: str = "") -> tuple[str, ...]:
     return (INSTRUCTION, *pictures, STATE)
 
 
-def differing(frames: Sequence[Frame], name: str) -> bool:
-    """Whether the frames hold more than one value of an input, so that it can be exchanged between them."""
-    first = frames[0].observation
-    return any(not same_input(first, frame.observation, name) for frame in frames[1:])
+def values_of(observations: Sequence[Observation], name: str) -> NDArray[np.intp]:
+    """Return (F,) a number of every observation's value of an input; equal values have one number."""
+    digests = [sha256(content_of(observation, name)).digest() for observation in observations]
+    return np.unique(np.array(digests, "V32"), return_inverse=True)[1]
 
 
 def controls_of(frame: Frame, name: str, spread: NDArray[np.float64]) -> list[Observation]:

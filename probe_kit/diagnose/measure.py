@@ -4,13 +4,15 @@ from collections.abc import Callable, Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import groupby
+from operator import itemgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.diagnose.importance import ActionScale, Exchanges, compare_with_base, importance_of
-from probe_kit.diagnose.inputs import controls_of, differing, inputs_of, spread_of_states
+from probe_kit.diagnose.inputs import controls_of, inputs_of, spread_of_states, values_of
 from probe_kit.diagnose.results import InputDiagnosis
 from probe_kit.errors import InstructionError, UsageError
 from probe_kit.extract.sources.donors import Frame, draw_donors
@@ -79,9 +81,19 @@ class InputExchange:
         return tuple(compared)
 
     def donors(self, name: str) -> list[tuple[int, int]]:
-        """Pairs (frame, donor) of an input, the same at every call; see `draw_donors`."""
+        """Pairs (frame, donor) of an input, the same at every call; see `draw_donors`.
+
+        Donors of a frame hold different values of the input, as far as there are so many.
+        """
         rng = np.random.default_rng(derive_seed(self.seed, "donors", name))
-        return draw_donors(self.frames, name, rng, DONORS)
+        values, pairs = self._values(name), []
+        drawn = draw_donors(self.frames, name, rng, len(self.frames))
+        for index, of_frame in groupby(drawn, key=itemgetter(0)):
+            donors = [donor for _, donor in of_frame]
+            distinct = [donors[at] for at in np.sort(np.unique(values[donors], return_index=True)[1])]
+            repeated = [donor for donor in donors if donor not in distinct]
+            pairs += [(index, donor) for donor in [*distinct, *repeated][:DONORS]]
+        return pairs
 
     def first_donors(self, name: str) -> list[tuple[int, int]]:
         """One donor per frame of an input, of those that `donors` draws."""
@@ -127,9 +139,13 @@ class InputExchange:
     def _seeds(self) -> list[int]:
         return [frame.seed for frame in self.frames]
 
+    def _values(self, name: str) -> NDArray[np.intp]:
+        return values_of(self.observations, name)
+
     def _measure(self, name: str) -> InputDiagnosis:
         frames, observations, clean, scale = self.frames, self.observations, self.clean, self.scale
-        if not differing(frames, name):
+        values = self._values(name)
+        if np.unique(values).size == 1:
             return InputDiagnosis(name, "not varied", f"all {len(frames)} frames hold one value")
         pairs = self.donors(name)
         if not pairs:
@@ -146,7 +162,8 @@ class InputExchange:
             control=None if control is None else scale.shares(control, clean)[rows],
             every=scale.shares(every, clean[rows]),
             groups=np.array([frames[index].group for index in rows]),
-            first=np.concatenate([[True], np.diff(rows) != 0]),
+            frames=rows,
+            repeated=_repeated(rows, values[[donor for _, donor in pairs]]),
             largest=np.abs(exchanged - clean[rows]).max(axis=(1, 2)),
             blanked=np.abs(blanked - clean[: len(blanked)]).max(axis=(1, 2), initial=0.0),
         )
@@ -172,6 +189,13 @@ class InputExchange:
             )
         except InstructionError:
             return np.zeros((0, 1, 1), np.float32)
+
+
+def _repeated(rows: NDArray[np.intp], values: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """(P,) whether an earlier pair of the same frame has a donor with the same value."""
+    repeated = np.ones(rows.size, bool)
+    repeated[np.unique(np.stack([rows, values]), axis=1, return_index=True)[1]] = False
+    return repeated
 
 
 def _declared(measured: InputDiagnosis) -> InputDiagnosis:

@@ -90,7 +90,7 @@ def hear_one_question(policy: Any) -> None:
 
     So the instruction of another frame and its control, the same in other letters, are two draws of one kind.
     """
-    tokenise, words = policy.tokenise, "put the cube on the red shape".split()
+    tokenise, words = policy.tokenise, ["put", "the", "cube", "on", "the", "red", "shape"]
 
     def heard(text: str) -> str:
         order = int.from_bytes(sha256(text.encode()).digest()[:8]) % ORDERS
@@ -124,7 +124,7 @@ def forget_words(policy: Any, observations: Sequence[Observation], steps: int = 
 
 
 def edited(edit: Edit) -> LoadPolicy:
-    """A loader of a run's policy that edits it. Of a base, named by any checkpoint, it is the policy as shipped."""
+    """A loader of a run's policy that edits it; of a base, under any name, the policy as it is shipped."""
 
     def load(run: Run, source: ReplaySource) -> "Policy":
         policy: Any = load_policy_of(run, replace(source, checkpoint=None))
@@ -140,7 +140,7 @@ def edited(edit: Edit) -> LoadPolicy:
 class Organism:
     """A policy and the truth of its inputs.
 
-    where: words of the sentence about an input's way. category: of the scene's items; TWO_CAMERAS for an environment.
+    where: words of the sentence about an input's way. category: of the scene's items, or TWO_CAMERAS.
     changes: of an input since the policy as shipped, which is the base where there are any.
     """
 

@@ -40,6 +40,15 @@ def same_input(first: Observation, second: Observation, vary: str) -> bool:
     return all(np.array_equal(picture_of(first, name), picture_of(second, name)) for name in _cameras(first, vary))
 
 
+def content_of(observation: Observation, vary: str) -> bytes:
+    """Return the bytes of one input: equal ones are one value of it, among observations of equal shapes."""
+    if vary == INSTRUCTION:
+        return observation.instruction.encode()
+    if vary == STATE:
+        return observation.state.tobytes()
+    return b"".join(_picture(observation, name).tobytes() for name in _cameras(observation, vary))
+
+
 def hardly_changed(clean: Observation, vary: str, spread: NDArray[np.floating]) -> Observation:
     """Return the clean observation after a change of one input that means nothing.
 
