@@ -64,8 +64,9 @@ class Exchanges:
 
     exchanged, control, every: (P,) shares of the variance, see `ActionScale.shares`: with the donor's input, with
     the control of the input (None where the model takes none), and with all inputs of the donor. groups: (P,).
-    frames: (P,) ascending. repeated: (P,) whether an earlier donor of the frame holds the same value. largest: (P,) the largest change of any number of the action
-    under the donor's input. blanked: (F,) the same of every frame under the blank.
+    frames: (P,) ascending. repeated: (P,) whether an earlier donor of the frame holds the same value.
+    largest: (P,) the largest change of any number of the action under the donor's input. blanked: (F,) the same of
+    every frame under the blank.
     """
 
     exchanged: NDArray[np.float64]
