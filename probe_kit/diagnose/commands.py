@@ -90,9 +90,13 @@ def diagnose(
     probe-kit diagnose runs/mine --target side.correct
     """
     from probe_kit.diagnose.diagnosis import diagnose_run
+    from probe_kit.diagnose.inputs import names_of
     from probe_kit.diagnose.paraphrases import read_paraphrases
+    from probe_kit.diagnose.results import check_names
     from probe_kit.train.train_options import TargetOptions
 
+    # A camera's name is known once the source is open; any other mistake costs no extraction.
+    check_names([name.partition(".")[0] for name in require or ()], names_of(()))
     words = {} if paraphrases is None else read_paraphrases(paraphrases)
     options = None if target is None else TargetOptions(target, labels, None, None, None)
     if options is not None:
@@ -103,6 +107,7 @@ def diagnose(
         _say_cost(_planned(model_or_run, typed, frames, out_folder), frames, inside, base is not None)
         return
     run = _run_of(model_or_run, typed, frames, out_folder)
+    check_names(require or (), names_of(run.certificate["policy"].get("cameras", ())))
     with err.status("diagnosing") as status:
         diagnosis = diagnose_run(
             run,

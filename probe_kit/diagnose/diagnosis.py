@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from probe_kit.runs.run import Run
     from probe_kit.train import Target
 
-FORMAT, FILE = "probe_kit diagnosis 3", "diagnosis.json"
+FORMAT, FILE = "probe_kit diagnosis 4", "diagnosis.json"
 Progress = Callable[[str], None]
 
 

@@ -27,8 +27,12 @@ def inputs_of(frames: Sequence[Frame], camera: str = "") -> tuple[str, ...]:
     """
     if not frames:
         raise UsageError("the source has no frame; diagnose needs at least two that differ")
-    cameras = list(frames[0].observation.cameras)
-    pictures = [f"{PICTURE}.{name}" for name in (camera or "first", *cameras)] if cameras else [PICTURE]
+    return names_of([camera or "first", *frames[0].observation.cameras])
+
+
+def names_of(cameras: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of the inputs of a model that is shown these cameras."""
+    pictures = [f"{PICTURE}.{name}" for name in cameras] if len(cameras) > 1 else [PICTURE]
     return (INSTRUCTION, *pictures, STATE)
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from probe_kit.diagnose.importance import ActionScale, Exchanges, compare_with_base, importance_of
 from probe_kit.diagnose.inputs import controls_of, inputs_of, spread_of_states, values_of
-from probe_kit.diagnose.results import InputDiagnosis
+from probe_kit.diagnose.results import InputDiagnosis, check_names
 from probe_kit.errors import InstructionError, UsageError
 from probe_kit.extract.sources.donors import Frame, draw_donors
 from probe_kit.extract.sources.inputs import blank_of, with_input
@@ -59,8 +59,7 @@ class InputExchange:
         other actions for the same observation and seed.
         """
         available = inputs_of(self.frames, camera)
-        if unknown := [name for name in names if name not in available]:
-            raise UsageError(f"no input is called {unknown[0]!r}; this source has {', '.join(available)}")
+        check_names(names, available)
         measured = map(self._measure, names or available)
         return tuple(_declared(diagnosed) if diagnosed.name in absent else diagnosed for diagnosed in measured)
 

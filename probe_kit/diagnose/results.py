@@ -225,11 +225,16 @@ class Diagnosis:
     base: str = ""
     knowledge: Knowledge | None = None
 
-    def exit_code(self, required: Sequence[str] = ()) -> int:
+    def check_names(names: Sequence[str], available: Sequence[str]) -> None:
+    """Raise UsageError for a name that no input has."""
+    if unknown := [name for name in names if name not in available]:
+        raise UsageError(f"no input is called {unknown[0]!r}; there are {', '.join(available)}")
+
+
+def exit_code(self, required: Sequence[str] = ()) -> int:
         """0 if every required input arrives and matters, else 1; see `exit_code`."""
         names = [diagnosed.name for diagnosed in self.inputs]
-        if unknown := [name for name in required if name not in names]:
-            raise UsageError(f"no input is called {unknown[0]!r}; this source has {', '.join(names)}")
+        check_names(required, names)
         return exit_code(self.inputs, required)
 
     def to_json(self) -> dict[str, Any]:
@@ -250,6 +255,12 @@ def _adapter() -> "TypeAdapter[Diagnosis]":
     from pydantic import TypeAdapter
 
     return TypeAdapter(Diagnosis)
+
+
+def check_names(names: Sequence[str], available: Sequence[str]) -> None:
+    """Raise UsageError for a name that no input has."""
+    if unknown := [name for name in names if name not in available]:
+        raise UsageError(f"no input is called {unknown[0]!r}; there are {', '.join(available)}")
 
 
 def exit_code(inputs: Sequence[InputDiagnosis], required: Sequence[str] = ()) -> int:

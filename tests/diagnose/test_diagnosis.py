@@ -103,6 +103,17 @@ def test_what_is_required_decides_the_exit_code(folder: Path) -> None:
     assert "instruction, picture, state" in answer.output
 
 
+def test_an_input_that_no_model_has_is_refused_before_anything_is_played(tmp_path: Path) -> None:
+    answer = run_command("pi0-tiny", "--require", "words", "--out", tmp_path / "run")
+    assert (answer.exit_code, "no input is called 'words'" in answer.output) == (2, True)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_camera_that_a_run_has_not_is_refused_before_its_model_is_loaded(folder: Path) -> None:
+    answer = run_command(folder / "run", "--require", "picture.wrist", "--base", "no/such-model")
+    assert (answer.exit_code, "there are instruction, picture, state" in answer.output) == (2, True)
+
+
 def test_settings_of_a_new_run_are_refused_for_a_stored_one(folder: Path) -> None:
     answer = run_command(folder / "run", "--categories", "color")
     assert answer.exit_code == 2

@@ -1,0 +1,40 @@
+"""A diagnosis of a network that is shown two cameras: each is an input of its own."""
+
+import pytest
+
+from probe_kit.diagnose.diagnosis import diagnose_run
+from probe_kit.extract import EnvSource, ExtractSettings, extract_run
+from probe_kit.runs import Run
+from probe_kit.suite import Suite
+from tests.support.acting_checkpoints import FAMILIES
+from tests.support.organisms import ORGANISMS, edited
+
+PICTURES = ("picture.top", "picture.wrist")
+
+
+@pytest.fixture(scope="module")
+def run(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    folder = tmp_path_factory.mktemp("two")
+    checkpoint = FAMILIES["smolvla"].made(small_suite, folder / "smolvla")
+    source = EnvSource("tests.support.reach_env:TwoCameras", max_steps=1)
+    settings = ExtractSettings("smolvla", checkpoint, source=source, execute=1, env_workers=0, accept_units=True)
+    return extract_run(settings, folder / "run")
+
+
+@pytest.mark.slow
+def test_both_cameras_of_a_network_arrive(run: Run) -> None:
+    diagnosis = diagnose_run(run, frames=6, inside=False)
+    assert [diagnosed.name for diagnosed in diagnosis.inputs] == ["instruction", *PICTURES, "state"]
+    assert all(diagnosed.arrives and diagnosed.n_pairs for diagnosed in diagnosis.inputs)
+
+
+@pytest.mark.slow
+def test_a_second_camera_that_is_masked_does_not_arrive_and_ends_behind_the_backbone(run: Run) -> None:
+    organism = ORGANISMS["second camera"]
+    diagnosis = diagnose_run(run, frames=6, inputs=PICTURES, load=edited(organism.edit), seed=1)
+    top, wrist = diagnosis.inputs
+    assert top.arrives
+    assert wrist.verdict == "does not arrive"
+    assert organism.where["picture.wrist"] in wrist.where
+    assert {site.stream for site in wrist.passage if site.differs} <= {"vision", "backbone", "kv"}
+    assert (diagnosis.exit_code(["picture.wrist"]), run.certificate["policy"]["cameras"]) == (1, ["top", "wrist"])
