@@ -225,13 +225,7 @@ class Diagnosis:
     base: str = ""
     knowledge: Knowledge | None = None
 
-    def check_names(names: Sequence[str], available: Sequence[str]) -> None:
-    """Raise UsageError for a name that no input has."""
-    if unknown := [name for name in names if name not in available]:
-        raise UsageError(f"no input is called {unknown[0]!r}; there are {', '.join(available)}")
-
-
-def exit_code(self, required: Sequence[str] = ()) -> int:
+    def exit_code(self, required: Sequence[str] = ()) -> int:
         """0 if every required input arrives and matters, else 1; see `exit_code`."""
         names = [diagnosed.name for diagnosed in self.inputs]
         check_names(required, names)

@@ -46,7 +46,7 @@ def content_of(observation: Observation, vary: str) -> bytes:
         return observation.instruction.encode()
     if vary == STATE:
         return observation.state.tobytes()
-    return b"".join(_picture(observation, name).tobytes() for name in _cameras(observation, vary))
+    return b"".join(picture_of(observation, name).tobytes() for name in _cameras(observation, vary))
 
 
 def hardly_changed(clean: Observation, vary: str, spread: NDArray[np.floating]) -> Observation:
