@@ -14,6 +14,7 @@ from probe_kit._system.lazy import lazy_names
 from probe_kit.version import __version__ as __version__
 
 if TYPE_CHECKING:
+    from probe_kit.diagnose import diagnose_run
     from probe_kit.env import Act2AnswerEnv, SceneSpec
     from probe_kit.errors import ProbeKitError
     from probe_kit.extract import EnvSource, ExtractSettings, LeRobotSource, PictureFolder, extract_run
@@ -75,6 +76,7 @@ __all__ = [
     "build_suite",
     "capture",
     "default_suite",
+    "diagnose_run",
     "extract_run",
     "layer_curve",
     "load_effects",
@@ -119,6 +121,7 @@ __getattr__, __dir__ = lazy_names(
         "ReplaySource": "intervene",
         "Suite": "suite",
         "Target": "train",
+        "diagnose_run": "diagnose",
         "build_suite": "suite",
         "capture": "hooks",
         "default_suite": "suite",

@@ -18,11 +18,12 @@ from probe_kit.train import load_results
 NAMES = (
     "01-first-run", "02-layer-curves", "03-compare-models", "04-your-own-model", "05-your-own-questions",
     "06-vlm-against-vla", "07-from-readable-to-used", "08-your-own-labels", "09-your-own-recordings",
+    "10-why-does-my-policy-ignore-me",
 )  # fmt: skip
 WHOLE_ONLY = NAMES[2:]
 """They run in the slow suite only: the tests in `acceptance/` use the same commands in the default one."""
-EXTRAS = {"09-your-own-recordings": ("datasets", "av")}
-"""Modules of extras that a notebook needs."""
+EXTRAS = dict.fromkeys(("09-your-own-recordings", "10-why-does-my-policy-ignore-me"), ("datasets", "av"))
+"""Modules of extras that a notebook needs; the tenth reads the recordings of the ninth."""
 MACHINE = re.compile(r"/(?:home|root|tmp|Users|usr|opt|work|private|var)/|site-packages|[A-Z]:\\\\")
 
 PICTURE = re.compile(r"(?:\.plot\(\)|^pk\.layer_curve\(.*\)|^Image\.open\(.*\)|^color|^sheet);?$", re.MULTILINE)

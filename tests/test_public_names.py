@@ -15,7 +15,7 @@ PUBLIC = (
     "probe_kit.runs", "probe_kit.extract", "probe_kit.train", "probe_kit.intervene",
     "probe_kit.intervene.patching", "probe_kit.retention",
     "probe_kit.retention.displays", "probe_kit.retention.report", "probe_kit.suite.converters",
-    "probe_kit.errors",
+    "probe_kit.diagnose", "probe_kit.errors",
 )  # fmt: skip
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
