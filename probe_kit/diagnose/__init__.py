@@ -1,8 +1,8 @@
 """Why a policy ignores an input: does it arrive, does it matter, and where on the way to the action is it lost?
 
 `frames` draws observations of a run. `measure` exchanges their inputs, which `inputs` names. `importance` measures
-how much of the action an input decides, `passage` at which sites it passes. `diagnosis` does all of it on a run, and
-stores it there.
+how much of the action an input decides, `passage` at which sites it passes. `diagnosis` does all of it on a run,
+and stores it there.
 """
 
 from typing import TYPE_CHECKING
