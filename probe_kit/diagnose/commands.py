@@ -11,7 +11,7 @@ from probe_kit._terminal import options as common
 from probe_kit._terminal.console import counter, err, marked, print_json, progress, say
 from probe_kit._terminal.field_options import command_with
 from probe_kit._terminal.options import further_option
-from probe_kit.diagnose.choices import FRAMES, count_groups
+from probe_kit.diagnose.choices import FRAMES
 from probe_kit.errors import UsageError
 from probe_kit.extract import command_options as start
 from probe_kit.extract.settings import ExtractSettings
@@ -159,8 +159,10 @@ def _prepared(
     from probe_kit.runs.store import locate
 
     in_scene = not {"dataset", "env", "pictures"} & set(typed)
-    captured = {"no_act": True} if in_scene else {}
-    items = {"items": 2 * count_groups(frames)} if in_scene and "items" not in typed else {}
+    # Of an environment too the first observation of an episode is all that is read.
+    captured = {"no_act": True} if in_scene else {"max_steps": 1, "execute": 1} if "env" in typed else {}
+    # Twice as many groups as are exchanged: a target is probed in all of them.
+    items = {"items": 2 * frames} if in_scene and "items" not in typed else {}
     # A policy that ignores both picture and instruction is what is looked for here.
     ignored = {"accept_ignored_inputs": True}
     settings = ExtractSettings.of_command({**typed, **items, "model": name, **captured, **ignored}, None)

@@ -19,6 +19,10 @@ if TYPE_CHECKING:
     from probe_kit.intervene.sessions.session import ReplaySession
 
 
+GOLDEN = (5**0.5 - 1) / 2
+"""Multiples of it, without their whole part, cover 0 to 1 evenly: episodes are not all looked at in one phase."""
+
+
 def frames_of(
     session: "ReplaySession", count: int, paraphrases: Mapping[str, str] = MappingProxyType({})
 ) -> list[Frame]:
@@ -40,17 +44,23 @@ def frames_of(
 
 
 def _observed(session: ObservedSession, count: int) -> Iterator[Frame]:
-    """Frames of recordings or of an environment: one of every group in turn, spread over its frames."""
-    groups: dict[str, list[Frame]] = {}
+    """Frames of recordings or of an environment: one of every group in turn, spread over groups and episodes."""
+    by_group: dict[str, list[Frame]] = {}
     for frame in session.frames.index:
-        groups.setdefault(frame.group, []).append(frame)
-    turns = -(-count // len(groups))
-    spread = [
-        [frames[int(at)] for at in np.unique(np.linspace(0, len(frames) - 1, min(turns, len(frames))).round())]
-        for frames in groups.values()
-    ]
+        by_group.setdefault(frame.group, []).append(frame)
+    groups = list(by_group.values())
+    # Data sets are often sorted by task: the first episodes alone would hold one instruction.
+    drawn = np.linspace(0, len(groups) - 1, min(count, len(groups))).round().astype(int)
+    turns = -(-count // len(drawn))
+    spread = [_spread(groups[group], turns, number * GOLDEN % 1) for number, group in enumerate(drawn)]
     in_turn = [frame for turn in zip_longest(*spread) for frame in turn if frame is not None]
     yield from in_turn[:count]
+
+
+def _spread(frames: list[Frame], turns: int, phase: float) -> list[Frame]:
+    """Up to `turns` frames of a group at equal distances. phase: of the first, in distances, from 0 up to 1."""
+    turns = min(turns, len(frames))
+    return [frames[int(len(frames) * (turn + phase) / turns)] for turn in range(turns)]
 
 
 def _drawn(session: "ReplaySession", count: int) -> Iterator[Frame]:
