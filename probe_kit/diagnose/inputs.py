@@ -39,7 +39,8 @@ def names_of(cameras: Sequence[str]) -> tuple[str, ...]:
 def values_of(observations: Sequence[Observation], name: str) -> NDArray[np.intp]:
     """Return (F,) a number of every observation's value of an input; equal values have one number."""
     digests = [sha256(content_of(observation, name)).digest() for observation in observations]
-    return np.unique(np.array(digests, "V32"), return_inverse=True)[1]
+    numbers = {digest: number for number, digest in enumerate(dict.fromkeys(digests))}
+    return np.array([numbers[digest] for digest in digests], np.intp)
 
 
 def controls_of(frame: Frame, name: str, spread: NDArray[np.float64]) -> list[Observation]:
