@@ -13,8 +13,9 @@ if TYPE_CHECKING:
     from probe_kit.diagnose.diagnosis import diagnose_run, load_diagnosis
     from probe_kit.diagnose.page import draw_passage, write_page
     from probe_kit.diagnose.results import Diagnosis
+    from probe_kit.diagnose.sentences import diagnosis_table
 
-__all__ = ["Diagnosis", "diagnose_run", "draw_passage", "load_diagnosis", "write_page"]
+__all__ = ["Diagnosis", "diagnose_run", "diagnosis_table", "draw_passage", "load_diagnosis", "write_page"]
 
 __getattr__, __dir__ = lazy_names(
     __name__,
@@ -22,6 +23,7 @@ __getattr__, __dir__ = lazy_names(
         "Diagnosis": "results",
         "diagnose_run": "diagnosis",
         "load_diagnosis": "diagnosis",
+        "diagnosis_table": "sentences",
         "draw_passage": "page",
         "write_page": "page",
     },

@@ -225,11 +225,6 @@ class Diagnosis:
     base: str = ""
     knowledge: Knowledge | None = None
 
-    def _repr_html_(self) -> str:
-        from probe_kit.diagnose.sentences import diagnosis_table
-
-        return diagnosis_table(self)._repr_html_()
-
     def exit_code(self, required: Sequence[str] = ()) -> int:
         """0 if every required input arrives and matters, else 1; see `exit_code`."""
         names = [diagnosed.name for diagnosed in self.inputs]

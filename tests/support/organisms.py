@@ -86,17 +86,17 @@ ORDERS = 12
 
 
 def hear_one_question(policy: Any) -> None:
-    """Every text is heard as the same words, in an order that is drawn anew for every other text.
+    """Every text is read as the same words, in an order that is drawn anew for every other text.
 
     So the instruction of another frame and its control, the same in other letters, are two draws of one kind.
     """
     tokenise, words = policy.tokenise, ["put", "the", "cube", "on", "the", "red", "shape"]
 
-    def heard(text: str) -> str:
+    def reordered(text: str) -> str:
         order = int.from_bytes(sha256(text.encode()).digest()[:8]) % ORDERS
         return " ".join(np.random.default_rng(order).permutation(words))
 
-    policy.tokenise = lambda texts, state=None: tokenise([heard(text) for text in texts], state)
+    policy.tokenise = lambda texts, state=None: tokenise([reordered(text) for text in texts], state)
 
 
 def forget_words(policy: Any, observations: Sequence[Observation], steps: int = 200, batch: int = 16) -> None:
@@ -185,7 +185,7 @@ ORGANISMS = {
     "untrained": Organism(make_untrained, {"instruction": NOTHING, "picture": NOTHING}),
     "null": Organism(hear_one_question, {"instruction": NOTHING}),
     FORGOT: Organism(
-        leave,  # `forget_words` takes a minute: whoever uses it keeps the weights
+        leave,  # `forget_words` takes a minute: its weights are kept
         {"instruction": ("moves", *NOTHING)},
         changes={"instruction": ("lost in fine-tuning", "weaker")},
     ),
