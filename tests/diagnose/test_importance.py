@@ -106,8 +106,10 @@ def test_a_policy_that_its_seed_decides_is_moved_by_its_inputs_at_most() -> None
 
 
 def test_nothing_matters_where_every_change_moves_as_much() -> None:
-    found = verdicts(linear_policy([0.0, 0.0, 0.0], wandering=1.0))
-    assert set(found.values()) <= {"open", "no effect"}
+    policy = linear_policy([0.0, 0.0, 0.0], wandering=1.0)
+    draws = [InputExchange(policy, frames(16, 8, seed), seed).measure() for seed in range(20)]
+    alarms = sum(diagnosed.verdict not in ("open", "no effect") for inputs in draws for diagnosed in inputs)
+    assert alarms <= 8, "5 % of 60, and three standard deviations"
 
 
 def test_words_that_mean_the_same_move_as_much_as_others_in_five_of_a_hundred_draws() -> None:
