@@ -131,6 +131,14 @@ class Forgetful(ReachEnv):
         return Step(found.observation, done, {**found.facts, **further})
 
 
+class Late(ReachEnv):
+    """Knows its facts behind the first step."""
+
+    def reset(self, episode: EnvEpisode) -> Observation:  # type: ignore[override]
+        """The beginning alone."""
+        return super().reset(episode).observation
+
+
 class Shrinking(ReachEnv):
     """Leaves numbers out of the state behind the first step."""
 

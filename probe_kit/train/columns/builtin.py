@@ -147,6 +147,11 @@ def _of_source(run: RunReader, name: str) -> BuiltinColumn:
     rows = _rows(run, [episode for episode, _ in pairs])
     calls = [call for _, call in pairs]
     cells = _cells(run, column, columns[column]()[rows, calls])
+    if run.in_own_environment and not any(calls) and all(cell is None for cell in cells):
+        raise UsageError(
+            f"{name} has no value, because facts come with a step and only the first inference was captured. "
+            "Extract with --captured-calls all, or return a `Step` with facts from `reset`"
+        )
     episodes, inferences = zip(*pairs, strict=True)
     return BuiltinColumn(None, episodes, inferences, cells)
 

@@ -73,6 +73,15 @@ def test_facts_are_labels_and_a_run_without_sides_refuses_them(played: Run, tmp_
         Target.of_run(played, "env.absent")
 
 
+def test_facts_of_a_run_that_captured_the_first_inference_alone_are_missed_with_the_way_to_get_them(
+    pi0_tiny: Pi0, tmp_path: Path
+) -> None:
+    late = settings("Late", captured_calls=1, episodes="0:2")
+    first = prepare(late, model=pi0_tiny).run(tmp_path / "run")
+    with pytest.raises(UsageError, match=r"first inference was captured\. Extract with --captured-calls all"):
+        Target.of_run(first, "env.left")
+
+
 def check_equal(some: Run, played: Run, rows: list[int]) -> None:
     """Batches of another size differ by rounding."""
     for name in some.streams:
