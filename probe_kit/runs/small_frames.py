@@ -13,8 +13,9 @@ SmallFrames = tuple[NDArray[np.uint8], ...]
 """(h, w, 3) uint8 each: the first and last frame, the first alone where nothing moved, or every one."""
 
 
-def shrink(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """A frame (H, W, 3) uint8 at `HEIGHT`."""
-    height, width, _ = frame.shape
+def shrink(*pictures: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Pictures (H, W, 3) uint8 of one moment side by side at `HEIGHT`, each as wide as the first one."""
+    height, width, _ = pictures[0].shape
     size = (round(width * HEIGHT / height), HEIGHT)
-    return np.asarray(Image.fromarray(frame).resize(size, Image.Resampling.LANCZOS))
+    resized = [Image.fromarray(picture).resize(size, Image.Resampling.LANCZOS) for picture in pictures]
+    return np.hstack([np.asarray(picture) for picture in resized])

@@ -70,14 +70,14 @@ def episode_frames(run: RunReader, position: int) -> EpisodeFrames | None:
     sheet = read_sheet(run.location, int(row.get("episode", position)))
     if sheet is not None and sheet.count is not None:
         return EpisodeFrames(sheet.content, sheet.count, "all")
+    cameras = len((run.settings.get(DATASET) or run.settings.get(ENVIRONMENT) or {}).get("cameras", ())) or 1
     if sheet is not None:  # a model that did not act has no last frame
-        return EpisodeFrames(sheet.content, 1 if "parse" in row or row["outcome"] == CAPTURE_ONLY else 2, "ends")
+        count = 1 if "parse" in row or row["outcome"] == CAPTURE_ONLY else 2
+        return EpisodeFrames(sheet.content, count, "ends", cameras)
     if inputs is None or "pixels" not in inputs.kinds:
         return None
     inferences = int((run.control_steps[position] >= 0).sum())
-    frames = tuple(np.hstack(list(cameras)) for cameras in inputs.row("pixels", position)[:inferences])
-    source = run.settings.get(DATASET) or run.settings.get(ENVIRONMENT) or {}
-    cameras = len(source.get("cameras", ())) or 1
+    frames = tuple(np.hstack(list(pictures)) for pictures in inputs.row("pixels", position)[:inferences])
     return EpisodeFrames(as_thumbnail(frames, "all"), len(frames), "inferences", cameras) if frames else None
 
 

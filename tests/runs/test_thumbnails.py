@@ -13,7 +13,7 @@ from probe_kit.errors import RunDamagedError, UsageError
 from probe_kit.extract import ExtractSettings, extract_run
 from probe_kit.runs import Run, open_run, verify_run
 from probe_kit.runs.records import HASH, as_record
-from probe_kit.runs.small_frames import FILM_HEIGHT, HEIGHT
+from probe_kit.runs.small_frames import FILM_HEIGHT, HEIGHT, shrink
 from probe_kit.runs.thumbnails import as_thumbnail, decode_frames, read_sheet, read_thumbnail
 from probe_kit.suite import build_suite, load_suite
 from tests.support.episode_tables import without_seconds
@@ -195,3 +195,11 @@ def test_a_commit_with_another_number_of_frames_is_damage(filmed: Run) -> None:
 def test_a_film_that_no_webp_can_hold_is_refused() -> None:
     with pytest.raises(UsageError, match="at most 544 frames"):
         ExtractSettings("idle", scene=SceneSpec(max_steps=544), frames="all")
+
+
+def test_the_pictures_of_several_cameras_stand_side_by_side_at_the_size_of_the_first() -> None:
+    first, wrist = (np.full((60, width, 3), value, np.uint8) for width, value in ((80, 10), (40, 200)))
+    together = shrink(first, wrist)
+    assert together.shape == (120, 320, 3)
+    np.testing.assert_array_equal(together[:, :160], shrink(first))
+    assert (together[:, 160:] == 200).all()

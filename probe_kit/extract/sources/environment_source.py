@@ -284,7 +284,7 @@ class EnvironmentPlayer(InputsPlayer):
         self.row, self._steps, self._succeeded = row, 0, False
         self._clear()
         step = started(self._environment, row.content, self._settings.name)
-        self._first = step.observation.image
+        self._first = _pictures(step)
         return self._see(step)
 
     def advance(self, actions: NDArray[np.float32]) -> Answer:
@@ -308,7 +308,7 @@ class EnvironmentPlayer(InputsPlayer):
 
     def _see(self, step: Step) -> Observation:
         observation, most = step.observation, self._played.calls
-        self._keep_pictures([observation.image, *observation.cameras.values()], self._settings.pixels, most)
+        self._keep_pictures(_pictures(step), self._settings.pixels, most)
         self._keep("state", observation.state, most)
         where = f"{self._settings.name}, step() {self._steps}"
         unknown = self._steps == 0 and not step.facts  # nothing is said of the beginning
@@ -326,11 +326,16 @@ class EnvironmentPlayer(InputsPlayer):
             "steps": self._steps,
             "done": bool(step.done),
         }
-        return self._ending(outcome, self._small_frames(step.observation.image))
+        return self._ending(outcome, self._small_frames(_pictures(step)))
 
-    def _small_frames(self, last: NDArray[np.uint8]) -> SmallFrames:
-        """The first and the last frame, in small."""
-        return () if self._played.frames == "none" else (shrink(self._first), shrink(last))
+    def _small_frames(self, last: list[NDArray[np.uint8]]) -> SmallFrames:
+        """The first and the last frame of all cameras side by side, in small."""
+        return () if self._played.frames == "none" else (shrink(*self._first), shrink(*last))
+
+
+def _pictures(step: Step) -> list[NDArray[np.uint8]]:
+    """The pictures of all cameras, the first one in front."""
+    return [step.observation.image, *step.observation.cameras.values()]
 
 
 def _succeeds(step: Step) -> bool:

@@ -23,8 +23,8 @@ def add_image_swap(
     """The row with the effect of the image swap on its category, judged by its own probes.
 
     effects: by category; may be empty. places: by category, where it passes and is read. tie: of the row's
-    category and view, see `intervene.results.ties`. other: the behaviour by the other readout, see
-    `intervene.results.readouts`.
+    category and view, see `evidence.stored_ties`. other: the behaviour by the other readout, see
+    `evidence.stored_other_readouts`.
     """
     of_category = effects.get(row.category)
     if of_category is None:

@@ -101,7 +101,7 @@ def test_small_frames_are_the_first_and_the_last_picture(name: str) -> None:
     stage = EnvironmentPlayer(EnvSource(f"reach_env:{name}", max_steps=3), FACTS, Played("ends"))
     stage.begin(planned(), film=False)
     stage.advance(np.tile(np.float32([0, 0.02, 0, 0, 0, 0, 0]), (3, 1)))
-    np.testing.assert_array_equal(stage._first[1:], first[1:])
+    np.testing.assert_array_equal(stage._first[0][1:], first[1:])
 
 
 # -- units and names ---------------------------------------------------------------------------------------
