@@ -19,9 +19,9 @@ from threadpoolctl import threadpool_limits
 
 from probe_kit.statistics.label_permutations import flip_groups, max_statistic_p, pointwise_p
 from probe_kit.statistics.significance import SIGNIFICANCE
-from probe_kit.train.crossval.metrics import correctness
 from probe_kit.train.crossval.nested_folds import nested_folds
 from probe_kit.train.crossval.site_probe import probe_site
+from probe_kit.train.crossval.task_scores import correctness
 from probe_kit.train.data.samples import Samples
 
 SITES, WIDTH, ITEMS, PERMUTATIONS = 4, 12, 24, 99

@@ -23,7 +23,7 @@ from probe_kit.hooks import Site
 from probe_kit.suite import Suite, build_suite
 from probe_kit.train import ArrayRun
 from probe_kit.train.controls.features import LAYERS, ControlInputs
-from probe_kit.train.crossval.metrics import correctness
+from probe_kit.train.crossval.task_scores import correctness
 from probe_kit.train.data.samples import Samples
 from probe_kit.train.execution import ExecutionSettings
 from probe_kit.train.probe_sweep import Sweep

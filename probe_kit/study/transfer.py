@@ -10,7 +10,7 @@ from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.label_permutations import flip_groups, max_statistic_p
-from probe_kit.train.crossval.metrics import correctness
+from probe_kit.train.crossval.task_scores import correctness
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_directions import Direction
 from probe_kit.train.results.probe_results import ProbeResults

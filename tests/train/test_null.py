@@ -5,9 +5,9 @@ import pytest
 from scipy.stats import binom
 
 from probe_kit.statistics.label_permutations import flip_groups, max_statistic_p, pointwise_p
-from probe_kit.train.crossval.metrics import correctness
 from probe_kit.train.crossval.nested_folds import nested_folds
 from probe_kit.train.crossval.site_probe import probe_site
+from probe_kit.train.crossval.task_scores import correctness
 from probe_kit.train.data.samples import Samples
 
 ITEMS = np.repeat(np.arange(20), 2)

@@ -20,7 +20,7 @@ from probe_kit.retention.compare.model_test import (
     retention_of_model,
     success_of_model,
 )
-from probe_kit.retention.compare.source_weights import Relation
+from probe_kit.retention.compare.origins import Relation
 from probe_kit.retention.estimators.stream_scores import (
     ACTION,
     BACKBONE,

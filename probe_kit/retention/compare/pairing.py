@@ -17,8 +17,7 @@ from probe_kit.retention.compare.common_items import (
     wording_of,
 )
 from probe_kit.retention.compare.compare import Difference, Side, compare, with_holm
-from probe_kit.retention.compare.origins import origins_of
-from probe_kit.retention.compare.source_weights import grew_from
+from probe_kit.retention.compare.origins import grew_from, origins_of
 from probe_kit.retention.rows.build import RowSettings, RowWithEstimates, run_rows
 from probe_kit.runs.reader import RunReader
 

@@ -1,7 +1,8 @@
 """The rows of one run, with the estimates that averages and differences are made of."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from math import isfinite
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,8 +10,9 @@ import numpy as np
 from probe_kit.env.scoring.rules import DEFAULT_RULE
 from probe_kit.errors import UnknownSiteError
 from probe_kit.hooks.contract.sites import first_of
-from probe_kit.intervene.kinds.image_swap import stored_image_swaps
+from probe_kit.intervene.kinds.image_swap import ImageSwapEffect, stored_image_swaps
 from probe_kit.intervene.results.evidence import StoredEvidence, stored_other_readouts, stored_places, stored_ties
+from probe_kit.intervene.results.verdict import Places, UseVerdict, classify_use, control_for
 from probe_kit.retention.behaviour.success_rate import (
     SuccessRate,
     capture_only,
@@ -22,9 +24,8 @@ from probe_kit.retention.behaviour.success_rate import (
 from probe_kit.retention.behaviour.vlm_answers import ask_of, read_by_clause
 from probe_kit.retention.choices import Iterations
 from probe_kit.retention.estimators.stream_scores import RowEstimates
-from probe_kit.retention.rows.interventions import add_image_swap
 from probe_kit.retention.rows.outcome_rules import OutcomeRuleScores, RunUnderRule
-from probe_kit.retention.rows.parts import AnswerStats, RunInfo
+from probe_kit.retention.rows.parts import AnswerStats, RunInfo, SwapEffect
 from probe_kit.retention.rows.probe_parts import number_or_none, with_probes
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.runs.reader import RunReader
@@ -135,6 +136,38 @@ def _row(
         row, streams = with_probes(row, results, settings.iterations, settings.absent_below, run.seed_text)
         estimates = replace(estimates, streams=streams)
     return RowWithEstimates(row, estimates, episodes if scored else None)
+
+
+def add_image_swap(
+    row: RetentionRow,
+    effects: Mapping[str, ImageSwapEffect],
+    places: Mapping[str, Places],
+    tie: str = "",
+    other: UseVerdict | None = None,
+) -> RetentionRow:
+    """The row with the effect of the image swap on its category, judged by its own probes.
+
+    effects: by category; may be empty. places: by category, where it passes and is read. tie: of the row's
+    category and view, see `evidence.stored_ties`. other: the behaviour by the other readout, see
+    `evidence.stored_other_readouts`.
+    """
+    of_category = effects.get(row.category)
+    if of_category is None:
+        return row
+    encoded = row.backbone.has_signal if row.backbone.exceeds else None
+    category, control = row.category, control_for(row.category, effects)
+    use = classify_use(encoded, of_category, control, places.get(category), tie, other)
+    effect = SwapEffect(
+        follow_rate=of_category.follow_rate,
+        reversal_rate=of_category.reversal_rate,
+        net_follow_rate=of_category.net_follow_rate,
+        net_follow_rate_ci=of_category.net_follow_rate_ci,
+        reach_share=of_category.reach_share,
+        reach_share_ci=of_category.reach_share_ci if isfinite(of_category.reach_share_ci[0]) else (None, None),
+        follow_p=of_category.follow_p,
+        use=use,
+    )
+    return replace(row, image_swap=effect)
 
 
 def run_info(run: RunReader, results: ProbeResults | None) -> RunInfo:

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.statistics.folds import Fold
-from probe_kit.train.crossval.metrics import log_loss, log_losses
 from probe_kit.train.crossval.nested_folds import STRENGTHS, FittedFold, InnerQuality, Matrix, NestedFold, select_c
+from probe_kit.train.crossval.task_scores import log_loss, log_losses
 from probe_kit.train.data.samples import Samples
 from probe_kit.train.solver.backend import Array, array_namespace, to_device_of, to_numpy
 from probe_kit.train.solver.design_matrix import StackedDesign

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from probe_kit.errors import TooFewGroupsError
 from probe_kit.train.crossval.joint_design import JointSite
 from probe_kit.train.crossval.joint_objective import JointProblems
-from probe_kit.train.crossval.metrics import log_loss, log_losses
 from probe_kit.train.crossval.nested_folds import STRENGTHS, FittedFold, InnerQuality, Matrix, NestedFold, select_c
+from probe_kit.train.crossval.task_scores import log_loss, log_losses
 from probe_kit.train.data.samples import Samples
 from probe_kit.train.solver.backend import Array, array_namespace, to_numpy
 from probe_kit.train.solver.mixed_precision import solve

@@ -7,7 +7,6 @@ from probe_kit.statistics.folds import Fold
 from probe_kit.train.crossval.batched_folds import cross_validate_together, is_small
 from probe_kit.train.crossval.joint import can_be_joint, cross_validate_jointly
 from probe_kit.train.crossval.joint_design import JointSite
-from probe_kit.train.crossval.metrics import log_loss, log_losses
 from probe_kit.train.crossval.nested_folds import (
     STRENGTHS,
     FittedFold,
@@ -16,6 +15,7 @@ from probe_kit.train.crossval.nested_folds import (
     NestedFold,
     select_c,
 )
+from probe_kit.train.crossval.task_scores import log_loss, log_losses
 from probe_kit.train.data.samples import Samples
 from probe_kit.train.solver.backend import to_numpy
 from probe_kit.train.solver.logistic import LogisticSolver

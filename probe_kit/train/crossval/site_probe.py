@@ -8,10 +8,9 @@ from numpy.typing import NDArray
 from probe_kit.errors import NonFiniteActivationError
 from probe_kit.train.choices import Task
 from probe_kit.train.crossval.logistic_folds import cross_validate
-from probe_kit.train.crossval.metrics import correctness
 from probe_kit.train.crossval.nested_folds import FittedFold, InnerQuality, Matrix, NestedFold
 from probe_kit.train.crossval.ridge_folds import predict_classes, predict_quantities
-from probe_kit.train.crossval.task_scores import balanced_scores, explained_scores
+from probe_kit.train.crossval.task_scores import balanced_scores, correctness, explained_scores
 from probe_kit.train.data.samples import Samples
 
 

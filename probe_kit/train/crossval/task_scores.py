@@ -84,3 +84,46 @@ def score_interval(
     weights = class_weights(labels)
     interval = Accuracy.of((scores / weights).clip(0, 1), groups, weights).interval()
     return interval.low, interval.high
+
+
+# -- of sides: decision values of two classes ---------------------------------------------------------------
+
+
+def correctness(decisions: Matrix, labels: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return for each episode whether it is classified correctly; `decisions` and `labels` are of one shape."""
+    right: NDArray[np.bool_] = (decisions > 0) == labels
+    return right
+
+
+def log_loss(decisions: Matrix, labels: NDArray[np.bool_]) -> Matrix:
+    """Mean of −log P(label), in nats, over the first axis."""
+    loss: Matrix = log_losses(decisions, labels).mean(axis=0)
+    return loss
+
+
+def log_losses(decisions: Matrix, labels: NDArray[np.bool_]) -> Matrix:
+    """Return −log P(label), in nats, of decisions and labels of one shape."""
+    losses: Matrix = np.logaddexp(0.0, np.where(labels, -decisions, decisions))
+    return losses
+
+
+def fold_auc(decisions: Matrix, labels: NDArray[np.bool_], folds: list[Fold]) -> float:
+    """Area under the ROC curve within each test fold, averaged over folds that hold both classes.
+
+    Within, because every fold's probe has its own scale and intercept.
+    """
+    areas = [
+        _auc(decisions[fold.test], labels[fold.test]) for fold in folds if np.unique(labels[fold.test]).size == 2
+    ]
+    return float(np.mean(areas)) if areas else float("nan")
+
+
+def _auc(decisions: Matrix, labels: NDArray[np.bool_]) -> float:
+    above = decisions[labels][:, None] - decisions[~labels][None, :]
+    return float((above > 0).mean() + 0.5 * (above == 0).mean())
+
+
+def chance_level(labels: NDArray[np.bool_]) -> float:
+    """Accuracy of always naming the larger class: 0.5 when both layouts of every item are there."""
+    share = float(labels.mean())
+    return max(share, 1 - share)

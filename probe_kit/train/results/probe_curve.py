@@ -15,8 +15,7 @@ from probe_kit.statistics.folds import Fold, fold_of_groups, split_by_fold, sums
 from probe_kit.statistics.label_permutations import max_statistic_p, smallest_p
 from probe_kit.statistics.paired_bootstrap import SHARED_PROBE
 from probe_kit.train.choices import Task
-from probe_kit.train.crossval.metrics import correctness
-from probe_kit.train.crossval.task_scores import class_weights, score_interval, squared_deviations
+from probe_kit.train.crossval.task_scores import class_weights, correctness, score_interval, squared_deviations
 
 Matrix = NDArray[np.float64]
 

@@ -8,8 +8,7 @@ import numpy as np
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.statistics.estimates.shares import effective_groups, group_shares, wilson_interval
 from probe_kit.statistics.label_permutations import pointwise_p
-from probe_kit.train.crossval.metrics import fold_auc, log_loss
-from probe_kit.train.crossval.task_scores import METRICS, fold_spearman
+from probe_kit.train.crossval.task_scores import METRICS, fold_auc, fold_spearman, log_loss
 from probe_kit.train.results.control_scores import Controls, Exceeds, has_signal
 from probe_kit.train.results.probe_curve import Matrix, ProbeCurve
 from probe_kit.train.settings import ProbeSettings

@@ -12,7 +12,7 @@ from probe_kit.intervene.kinds.image_swap import ImageSwapEffect
 from probe_kit.intervene.results.verdict import Places
 from probe_kit.retention.behaviour.success_rate import Regime, SuccessRate
 from probe_kit.retention.columns.sentences import conclusion, describe_category, verdict
-from probe_kit.retention.rows.interventions import add_image_swap
+from probe_kit.retention.rows.build import add_image_swap
 from probe_kit.retention.rows.parts import ActionPart, BackbonePart, RunInfo
 from probe_kit.retention.rows.row import RetentionRow
 

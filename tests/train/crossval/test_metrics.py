@@ -6,7 +6,7 @@ from sklearn import metrics
 
 from probe_kit.statistics.estimates.shares import Share
 from probe_kit.statistics.folds import Fold
-from probe_kit.train.crossval.metrics import chance_level, fold_auc, log_loss
+from probe_kit.train.crossval.task_scores import chance_level, fold_auc, log_loss
 
 GENERATOR = np.random.default_rng(0)
 LABELS = GENERATOR.random(80) < 0.3
