@@ -65,7 +65,7 @@ class Row:
     line: its number in the file, from 1. instruction: the imperative. correct, wrong: files, beside the table.
     group: rows of one group are never in training and test at once; empty where pictures alone decide. object:
     what the correct picture is called, part of the instruction. other_object: what the wrong one is called; empty
-    for its file's name.
+    for what its twin calls it, or else for its file's name.
     """
 
     line: int
@@ -234,12 +234,15 @@ def suite_from_csv(
 def _ask_rows(questions: _Questions, drawn: Sequence[tuple[Row, Picture, Picture]]) -> None:
     pixels = [(row.category, correct.pixels_sha256, wrong.pixels_sha256) for row, correct, wrong in drawn]
     together = Counter((category, frozenset(both)) for category, *both in pixels)
-    orders, turns = set(pixels), dict[str, Iterator[int]]()
+    phrases = {key: row.object for (row, *_), key in zip(drawn, pixels, strict=True)}
+    turns = dict[str, Iterator[int]]()
     for (row, correct, wrong), (category, right_pixels, wrong_pixels) in zip(drawn, pixels, strict=True):
         twins = (
             together[category, frozenset((right_pixels, wrong_pixels))] == 2
-            and (category, wrong_pixels, right_pixels) in orders
+            and (category, wrong_pixels, right_pixels) in phrases
         )
+        # A picture has one name in both questions, so that labels of its concept are the same in both.
+        other = phrases[category, wrong_pixels, right_pixels] if twins else f"what {row.wrong.stem} shows"
         content = sorted((right_pixels, wrong_pixels)) + ([] if twins else [row.instruction])
         pair_id = questions.pair_id(category, content)
         side: Side = "right" if next(turns.setdefault(category, count())) % 2 else "left"
@@ -249,7 +252,7 @@ def _ask_rows(questions: _Questions, drawn: Sequence[tuple[Row, Picture, Picture
         item_id = f"{pair_id}-{sha256_json([row.instruction, right_pixels])[:8]}"
         questions.ask(
             item_id, pair_id, category, row.instruction, article, side, (correct, row.object),
-            (wrong, row.other_object),
+            (wrong, row.other_object or other),
         )  # fmt: skip
 
 
@@ -330,7 +333,7 @@ def _row(record: Mapping[str, str | None], line: int, opened: TextTable, categor
             "'Put the cube on the …', or name the words in a column `object`"
         )
     correct, wrong = (table.parent / cells[column] for column in ("correct", "wrong"))
-    other = cells.get("other_object") or f"what {wrong.stem} shows"
+    other = cells.get("other_object") or ""
     try:
         slug = check_slug(cells.get("category") or category)
     except UsageError as error:

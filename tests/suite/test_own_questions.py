@@ -110,6 +110,8 @@ def test_two_rows_over_the_same_pictures_that_ask_the_other_way_round_are_twins(
     assert one.pair_id == other.pair_id
     assert one.left_pixels_sha256 == other.left_pixels_sha256
     assert {one.correct_side, other.correct_side} == {"left", "right"}
+    names = [(item.target_concept, item.distractor_concept) for item in suite.items]
+    assert names == [("banana", "lime"), ("lime", "banana")], "a picture has one name, whichever is asked for"
 
 
 @pytest.mark.parametrize(

@@ -149,8 +149,9 @@ def _of_source(run: RunReader, name: str) -> BuiltinColumn:
     cells = _cells(run, column, columns[column]()[rows, calls])
     if run.in_own_environment and not any(calls) and all(cell is None for cell in cells):
         raise UsageError(
-            f"{name} has no value, because facts come with a step and only the first inference was captured. "
-            "Extract with --captured-calls all, or return a `Step` with facts from `reset`"
+            f"{name} has no value, because facts come with a step and only first inferences were captured. Return "
+            "a `Step` with facts from `reset`, or extract with --captured-calls all, and with a smaller --execute "
+            "where an episode ends within one chunk"
         )
     episodes, inferences = zip(*pairs, strict=True)
     return BuiltinColumn(None, episodes, inferences, cells)

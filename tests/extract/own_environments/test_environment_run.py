@@ -78,7 +78,7 @@ def test_facts_of_a_run_that_captured_the_first_inference_alone_are_missed_with_
 ) -> None:
     late = settings("Late", captured_calls=1, episodes="0:2")
     first = prepare(late, model=pi0_tiny).run(tmp_path / "run")
-    with pytest.raises(UsageError, match=r"first inference was captured\. Extract with --captured-calls all"):
+    with pytest.raises(UsageError, match=r"first inferences were captured\. Return .* --captured-calls all"):
         Target.of_run(first, "env.left")
 
 
