@@ -7,7 +7,6 @@ commit protocol needs. Folders have locks and renaming besides, which are replac
   remove: half an upload is no object, and objects without a commit are written again under the same key.
 * A run begins with its objects created one by one, `run.json` last. Two processes that begin at once create the
   same bytes, or one of them is refused.
-* Derived groups carry their stamp in their key, so that processes that saw different commits never mix them.
 
 A store may be busy or away for a while: from its first answer on, every request is repeated for `PATIENCE`. Before
 it has answered once, the address is more likely wrong, and it is given up within seconds.
@@ -32,7 +31,6 @@ from zarr.storage import WrapperStore
 from probe_kit._system.optional_dependencies import require
 from probe_kit.errors import SettingsMismatchError, StoreError, UsageError
 from probe_kit.runs.location import Location, check_size
-from probe_kit.runs.records import NAME_DIGITS
 
 if TYPE_CHECKING:
     from obstore import ReadableFile
@@ -303,20 +301,6 @@ class Bucket(Location):
         """No lock: files of other content have other names, and the last head counts."""
         yield
 
-    def derived(self, folder: str, stamp: str) -> str:
-        """A folder per stamp."""
-        return f"{folder}/{stamp[:NAME_DIGITS]}"
-
-    @contextmanager
-    def rebuilding(self, folder: str, stamp: str) -> Iterator[Store]:
-        """Build in the final folder, which is not read before its stamp is written, and as if it were empty.
-
-        Two processes that build it at once write the same bytes, and neither removes what the other wrote.
-        """
-        final = self.derived(folder, stamp)
-        yield _BlankStore(self.store(final))
-        self._delete([key for key in self.keys(folder) if not key.startswith(f"{final}/")])
-
 
 def pauses_for(time_to_repeat: timedelta) -> Iterator[float]:
     """Seconds to wait before every further try, until the time is over."""
@@ -330,7 +314,7 @@ class _PatientStore(WrapperStore[Store]):
     """A store of Zarr whose errors are those of its bucket, and that waits for them to pass.
 
     obstore repeats most requests, but not an answer that breaks off. Of Zarr's operations it covers those that
-    `CheckedStore`, `RecordingStore` and `_BlankStore` pass on.
+    `CheckedStore`, `RecordingStore` and `BlankStore` pass on.
     """
 
     def __init__(self, store: Store, bucket: Bucket) -> None:
@@ -379,39 +363,6 @@ class _PatientStore(WrapperStore[Store]):
     async def delete(self, key: str) -> None:
         """Remove one."""
         await self._answer(lambda: self._store.delete(key))
-
-
-class _BlankStore(WrapperStore[Store]):
-    """A store that shows only what was written through it."""
-
-    def __init__(self, store: Store) -> None:
-        super().__init__(store)
-        self._written: set[str] = set()
-
-    async def set(self, key: str, value: Buffer) -> None:
-        """Write one object, which exists from now on."""
-        self._written.add(key)
-        await super().set(key, value)
-
-    async def set_if_not_exists(self, key: str, value: Buffer) -> None:
-        """Write one object over any former one."""
-        if key not in self._written:
-            await self.set(key, value)
-
-    async def get(
-        self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None
-    ) -> Buffer | None:
-        """One object or a part of it, if it was written here."""
-        return await super().get(key, prototype, byte_range) if key in self._written else None
-
-    async def exists(self, key: str) -> bool:
-        """Whether it was written here."""
-        return key in self._written
-
-    async def delete_dir(self, prefix: str) -> None:
-        """Remove what was written here below `prefix`."""
-        for key in [key for key in self._written if key.startswith(prefix)]:
-            await self.delete(key)
 
 
 class _Ranges(RawIOBase):

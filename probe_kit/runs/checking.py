@@ -1,4 +1,4 @@
-"""A store that checks every object, or each part that is read, against its hash."""
+"""Stores of Zarr that hash what passes through them: everything that is written, every part that is read."""
 
 from collections.abc import AsyncGenerator, AsyncIterator, Callable, Iterable, Mapping, Sequence
 from itertools import count
@@ -9,10 +9,77 @@ from zarr.core.buffer import Buffer, BufferPrototype, default_buffer_prototype
 from zarr.storage import LocalStore, WrapperStore
 
 from probe_kit.errors import RunDamagedError
-from probe_kit.runs.arrays import chunk_slices, index_bytes
-from probe_kit.runs.records import BLOCK_BYTES, Sum, block_digest
+from probe_kit.runs.arrays import chunk_slices, index_bytes, inner_chunks
+from probe_kit.runs.records import BLOCK_BYTES, Sum, block_digest, digest
 
 _BLOCK = 2 * BLOCK_BYTES
+
+
+class RecordingStore(WrapperStore[Store]):
+    """Passes writes on and keeps length and hash of every object, computed while its bytes are at hand.
+
+    shards: number of inner chunks in every object of a sharded array, by the array's path.
+    """
+
+    def __init__(self, store: Store, shards: Mapping[str, int] | None = None) -> None:
+        super().__init__(store)
+        self.sums: dict[str, Sum] = {}
+        self.shards = dict(shards or {})
+
+    async def set(self, key: str, value: Buffer) -> None:
+        """Write one object."""
+        self._record(key, value)
+        await super().set(key, value)
+
+    async def set_if_not_exists(self, key: str, value: Buffer) -> None:
+        """Write one object unless it is there; Zarr does so with groups on the way to an array."""
+        if key not in self.sums:
+            self._record(key, value)
+        await super().set_if_not_exists(key, value)
+
+    def set_sync(self, key: str, value: Buffer) -> None:
+        """Write one object from synchronous code."""
+        self._record(key, value)
+        super().set_sync(key, value)
+
+    def _record(self, key: str, value: Buffer) -> None:
+        content = value.to_bytes()
+        count = self.shards.get(key.partition("/c/")[0], 0) if "/c/" in key else 0
+        blocks = "".join(block_digest(content[part]) for part in inner_chunks(content, count)) if count else ""
+        self.sums[key] = Sum(len(content), digest(content), blocks)
+
+
+class BlankStore(RecordingStore):
+    """A recording store that shows only what was written through it.
+
+    What a killed process left in its folder, or another one writes there at the same time, does not exist for it.
+    """
+
+    async def set_if_not_exists(self, key: str, value: Buffer) -> None:
+        """Write one object over any former one."""
+        if key not in self.sums:
+            await self.set(key, value)
+
+    async def get(
+        self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None
+    ) -> Buffer | None:
+        """One object or a part of it, if it was written here."""
+        return await super().get(key, prototype, byte_range) if key in self.sums else None
+
+    def get_sync(
+        self, key: str, *, prototype: BufferPrototype | None = None, byte_range: ByteRequest | None = None
+    ) -> Buffer | None:
+        """The same, from synchronous code."""
+        return super().get_sync(key, prototype=prototype, byte_range=byte_range) if key in self.sums else None
+
+    async def exists(self, key: str) -> bool:
+        """Whether it was written here."""
+        return key in self.sums
+
+    async def delete_dir(self, prefix: str) -> None:
+        """Remove what was written here below `prefix`."""
+        for key in [key for key in self.sums if key.startswith(prefix)]:
+            await self.delete(key)
 
 
 class CheckedStore(WrapperStore[Store]):

@@ -3,11 +3,13 @@
 A row store answers "everything of one episode". Columns hold the same numbers the other way round; `seal`
 writes them. They are derived: safe to delete, and used only while their stamp matches the commits.
 
-    columns.zarr/<stream>/pooled   float32 (call, view, [iteration,] layer, episode, feature)
-    columns.zarr/<stream>/later    uint16 (call - 1, [iteration,] layer, episode, feature), with --later-views mean
-    columns.zarr/<stream>/role     uint8   (call, episode, token), codes named by the attribute `roles`
-    sealed/<stamp>.json            the hash of every object in columns.zarr, and of which run and commits they are
+    columns.zarr/<stamp>/<stream>/
+        pooled            float32 (call, view, [iteration,] layer, episode, feature)
+        later             uint16 (call - 1, [iteration,] layer, episode, feature), with --later-views mean
+        role              uint8 (call, episode, token), codes named by the attribute `roles`
+    sealed/<stamp>.json   the hash of every object there, and of which run and commits they are
 
+Their key carries the stamp, so that processes that saw different commits never mix them.
 A seal says which episodes it was made of. It is older than a run that has more; one that names an episode which is
 not committed any more shows that the run lost it.
 """
@@ -115,12 +117,17 @@ def find_columns(root: Root, commits: Mapping[int, Commit]) -> Columns | None:
     seal = next((seal for seal in _read_seals(root, commits) if seal.stamp == stamp), None)
     if seal is None:
         return None
-    columns = Columns(location, location.derived(COLUMNS, stamp), seal.objects)
+    columns = Columns(location, columns_folder(stamp), seal.objects)
     if not location.exists(f"{columns.folder}/{METADATA}"):
         if not (location.keys(columns.folder) and location.exists(seal_key(stamp))):
             return None  # all of them were removed, as is allowed, or are being built again
         raise RunDamagedError(f"{location}/{columns.folder}/{METADATA} is missing. {columns.advice}")
     return columns
+
+
+def columns_folder(stamp: str) -> str:
+    """Return the folder of the columns that were made from the commits that `stamp` names."""
+    return f"{COLUMNS}/{stamp[:NAME_DIGITS]}"
 
 
 def seal_key(stamp: str) -> str:

@@ -16,11 +16,11 @@ from zarr.storage import LocalStore
 
 from probe_kit._system.drafts import draft_of
 from probe_kit.errors import FULL_DISK, DiskSpaceError, RunDamagedError, SettingsMismatchError
-from probe_kit.runs.layout import DATA, RUN_FILE
+from probe_kit.runs.layout import COLUMNS, DATA, RUN_FILE
 from probe_kit.runs.location import Location, check_size
 
-_DRAFTS = ("*.tmp", "*/*.tmp", f"{DATA}/**/*.partial")
-"""Patterns of what a killed process leaves: objects and columns without their final name."""
+_DRAFTS = ("*.tmp", "*/*.tmp", f"{DATA}/**/*.partial", f"{COLUMNS}/**/*.partial")
+"""Patterns of what a killed process leaves: objects without their final name."""
 _PIECE = 1 << 20
 _TRIES = 5
 """Times that a file is written whose folder another process clears or removes meanwhile."""
@@ -220,10 +220,7 @@ class Folder(Location):
     def _clear_drafts(self) -> None:
         for pattern in _DRAFTS:
             for draft in self._path.glob(pattern):
-                if draft.is_dir():
-                    shutil.rmtree(draft)
-                else:
-                    draft.unlink()
+                draft.unlink()
 
     @contextmanager
     def tended(self, folder: str) -> Iterator[None]:
@@ -239,22 +236,6 @@ class Folder(Location):
             yield
         finally:
             os.close(handle)
-
-    def derived(self, folder: str, stamp: str) -> str:  # noqa: ARG002 - there is only one, see `rebuilding`
-        """Always `folder`."""
-        return folder
-
-    @contextmanager
-    def rebuilding(self, folder: str, stamp: str) -> Iterator[Store]:
-        """A draft, then renamed, so that a crash leaves the old group or none."""
-        draft = self._path / f"{folder}{secrets.token_hex(8)}.tmp"
-        draft.mkdir()
-        try:
-            yield LocalStore(draft)
-            self.remove(folder)
-            draft.rename(self._path / self.derived(folder, stamp))
-        finally:
-            shutil.rmtree(draft, ignore_errors=True)
 
 
 def _inside(key: str) -> bool:

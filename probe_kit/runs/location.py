@@ -143,11 +143,3 @@ class Location(ABC):
     @abstractmethod
     def tended(self, folder: str) -> AbstractContextManager[None]:
         """Let processes that work on `folder` take turns; drafts of killed ones in it are removed."""
-
-    @abstractmethod
-    def derived(self, folder: str, stamp: str) -> str:
-        """The folder of the group derived from `stamp` that belongs to `folder`."""
-
-    @abstractmethod
-    def rebuilding(self, folder: str, stamp: str) -> AbstractContextManager[Store]:
-        """Return a store to build that group in; it replaces those of other stamps when the body is left."""

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.runs.arrays import codecs
-from probe_kit.runs.columns import seal_key, write_seal
+from probe_kit.runs.checking import BlankStore
+from probe_kit.runs.columns import columns_folder, seal_key, write_seal
 from probe_kit.runs.layout import COLUMNS, DATA, SEALED, StoredStream, VectorKind
-from probe_kit.runs.recording import RecordingStore
 from probe_kit.runs.records import is_hash_name
 from probe_kit.runs.rows import Rows
 from probe_kit.runs.run import Run, read_run
@@ -40,26 +40,30 @@ def _seal(run: Run) -> bool:
     if run.root.left_out:
         run.root.refuse_left_out("there is nothing to seal")
     if run.sealed:
-        _remove_former_seals(run)
+        _remove_former(run)
         return False
     run.location.remove(SEALED)  # nothing counts that is not whole
-    with run.location.rebuilding(COLUMNS, run.stamp) as built:
-        store = RecordingStore(built)
-        group = zarr.open_group(store, mode="w", zarr_format=3)
-        for name in run.streams:
-            for kind in run.root.vector_kinds:
-                _write_vectors(run, name, kind, group)
-            _write_roles(run, name, group)
-        group.attrs["stamp"] = run.stamp
-    folder = run.location.derived(COLUMNS, run.stamp)
+    folder = columns_folder(run.stamp)
+    store = BlankStore(run.location.store(folder))
+    group = zarr.open_group(store, mode="w", zarr_format=3)
+    for name in run.streams:
+        for kind in run.root.vector_kinds:
+            _write_vectors(run, name, kind, group)
+        _write_roles(run, name, group)
+    group.attrs["stamp"] = run.stamp
     run.location.flush(f"{folder}/{key}" for key in store.sums)
     commits = {commit.episode: commit for commit in run.commits()}
     write_seal(run.root, commits, store.sums)  # what makes them count, so last
+    _remove_former(run)
     return True
 
 
-def _remove_former_seals(run: Run) -> None:
-    """Remove seals of other commits: a process that saw fewer may have written one late to an object store."""
+def _remove_former(run: Run) -> None:
+    """Remove columns and seals of other commits; a process that saw fewer may have written some late."""
+    folder = columns_folder(run.stamp)
+    former = {key.split("/")[1] for key in run.location.keys(COLUMNS) if not key.startswith(f"{folder}/")}
+    for name in former:
+        run.location.remove(f"{COLUMNS}/{name}")
     for key in run.location.keys(SEALED):
         if is_hash_name(key.removeprefix(f"{SEALED}/")) and key != seal_key(run.stamp):
             run.location.delete(key)

@@ -18,6 +18,7 @@ from probe_kit.errors import SettingsMismatchError
 from probe_kit.hashing import canonical_json
 from probe_kit.runs.arrays import ROOM, create_arrays
 from probe_kit.runs.certificates import write_certificate
+from probe_kit.runs.checking import RecordingStore
 from probe_kit.runs.commits import Commit, commit_key, read_commit, read_commits, write_commit, write_failure
 from probe_kit.runs.growth import check_other_settings, further_rows
 from probe_kit.runs.inputs import create_inputs, write_inputs
@@ -41,7 +42,6 @@ from probe_kit.runs.provenance import (
     provenance_here,
     read_provenances,
 )
-from probe_kit.runs.recording import RecordingStore
 from probe_kit.runs.records import Sum
 from probe_kit.runs.root import Root, new_root, read_root
 from probe_kit.runs.seconds import Seconds, write_seconds

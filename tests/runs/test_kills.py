@@ -14,8 +14,7 @@ from typing import Any
 
 import pytest
 
-from probe_kit.runs import open_run, verify_run
-from probe_kit.runs.layout import COLUMNS
+from probe_kit.runs import verify_run
 from probe_kit.runs.store import locate
 from probe_kit.suite import Suite, build_suite
 
@@ -65,14 +64,10 @@ def nursery(suite: Suite) -> Iterator[Nursery]:
 
 
 def objects(run: Path | str) -> dict[str, bytes]:
-    """Every object by key, columns by their name in a folder.
-
-    Of probes, all but the record that tells the time.
-    """
+    """Every object by key; of probes, all but the record that tells the time."""
     location = locate(run)
-    stamped = f"{location.derived(COLUMNS, open_run(run, allow_partial=True).stamp)}/"
     return {
-        key.replace(stamped, f"{COLUMNS}/"): location.read(key)
+        key: location.read(key)
         for key in location.keys("")
         if not (key.startswith("probes/") and key.endswith("/times.json"))
     }

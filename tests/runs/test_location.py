@@ -10,6 +10,7 @@ import zarr
 
 from probe_kit._system.installing import install_command
 from probe_kit.errors import DiskSpaceError, MissingExtraError, SettingsMismatchError, StoreError, UsageError
+from probe_kit.runs.checking import BlankStore
 from probe_kit.runs.folder import Folder
 from probe_kit.runs.store import Location, locate
 
@@ -82,14 +83,16 @@ class LocationContract:
             location.begin(BEGINNING, "run.json")
         assert location.keys("") == ["thesis.txt"]
 
-    def test_a_derived_group_replaces_the_former_one_when_it_is_complete(self, location: Location) -> None:
+    def test_a_group_is_built_as_if_nothing_of_a_killed_process_lay_there(self, location: Location) -> None:
         location.begin(BEGINNING, "run.json")
-        for stamp in ("a" * 64, "b" * 64):
-            with location.rebuilding("columns.zarr", stamp) as store:
-                zarr.open_group(store, mode="w", zarr_format=3, attributes={"stamp": stamp})
-        folder = location.derived("columns.zarr", "b" * 64)
-        assert zarr.open_group(location.store(folder, read_only=True), mode="r").attrs["stamp"] == "b" * 64
-        assert location.keys("columns.zarr") == [f"{folder}/zarr.json"]
+        for stamp in ("a", "b"):
+            store = BlankStore(location.store("columns.zarr/x"))
+            group = zarr.open_group(store, mode="w", zarr_format=3, attributes={"stamp": stamp})
+            group.create_array("y", shape=(2,), dtype="f4")[:] = ord(stamp)
+            assert {key for key in store.sums if "y" in key} == {"y/zarr.json", "y/c/0"}
+        group = zarr.open_group(location.store("columns.zarr/x", read_only=True), mode="r")
+        assert (group.attrs["stamp"], group["y"][1]) == ("b", ord("b"))
+        assert set(location.keys("columns.zarr")) == {f"columns.zarr/x/{key}" for key in store.sums}
 
     def test_arrays_are_stored_and_a_missing_chunk_is_an_error(self, location: Location) -> None:
         array = zarr.create_array(location.store("data.zarr"), name="x", shape=(4, 3), chunks=(1, 3), dtype="f4")

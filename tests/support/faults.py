@@ -54,7 +54,8 @@ class Stored:
         for path in sorted(home.rglob("*")):
             if path.is_file():
                 parts = path.relative_to(home).parts
-                array = "/".join(parts[1:3]) if parts[0] in ("data.zarr", "columns.zarr") else ""
+                array = "/".join(parts[2:4]) if parts[0] == "columns.zarr" else ""
+                array = "/".join(parts[1:3]) if parts[0] == "data.zarr" else array
                 metadata = path.name if path.name == "zarr.json" else ""
                 probes = path.name if parts[0] in ("probes", "interventions") else ""
                 kinds.setdefault(f"{parts[0]} {metadata or array} {probes}", []).append(path)
