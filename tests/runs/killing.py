@@ -2,7 +2,7 @@
 
 Usage: python -m tests.runs.killing RUN SUITE [POINT], in the root of the repository.
 
-It loads no model, so that sixty kills take seconds. POINT is where it kills itself: before-put, after-put,
+It loads no model, so that a kill takes seconds. POINT is where it kills itself: before-put, after-put,
 before-commit or after-commit of the third episode it writes.
 """
 

@@ -2,12 +2,10 @@
 
 import hashlib
 import os
-import random
 import shutil
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,7 +18,6 @@ from probe_kit.suite import Suite, build_suite
 
 ROOT = Path(__file__).parents[2]
 KILLING = ("-m", "tests.runs.killing")
-KILLS = 60
 
 
 def tree(folder: Path) -> dict[str, str]:
@@ -67,15 +64,6 @@ def test_a_kill_at_any_point_of_an_episode_costs_at_most_that_episode(
     assert tree(run) == tree(whole)
 
 
-@pytest.mark.slow
-def test_three_writers_at_once_give_the_same_store(suite: Suite, whole: Path, tmp_path: Path) -> None:
-    run = tmp_path / "run"
-    writers = [start(run, suite) for _ in range(3)]
-    assert [writer.wait() for writer in writers] == [0, 0, 0]
-    assert tree(run) == tree(whole)
-    assert list(tmp_path.iterdir()) == [run], "no half-made folder stays behind"
-
-
 def test_leftovers_of_a_killed_process_are_cleared_by_the_next_owner(
     suite: Suite, whole: Path, tmp_path: Path
 ) -> None:
@@ -87,36 +75,6 @@ def test_leftovers_of_a_killed_process_are_cleared_by_the_next_owner(
         (run / orphan).write_text("torn", encoding="utf-8")
     assert start(run, suite).wait() == 0
     assert tree(run) == tree(whole)
-
-
-@pytest.mark.slow
-def test_sixty_random_kills_lose_nothing_that_was_committed(suite: Suite, whole: Path, tmp_path: Path) -> None:
-    draw = random.Random(0)
-    began = time.monotonic()
-    assert start(tmp_path / "undisturbed", suite).wait() == 0
-    usual = time.monotonic() - began
-    kills = rounds = 0
-    while kills < KILLS:
-        run, seen = tmp_path / str(rounds), set[str]()
-        while not finishes(start(run, suite), draw.uniform(0.3, 1.3) * usual if kills < KILLS else None):
-            kills += 1
-            committed = {path.name for path in run.glob("commits/*.json")}
-            assert seen <= committed
-            seen = committed
-            assert not committed or verify_run(run, deep=True).ok
-        assert tree(run) == tree(whole)
-        rounds += 1
-    print(f"{kills} kills, {rounds} runs")
-
-
-def finishes(process: subprocess.Popen[bytes], patience: float | None) -> bool:
-    """Whether the process ends by itself, and well, before it is killed after `patience` seconds."""
-    try:
-        assert process.wait(patience) == 0
-    except subprocess.TimeoutExpired:
-        process.kill()
-        return process.wait() == 0
-    return True
 
 
 @pytest.fixture

@@ -1,6 +1,6 @@
 """Kills at random moments of everything that writes into a run: nothing is lost, and the bytes are the same.
 
-Writing by one process is killed in `test_crashes`; here are sealing, probing, two writers, and an object store.
+Writing is killed at single points in `test_crashes`.
 """
 
 import json
@@ -105,10 +105,11 @@ def kill_often(
     print(f"{task}, {workers} at once, seed {seed}: {kills} kills in {rounds} rounds, usually {usual:.2f} s")
 
 
-def test_kills_of_two_writers_at_once(nursery: Nursery, tmp_path: Path) -> None:
+@pytest.mark.parametrize("workers", [1, 2])
+def test_kills_of_writers(nursery: Nursery, tmp_path: Path, workers: int) -> None:
     nursery("extract", tmp_path / "whole")
     expected = objects(tmp_path / "whole")
-    kill_often(nursery, "extract", lambda number: tmp_path / str(number), expected, workers=2, seed=1)
+    kill_often(nursery, "extract", lambda number: tmp_path / str(number), expected, workers, seed=1)
 
 
 @pytest.mark.parametrize("task", ["seal", "train"])

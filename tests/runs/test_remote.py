@@ -1,6 +1,5 @@
 """Runs in an object store: the same bytes as in a folder, and the same promises."""
 
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -71,19 +70,6 @@ def test_a_run_in_a_bucket_has_the_same_bytes_as_one_in_a_folder(
         for place in (f"{bucket}/prefix/run", tmp_path / "run")
     )
     assert there == here
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("point", ["before-commit", "after-commit"])
-def test_killed_and_resumed_in_a_bucket_equals_never_killed(
-    point: str, suite: Suite, whole: Path, bucket: str
-) -> None:
-    run = f"{bucket}/run"
-    assert start(run, suite, point).wait() == -signal.SIGKILL
-    assert len(open_run(run, allow_partial=True).episodes) == (3 if point == "after-commit" else 2)
-    assert verify_run(run, deep=True).ok
-    assert start(run, suite).wait() == 0
-    assert objects(run) == objects(whole)
 
 
 @pytest.mark.slow

@@ -2,19 +2,14 @@
 
 import shutil
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import pytest
 import zarr
 
-from probe_kit.errors import NoTrajectoryError, RunDamagedError, UsageError
+from probe_kit.errors import RunDamagedError, UsageError
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.runs import Run, open_run, rows, verify_run
-from probe_kit.runs.store import locate
-from probe_kit.runs.writer import EpisodeRecord, RunWriter
-from probe_kit.suite import Suite
-from tests.support.plans import make_plan
 from tests.support.rehashing import rehash
 
 
@@ -85,12 +80,6 @@ def test_trajectories_that_are_read_together_are_those_that_are_read_alone(
         next(reading)
 
 
-def test_a_lost_trajectory_is_no_empty_one(copy: Path) -> None:
-    (copy / "data.zarr/trajectory/c/3/0/0").unlink()
-    with pytest.raises(RunDamagedError, match="trajectory/c/3/0/0"):
-        open_run(copy)
-
-
 def test_channels_of_another_version_are_refused(copy: Path) -> None:
     array = zarr.open_array(copy / "data.zarr/trajectory", mode="r+")
     array.attrs["channels"] = [str(name).replace("held", "grip") for name in array.attrs["channels"]]
@@ -99,27 +88,3 @@ def test_channels_of_another_version_are_refused(copy: Path) -> None:
     rehash(copy)
     with pytest.raises(RunDamagedError, match=r"lack held\.bool"):
         _ = open_run(copy).trajectories
-
-
-def test_a_run_begun_without_room_for_them_is_finished_without(
-    copy: Path, recorded_run: Run, small_suite: Suite
-) -> None:
-    """As a run that an earlier version began."""
-    shutil.rmtree(copy / "data.zarr/trajectory")
-    shutil.rmtree(copy / "commits")
-    shutil.rmtree(copy / "sealed", ignore_errors=True)
-    rehash(copy)
-    run = Run(locate(copy))
-    assert not run.has_trajectories
-    with pytest.raises(NoTrajectoryError, match="keeps no trajectories"):
-        run.trajectory(0)
-    streams = [recorded_run.stored(name) for name in recorded_run.streams]
-    planned = make_plan(small_suite, streams, 0, 1, True)
-    writer = RunWriter(locate(copy), planned, run.root.own_settings)
-    frames = recorded_run.trajectory(0).frames
-    kinds: tuple[Literal["pooled", "tokens"], ...] = ("pooled", "tokens")
-    arrays = {kind: {name: recorded_run.rows(name, kind)[0] for name in recorded_run.streams} for kind in kinds}
-    outcome = {"outcome": "oob", "side_placed": "none", "steps": 4}
-    writer.write(EpisodeRecord(planned.episodes[0], outcome, arrays, [], frames, (1, 2)))
-    assert list(writer.location.keys("data.zarr/trajectory")) == []
-    assert Run(locate(copy)).instruction_ids(0) == (1, 2)

@@ -64,18 +64,6 @@ def interrupt(number: int, act: Callable[[], object], monkeypatch: pytest.Monkey
     monkeypatch.setattr(writers, "write_commit", commit_later)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("where", ["folder", "bucket"], indirect=True)
-def test_an_episode_that_another_process_finished_keeps_its_numbers(where: str, plan: Plan) -> None:
-    first, second = (little_writer(locate(where), plan) for _ in range(2))
-    assert first.remaining() == second.remaining() == [0, 1]
-    first.write(episode(plan, 0))
-    kept = open_run(where, allow_partial=True).rows("backbone")[0]
-    second.write(rounded_otherwise(episode(plan, 0)))
-    assert verify_run(where, deep=True).problems == ()
-    np.testing.assert_array_equal(open_run(where, allow_partial=True).rows("backbone")[0], kept)
-
-
 @pytest.mark.parametrize("where", ["folder", pytest.param("bucket", marks=pytest.mark.slow)], indirect=True)
 @pytest.mark.parametrize("number", range(ARRAYS + 1))
 def test_an_episode_that_two_processes_write_at_once_is_that_of_one_of_them(
