@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -90,14 +91,14 @@ def test_an_episode_that_fails_twice_is_named_and_all_others_are_kept(
     from probe_kit.extract.rollout.controllers import PolicyController
 
     poison = prepare(ExtractSettings("expert", suite=suite.folder, items=4)).plan.episodes[5]
-    act = PolicyController.act
+    infer = PolicyController.infer
 
-    def act_badly(self, turns):
-        chunks = act(self, turns)
-        bad = [np.nan if turn.seed == poison.policy_seed else 1 for turn in turns]
-        return [chunk * factor for chunk, factor in zip(chunks, bad, strict=True)]
+    def infer_badly(self, turns):
+        bad = [np.float32(np.nan if turn.row.policy_seed == poison.policy_seed else 1) for turn in turns]
+        inferences = infer(self, turns)
+        return [replace(one, actions=one.actions * bad[row]) for row, one in enumerate(inferences)]
 
-    monkeypatch.setattr(PolicyController, "act", act_badly)
+    monkeypatch.setattr(PolicyController, "infer", infer_badly)
     with pytest.raises(EpisodesFailedError, match="1 episode failed twice") as caught:
         extract_run(settings(suite, env_workers=0), tmp_path / "run")
     assert poison.episode_id in caught.value.__notes__[0]
