@@ -210,8 +210,9 @@ class Settings(Part):
         cls, typed: Mapping[str, Any], before: SourceSettings | None
     ) -> tuple[type[SourceSettings], dict[str, Any]]:
         """The kind of source that options name, and the values of its fields."""
-        options = {kind: {option.parameter: option for option in options_of(kind)} for kind in SOURCES}
-        options[SceneSettings] |= {option.parameter: option for option in options_of(SceneOptions)}
+        options = {
+            kind: {option.parameter: option for option in kind.command_options().values()} for kind in SOURCES
+        }
         keys = {kind: next(iter(options[kind].values())) for kind in SOURCES[1:]}
         typed_kinds = [kind for kind, key in keys.items() if key.parameter in typed]
         if len(typed_kinds) > 1:

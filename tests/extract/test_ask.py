@@ -116,21 +116,6 @@ def test_who_acts_in_the_same_scene_begins_with_the_same_frame(
     assert acted["first_frame_sha256"].nunique() == 2, "items of a pair share their pictures, exchanged"
 
 
-@pytest.mark.slow
-def test_an_interrupted_run_continues_to_the_same_bytes(settings: AskSettings, asked: Run, tmp_path: Path) -> None:
-    class CrashError(Exception):
-        pass
-
-    def crash(*_: object) -> None:
-        raise CrashError
-
-    pooled = settings.changed(tokens="pooled")
-    with pytest.raises(CrashError):
-        ask_run(pooled, tmp_path / "run", crash)
-    assert 1 <= len(open_run(tmp_path / "run", allow_partial=True).episodes) < 4
-    assert files(ask_run(pooled, tmp_path / "run").path) == files(asked.path)
-
-
 @pytest.mark.parametrize("change", [{"prompt": SEEN}, {"picture": "none"}, {"query": "distractor"}, {"seed": 1}])
 def test_other_questions_are_another_run(settings: AskSettings, asked: Run, change: dict) -> None:
     with pytest.raises(SettingsMismatchError):

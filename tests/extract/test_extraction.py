@@ -61,17 +61,6 @@ def stop_after(count: int):
     return progress
 
 
-@pytest.mark.slow
-def test_a_run_that_was_interrupted_continues_to_the_same_bytes(two_items: Suite, tmp_path: Path) -> None:
-    settings = ExtractSettings("pi0-tiny", suite=two_items.folder, scene=SHORT, tokens="all")
-    extract_run(settings, tmp_path / "whole")
-    with pytest.raises(CrashError):
-        extract_run(settings, tmp_path / "resumed", stop_after(1))
-    assert 1 <= len(open_run(tmp_path / "resumed", allow_partial=True).episodes) < 4
-    extract_run(settings, tmp_path / "resumed")
-    assert files(tmp_path / "resumed") == files(tmp_path / "whole")
-
-
 def test_an_unfinished_run_does_not_read_as_whole(two_items: Suite, tmp_path: Path) -> None:
     settings = ExtractSettings("expert", suite=two_items.folder)
     with pytest.raises(CrashError):
@@ -121,15 +110,6 @@ def test_a_nan_action_stops_the_run_and_commits_nothing(
     assert "ActionError" in caught.value.__notes__[0]
     assert caught.value.exit_code == 1
     assert open_run(tmp_path / "run", allow_partial=True).episodes.empty
-
-
-@pytest.mark.slow
-def test_the_expert_is_always_right_and_its_mirror_image_always_wrong(small_suite: Suite, tmp_path: Path) -> None:
-    for model, outcome in (("expert", "correct"), ("expert-mirrored", "wrong")):
-        settings = ExtractSettings(model, suite=small_suite.folder, categories=("shape",), items=2, scene=IN_HAND)
-        run = extract_run(settings, tmp_path / model)
-        assert (run.episodes["outcome"] == outcome).all()
-        assert len(run.episodes) == 4
 
 
 def test_a_policy_that_does_nothing_leaves_a_run_in_which_nothing_was_moved(
@@ -213,14 +193,6 @@ def test_what_cannot_be_run_is_refused_before_anything_is_written(
     with pytest.raises(error, match=message):
         extract_run(ExtractSettings(suite=small_suite.folder, **settings), tmp_path / "run")
     assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.parametrize(
-    "field", [{"tokens": "some"}, {"codec": "gzip"}, {"video": "last"}, {"captured_calls": 0}]
-)
-def test_settings_out_of_range_are_refused(field: dict) -> None:
-    with pytest.raises(UsageError, match="expected"):
-        ExtractSettings("expert", **field)
 
 
 def test_a_picture_that_changed_on_disk_stops_everything(two_items: Suite, tmp_path: Path) -> None:

@@ -147,15 +147,6 @@ def test_runs_that_took_other_seconds_and_were_resumed_are_equal_in_every_other_
     assert files_of(again.path, but=()) != files_of(acted.path, but=())
 
 
-@pytest.mark.slow
-def test_two_workers_store_the_same_and_their_own_seconds(small_suite: Suite, tmp_path: Path) -> None:
-    here = extract_run(scripted(small_suite), tmp_path / "here")
-    run = extract_run(scripted(small_suite, workers=2), tmp_path / "run")
-    assert files_of(run.path) == files_of(here.path)
-    assert (run.episodes["seconds_simulation"] > 0).all()
-    assert verify_run(run.path, deep=True).ok
-
-
 def test_all_seconds_may_be_deleted_and_one_alone_is_damage(acted: Run, tmp_path: Path) -> None:
     place = Path(shutil.copytree(acted.path, tmp_path / "run"))
     (place / "times/00000002.json").unlink()

@@ -65,24 +65,6 @@ def test_thumbnails_change_neither_numbers_nor_settings_and_can_be_left_out(
     assert read_thumbnail(bare.path, 0) is None
 
 
-@pytest.mark.slow
-def test_environment_processes_give_the_same_thumbnails(
-    settings: ExtractSettings, run: Run, tmp_path: Path
-) -> None:
-    other = extract_run(settings.changed(env_workers=0), tmp_path / "run")
-    for number in run.episodes["episode"]:
-        assert read_thumbnail(other.path, number) == read_thumbnail(run.path, number)
-
-
-@pytest.mark.slow
-def test_a_torn_thumbnail_of_a_killed_process_is_cleared(settings: ExtractSettings, tmp_path: Path) -> None:
-    run = extract_run(settings, tmp_path / "run")
-    torn = run.path / "frames" / "abc.tmp"
-    torn.write_bytes(b"RIFF")
-    extract_run(settings, tmp_path / "run")
-    assert not torn.exists()
-
-
 def different_frames(count: int) -> tuple[np.ndarray, ...]:
     """Flat pictures of different shades; WebP keeps a flat shade to a few units."""
     return tuple(np.full((240, 320, 3), 10 * number, np.uint8) for number in range(count))

@@ -8,15 +8,13 @@ import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from pydantic import BaseModel
-
 from probe_kit._system.entry_points import entry_points
 from probe_kit._terminal.field_options import options_of
 from probe_kit.errors import UsageError
 from probe_kit.extract.sources.environment import EnvSource
 from probe_kit.extract.sources.pictures import PictureFolder
 from probe_kit.extract.sources.recording import LeRobotSource
-from probe_kit.extract.sources.scene import SceneOptions, SceneSettings
+from probe_kit.extract.sources.scene import SceneSettings
 from probe_kit.extract.sources.source import SourceSettings
 
 ENTRY_POINTS = "probe_kit.sources"
@@ -29,8 +27,7 @@ class BrokenSourceWarning(UserWarning):
 
 def _third_party() -> Iterator[type[SourceSettings]]:
     """The settings that entry points name; a warning for each that cannot be used."""
-    models: tuple[type[BaseModel], ...] = (*OWN, SceneOptions)
-    options = {option.parameter for model in models for option in options_of(model)}
+    options = {option.parameter for kind in OWN for option in kind.command_options().values()}
     kinds = {kind.model_fields["kind"].default for kind in OWN}
     for entry in entry_points(group=ENTRY_POINTS):
         try:

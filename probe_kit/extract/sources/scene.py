@@ -9,7 +9,7 @@ import typer
 from pydantic import BeforeValidator, Field
 
 from probe_kit._terminal import options as common
-from probe_kit._terminal.field_options import Part, plain
+from probe_kit._terminal.field_options import FieldOption, Part, options_of, plain
 from probe_kit._terminal.options import choices as listed_choices
 from probe_kit._terminal.options import further_option, read_size, some_of
 from probe_kit.errors import UsageError
@@ -138,6 +138,13 @@ class SceneSettings(SourceSettings):
     def steps(self) -> int:
         """Count the actions that an episode can have."""
         return self.scene.max_steps
+
+    @classmethod
+    def command_options(cls) -> dict[str, FieldOption]:
+        """Return the options of a command by the field that they give."""
+        return super().command_options() | {
+            f"{_SCENE}{option.field}": option for option in options_of(SceneOptions)
+        }
 
     @classmethod
     def with_files(cls, values: Mapping[str, Any], files: Mapping[str, str]) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
-from probe_kit._terminal.field_options import Part
+from probe_kit._terminal.field_options import FieldOption, Part, options_of
 from probe_kit.errors import InstructionError, RecordingError, UsageError
 
 if TYPE_CHECKING:
@@ -66,6 +66,11 @@ class SourceSettings(Part):
     def steps(self) -> int:
         """Count the actions that an episode can have; 0 where nothing acts."""
         return 0
+
+    @classmethod
+    def command_options(cls) -> dict[str, FieldOption]:
+        """Return the options of a command by the field that they give; a field of a scene is `scene.NAME`."""
+        return {option.field: option for option in options_of(cls)}
 
     def files(self) -> dict[str, Path]:
         """Return files and folders of this machine that the source is made of, by the field that gives them.
