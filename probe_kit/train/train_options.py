@@ -35,7 +35,8 @@ class TargetOptions:
         if self.file is None and not is_side and not is_builtin(self.name):
             raise UsageError(
                 f"--target {self.name!r} is not one of {sides}, nor a built-in column "
-                f"({', '.join(builtin_names())}). Give the table of another column with --labels FILE"
+                f"({', '.join(builtin_names())}). `probe-kit targets RUN` lists those of a run, such as "
+                "dataset.NAME; give the table of another column with --labels FILE"
             )
         options = {
             "--task": self.task, "--group-by": self.group_by, "--exchange-within": self.exchange_within,
