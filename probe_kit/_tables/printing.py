@@ -22,7 +22,8 @@ def print_table(table: Any, style: str, notes: Sequence[str] = ()) -> None:
     elif style == "json":
         print_json_text(table.to_json())
     else:
-        written = {"csv": table.to_csv, "markdown": table.to_markdown, "latex": table.to_latex}
-        print_text((written[style]() if style in written else table.to_text(style)).rstrip("\n"))
+        # Results of interventions have their own JSON and CSV, and no other format.
+        written = getattr(table, f"to_{style}", None)
+        print_text((table.to_text(style) if written is None else written()).rstrip("\n"))
     for note in notes:
         say(marked("[yellow]note:[/] {}", note))
