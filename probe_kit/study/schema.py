@@ -1,7 +1,7 @@
 """The tables of a study file and their fields. Values are checked here, references to names in `checks`."""
 
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, get_args
+from typing import Annotated, Any, Literal, Self
 from unicodedata import category
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
@@ -66,7 +66,6 @@ TableKind = Literal[
 ]
 Control = Literal["untrained"] | FeatureControl
 FigureKind = Literal["curves", "sides", "dose", "overview"]
-KINDS: tuple[TableKind, ...] = get_args(TableKind)
 
 
 class _Table(BaseModel):

@@ -9,9 +9,6 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import ObservationError
 
-NEEDS = ("state", "intrinsics")
-"""What an observation may lack and a card may ask for; a further camera is asked for as `camera.<name>`."""
-
 
 @dataclass(frozen=True)
 class Observation:

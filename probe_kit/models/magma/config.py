@@ -17,7 +17,6 @@ from probe_kit.models.config_file import STORED_TYPE, ConfigFile, Count, Index, 
 
 # Older checkpoints append the number of trace tokens; the modules are the same.
 _PROJECTOR = re.compile(r"mlp(?P<layers>[1-9]\d?)x_gelu(_segtokv\d+)?")
-STRATEGIES = ("crop", "global")
 
 
 class VisionConfig(ConfigFile):

@@ -90,7 +90,6 @@ _KIND = re.compile(
 )
 _ARTICLE = re.compile(r"^(the|a|an|one|some)\s+", re.IGNORECASE)
 _GENERIC = ("image", "picture", "photo", "one", "option")
-_MORE = r"(?:more|less|fewer)"
 _ER = r"(?:[a-z]+er|worse|more|less|fewer)"
 
 
