@@ -57,8 +57,8 @@ def _origin(module: str) -> str | None:
     """The distribution or the part of Python that has a module of this name; None where there is none."""
     if module in sys.stdlib_module_names or module in sys.builtin_module_names:
         return "Python's standard library"
-    if module in packages_distributions():
-        return " and ".join(sorted(set(packages_distributions()[module])))
+    if distributions := packages_distributions().get(module):
+        return " and ".join(sorted(set(distributions)))
     spec = find_spec(module)
     return None if spec is None or spec.origin is None else str(spec.origin)
 
