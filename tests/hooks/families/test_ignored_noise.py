@@ -50,7 +50,7 @@ def test_noise_that_is_ignored_fails_the_contract(family: str, tmp_path: Path) -
     assert isinstance(policy, Policy)
     assert (policy.draws_noise is True) == (family in NOISY)
     if family not in NOISY:
-        first, other = (checked(policy).run_row(checked(policy).one[0], seed) for seed in (5, 6))
+        first, other = (checked(policy).run_row(checked(policy).single[0], seed) for seed in (5, 6))
         assert (first == other).all()  # nothing is drawn, so that there is no noise to ignore
         return
     for own in (DRAWN, CONSTANT):
