@@ -58,6 +58,7 @@ def test_stored_tokens_are_those_that_the_pooled_views_are_means_of(run: pk.Run)
     assert (away <= 2**-8 * sizes + 1e-4).all(), "bfloat16 rounds each token by 2^-9 of its size"
 
 
+@pytest.mark.slow
 def test_the_same_settings_give_the_same_numbers_in_another_folder(run: pk.Run, tmp_path: Path) -> None:
     words = dict(zip(PLAYED[::2], PLAYED[1::2], strict=True)) | {"--items": "2"}
     typed = [word for pair in words.items() for word in pair]

@@ -71,6 +71,7 @@ def test_swapped_images_show_that_the_policy_uses_the_answer(intervened: Path, a
     assert row["verdict"] == "used"
 
 
+@pytest.mark.slow
 def test_a_swapped_instruction_changes_the_action_too(intervened: Path, answers: dict[str, Answer]) -> None:
     (row,) = effects("instruction-swap", intervened, answers)
     assert row["instruction_changed"] == row["images_changed"] == 1
@@ -121,6 +122,7 @@ def test_steering_without_strength_changes_nothing_and_with_it_moves_tokens_as_f
     assert moved[0]["relative_change"] == pytest.approx(moved[1]["relative_change"], rel=1e-3)
 
 
+@pytest.mark.slow
 def test_in_a_closed_loop_the_patched_policy_places_the_cube_on_the_other_side(
     intervened: Path, answers: dict[str, Answer]
 ) -> None:

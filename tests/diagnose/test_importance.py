@@ -112,6 +112,7 @@ def test_nothing_matters_where_every_change_moves_as_much() -> None:
     assert alarms <= 8, "5 % of 60, and three standard deviations"
 
 
+@pytest.mark.slow
 def test_words_that_mean_the_same_move_as_much_as_others_in_five_of_a_hundred_draws() -> None:
     policy = linear_policy([0.0, 1.0, 1.0], wandering=0.3)
     alarms = 0
@@ -243,6 +244,7 @@ def test_a_base_says_what_was_lost_gained_or_never_there() -> None:
     assert change_of([0.3, 1.0, 1.0], [1.0, 0.3, 1.0])["instruction"] == "weaker"
 
 
+@pytest.mark.slow
 def test_a_base_with_other_effects_by_chance_is_not_a_loss_in_more_than_five_of_a_hundred_draws() -> None:
     alarms = 0
     for seed in range(100):

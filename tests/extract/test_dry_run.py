@@ -281,6 +281,7 @@ def test_a_folder_that_is_not_there_is_refused_without_the_network(name: str, sm
         prepare(settings_of(name, small_suite, checkpoint="./nowhere"), fetch=False)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("nowhere")
 def test_a_plan_of_a_few_items_draws_these_and_one_category(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -73,12 +73,14 @@ def test_a_run_with_edits_is_checked_with_them(tmp_path: Path, pi0_tiny: Policy)
     assert run.certificate["input_check"] == {"picture": "nothing", "instruction": "nothing"}
 
 
+@pytest.mark.slow
 def test_an_input_that_a_family_declares_absent_is_not_tested(tmp_path: Path) -> None:
     policy = edited(make_deaf)
     policy.absent_inputs = frozenset({"instruction"})
     assert extracted(tmp_path / "run", policy).certificate["input_check"] == {"picture": "output"}
 
 
+@pytest.mark.slow
 def test_recordings_of_one_instruction_are_checked_too(tmp_path: Path) -> None:
     pytest.importorskip("lerobot.datasets.lerobot_dataset", reason="the extra `datasets` is not installed")
     observed = prepare(SETTINGS).source.example("Put the cube on the red shape")

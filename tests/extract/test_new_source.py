@@ -41,6 +41,7 @@ def typed(package: Path, *line: str) -> None:
     assert ended.returncode == 0, ended.stderr
 
 
+@pytest.mark.slow
 def test_a_source_is_one_file_from_its_option_to_its_run(package: Path, tmp_path: Path) -> None:
     line = ("extract", "--model", "pi0-tiny", "--noise", "3", "--env-workers", "0")
     typed(package, *line, "--out", str(tmp_path / "run"))

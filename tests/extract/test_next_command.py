@@ -9,7 +9,9 @@ from probe_kit.cli import app
 from probe_kit.suite import Suite
 
 
-@pytest.mark.parametrize(("items", "command"), [(4, "retention"), (10, "train")])
+@pytest.mark.parametrize(
+    ("items", "command"), [(4, "retention"), pytest.param(10, "train", marks=pytest.mark.slow)]
+)
 def test_probes_are_only_the_next_step_of_as_many_groups_as_they_have_folds(
     items: int, command: str, small_suite: Suite, tmp_path: Path
 ) -> None:

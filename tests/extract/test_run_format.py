@@ -52,6 +52,7 @@ def acted(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Run:
 # -- items and the suite's parent ---------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_plan_names_the_content_of_every_item_and_the_suite_it_was_selected_from(
     acted: Run, small_suite: Suite
 ) -> None:

@@ -73,6 +73,7 @@ def test_a_decoder_in_bfloat16_is_read(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_direction(f"{tmp_path}#2").vectors, [[7, 8, 9]])
 
 
+@pytest.mark.slow
 def test_probes_directions_are_written_for_the_sites_and_weights_that_they_are_of(
     session: SceneSession, tmp_path: Path
 ) -> None:

@@ -49,6 +49,7 @@ def session(played: Run, pi0_tiny: "Pi0") -> Iterator[ObservedSession]:
         yield opened
 
 
+@pytest.mark.slow
 def test_a_pair_has_the_picture_of_another_group_and_all_else_of_its_own(session: ObservedSession) -> None:
     for item in session.items:
         for pair in session.pairs(item):
@@ -78,10 +79,10 @@ def test_the_first_action_of_every_episode_is_inferred_again_bit_for_bit(
     ("intervention", "rows"),
     [
         (ImageSwap(), 1),
-        (InstructionSwap(), 1),
-        (ImageSwap(vary="state"), 1),
+        pytest.param(InstructionSwap(), 1, marks=pytest.mark.slow),
+        pytest.param(ImageSwap(vary="state"), 1, marks=pytest.mark.slow),
         (Interchange(sites=("backbone.01", "kv.*"), roles=("image",)), 4),
-        (AttentionReadout(roles=("image",)), None),
+        pytest.param(AttentionReadout(roles=("image",)), None, marks=pytest.mark.slow),
     ],
 )
 def test_kinds_work_in_an_environment_and_are_read_again(

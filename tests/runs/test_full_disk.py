@@ -29,10 +29,10 @@ def full_disk(tmp_path: Path) -> Iterator[Path]:
 
 @pytest.mark.parametrize(
     "words",
-    ["export --format h5", "export --format sae"]
+    ["export --format h5"]
     + [
         pytest.param(words, marks=pytest.mark.slow)
-        for words in ("export --format safetensors", "export --format parquet", "copy")
+        for words in ("export --format sae", "export --format safetensors", "export --format parquet", "copy")
     ],
 )
 def test_a_full_disk_is_named_and_nothing_is_left(little_runs: Path, full_disk: Path, words: str) -> None:

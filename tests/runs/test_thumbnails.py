@@ -89,6 +89,7 @@ def filmed(film_settings: ExtractSettings, tmp_path_factory: pytest.TempPathFact
     return extract_run(film_settings, tmp_path_factory.mktemp("filmed") / "run")
 
 
+@pytest.mark.slow
 def test_all_frames_are_those_that_the_environment_draws_in_the_same_episode(
     filmed: Run, film_settings: ExtractSettings
 ) -> None:

@@ -52,6 +52,7 @@ def by_category(table: RetentionTable) -> Mapping[str, RetentionRow]:
     return {row.category: row for row in table.rows}
 
 
+@pytest.mark.slow
 def test_means_and_normalised_scores_of_17_systems(
     rows: dict[str, RetentionTable], derived: dict[str, Any]
 ) -> None:

@@ -166,6 +166,7 @@ def test_a_rate_whose_interval_and_range_of_guessing_disagree_is_marked() -> Non
     assert "disagree about 50 %" in "; ".join(made.notes)
 
 
+@pytest.mark.slow
 def test_without_a_name_all_tables_are_printed_and_their_tests_are_counted(
     played: LoadedStudy, tmp_path: Path
 ) -> None:

@@ -162,6 +162,7 @@ def test_a_damaged_result_stops_the_table_by_name(copied: Path) -> None:
     assert not answer.out
 
 
+@pytest.mark.slow
 def test_a_grown_run_is_whole_and_equals_one_that_was_played_at_once(tmp_path: Path) -> None:
     settings = ("--model", "pi0-tiny", "--no-act", "--categories", "color", "--env-workers", "0", "--batch", "1")
     for run, items in (("grown", 2), ("grown", 4), ("once", 4)):

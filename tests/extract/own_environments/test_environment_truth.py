@@ -129,6 +129,7 @@ def test_states_in_other_units_are_refused_of_an_environment_unless_accepted(
     assert one.settings.identity() == two.settings.identity(), "accepting units changes no number"
 
 
+@pytest.mark.slow
 def test_a_scene_whose_states_lie_outside_the_statistics_is_refused_unless_accepted(
     pi0_tiny: Pi0, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -27,7 +27,12 @@ FILES = {
 }  # fmt: skip
 
 
-@pytest.fixture(params=SOURCES)
+@pytest.fixture(
+    params=[
+        pytest.param(source, marks=pytest.mark.slow if source in ("scene with a photo", "pictures") else ())
+        for source in SOURCES
+    ]
+)
 def made(
     request: pytest.FixtureRequest,
     recording: Path,

@@ -19,6 +19,7 @@ def twins_of(suite: Suite) -> list[tuple[Item, Item]]:
     return [(first, second) for first, second in pairs.values()]
 
 
+@pytest.mark.slow
 def test_twins_show_the_same_pictures_in_the_same_places_and_ask_both_ways(embedded: Suite) -> None:
     for first, second in twins_of(embedded):
         assert [first.picture(side) for side in SIDES] == [second.picture(side) for side in SIDES]

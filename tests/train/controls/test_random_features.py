@@ -55,6 +55,7 @@ def probed(suite: Suite, path: Path, knowledge: float = 0.0) -> ProbeResults:
     return train_probes(run, permutations=39, controls=("random-features",), suite=suite.folder)
 
 
+@pytest.mark.slow
 def test_a_random_network_does_not_exceed_random_features(suite: Suite, tmp_path: Path) -> None:
     scores = probed(suite, tmp_path / "random").scores
     assert not scores["exceeds_random_features"].any()

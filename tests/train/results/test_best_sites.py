@@ -17,6 +17,7 @@ def with_pixels(results: ProbeResults, p: float) -> ProbeResults:
     return replace(results, controls=results.controls.with_scores(scores))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("p", "is_named"), [(0.01, True), (0.2, False)])
 def test_pictures_that_decode_the_target_alone_are_named(
     planted_run: PlantedRun, p: float, is_named: bool

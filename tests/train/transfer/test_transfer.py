@@ -141,6 +141,7 @@ def test_labels_of_the_other_run_take_part_in_no_fit() -> None:
     np.testing.assert_array_equal(one.curves["mean"].fitted.decisions, two.curves["mean"].fitted.decisions)
 
 
+@pytest.mark.slow
 def test_unrelated_labels_transfer_as_often_as_p_says() -> None:
     """Of 60 label pairs that know nothing of the features, alike in groups; 0.05 and two standard errors."""
     found = []

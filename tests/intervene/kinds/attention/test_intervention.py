@@ -258,6 +258,7 @@ def test_the_command_shows_a_table_json_and_csv(copy: Run, attention_records: In
     assert len(found["effects"]) == BLOCKS * ITERATIONS * HEADS * len({row["role"] for row in found["effects"]})
 
 
+@pytest.mark.slow
 def test_along_the_whole_episode_every_call_is_noted(copy: Run, source: ReplaySource, twin: "Policy") -> None:
     intervention = AttentionReadout(categories=("shape",), items=1, roles=("language",), readout="per-step")
     effects = run_intervention(copy, intervention, source, load=lambda *_: twin)
@@ -293,6 +294,7 @@ def test_killed_and_resumed_gives_the_same_bytes_and_damage_is_found(
     assert any("attention.npz" in problem for problem in verify_run(mine.path, deep=True).problems)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_told_is_refused_by_name(session: ReplaySession) -> None:
     for intervention, family, missing in (
         (AttentionReadout(), "internvla-m1", "attention"),

@@ -26,6 +26,7 @@ def result(copy: Run, source: ReplaySource, twin: "Policy") -> InterventionResul
     return run_intervention(copy, asked, source, load=lambda *_: twin)
 
 
+@pytest.mark.slow
 def test_one_cell_alone_is_the_interchange_at_its_place_bit_for_bit(
     copy: Run, source: ReplaySource, twin: "Policy", result: InterventionResult
 ) -> None:
