@@ -28,14 +28,16 @@ _ACTING = frozenset(
 )
 """Options of runs that act, or store more than a diagnosis reads."""
 ModelOrRun = Annotated[str, typer.Argument(metavar="MODEL|RUN", help="Model to diagnose, or folder of a run.")]
-Frames = Annotated[int, typer.Option("--frames", min=6, max=1000, help="Number of frames.")]
+Frames = Annotated[
+    int, typer.Option("--frames", min=6, max=1000, metavar="N", help="Number of frames, at least 6.")
+]
 Require = Annotated[
     common.Names | None,
     typer.Option(
         "--require",
         parser=common.Names.parse,
         metavar="A,B,…",
-        help="Inputs that must matter, such as instruction,state. Default: all that vary.",
+        help="Inputs that must matter. Default: all that vary.",
     ),
 ]
 Paraphrases = Annotated[
@@ -86,7 +88,7 @@ def diagnose(
     \b
     probe-kit diagnose pi0-tiny --categories color
     probe-kit diagnose pi0 --checkpoint DIR --dataset FOLDER --require instruction
-    probe-kit diagnose pi0 --checkpoint DIR --dataset FOLDER --base lerobot/pi0_base
+    probe-kit diagnose runs/mine --base lerobot/pi0_base
     probe-kit diagnose runs/mine --target side.correct
     """
     from probe_kit.diagnose.diagnosis import diagnose_run

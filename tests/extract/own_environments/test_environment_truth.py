@@ -141,7 +141,7 @@ def test_a_scene_whose_states_lie_outside_the_statistics_is_refused_unless_accep
         return np.arange(states.shape[1]) * np.ones_like(states) == 3
 
     monkeypatch.setattr(pi0_tiny, "unusual_states", still)
-    with pytest.raises(UnitsError, match=r"the scene .*outside the statistics of .* \(3 100%\); .*--accept-units"):
+    with pytest.raises(UnitsError, match=r"the scene .*outside the statistics .* \(number 3 in 100%\); .*-units"):
         prepare(chosen, model=pi0_tiny)
     accepted = ExtractSettings("pi0-tiny", categories=("color",), items=2, env_workers=0, accept_units=True)
     assert prepare(accepted, model=pi0_tiny).plan.episodes

@@ -34,7 +34,7 @@ def test_the_last_lines_are_short_sentences_of_two_numbers_without_brackets(plan
     results = with_pixels(train_probes(run, permutations=39), 0.01)
     lines = [line for line in best_sites_findings(results) if "was not run" not in line]
     assert [line[:13] for line in lines] == ["Color        ", "Public Info  "]
-    assert lines[0].startswith("Color        decodable in the backbone, ")
+    assert lines[0].startswith("Color        decodable in the backbone at ")
     for line in lines:
         assert line.endswith("; the pictures alone decode it too.")
         assert len(line.split()) <= 25
