@@ -51,7 +51,7 @@ Target = Annotated[
     typer.Option(
         "--target",
         metavar="COLUMN",
-        help="Probe this at every site too: a side, or a column, built in or of --labels.",
+        help="Probe a side or a column, built in or of --labels.",
     ),
 ]
 Labels = Annotated[Path | None, further_option("--labels", help="Table with the column of --target.")]
