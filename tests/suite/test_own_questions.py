@@ -346,6 +346,8 @@ def test_a_category_of_ones_own_is_a_row_and_a_misspelt_one_is_pointed_out(
         assert "Not in this suite" not in report.to_text()
         assert not [finding for finding in report.warnings if finding.rule == "W08"]
     known = PicturePair("shape", "red disc", discs["red"], "green disc", discs["green"])
+    of_the_paper = suite_from_pictures(tmp_path / "shapes", [known], **ABOUT)
+    assert "Not in this suite" not in validate_suite(of_the_paper.folder).to_text()
     both = [replace(pair, category="colour"), known]
     misspelt = suite_from_pictures(tmp_path / "other", both, **ABOUT)
     assert [str(f) for f in validate_suite(misspelt.folder).warnings if f.rule == "W08"] == [
