@@ -122,25 +122,34 @@ def test_words_that_mean_the_same_move_as_much_as_others_in_five_of_a_hundred_dr
     assert alarms <= 10, "5 % of 100, and three standard deviations"
 
 
-def turned_around(chance: float, alike: float, seed: int) -> Exchanges:
-    """Exchanges of 24 frames that turn the action around or leave it, as a policy with two answers does.
+SCENE, RECORDED = (12, 2, 6), (24, 1, 6)
+"""Groups, frames of a group and donors of a frame, as 24 frames of the scene and of recordings have them."""
+
+
+def turned_around(chance: float, alike: float, seed: int, design: tuple[int, int, int] = SCENE) -> Exchanges:
+    """Exchanges that turn the action around or leave it, as a policy with two answers does.
 
     chance: that an exchange of one input does; of all inputs, in half. alike: how alike donors of a frame are.
+    design: groups, frames of a group, donors of a frame.
     """
+    groups, of_group, donors = design
+    frame_count, count = groups * of_group, groups * of_group * donors
     rng = np.random.default_rng(seed)
-    of_frame = rng.beta(chance * (1 - alike) / alike, (1 - chance) * (1 - alike) / alike, (24, 1))
-    exchanged = 2.0 * (rng.random((24, 3)) < of_frame).ravel()
-    every = 2.0 * (rng.random(72) < 0.5)
-    groups = np.repeat([f"group {index}" for index in range(24)], 3)
-    repeated = np.zeros(72, bool)
-    return Exchanges(
-        exchanged, np.zeros(72), every, groups, np.repeat(range(24), 3), repeated, exchanged, np.ones(24)
-    )
+    of_frame = rng.beta(chance * (1 - alike) / alike, (1 - chance) * (1 - alike) / alike, (frame_count, 1))
+    exchanged = 2.0 * (rng.random((frame_count, donors)) < of_frame).ravel()
+    every = 2.0 * (rng.random(count) < 0.5)
+    names = np.repeat([f"group {index}" for index in range(groups)], of_group * donors)
+    frame_of = np.repeat(range(frame_count), donors)
+    repeated = np.zeros(count, bool)
+    return Exchanges(exchanged, np.zeros(count), every, names, frame_of, repeated, exchanged, np.ones(frame_count))
 
 
+@pytest.mark.parametrize("design", [SCENE, RECORDED], ids=["scene", "recorded"])
 @pytest.mark.parametrize("alike", [0.3, 0.9])
-def test_an_input_that_changes_half_as_much_as_all_decides_in_five_of_a_hundred_draws(alike: float) -> None:
-    verdicts = [importance_of("words", turned_around(0.25, alike, seed)).verdict for seed in range(400)]
+def test_an_input_that_changes_half_as_much_as_all_decides_in_five_of_a_hundred_draws(
+    alike: float, design: tuple[int, int, int]
+) -> None:
+    verdicts = [importance_of("words", turned_around(0.25, alike, seed, design)).verdict for seed in range(400)]
     assert verdicts.count("decides") <= 0.05 * 400 + 3 * np.sqrt(0.05 * 0.95 * 400)
 
 
