@@ -109,7 +109,7 @@ def diagnose(
         _say_cost(_planned(model_or_run, typed, frames, out_folder), frames, inside, base is not None)
         return
     run = _run_of(model_or_run, typed, frames, out_folder)
-    check_names(require or (), names_of(run.certificate["policy"].get("cameras", ())))
+    check_names(require or (), names_of(run.certificate["policy"]["cameras"]))
     with err.status("diagnosing") as status:
         diagnosis = diagnose_run(
             run,
@@ -144,13 +144,20 @@ def _is_run(name: str, typed: Mapping[str, Any]) -> bool:
 
 def _run_of(name: str, typed: Mapping[str, Any], frames: int, out_folder: str | None) -> "Run":
     """The stored run of this name, or one that is extracted now."""
-    from probe_kit.runs import open_run
-
     if _is_run(name, typed):
-        return open_run(name)
+        return _stored(name)
     extraction, location = _prepared(name, typed, frames, out_folder, fetch=True)
     with progress() as bar:
         return extraction.run(location, progress=counter(bar, "episodes"))
+
+
+def _stored(name: str) -> "Run":
+    from probe_kit.diagnose.diagnosis import check_network
+    from probe_kit.runs import open_run
+
+    run = open_run(name)
+    check_network(run)
+    return run
 
 
 def _prepared(
@@ -182,10 +189,9 @@ Planned = tuple[str, Sequence[Any], list[str]]
 def _planned(name: str, typed: Mapping[str, Any], frames: int, out_folder: str | None) -> Planned:
     """Return what a diagnosis of this run, or of a planned one, would exchange and patch."""
     from probe_kit.intervene.settings import has_sides
-    from probe_kit.runs import open_run
 
     if _is_run(name, typed):
-        run = open_run(name)
+        run = _stored(name)
         texts, cameras, in_scene = (
             run.episodes["instruction"],
             run.certificate["policy"]["cameras"],

@@ -64,8 +64,7 @@ def diagnose_run(
     from probe_kit.intervene.sessions.opening import open_session
     from probe_kit.intervene.sessions.session import ReplaySource
 
-    if run.weights_sha256 is None or not run.streams:
-        raise UsageError(f"{run.location}: {run.model} is scripted and has no network; diagnose a policy")
+    check_network(run)
     source = source or ReplaySource()
     if target is not None:
         progress("probes")
@@ -100,6 +99,12 @@ def diagnose_run(
     files = {FILE: as_json(diagnosis.to_json())}
     write_bundle(run.location, DIAGNOSES, key, {"settings": settings}, files, {"created": now})
     return replace(diagnosis, knowledge=knowledge)
+
+
+def check_network(run: "Run") -> None:
+    """Raise UsageError for a run of a scripted model, which has no inputs to exchange."""
+    if run.weights_sha256 is None or not run.streams:
+        raise UsageError(f"{run.location}: {run.model} is scripted and has no network; diagnose a policy")
 
 
 def load_diagnosis(run: "Run", key: str) -> Diagnosis:

@@ -33,7 +33,7 @@ def frames_of(
     paraphrases: by instruction, other words of the same meaning. Raises UsageError for a run with too few groups.
     """
     listed = _observed(session, count) if isinstance(session, ObservedSession) else _drawn(session, count)
-    frames = [replace(frame, other_words=paraphrases.get(frame.observation.instruction, "")) for frame in listed]
+    frames = [_read(frame, paraphrases) for frame in listed]
     groups = len({frame.group for frame in frames})
     if groups < LEAST_GROUPS:
         raise UsageError(
@@ -41,6 +41,13 @@ def frames_of(
             "Extract more episodes or items"
         )
     return frames
+
+
+def _read(frame: Frame, paraphrases: Mapping[str, str]) -> Frame:
+    """The frame with its observation in memory: every input of it is compared and exchanged many times."""
+    observation = frame.observation
+    other_words = paraphrases.get(observation.instruction, "")
+    return replace(frame, observe=lambda _: observation, other_words=other_words)
 
 
 def _observed(session: ObservedSession, count: int) -> Iterator[Frame]:

@@ -18,6 +18,7 @@ from probe_kit.diagnose.diagnosis import diagnose_run, load_diagnosis, with_inpu
 from probe_kit.diagnose.frames import frames_of
 from probe_kit.diagnose.paraphrases import read_paraphrases
 from probe_kit.diagnose.results import Diagnosis
+from probe_kit.env import SceneSpec
 from probe_kit.errors import UsageError
 from probe_kit.extract import ExtractSettings, LeRobotSource, extract_run
 from probe_kit.hooks import Policy
@@ -25,6 +26,7 @@ from probe_kit.hooks.families.pi0.adapter import load_pi0_tiny
 from probe_kit.intervene.sessions.opening import open_session
 from probe_kit.intervene.sessions.session import ReplaySource
 from probe_kit.runs import Run, verify_run
+from probe_kit.suite import Suite
 from tests.support.lerobot_recordings import CAMERA, write_recording
 from tests.support.made_once import made_once
 from tests.support.organisms import ORGANISMS, edited, make_deaf
@@ -126,6 +128,24 @@ def test_a_plan_says_how_many_inferences_it_takes_and_plays_nothing(tmp_path: Pa
     assert answer.exit_code == 0
     assert "inferences" in answer.output
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("options", [(), ("--dry-run",), ("--require", "picture")], ids=" ".join)
+def test_a_scripted_policy_has_nothing_to_diagnose(
+    options: tuple[str, ...], small_suite: Suite, tmp_path: Path
+) -> None:
+    settings = ExtractSettings(
+        "idle",
+        suite=small_suite.folder,
+        categories=("color",),
+        items=2,
+        scene=SceneSpec(max_steps=1),
+        env_workers=0,
+    )
+    extract_run(settings, tmp_path / "run")
+    answer = run_command(tmp_path / "run", *options)
+    assert answer.exit_code == 2
+    assert "idle is scripted and has no network; diagnose a policy" in " ".join(answer.output.split())
 
 
 def test_too_few_groups_are_refused_with_their_number(run: Run) -> None:
