@@ -79,10 +79,11 @@ class PlaceName:
         return self.layer, self.iterations or (0, 0), self.quantity, -1 if self.head is None else self.head
 
 
-def list_places(names: Sequence[str]) -> str:
+def list_places(names: Sequence[str], most: int | None = None) -> str:
     """Places, each with its role if it has one, in words: `backbone.01 to backbone.07 language, kv.02 image`.
 
-    Three or more of one kind in consecutive layers become one range.
+    Three or more of one kind in consecutive layers become one range. most: how many places and ranges are named,
+    by default all; the number of others follows.
     """
     ranges: list[list[tuple[PlaceName, str]]] = []
     for name in names:
@@ -93,12 +94,12 @@ def list_places(names: Sequence[str]) -> str:
             ranges[-1].append((parsed, role))
         else:
             ranges.append([(parsed, role)])
-    return ", ".join(
-        f"{parts[0][0]} to {' '.join(filter(None, map(str, parts[-1])))}"
-        if len(parts) >= SHORTEST_RANGE
-        else ", ".join(" ".join(filter(None, map(str, part))) for part in parts)
-        for parts in ranges
-    )
+    texts: list[str] = []
+    for parts in ranges:
+        places = [" ".join(filter(None, map(str, part))) for part in parts]
+        texts += [f"{parts[0][0]} to {places[-1]}"] if len(parts) >= SHORTEST_RANGE else places
+    more = f" and {len(texts) - most} more" if most is not None and len(texts) > most else ""
+    return f"{', '.join(texts[:most])}{more}"
 
 
 @dataclass(frozen=True)

@@ -232,15 +232,12 @@ class JointPlaces(Intervention):
     def finding(rows: "Sequence[JointEffect]", context: TableContext) -> str:
         """Return where the answer is read, alone or jointly, in few words."""
         del context
-        places = describe_joint_places(rows).removeprefix("no single place: ").partition(" (")[0]
-        if not places:
+        joint = joint_places(rows)
+        if joint.is_past:
+            return f"{joint.verb} {joint.cells[0]}: the answer reaches the action without passing there"
+        if not joint.cells:
             return "open: no place was found at which the answer is read"
-        if places.startswith("past"):
-            return f"{places}: the answer reaches the action without passing there"
-        verdict, _, names = places.partition(" at ")
-        places_read = names.split(", ")
-        more = f" and {len(places_read) - MOST_PLACES} more" * (len(places_read) > MOST_PLACES)
-        return f"{verdict}: at {', '.join(places_read[:MOST_PLACES])}{more}"
+        return f"{joint.verb}: at {joint.list_cells(MOST_PLACES)}"
 
     @staticmethod
     def notes(rows: "Sequence[JointEffect]", measurement: Measurement) -> list[str]:
@@ -341,8 +338,27 @@ def is_read_jointly(rows: Sequence[JointEffect]) -> bool:
     return any(row.part == MINIMAL and row.finding == "read jointly" for row in rows)
 
 
-def describe_joint_places(rows: Sequence[JointEffect]) -> str:
-    """Return where it is read, or passes in the backbone, in words for a verdict; empty where that remains open.
+@dataclass(frozen=True)
+class JointReading:
+    """The cells at which it is read, or passes in the backbone, and how. cells: none where that remains open.
+
+    is_jointly: of a smallest set, whose cells are one text joined by `+`. is_past: it reaches the action past all
+    cells. alone: the shares that single cells carry, by cell.
+    """
+
+    verb: str
+    cells: tuple[str, ...]
+    alone: Mapping[str, float]
+    is_jointly: bool = False
+    is_past: bool = False
+
+    def list_cells(self, most: int | None = None) -> str:
+        """Return the cells in words. most: how many places are named, by default all."""
+        return self.cells[0] if self.is_jointly else list_places(self.cells, most)
+
+
+def joint_places(rows: Sequence[JointEffect]) -> JointReading:
+    """Return where it is read, or passes in the backbone.
 
     A smallest set is named if no cell alone comes near what all cells carry.
     """
@@ -350,17 +366,24 @@ def describe_joint_places(rows: Sequence[JointEffect]) -> str:
     cells = [row for row in rows if row.part == "cell"]
     single = {row.cells: row.alone or 0.0 for row in cells if row.finding in ("read here", "enough alone")}
     if every.finding == "past it" and not single:
-        return f"past {every.cells}"
+        return JointReading("past", (every.cells,), single, is_past=True)
     verb = "read" if all(row.cells.startswith(f"{KV_STREAM}.") for row in cells) else "passes"
     if is_read_jointly(rows) and max(single.values(), default=0.0) < KEEP * (every.alone or 0.0):
         (minimal,) = (row for row in rows if row.part == MINIMAL)
-        alone = [f"{name} {share:.2f}" for name, share in single.items()]
-        return (
-            f"{verb} jointly at {minimal.cells} (alone: {', '.join(alone)})"
-            if alone
-            else f"no single place: {verb} jointly at {minimal.cells}"
-        )
-    return f"{verb} at {list_places(list(single))}" if single else ""
+        return JointReading(f"{verb} jointly", (minimal.cells,), single, is_jointly=True)
+    return JointReading(verb, tuple(single), single)
+
+
+def describe_joint_places(rows: Sequence[JointEffect]) -> str:
+    """Return `joint_places` in words for a verdict; empty where they remain open."""
+    joint = joint_places(rows)
+    if joint.is_past:
+        return f"{joint.verb} {joint.cells[0]}"
+    text = f"{joint.verb} at {joint.list_cells()}" if joint.cells else ""
+    if not joint.is_jointly:
+        return text
+    alone = ", ".join(f"{name} {share:.2f}" for name, share in joint.alone.items())
+    return f"{text} (alone: {alone})" if alone else f"no single place: {text}"
 
 
 def describe_remainder(rows: Sequence[JointEffect]) -> str:
@@ -368,8 +391,7 @@ def describe_remainder(rows: Sequence[JointEffect]) -> str:
     (every,) = (row for row in rows if row.part == EVERY)
     opposing = [row.cells for row in rows if row.part == "cell" and row.finding == "opposes it"]
     parts = [f"opposed at {list_places(opposing)}"] * bool(opposing)
-    is_past = describe_joint_places(rows).startswith("past")
-    if not is_past and every.alone_ci is not None and every.alone_ci[1] < KEEP:
+    if not joint_places(rows).is_past and every.alone_ci is not None and every.alone_ci[1] < KEEP:
         parts.append(f"all cells of {every.cells} carry {every.alone:.2f} of it")
     return "; ".join(parts)
 
