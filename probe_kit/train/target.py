@@ -22,7 +22,7 @@ from probe_kit.runs.layout import RECORDED_EPISODES
 from probe_kit.runs.reader import RunReader, check_sides
 from probe_kit.statistics.label_permutations import flip_items
 from probe_kit.train.choices import SIDES, Task
-from probe_kit.train.columns.builtin import BuiltinColumn, builtin_column
+from probe_kit.train.columns.builtin import BuiltinColumn, BuiltinColumns
 from probe_kit.train.columns.table import EPISODE, FRAME, INFERENCE, SOURCE, read_table
 from probe_kit.train.columns.values import LabelValues, code_labels
 
@@ -173,7 +173,7 @@ class Target:
         """
         if name in SIDES:
             return _side(run, name, seed, task, group_by, exchange_within)
-        return cls.of_column(name, builtin_column(run, name), task, group_by, exchange_within)
+        return cls.of_column(name, BuiltinColumns(run).read(name), task, group_by, exchange_within)
 
     @classmethod
     def of_column(

@@ -63,27 +63,20 @@ CONSTANT = "one value"
 """In place of a task, of a column in which there is nothing to decode."""
 
 
-def _names(run: "RunReader") -> list[str]:
-    from probe_kit.train.columns.builtin import builtin_names, outcome_column, prefix_of, recorded_columns
-
-    if run.inputs is None:
-        return [*SIDES, *builtin_names()]
-    return [*(prefix_of(run) + name for name in recorded_columns(run)), *outcome_column(run)]
-
-
 def listed_targets(run: "RunReader") -> Iterator[tuple[str, str, str, str, str]]:
     """Yield name, task, `episode` or `inference`, classes or range, and groups that are too few, of every target.
 
     One that the run cannot give has the reason in place of the classes, one of a single value the task `CONSTANT`.
     """
-    from probe_kit.train.columns.builtin import builtin_column
+    from probe_kit.train.columns.builtin import BuiltinColumns
     from probe_kit.train.target import Target
 
-    for name in _names(run):
+    columns = BuiltinColumns(run)
+    for name in [*(SIDES if run.inputs is None else ()), *columns.names]:
         try:
             if name in SIDES:
                 target, task = Target.of_run(run, name), "binary"
-            elif (column := builtin_column(run, name)).is_constant:
+            elif (column := columns.read(name)).is_constant:
                 yield name, CONSTANT, "–", "–", ""
                 continue
             else:

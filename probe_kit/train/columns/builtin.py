@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache, cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -109,52 +109,72 @@ ITEM_COLUMNS = {
 }
 
 
-def builtin_column(run: RunReader, name: str) -> BuiltinColumn:
-    """The built-in column `name` of a run, for every episode or captured inference that it has.
+class BuiltinColumns:
+    """The built-in columns of a run; what several of them are made of is read once."""
 
-    Raises UsageError for another name and for a run of which nothing such is stored; NoTrajectoryError without
-    trajectories.
-    """
-    if name.startswith(SIM) and name.removeprefix(SIM) in SIM_COLUMNS:
-        task, value = SIM_COLUMNS[name.removeprefix(SIM)]
+    def __init__(self, run: RunReader) -> None:
+        self._run = run
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the columns of a run of this kind; it may lack some still."""
+        if self._run.inputs is None:
+            return builtin_names()
+        return [*(prefix_of(self._run) + name for name in self._recorded), *outcome_column(self._run)]
+
+    def read(self, name: str) -> BuiltinColumn:
+        """Return a column by its name, for every episode or captured inference that the run has.
+
+        Raises UsageError for another name and for a run of which nothing such is stored; NoTrajectoryError without
+        trajectories.
+        """
+        run = self._run
+        if name.startswith(SIM) and name.removeprefix(SIM) in SIM_COLUMNS:
+            name = name.removeprefix(SIM)
+            episodes, inferences = tuple(zip(*_inferences(run), strict=True)) or ((), ())
+            return BuiltinColumn(SIM_COLUMNS[name][0], episodes, inferences, self._sim[name])
+        if name.startswith(ITEM) and name.removeprefix(ITEM) in ITEM_COLUMNS:
+            ids = tuple(run.episodes[EPISODE].astype(str))
+            return BuiltinColumn("classes", ids, None, tuple(_of_item(run, name.removeprefix(ITEM))))
+        if name == OUTCOME and OUTCOME in outcome_column(run):
+            outcomes = tuple(run.episodes["outcome"].astype(str))
+            return BuiltinColumn("binary", tuple(run.episodes[EPISODE].astype(str)), None, outcomes)
+        if name.startswith((RECORDED, PLAYED)):
+            return self._of_source(name)
+        raise UsageError(f"there is no built-in column {name!r}; there are: {', '.join(builtin_names())}")
+
+    @cached_property
+    def _recorded(self) -> dict[str, Callable[[], NDArray[np.float64]]]:
+        return recorded_columns(self._run)
+
+    @cached_property
+    def _sim(self) -> dict[str, tuple[Cell, ...]]:
+        return _sim_columns(self._run)
+
+    def _of_source(self, name: str) -> BuiltinColumn:
+        """A column of data set or environment for every shown frame, such as `dataset.state.x` or `env.held`."""
+        run, columns = self._run, self._recorded
+        prefix = prefix_of(run)
+        column = name.removeprefix(prefix)
+        if not name.startswith(prefix) or column not in columns:
+            source = "recordings" if name.startswith(RECORDED) else "an environment of your own"
+            available = (
+                ", ".join(prefix + known_column for known_column in columns)
+                or f"none, because the run is not of {source}"
+            )
+            raise UsageError(f"{run.location} has no column {name}; there are: {available}")
         pairs = list(_inferences(run))
-        of_frames = _of_frames(run, [value])
-        keys = tuple(zip(*pairs, strict=True)) or ((), ())
-        return BuiltinColumn(task, keys[0], keys[1], tuple(cells[0] for cells in of_frames))
-    if name.startswith(ITEM) and name.removeprefix(ITEM) in ITEM_COLUMNS:
-        ids = tuple(run.episodes[EPISODE].astype(str))
-        return BuiltinColumn("classes", ids, None, tuple(_of_item(run, name.removeprefix(ITEM))))
-    if name == OUTCOME and OUTCOME in outcome_column(run):
-        outcomes = tuple(run.episodes["outcome"].astype(str))
-        return BuiltinColumn("binary", tuple(run.episodes[EPISODE].astype(str)), None, outcomes)
-    if name.startswith((RECORDED, PLAYED)):
-        return _of_source(run, name)
-    raise UsageError(f"there is no built-in column {name!r}; there are: {', '.join(builtin_names())}")
-
-
-def _of_source(run: RunReader, name: str) -> BuiltinColumn:
-    """A column of the data set or environment for every shown frame, such as `dataset.state.x` or `env.held`."""
-    prefix, columns = prefix_of(run), recorded_columns(run)
-    column = name.removeprefix(prefix)
-    if not name.startswith(prefix) or column not in columns:
-        source = "recordings" if name.startswith(RECORDED) else "an environment of your own"
-        available = (
-            ", ".join(prefix + known_column for known_column in columns)
-            or f"none, because the run is not of {source}"
-        )
-        raise UsageError(f"{run.location} has no column {name}; there are: {available}")
-    pairs = list(_inferences(run))
-    rows = _rows(run, [episode for episode, _ in pairs])
-    calls = [call for _, call in pairs]
-    cells = _cells(run, column, columns[column]()[rows, calls])
-    if run.in_own_environment and not any(calls) and all(cell is None for cell in cells):
-        raise UsageError(
-            f"{name} has no value, because facts come with a step and only first inferences were captured. Return "
-            "a `Step` with facts from `reset`, or extract with --captured-calls all, and with a smaller --execute "
-            "where an episode ends within one chunk"
-        )
-    episodes, inferences = zip(*pairs, strict=True)
-    return BuiltinColumn(None, episodes, inferences, cells)
+        rows = _rows(run, [episode for episode, _ in pairs])
+        calls = [call for _, call in pairs]
+        cells = _cells(run, column, columns[column]()[rows, calls])
+        if run.in_own_environment and not any(calls) and all(cell is None for cell in cells):
+            raise UsageError(
+                f"{name} has no value, because facts come with a step and only first inferences were captured. "
+                "Return a `Step` with facts from `reset`, or extract with --captured-calls all, and with a "
+                "smaller --execute where an episode ends within one chunk"
+            )
+        episodes, inferences = zip(*pairs, strict=True)
+        return BuiltinColumn(None, episodes, inferences, cells)
 
 
 def _cells(run: RunReader, name: str, values: NDArray[np.float64]) -> tuple[Cell, ...]:
@@ -231,9 +251,8 @@ def label_frame(run: RunReader) -> "pd.DataFrame":
     table: dict[str, Sequence[Any]] = {EPISODE: ids, INFERENCE: inferences}
     sim: dict[str, Any] = {}
     if why_no_sim(run) is None:
-        values = _of_frames(run, [value for _, value in SIM_COLUMNS.values()])
-        sim = dict(zip((SIM + name for name in SIM_COLUMNS), zip(*values, strict=True), strict=True))
-        table["control_step"] = [frame for _, _, frames in frames_of_inferences(run) for frame in frames]
+        sim = {SIM + name: cells for name, cells in _sim_columns(run).items()}
+        table["control_step"] = run.control_steps[rows, list(inferences)].astype(int).tolist()
     if run.recorded:
         steps = run.control_steps
         table["source_episode"] = run.episodes["source_episode"].iloc[rows].tolist()
@@ -293,12 +312,17 @@ def frames_of_inferences(run: RunReader) -> Iterator[tuple[Any, int, list[int]]]
         yield trajectory, row, steps[row, np.flatnonzero(reached[row])].astype(int).tolist()
 
 
-def _of_frames(run: RunReader, values: Sequence[Callable[[Instant], Cell]]) -> Iterator[list[Cell]]:
-    """The cells of some `sim.*` columns for every captured inference."""
+def _sim_columns(run: RunReader) -> dict[str, tuple[Cell, ...]]:
+    """The cells of all `sim.*` columns for every captured inference, without the prefix."""
+    rows = [[_finite(value(at)) for _, value in SIM_COLUMNS.values()] for at in _instants(run)]
+    return {name: tuple(cells[number] for cells in rows) for number, name in enumerate(SIM_COLUMNS)}
+
+
+def _instants(run: RunReader) -> Iterator[Instant]:
+    """Yield the instant of every captured inference."""
     for trajectory, row, frames in frames_of_inferences(run):
         side = str(run.episodes["side_correct"].iloc[row])
-        for frame in frames:
-            yield [_finite(value(Instant(trajectory, side, frame))) for value in values]
+        yield from (Instant(trajectory, side, frame) for frame in frames)
 
 
 def _finite(value: Cell) -> Cell:
