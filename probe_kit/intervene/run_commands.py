@@ -51,6 +51,7 @@ def list_runs(
             say(marked("[yellow]{} cannot be read: {}[/]", line["run"], line["error"]))
 
 
+    from probe_kit.runs.reader import full_name
 def _facts(run: "Run") -> dict[str, Any]:
     from probe_kit.intervene.results.inventory import listed_interventions
     from probe_kit.train.results.inventory import inventory
@@ -58,7 +59,7 @@ def _facts(run: "Run") -> dict[str, Any]:
     outcomes = run.episodes.get("outcome")
     judged = outcomes is not None and len(outcomes) > 0 and set(outcomes) <= {"correct", "wrong", "oob"}
     return {
-        "model": run.label + " (random weights)" * run.random_weights,
+        "model": full_name(run.label, run.random_weights),
         "suite": run.suite,
         "episodes": len(run.episodes),
         "correct": float((outcomes == "correct").mean()) if judged and outcomes is not None else None,

@@ -237,6 +237,11 @@ class RunReader(Protocol):
         """The reading of answers by which outcomes are given, see `scored`."""
 
 
+def full_name(label: str, random_weights: bool, captured_only: bool = False) -> str:
+    """Return the label of a run, marked if the weights are random or the model only captured."""
+    return label + (" (random weights)" if random_weights else "") + (" (capture only)" if captured_only else "")
+
+
 def origin_of(run: RunReader) -> Origin:
     """Return files and choices that the run was made of; none where it does not say."""
     return run.origins[0] if run.origins else Origin()

@@ -203,11 +203,13 @@ def facts_table(inventory: "Inventory", more_lines: Mapping[str, str]) -> "Table
     """A run and what is stored with it. more_lines: those below, by name."""
     from rich.table import Table
 
+    from probe_kit.runs.reader import full_name
+
     missing = inventory.planned - inventory.episodes
     outcomes = ", ".join(f"{name} {count}" for name, count in inventory.outcomes.items())
     facts = {
         "run": inventory.run,
-        "model": inventory.model + (" (random weights)" if inventory.random_weights else ""),
+        "model": full_name(inventory.model, inventory.random_weights),
         "weights": (inventory.weights_sha256 or "none (scripted)")[:12],
         "suite": inventory.suite,
         "settings": inventory.settings_sha256[:12],

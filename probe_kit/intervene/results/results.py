@@ -25,7 +25,7 @@ from probe_kit.intervene.results.evidence import (
 )
 from probe_kit.intervene.results.verdict import Places, UseVerdict, classify_all, describe_readouts, encoded_in
 from probe_kit.intervene.settings import PER_STEP
-from probe_kit.runs.reader import RunReader
+from probe_kit.runs.reader import RunReader, full_name
 from probe_kit.statistics.paired_tests import smallest_flip_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.suite.categories import category_of
@@ -200,14 +200,10 @@ class InterventionResult:
 
     @property
     def _context(self) -> TableContext:
-        random = " (random weights)" * self.random_weights
+        label = full_name(self.label, self.random_weights)
         # The label of a run of recordings says on what already.
         name = self.suite.partition("#")[0]
-        subject = (
-            f"{self.label}{random}"
-            if self.label.endswith(f" on {name}")
-            else f"{self.label}{random} on {self.suite}"
-        )
+        subject = label if self.label.endswith(f" on {name}") else f"{label} on {self.suite}"
         uses = (self.verdicts.get(row.category) for row in self.effects)
         vary = str(self.settings.get("vary") or "")
         exchange = "image swap" if self.outcomes.has_sides else f"exchange of the {vary}"

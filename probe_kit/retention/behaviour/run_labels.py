@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour.success_rate import capture_only
-from probe_kit.runs.reader import RunReader
+from probe_kit.runs.reader import RunReader, full_name
 
 _MARKS: Sequence[Callable[[RunReader, int], str]] = (
     lambda run, _: run.settings_sha256[:6],
@@ -13,11 +13,6 @@ _MARKS: Sequence[Callable[[RunReader, int], str]] = (
     lambda _, number: str(number),
 )
 """What is added to a name that comes twice, one after the other, until none does: settings, folder, number."""
-
-
-def full_name(label: str, random_weights: bool, heard: bool = False) -> str:
-    """A label, marked if the weights are random or the model only captured."""
-    return label + (" (random weights)" if random_weights else "") + (" (capture only)" if heard else "")
 
 
 def distinct_labels(runs: Sequence[RunReader], names: Mapping[str, str] | None = None) -> dict[str, str]:

@@ -17,6 +17,7 @@ from probe_kit.retention.compare.compare import Difference
 from probe_kit.retention.compare.known_used import OVERALL, PAIRS, CategoryCounts, Comparison, KnownUsedTable
 from probe_kit.retention.compare.origins import Relation
 from probe_kit.retention.rows.row import MEAN, RetentionRow
+from probe_kit.runs.reader import full_name
 
 _LADDER = (
     "same items, same seeds; only one: episodes right in the first wording alone, and in the second alone; p: "
@@ -66,7 +67,7 @@ def size_table(means: Sequence[RetentionRow]) -> list[Table]:
     )
     lines: dict[tuple[str, str], dict[str, str]] = {}
     for row in of_vlms:
-        name = f"{row.run.model} (random weights)" if row.run.random_weights else row.run.model
+        name = full_name(row.run.model, row.run.random_weights)
         extras = [
             str(part) for part in (row.answers.picture, row.answers.asked_for) if part not in ("frame", "target")
         ]

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import label_of
-from probe_kit.retention.behaviour.run_labels import full_name
 from probe_kit.retention.choices import Iterations
 from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
@@ -26,6 +25,7 @@ from probe_kit.retention.displays.base.style import (
     plain,
     series,
 )
+from probe_kit.runs.reader import full_name
 from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:

@@ -9,8 +9,8 @@ from typing import Literal
 
 from probe_kit.hooks.contract.sites import label_of
 from probe_kit.intervene.results.verdict import UseVerdict
-from probe_kit.retention.behaviour.run_labels import full_name
 from probe_kit.retention.estimators.stream_scores import Limits
+from probe_kit.runs.reader import full_name
 from probe_kit.statistics.estimates.verdict import Verdict
 from probe_kit.train.results.control_scores import has_signal
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
 from probe_kit.runs.layout import DATASET
-from probe_kit.runs.reader import RunReader
+from probe_kit.runs.reader import RunReader, full_name
 from probe_kit.statistics.estimates.shares import Accuracy
 from probe_kit.statistics.paired_bootstrap import better_than_best
 from probe_kit.train.controls.fit import comparison_seed, comparisons, control_score
@@ -198,5 +198,5 @@ def _gains(
             untrained_accuracy=float(untrained_hits.mean()),
             difference=float((correct - untrained_correct)[:, column].mean()),
             ci=(gap.low, gap.high),
-            untrained=untrained.label + (" (random weights)" if untrained.settings.random_weights else ""),
+            untrained=full_name(untrained.label, untrained.settings.random_weights),
         )
