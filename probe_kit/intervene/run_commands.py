@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from probe_kit._system.counting import counted
+from probe_kit._tables.numbers import whole_percent
 from probe_kit._tables.printing import Format, print_table
 from probe_kit._tables.table import Table
 from probe_kit._terminal.console import marked, out, print_json, say
@@ -19,11 +20,8 @@ if TYPE_CHECKING:
     from probe_kit.runs import Run
 
 
-_COLUMNS = {
-    name: "correct %" if name == "correct" else name
-    for name in ("run", "model", "suite", "episodes", "correct", "probes", "interventions")
-}
-"""Headings by the name of a fact."""
+_COLUMNS = ("run", "model", "suite", "episodes", "correct", "probes", "interventions")
+"""Facts that are shown, by their names."""
 
 
 def list_runs(
@@ -51,9 +49,9 @@ def list_runs(
             say(marked("[yellow]{} cannot be read: {}[/]", line["run"], line["error"]))
 
 
-    from probe_kit.runs.reader import full_name
 def _facts(run: "Run") -> dict[str, Any]:
     from probe_kit.intervene.results.inventory import listed_interventions
+    from probe_kit.runs.reader import full_name
     from probe_kit.train.results.inventory import inventory
 
     outcomes = run.episodes.get("outcome")
@@ -73,11 +71,12 @@ def _table(lines: list[dict[str, Any]], folder: Path) -> Table:
     rows = []
     for line in lines:
         if "error" not in line:
-            correct = "–" if line["correct"] is None else f"{100 * line['correct']:.0f}"
             # Hashes stay in the numbers: they would take the room of names.
-            texts = {**line, "correct": correct, "suite": line["suite"].partition("#")[0]}
+            suite = line["suite"].partition("#")[0]
+            texts = {**line, "correct": whole_percent(line["correct"]), "suite": suite}
             rows.append([str(texts[name]) for name in _COLUMNS])
-    return Table.of(f"runs below {folder}", tuple(_COLUMNS.values()), rows, numbers=tuple(lines), overflow="wrap")
+    headings = ["correct %" if name == "correct" else name for name in _COLUMNS]
+    return Table.of(f"runs below {folder}", headings, rows, numbers=tuple(lines), overflow="wrap")
 
 
 def show(
