@@ -138,17 +138,21 @@ def attention_on_picture(run: RunReader, category: str | None = None) -> "Figure
     first one with stored patches, of whose episodes the first one with a picture is drawn. Raises
     NoInterventionsError where patches or pictures are not stored.
     """
-    from matplotlib.collections import PatchCollection
-    from matplotlib.patches import Rectangle
-
-    drawn = _first_pictured(run, category)
-    if drawn is None:
+    pictured = _first_pictured(run, category)
+    if pictured is None:
         raise NoInterventionsError(
             f"{run.location} has no attention on patches{f' of {category!r}' if category else ''}, or no picture "
             f"to draw it on. Run `probe-kit intervene {run.location} --kind attention` on a run that stores "
             "pictures, with a family that says which token sees which pixels"
         )
-    episode, picture, on_frame, weights = drawn
+    return _draw_on_picture(pictured, ProvenanceLine.of_run(run))
+
+
+def _draw_on_picture(pictured: "_Pictured", certificate: ProvenanceLine) -> "Figure":
+    from matplotlib.collections import PatchCollection
+    from matplotlib.patches import Rectangle
+
+    episode, picture, on_frame, weights = pictured
     read = [block for block in range(len(weights)) if not np.isnan(weights[block]).all()]
     maps = {"all blocks": weights[read].mean(axis=0), **{f"block {block}": weights[block] for block in read}}
     height, width = picture.shape[:2]
@@ -164,13 +168,17 @@ def attention_on_picture(run: RunReader, category: str | None = None) -> "Figure
         axes.add_collection(PatchCollection(patches, facecolors=[(*_HEAT, alpha) for alpha in strength], lw=0))
         axes.set_title(f"{title}: {100 * values.sum():.0f} %", fontsize=8, loc="left")
         axes.set_axis_off()
-    caption(figure, ProvenanceLine.of_run(run))
+    caption(figure, certificate)
     figure.caption = f"episode {episode} · {figure.caption}"  # type: ignore[attr-defined]
     return figure
 
 
-def _first_pictured(run: RunReader, category: str | None = None) -> tuple[str, Picture, Boxes, Percent] | None:
-    """The first episode with attention and a picture: its id, the picture, (P, 4) boxes, (B, P) shares."""
+_Pictured = tuple[str, Picture, Boxes, Percent]
+"""An episode: its id, its picture, (P, 4) boxes of patches and (B, P) shares of the attention."""
+
+
+def _first_pictured(run: RunReader, category: str | None = None) -> _Pictured | None:
+    """The first episode with attention and a picture."""
     stored = stored_patch_attention(run)
     patches = stored.get(category) if category is not None else next(iter(stored.values()), None)
     if patches is None:
@@ -194,13 +202,13 @@ PLACE = 15
 def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
     """Yield the figures that a report of these runs shows, once per run."""
     for drawn in {drawn.position: drawn for drawn in reversed(source.runs)}.values():
-        if _first_pictured(drawn.run) is not None:
+        if (pictured := _first_pictured(drawn.run)) is not None:
             yield ReportFigure(
                 f"{drawn.stem}-attention-picture", "Attention on the picture", "interventions",
                 "Where on the picture the acting stream's attention lies at one episode's first inference, by "
                 "block, with the share of all attention. The strongest patch has the full colour. Descriptive: an "
                 "attended patch need not be used, and no verdict reads this.",
-                drawn.position, partial(attention_on_picture, drawn.run),
+                drawn.position, partial(_draw_on_picture, pictured, ProvenanceLine.of_run(drawn.run)),
             )  # fmt: skip
         if stored_attention(drawn.run):
             yield ReportFigure(
