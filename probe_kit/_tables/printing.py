@@ -6,7 +6,7 @@ from typing import Annotated, Any
 import typer
 
 from probe_kit._tables import formats
-from probe_kit._terminal.console import marked, out, print_json_text, print_text, say
+from probe_kit._terminal.console import out, print_json_text, print_text, say_note
 from probe_kit._terminal.options import choices, one_of
 
 STYLES = ("table", "json", "csv", *formats.names())
@@ -26,4 +26,4 @@ def print_table(table: Any, style: str, notes: Sequence[str] = ()) -> None:
         written = getattr(table, f"to_{style}", None)
         print_text((table.to_text(style) if written is None else written()).rstrip("\n"))
     for note in notes:
-        say(marked("[yellow]note:[/] {}", note))
+        say_note(note)

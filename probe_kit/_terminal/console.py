@@ -126,6 +126,11 @@ def say(renderable: RenderableType) -> None:
     err.print(renderable, soft_wrap=True)
 
 
+def say_note(text: str) -> None:
+    """Print on stderr what a reader of a result has to know."""
+    say(marked("[yellow]note:[/] {}", text))
+
+
 def complain(kind: str, message: str, notes: Iterable[str] = ()) -> None:
     """Print an error on stderr: what it is called, what it says, and what belongs to it."""
     say(marked("[bold red]{}[/]: {}", kind, message))

@@ -12,7 +12,7 @@ from rich.text import Text
 
 from probe_kit._tables.printing import Format, print_table
 from probe_kit._terminal import options as common
-from probe_kit._terminal.console import counter, marked, out, progress, say, split
+from probe_kit._terminal.console import counter, marked, out, progress, say, say_note, split
 from probe_kit._terminal.options import LISTED, Names, choices, further_option, one_of
 from probe_kit._terminal.panelled_help import PanelledHelp
 from probe_kit.errors import UsageError
@@ -268,11 +268,10 @@ def _run(run: "Run", intervention: "Intervention", source: "ReplaySource") -> "I
     if few:
         counts = ", ".join(f"{name} has {count}" for name, count in few.items())
         needed = groups_for_not_used()
-        text = "[yellow]note:[/] “not used” needs {} groups of items and cannot be found: {}. Extract more items."
-        say(marked(text, needed, counts))
+        say_note(f"“not used” needs {needed} groups of items and cannot be found: {counts}. Extract more items.")
     unread = () if was_stored else unread_sites(run, intervention)
     if unread:
-        say(marked("[yellow]note:[/] {}", unread_note(unread)))
+        say_note(unread_note(unread))
     with progress() as bar:
         fitted = counter(bar, "items fitted on") if intervention.fits_first else None
         replayed = counter(bar, "items replayed")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal, cast
 
 from probe_kit._tables.printing import Format, print_table
 from probe_kit._terminal import options as common
-from probe_kit._terminal.console import err, marked, out, print_text, say, split
+from probe_kit._terminal.console import err, out, print_text, say_note, split
 from probe_kit.errors import UsageError
 from probe_kit.retention import command_options as own
 from probe_kit.retention.output import save_all, say_report
@@ -154,7 +154,7 @@ def _print_sections(table: "RetentionTable", style: str, details: Sequence[str])
     else:
         print_text(table.to_latex(sections) if style == "latex" else table.to_text(style, sections))
         for note in table.notes:
-            say(marked("[yellow]note:[/] {}", note))
+            say_note(note)
 
 
 def _show_steps(table: "RetentionTable", training: Mapping[str, int], style: str, figures: Path | None) -> None:
