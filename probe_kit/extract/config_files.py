@@ -10,10 +10,9 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from probe_kit._system.bounded_json import read_json_object
-from probe_kit._terminal.field_options import options_of
 from probe_kit.errors import UsageError
 from probe_kit.extract.settings import Settings
-from probe_kit.extract.sources.kinds import SOURCES, kind_of
+from probe_kit.extract.sources.kinds import kind_of, kinds_typed
 from probe_kit.hooks.contract.options import read_pairs
 from probe_kit.runs.layout import RUN_FILE
 from probe_kit.runs.origin import is_here, option_files
@@ -93,14 +92,10 @@ def _model_of_run(run: "Run", model: Mapping[str, Any], typed: Mapping[str, Any]
 def _typed_or_stored_source(run: "Run", typed: Mapping[str, Any]) -> dict[str, Any]:
     """The part `source` of a run's settings; empty where a command line names one of another kind."""
     kind = kind_of(run.settings[CONFIG]["source"])
-    options = kind.command_options()
-    other_kinds = [next(options_of(other)).parameter for other in SOURCES[1:] if other is not kind]
-    if any(parameter in typed for parameter in other_kinds):
+    if kinds_typed(typed).keys() - {kind}:
         return {}
-    replaced = [field for field, option in options.items() if option.parameter in typed]
-    # A preset that is typed takes the place of the whole scene.
-    replaced += [field for field in options if field.startswith("scene.") and "scene.scene" in replaced]
-    return {"source": source_of_run(run, replaced, {field: option.flag for field, option in options.items()})}
+    flags = {field: option.flag for field, option in kind.command_options().items()}
+    return {"source": source_of_run(run, kind.replaced_by(typed), flags)}
 
 
 def source_of_run(run: "Run", replaced: Collection[str], flags: Mapping[str, str]) -> dict[str, Any]:

@@ -29,7 +29,7 @@ from probe_kit.extract.parts import (
     read_options,
 )
 from probe_kit.extract.protocols import has_network, protocol_identity, protocol_row, scene_of
-from probe_kit.extract.sources.kinds import SOURCES, kind_of
+from probe_kit.extract.sources.kinds import SOURCES, kind_of, kinds_typed
 from probe_kit.extract.sources.scene import SceneOptions, SceneSettings
 from probe_kit.extract.sources.source import SourceSettings
 from probe_kit.extract.vqa.templates import INSTRUCTION, find_template
@@ -213,12 +213,10 @@ class Settings(Part):
         options = {
             kind: {option.parameter: option for option in kind.command_options().values()} for kind in SOURCES
         }
-        keys = {kind: next(iter(options[kind].values())) for kind in SOURCES[1:]}
-        typed_kinds = [kind for kind, key in keys.items() if key.parameter in typed]
-        if len(typed_kinds) > 1:
-            flags = " and ".join(keys[kind].flag for kind in typed_kinds)
-            raise UsageError(f"{flags} are {len(typed_kinds)} sources; give one")
-        kind = typed_kinds[0] if typed_kinds else SceneSettings if before is None else type(before)
+        kinds = kinds_typed(typed)
+        if len(kinds) > 1:
+            raise UsageError(f"{' and '.join(kinds.values())} are {len(kinds)} sources; give one")
+        kind = next(iter(kinds), SceneSettings if before is None else type(before))
         if strange := [name for name in typed if name not in options[kind]]:
             if kind is not SceneSettings:
                 _refuse(strange, kind)

@@ -5,7 +5,7 @@ torch, and names the module of its `Source` in `opens`.
 """
 
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
 from probe_kit._system.entry_points import entry_points
@@ -65,6 +65,12 @@ def _problem(settings: Any, kinds: set[str], options: set[str]) -> str:
 
 SOURCES: tuple[type[SourceSettings], ...] = (*OWN, *_third_party())
 """The settings of all sources; that of no option, the scene, first."""
+
+
+def kinds_typed(typed: Collection[str]) -> dict[type[SourceSettings], str]:
+    """Return the kinds whose first option is among typed parameters, with the option's flag; never the scene."""
+    first = {kind: next(options_of(kind)) for kind in SOURCES[1:]}
+    return {kind: option.flag for kind, option in first.items() if option.parameter in typed}
 
 
 def kind_of(values: Mapping[str, Any]) -> type[SourceSettings]:

@@ -1,6 +1,6 @@
 """The scene as a source: settings of what is played there."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
@@ -145,6 +145,14 @@ class SceneSettings(SourceSettings):
         return super().command_options() | {
             f"{_SCENE}{option.field}": option for option in options_of(SceneOptions)
         }
+
+    @classmethod
+    def replaced_by(cls, typed: Collection[str]) -> set[str]:
+        """Return the fields whose values typed parameters replace: a preset takes the place of the whole scene."""
+        fields = super().replaced_by(typed)
+        if f"{_SCENE}scene" in fields:
+            fields |= {field for field in cls.command_options() if field.startswith(_SCENE)}
+        return fields
 
     @classmethod
     def with_files(cls, values: Mapping[str, Any], files: Mapping[str, str]) -> dict[str, Any]:

@@ -4,7 +4,7 @@ A source knows neither what a model does with its observations nor how runs are 
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -71,6 +71,11 @@ class SourceSettings(Part):
     def command_options(cls) -> dict[str, FieldOption]:
         """Return the options of a command by the field that they give; a field of a scene is `scene.NAME`."""
         return {option.field: option for option in options_of(cls)}
+
+    @classmethod
+    def replaced_by(cls, typed: Collection[str]) -> set[str]:
+        """Return the fields whose values typed parameters replace."""
+        return {field for field, option in cls.command_options().items() if option.parameter in typed}
 
     def files(self) -> dict[str, Path]:
         """Return files and folders of this machine that the source is made of, by the field that gives them.
