@@ -11,7 +11,8 @@ from probe_kit.hooks.contract.card import EMBEDDED
 ORIGIN = "origin"
 """Entry of a certificate."""
 SUITE = "suite"
-_SCENE = "scene."
+OF_SCENE = "scene."
+"""Beginning of the name of a file that a field of the scene gives."""
 
 
 class LoadedModel(Protocol):
@@ -84,7 +85,9 @@ class Origin:
     def scene_files(self) -> dict[str, Path]:
         """The files of the scene by its fields."""
         return {
-            name.removeprefix(_SCENE): Path(path) for name, path in self.files.items() if name.startswith(_SCENE)
+            name.removeprefix(OF_SCENE): Path(path)
+            for name, path in self.files.items()
+            if name.startswith(OF_SCENE)
         }
 
     def to_json(self) -> dict[str, Any]:

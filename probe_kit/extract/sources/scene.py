@@ -15,6 +15,7 @@ from probe_kit._terminal.options import further_option, read_size, some_of
 from probe_kit.errors import UsageError
 from probe_kit.extract.parts import LARGEST, Scene, option_of
 from probe_kit.extract.sources.source import SourceSettings
+from probe_kit.runs.origin import OF_SCENE
 from probe_kit.scene_names import ArmName, Rendering
 from probe_kit.suite.wording import WORDINGS, Wording, check_wordings
 
@@ -22,8 +23,6 @@ if TYPE_CHECKING:
     from probe_kit.env import SceneSpec
 
 _option = partial(typer.Option, rich_help_panel="Scene")
-_SCENE = "scene."
-"""Beginning of the name of a file that a field of the scene gives."""
 
 
 def _size(value: Any) -> Any:
@@ -143,25 +142,25 @@ class SceneSettings(SourceSettings):
     def command_options(cls) -> dict[str, FieldOption]:
         """Return the options of a command by the field that they give."""
         return super().command_options() | {
-            f"{_SCENE}{option.field}": option for option in options_of(SceneOptions)
+            f"{OF_SCENE}{option.field}": option for option in options_of(SceneOptions)
         }
 
     @classmethod
     def replaced_by(cls, typed: Collection[str]) -> set[str]:
         """Return the fields whose values typed parameters replace: a preset takes the place of the whole scene."""
         fields = super().replaced_by(typed)
-        if f"{_SCENE}scene" in fields:
-            fields |= {field for field in cls.command_options() if field.startswith(_SCENE)}
+        if f"{OF_SCENE}scene" in fields:
+            fields |= {field for field in cls.command_options() if field.startswith(OF_SCENE)}
         return fields
 
     @classmethod
     def with_files(cls, values: Mapping[str, Any], files: Mapping[str, str]) -> dict[str, Any]:
         """Return settings as values, with other texts for `files`."""
-        of_scene = {name.removeprefix(_SCENE): file for name, file in files.items() if name.startswith(_SCENE)}
-        suite = {name: file for name, file in files.items() if not name.startswith(_SCENE)}
+        of_scene = {name.removeprefix(OF_SCENE): file for name, file in files.items() if name.startswith(OF_SCENE)}
+        suite = {name: file for name, file in files.items() if not name.startswith(OF_SCENE)}
         return {**values, **suite, "scene": {**values["scene"], **of_scene}}
 
     def files(self) -> dict[str, Path]:
         """Return the suite, where it is a folder, and the files of the scene by its field."""
-        scene = {f"{_SCENE}{name}": getattr(self.scene, name) for name in ("arm_urdf", "background")}
+        scene = {f"{OF_SCENE}{name}": getattr(self.scene, name) for name in ("arm_urdf", "background")}
         return {name: path for name, path in ({"suite": self.suite} | scene).items() if path is not None}
