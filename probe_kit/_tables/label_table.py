@@ -1,12 +1,13 @@
 """Columns of labels that people wrote or a program gave, as values of one type, with the place of every cell."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import isinf
-from typing import Literal
+from typing import Literal, Self
 
 from probe_kit._system.column_cells import Cell, values_of
 from probe_kit._system.table_cells import group_names, number_of
+from probe_kit._system.text_tables import TextTable
 from probe_kit._terminal.plain_text import UNSAFE, terminal_safe
 from probe_kit.errors import UsageError
 
@@ -33,6 +34,18 @@ class LabelTable:
     columns: dict[str, list[Cell]]
     lines: list[int]
     semicolons: bool = False
+
+    @classmethod
+    def of_lines(
+        cls, file: TextTable, lines: Iterable[tuple[int, Mapping[str, str | None]]], columns: Sequence[str]
+    ) -> Self:
+        """Return some columns of a file. lines: number and cells of each, as `TextTable.rows` yields them."""
+        table = cls(str(file.path), "line", file.names, {name: [] for name in columns}, [], file.separator == ";")
+        for number, cells in lines:
+            table.lines.append(number)
+            for name in columns:
+                table.columns[name].append(cells[name])
+        return table
 
     def where(self, row: int, column: str | None = None) -> str:
         """The place of a cell, as errors name it."""

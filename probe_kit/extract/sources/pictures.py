@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator
 
 from probe_kit._system.bounded_files import read_regular
-from probe_kit._system.column_cells import Cell
 from probe_kit._system.table_cells import group_names
 from probe_kit._system.text_tables import MOST_BYTES, TextTable, open_table
 from probe_kit._tables.label_table import LabelTable
@@ -120,10 +119,7 @@ class Labels:
     @classmethod
     def of(cls, table: TextTable, lines: Sequence[tuple[int, Cells]], names: Sequence[str]) -> Self:
         """Read the columns by the rules of all labels. Raises UsageError for a cell that breaks one."""
-        columns: dict[str, list[Cell]] = {name: [text[name] for _, text in lines] for name in names}
-        read = LabelTable(
-            str(table.path), "line", table.names, columns, [number for number, _ in lines], table.separator == ";"
-        )
+        read = LabelTable.of_lines(table, lines, names)
         values: dict[str, list[float]] = {}
         truths: list[str] = []
         classes: dict[str, list[str]] = {}
@@ -133,8 +129,9 @@ class Labels:
                 classes[name] = texts
             elif any(isinstance(cell, bool) for cell in cells):
                 truths.append(name)
+            code_of = {text: code for code, text in enumerate(texts)}
             values[name] = [
-                np.nan if cell is None else float(texts.index(cell) if isinstance(cell, str) else cell)
+                np.nan if cell is None else float(code_of[cell] if isinstance(cell, str) else cell)
                 for cell in cells
             ]
         return cls(values, truths, classes)

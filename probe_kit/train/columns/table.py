@@ -53,13 +53,7 @@ def _check_file(path: Path) -> None:
 def _of_csv(path: Path, requested: Sequence[str]) -> LabelTable:
     opened = open_table(path, (EPISODE, SOURCE))
     read = list(_places(opened.names, requested, str(path), opened.line))
-    columns: dict[str, list[Cell]] = {name: [] for name in read}
-    lines = []
-    for line, cells in opened.rows(read):
-        lines.append(line)
-        for name, cell in cells.items():
-            columns[name].append(cell)
-    return LabelTable(str(path), "line", opened.names, columns, lines, opened.separator == ";")
+    return LabelTable.of_lines(opened, opened.rows(read), read)
 
 
 def _places(names: Sequence[str], requested: Sequence[str], source: str, line: int = 1) -> dict[str, int]:
