@@ -84,7 +84,7 @@ def _word[Value: (bool, str)](cell: Cell, words: dict[str, Value]) -> Value | No
 def _numbers(cells: Sequence[Cell], where: Where, semicolons: bool, as_names: bool) -> list[Cell]:
     """The cells with numbers in place of the texts that spell them."""
     texts = {row: with_minus(cell) for row, cell in enumerate(cells) if isinstance(cell, str)}
-    numbers = [_number_or_text(cell) for cell in cells]
+    numbers = [number_or_cell(cell) for cell in cells]
     if as_names:
         return numbers
     percents = {row: match[1] for row, text in texts.items() if (match := _PERCENT.fullmatch(text))}
@@ -117,10 +117,9 @@ def _numbers(cells: Sequence[Cell], where: Where, semicolons: bool, as_names: bo
     return numbers
 
 
-def _number_or_text(cell: Cell) -> Cell:
-    if not isinstance(cell, str):
-        return cell
-    number = number_of(cell)
+def number_or_cell(cell: Cell) -> Cell:
+    """Return the number that a text spells; any other cell as it is."""
+    number = number_of(cell) if isinstance(cell, str) else None
     return cell if number is None else number
 
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 from math import isinf
 from typing import Literal, Self
 
-from probe_kit._system.column_cells import Cell, values_of
-from probe_kit._system.table_cells import group_names, number_of
+from probe_kit._system.column_cells import Cell, number_or_cell, values_of
+from probe_kit._system.table_cells import group_names
 from probe_kit._system.text_tables import TextTable
 from probe_kit._terminal.plain_text import UNSAFE, terminal_safe
 from probe_kit.errors import UsageError
@@ -116,8 +116,7 @@ class LabelTable:
 
     def numbers(self, column: str) -> list[Cell]:
         """The cells of one column, with numbers in place of the texts that spell them."""
-        spelled = ((cell, number_of(cell) if isinstance(cell, str) else None) for cell in self.columns[column])
-        return [cell if number is None else number for cell, number in spelled]
+        return [number_or_cell(cell) for cell in self.columns[column]]
 
     def _kind(self, row: int, column: str, cell: Cell) -> Kind:
         if isinstance(cell, bool):
