@@ -81,12 +81,11 @@ class Settings(Part):
     """Settings of a run of any kind; the defaults are the command line's.
 
     label: the name of the run in tables and legends; None for the model and what sets it apart, see `run_label`.
-    opens: MODULE:CLASS of the task, which is imported when a run is prepared. in_groups: whether runs come in
-    several of one label, so that all of a label's marks are needed.
+    opens: MODULE:CLASS of the task, which is imported when a run is prepared. asks: whether the model is asked.
     """
 
     opens: ClassVar[str]
-    in_groups: ClassVar[bool] = False
+    asks: ClassVar[bool] = False
 
     model: ModelSettings
     source: Annotated[SerializeAsAny[SourceSettings], BeforeValidator(_read_source)]
@@ -375,7 +374,7 @@ class AskSettings(Settings):
     """
 
     opens = "probe_kit.extract.rollout.ask:Ask"
-    in_groups = True
+    asks = True
 
     capture: AskCapture
     task: AskTask
@@ -513,7 +512,8 @@ def _short(checkpoint: str) -> str:
 def run_label(settings: Settings) -> str:
     """The name of the run in tables: checkpoints and options of one family differ in it."""
     if settings.label is not None:
-        return " · ".join([settings.label, *(settings.marks() if settings.in_groups else [])])
+        # A model is asked in several runs of one label.
+        return " · ".join([settings.label, *(settings.marks() if settings.asks else [])])
     model, parts = settings.model, [settings.model.family]
     if followed := settings.follows().get("protocol"):
         is_variant = "variant" in followed and "checkpoint" not in followed["deviations"]

@@ -4,7 +4,6 @@ import json
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from math import ceil
 from pathlib import Path
 from typing import Any
 
@@ -62,7 +61,7 @@ class Cell:
     @property
     def asks(self) -> bool:
         """Whether a VLM is asked."""
-        return self.settings.in_groups
+        return self.settings.asks
 
     @property
     def captured(self) -> bool:
@@ -96,7 +95,7 @@ class Cell:
             return 0
         if self.captured:
             return self.episodes
-        return self.episodes * ceil(self.settings.scene.max_steps / (self.settings.task.execute or 1))
+        return self.episodes * self.settings.most_inferences(self.settings.task.execute or 1)
 
     @property
     def units(self) -> float:
