@@ -21,10 +21,10 @@ class RecordingStore(WrapperStore[Store]):
     shards: number of inner chunks in every object of a sharded array, by the array's path.
     """
 
-    def __init__(self, store: Store, shards: Mapping[str, int] | None = None) -> None:
+    def __init__(self, store: Store) -> None:
         super().__init__(store)
         self.sums: dict[str, Sum] = {}
-        self.shards = dict(shards or {})
+        self.shards: dict[str, int] = {}
 
     async def set(self, key: str, value: Buffer) -> None:
         """Write one object."""

@@ -4,7 +4,7 @@ It decides only that an input is dead: one inference cannot show that a model us
 """
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import partial
 from itertools import islice
@@ -35,7 +35,7 @@ def check_inputs[Question](
     clean: Question,
     variants: Mapping[str, Iterable[Question]],
     last: "Site | None",
-    around: Callable[[Question], AbstractContextManager[None]] = lambda _: nullcontext(),
+    around: Callable[[Question], AbstractContextManager[None]],
 ) -> dict[str, Reach]:
     """Return, by input, how far a change of it came.
 
