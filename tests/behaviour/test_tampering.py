@@ -149,8 +149,6 @@ def test_more_commits_than_planned_are_found(run: Path) -> None:
 
 # -- chunks ------------------------------------------------------------------------------------------------
 
-ARRAYS = ("backbone/pooled", "backbone/tokens", "expert/pooled", "expert/tokens", "trajectory")
-
 
 def chunk(run: Path, array: str, episode: int) -> Path:
     (path,) = (path for path in (run / f"data.zarr/{array}/c/{episode}").rglob("*") if path.is_file())
@@ -324,11 +322,6 @@ def stop_after(run: Run, permutations: int, sites: int) -> None:
 
 
 # -- interventions -----------------------------------------------------------------------------------------
-
-
-def stored_intervention(run: Path) -> Path:
-    (folder,) = (run / "interventions").iterdir()
-    return folder
 
 
 def test_interventions_of_another_run_are_found(run: Path, other: Path) -> None:

@@ -1,6 +1,5 @@
 """VLM runs: what is stored, what controls say, that they resume, and that they see what policies see."""
 
-import hashlib
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -56,14 +55,6 @@ def settings(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> As
 @pytest.fixture(scope="module")
 def asked(settings: AskSettings, tmp_path_factory: pytest.TempPathFactory) -> Run:
     return ask_run(settings.changed(tokens="pooled"), tmp_path_factory.mktemp("asked") / "run")
-
-
-def files(run: Path) -> dict[str, str]:
-    return {
-        str(path.relative_to(run)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(run.rglob("*"))
-        if path.is_file() and path.parent.name not in ("certificates", "times")
-    }
 
 
 # -- what is stored --------------------------------------------------------------------------------------

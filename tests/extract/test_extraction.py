@@ -1,4 +1,3 @@
-import hashlib
 import json
 import shutil
 from dataclasses import replace
@@ -26,18 +25,10 @@ from probe_kit.hooks import Site, Tap
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.runs import open_run
 from probe_kit.suite import Suite, build_suite
+from tests.support.killed_commands import run_files
 
 SHORT = SceneSpec(max_steps=2)
 IN_HAND = SceneSpec(start_grasped=True)
-
-
-def files(run: Path) -> dict[str, str]:
-    """Hash of every file that is the same in two equal runs."""
-    return {
-        str(path.relative_to(run)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(run.rglob("*"))
-        if path.is_file() and path.parent.name not in ("certificates", "times")  # of processes
-    }
 
 
 @pytest.fixture(scope="module")
@@ -72,13 +63,13 @@ def test_an_unfinished_run_does_not_read_as_whole(two_items: Suite, tmp_path: Pa
 def test_other_settings_in_the_same_folder_are_refused_by_name(two_items: Suite, tmp_path: Path) -> None:
     settings = ExtractSettings("expert", suite=two_items.folder, scene=SHORT)
     extract_run(settings, tmp_path / "run")
-    before = files(tmp_path / "run")
+    before = run_files(tmp_path / "run")
     other = ExtractSettings("expert", suite=two_items.folder, scene=SceneSpec(max_steps=3), seed=1)
     with pytest.raises(
         SettingsMismatchError, match=r"scene\.max_steps: stored 2, asked 3\n  seed: stored 0, asked 1"
     ):
         extract_run(other, tmp_path / "run")
-    assert files(tmp_path / "run") == before
+    assert run_files(tmp_path / "run") == before
 
 
 def test_a_folder_that_is_no_run_is_left_alone(two_items: Suite, tmp_path: Path) -> None:

@@ -1,6 +1,5 @@
 """Crashes: killed and resumed equals never killed."""
 
-import hashlib
 import os
 import shutil
 import signal
@@ -15,17 +14,10 @@ from probe_kit.errors import DiskSpaceError
 from probe_kit.runs import open_run, verify_run
 from probe_kit.runs.store import locate
 from probe_kit.suite import Suite, build_suite
+from tests.runs.contents import hashes
 
 ROOT = Path(__file__).parents[2]
 KILLING = ("-m", "tests.runs.killing")
-
-
-def tree(folder: Path) -> dict[str, str]:
-    return {
-        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
 
 
 def start(run: Path, suite: Suite, *point: str) -> subprocess.Popen[bytes]:
@@ -61,7 +53,7 @@ def test_a_kill_at_any_point_of_an_episode_costs_at_most_that_episode(
     assert len(open_run(run, allow_partial=True).episodes) == committed
     assert verify_run(run, deep=True).ok
     assert start(run, suite).wait() == 0
-    assert tree(run) == tree(whole)
+    assert hashes(run) == hashes(whole)
 
 
 def test_leftovers_of_a_killed_process_are_cleared_by_the_next_owner(
@@ -74,7 +66,7 @@ def test_leftovers_of_a_killed_process_are_cleared_by_the_next_owner(
         (run / orphan).parent.mkdir(parents=True, exist_ok=True)
         (run / orphan).write_text("torn", encoding="utf-8")
     assert start(run, suite).wait() == 0
-    assert tree(run) == tree(whole)
+    assert hashes(run) == hashes(whole)
 
 
 @pytest.fixture
@@ -112,7 +104,7 @@ def test_a_full_disk_is_named_and_leaves_a_store_that_resumes(suite: Suite, whol
     assert not list(run.rglob("*.tmp"))
     subprocess.run(["mount", "-o", "remount,size=20m", str(small_disk)], check=True)
     assert start(run, suite).wait() == 0
-    assert tree(run) == tree(whole)
+    assert hashes(run) == hashes(whole)
 
 
 def test_other_errors_of_the_disk_keep_their_name(tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ import pytest
 from probe_kit.runs import verify_run
 from probe_kit.runs.store import locate
 from probe_kit.suite import Suite, build_suite
+from tests.runs import contents
 
 ROOT = Path(__file__).parents[2]
 KILLS = 50
@@ -65,10 +66,9 @@ def nursery(suite: Suite) -> Iterator[Nursery]:
 
 def objects(run: Path | str) -> dict[str, bytes]:
     """Every object by key; of probes, all but the record that tells the time."""
-    location = locate(run)
     return {
-        key: location.read(key)
-        for key in location.keys("")
+        key: content
+        for key, content in contents.objects(run).items()
         if not (key.startswith("probes/") and key.endswith("/times.json"))
     }
 

@@ -1,4 +1,3 @@
-import hashlib
 import shutil
 import subprocess
 import sys
@@ -14,6 +13,7 @@ from probe_kit.errors import RunDamagedError
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.runs import Run, open_run, seal
 from probe_kit.runs.run import NotSealedWarning
+from tests.runs.contents import hashes
 
 SITES = (Site("backbone", 2), Site("expert", 3, iteration=7))
 
@@ -21,14 +21,6 @@ SITES = (Site("backbone", 2), Site("expert", 3, iteration=7))
 @pytest.fixture
 def copy(recorded_run: Run, tmp_path: Path) -> Path:
     return Path(shutil.copytree(recorded_run.path, tmp_path / "run"))
-
-
-def tree(folder: Path) -> dict[str, str]:
-    return {
-        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
 
 
 def test_columns_hold_exactly_the_numbers_of_the_rows(recorded_run: Run, copy: Path) -> None:
@@ -44,21 +36,21 @@ def test_columns_hold_exactly_the_numbers_of_the_rows(recorded_run: Run, copy: P
 
 
 def test_sealing_again_gives_the_same_bytes_and_a_second_time_does_nothing(copy: Path) -> None:
-    before = tree(copy)
+    before = hashes(copy)
     assert not seal(copy)
     shutil.rmtree(copy / "columns.zarr")
     assert seal(copy)
-    assert tree(copy) == before
+    assert hashes(copy) == before
     shutil.rmtree(copy / "columns.zarr")
     answer = CliRunner().invoke(app, ["run", "verify", str(copy), "--seal"])
     assert (answer.exit_code, "48 of 48 episodes, sealed" in answer.stdout) == (0, True), answer.output
-    assert tree(copy) == before
+    assert hashes(copy) == before
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("finished", [True, False])
 def test_what_a_killed_seal_left_is_cleared_by_the_next_one(copy: Path, finished: bool) -> None:
-    before = tree(copy)
+    before = hashes(copy)
     left = copy / "columns.zarr" / "of-fewer"
     left.mkdir()
     (left / "zarr.json").write_bytes(b"{}")
@@ -67,16 +59,16 @@ def test_what_a_killed_seal_left_is_cleared_by_the_next_one(copy: Path, finished
         (columns / "zarr.json").write_bytes(b"{}")
         shutil.rmtree(copy / "sealed")
     seal(copy)
-    assert tree(copy) == before
+    assert hashes(copy) == before
 
 
 @pytest.mark.slow
 def test_a_slab_smaller_than_the_run_changes_nothing(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    before = tree(copy)
+    before = hashes(copy)
     shutil.rmtree(copy / "columns.zarr")
     monkeypatch.setattr("probe_kit.runs.sealing.SLAB_BYTES", 3 * 48 * 96 * 4)
     seal(copy)
-    assert tree(copy) == before
+    assert hashes(copy) == before
 
 
 @pytest.mark.filterwarnings("ignore:.*is not sealed")
