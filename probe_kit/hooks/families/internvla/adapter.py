@@ -45,7 +45,6 @@ from probe_kit.models.statistics_choice import STATISTICS_FILE
 DEFAULT_CHECKPOINT = "InternRobotics/InternVLA-M1-Pretrain-RT-1-Bridge"
 STEPS, GUIDANCE = 10, 1.5
 """As the released evaluation runs it."""
-_TIED = ("qwen_vl_interface.model.lm_head.weight",)
 _BLOCK = ("residual", "attention", "mlp")
 _UNCONDITIONAL = "expert_unconditional"
 
@@ -291,7 +290,5 @@ def load_internvla(
         dtype,
         random_weights,
         weights_seed,
-        tied=lambda _: _TIED if parts.config.vlm.tie_word_embeddings else (),
-        tie=lambda network: network.vlm.tie_weights(),
     )
     return InternVLA(loaded, parts, unnorm_key, steps, guidance, tokenizer)

@@ -64,8 +64,6 @@ def load_checkpoint(
         chosen_dtype(dtype, config.dtype, DTYPES),
         random_weights,
         weights_seed,
-        tied=lambda _: {"language_model.lm_head.weight"} if config.text.tie_word_embeddings else (),
-        tie=lambda network: network.language_model.tie_weights(),
         tensors_of=tensors_of,
         draw=_draw,
     )

@@ -1,6 +1,6 @@
 """Loading of native networks from files or with random weights, and the card of what was loaded."""
 
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -84,8 +84,6 @@ def load_network[Network: nn.Module](
     random_weights: bool,
     weights_seed: int,
     *,
-    tied: Callable[[Network], Collection[str]] = lambda _: (),
-    tie: Callable[[Network], object] = _nothing,
     name_in_module: Callable[[str], str] = str,
     tensors_of: Callable[[Weights], Mapping[str, Tensor]] | None = None,
     draw: Callable[[Network, int], object] = initialise,
@@ -93,11 +91,12 @@ def load_network[Network: nn.Module](
 ) -> Loaded[Network]:
     """Load the network that `build(dtype, device)` makes, with exactly the weights of `read()` or random ones.
 
-    dtype: float32 or bfloat16; default that of the tensors in the file, float32 for random weights. tied: names of
-    parameters that are another one's double, which a file may leave out. tie: ties them again. name_in_module: the
-    network's name of a tensor in the file. tensors_of: the tensors under the network's names, where that is not
-    all. draw: random weights of a seed. finish: called with the whole network, before it goes to the device.
-    Raises UsageError for another dtype, WeightsError for weights that are not exactly the network's.
+    A file may leave out parameters that are another one's double, such as tied output weights.
+
+    dtype: float32 or bfloat16; default that of the tensors in the file, float32 for random weights.
+    name_in_module: the network's name of a tensor in the file. tensors_of: the tensors under the network's names,
+    where that is not all. draw: random weights of a seed. finish: called with the whole network, before it goes to
+    the device. Raises UsageError for another dtype, WeightsError for weights that are not exactly the network's.
     """
     if random_weights:
         name = checked_dtype(dtype or "float32")
@@ -110,8 +109,7 @@ def load_network[Network: nn.Module](
         name = checked_dtype(dtype or _stored_dtype(weights))
         network = build(DTYPES[name], "meta")
         tensors = tensors_of(weights) if tensors_of else renamed_tensors(weights, name_in_module)
-        typed = as_dtype(tensors, DTYPES[name])
-        audit = assign_weights(network, weights, typed, tied(network), lambda: tie(network), name_in_module)
+        audit = assign_weights(network, weights, as_dtype(tensors, DTYPES[name]), name_in_module)
     network.requires_grad_(False)
     finish(network)
     seed = weights_seed if random_weights else None
@@ -131,25 +129,32 @@ def assign_weights(
     network: nn.Module,
     weights: Weights,
     tensors: Mapping[str, Tensor],
-    tied: Collection[str],
-    tie: Callable[[], object],
-    name_in_module: Callable[[str], str] = str,
+    name_in_module: Callable[[str], str],
 ) -> WeightsAudit:
-    """Make `tensors` the parameters of a network on the meta device.
+    """Make `tensors` the parameters of a network on the meta device, and tie doubles again.
 
-    tied: parameters that are another one's double, which a file may leave out. tie: ties them again. Raises
-    WeightsError for a double with other numbers, for tensors without memory, and what `load_weights` raises.
+    Raises WeightsError for a double with other numbers and for tensors without memory, and what `load_weights`
+    raises.
     """
+    tied = doubles(network)
     audit = load_weights(network, weights, tensors, tied, assign=True, name_in_module=name_in_module)
-    tie()
-    for double in set(tied) & set(tensors):
-        if not torch.equal(network.state_dict()[double], tensors[double]):
+    for double, original in tied.items():
+        module, _, name = double.rpartition(".")
+        setattr(network.get_submodule(module), name, network.get_parameter(original))
+        if double in tensors and not torch.equal(network.state_dict()[double], tensors[double]):
             raise WeightsError(
                 f"{weights.source}: {double} differs from the tensor that config.json ties it to "
                 "(tie_word_embeddings); one of the two files is another model's"
             )
     _check_filled(network, weights.source)
     return audit
+
+
+def doubles(network: nn.Module) -> dict[str, str]:
+    """Parameters that are another one's double, with the name of that one."""
+    names = {id(parameter): name for name, parameter in network.named_parameters()}
+    every = network.named_parameters(remove_duplicate=False)
+    return {name: names[id(parameter)] for name, parameter in every if names[id(parameter)] != name}
 
 
 def as_dtype(tensors: Mapping[str, Tensor], dtype: torch.dtype) -> dict[str, Tensor]:

@@ -52,7 +52,6 @@ from probe_kit.models.xiaomi.robots import DEFAULT_ROBOT, STATISTICS_FILE
 DEFAULT_CHECKPOINT = "XiaomiRobotics/Xiaomi-Robotics-0-SimplerEnv-WidowX"
 EXECUTE = 4
 """Actions the released evaluation carries out before it looks again."""
-_TIED = ("vlm.lm_head.weight",)
 
 
 class Xiaomi(QwenVLA):
@@ -282,7 +281,5 @@ def load_xiaomi(
         kind,
         random_weights,
         weights_seed,
-        tied=lambda _: _TIED if config.vlm.tie_word_embeddings else (),
-        tie=lambda network: network.vlm.tie_weights(),
     )
     return Xiaomi(loaded, config, robot, steps, tokenizer, openness)

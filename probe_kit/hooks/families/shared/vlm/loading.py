@@ -8,7 +8,6 @@ from typing import Any
 
 import torch
 from huggingface_hub.errors import StrictDataclassError
-from torch import nn
 
 from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import CheckpointError, UsageError
@@ -70,8 +69,6 @@ def load_vlm(
         dtype,
         random_weights,
         weights_seed,
-        tied=doubles,
-        tie=lambda network: network.tie_weights(),
         name_in_module=lambda name: renamed(name, recipe.names),
     )
 
@@ -87,13 +84,3 @@ def _describing(file: Path) -> Iterator[None]:
             f"{file} describes no network of this family ({type(error).__name__}: {reason}); download it "
             "again, or pass the right --model"
         ) from error
-
-
-def doubles(network: nn.Module) -> tuple[str, ...]:
-    """Parameters that are another one's double, such as tied output weights: files hold one of them."""
-    first: dict[int, str] = {}
-    names = []
-    for name, tensor in network.state_dict(keep_vars=True).items():
-        if first.setdefault(id(tensor), name) != name:
-            names.append(name)
-    return tuple(names)
