@@ -38,6 +38,23 @@ def fill_decoder_rotary(language_model: Any) -> None:
     decoder.rotary_emb = type(decoder.rotary_emb)(config=language_model.config)
 
 
+def last_logits(language_model: Any, embeddings: Tensor, mask: Tensor, cache: DynamicCache) -> Tensor:
+    """(B, V) logits behind the last position, in one pass of a language model.
+
+    embeddings: (B, T, D) of what is new. mask: (B, past + T) bool, False at padding.
+    """
+    output = language_model(
+        inputs_embeds=embeddings,
+        position_ids=positions(mask)[:, -embeddings.shape[1] :],
+        attention_mask=needed(mask),
+        past_key_values=cache,
+        use_cache=True,
+        logits_to_keep=1,
+    )
+    logits: Tensor = output.logits[:, -1]
+    return logits
+
+
 @dataclass(frozen=True)
 class Decoded:
     """Tokens behind a prompt: ids (B, N) int64, and the logits (B, N, V) that chose them.
@@ -67,24 +84,9 @@ class TokenNetwork(nn.Module):
             output_hidden_states=True,
         )
 
-    def next_logits(
-        self, embeddings: Tensor, mask: Tensor, cache: DynamicCache, language_model: Any = None
-    ) -> Tensor:
-        """(B, V) logits behind the last position.
-
-        embeddings: (B, T, D) of what is new. mask: (B, past + T) bool, False at padding. language_model: another
-        one with the same weights, through which the pass goes.
-        """
-        output = (self.language_model if language_model is None else language_model)(
-            inputs_embeds=embeddings,
-            position_ids=positions(mask)[:, -embeddings.shape[1] :],
-            attention_mask=needed(mask),
-            past_key_values=cache,
-            use_cache=True,
-            logits_to_keep=1,
-        )
-        logits: Tensor = output.logits[:, -1]
-        return logits
+    def next_logits(self, embeddings: Tensor, mask: Tensor, cache: DynamicCache) -> Tensor:
+        """(B, V) logits behind the last position; see `last_logits`."""
+        return last_logits(self.language_model, embeddings, mask, cache)
 
     def decode_behind(
         self, embeddings: Tensor, mask: Tensor, steps: int, choose: Choose = greedy, fed: Tensor | None = None
@@ -107,12 +109,3 @@ class TokenNetwork(nn.Module):
             following = ids[-1] if fed is None else fed[:, len(ids) - 1]
             embeddings = self.language_model.get_input_embeddings()(following[:, None])
             mask = torch.cat([mask, torch.ones_like(mask[:, :1])], dim=1)
-
-    def logits_behind(self, decoded: Decoded, language_model: Any) -> Tensor:
-        """(B, V) logits behind the last id, through another language model with the same weights.
-
-        `decoded` cannot be continued afterwards: its cache has grown.
-        """
-        more = decoded.mask.new_ones(decoded.ids.shape)
-        embeddings = language_model.get_input_embeddings()(decoded.ids[:, -1:])
-        return self.next_logits(embeddings, torch.cat([decoded.mask, more], dim=1), decoded.cache, language_model)

@@ -11,7 +11,7 @@ from torch import Tensor
 from transformers import LlamaForCausalLM
 
 from probe_kit.models.building import build_empty
-from probe_kit.models.decoding import Choose, Decoded, TokenNetwork, fill_decoder_rotary, greedy
+from probe_kit.models.decoding import Choose, Decoded, TokenNetwork, fill_decoder_rotary, greedy, last_logits
 from probe_kit.models.magma.config import MagmaConfig
 from probe_kit.models.magma.packing import PictureSpan, placeholder
 from probe_kit.models.magma.pictures import Grid, Picture
@@ -106,6 +106,16 @@ class MagmaNetwork(TokenNetwork):
         twin.load_state_dict(self.language_model.state_dict(keep_vars=True), strict=True, assign=True)
         twin.model.rotary_emb = self.language_model.model.rotary_emb
         return twin.eval()
+
+    @staticmethod
+    def logits_behind(decoded: Decoded, language_model: Any) -> Tensor:
+        """(B, V) logits behind the last id, through another language model with the same weights.
+
+        `decoded` cannot be continued afterwards: its cache has grown.
+        """
+        more = decoded.mask.new_ones(decoded.ids.shape)
+        embeddings = language_model.get_input_embeddings()(decoded.ids[:, -1:])
+        return last_logits(language_model, embeddings, torch.cat([decoded.mask, more], dim=1), decoded.cache)
 
 
 def build_magma(config: MagmaConfig, dtype: torch.dtype, device: str = "meta") -> MagmaNetwork:

@@ -138,11 +138,8 @@ class SpatialVLANetwork(TokenNetwork):
             output_hidden_states=past is None,
         )
 
-    def next_logits(
-        self, embeddings: Tensor, mask: Tensor, cache: DynamicCache, language_model: Any = None
-    ) -> Tensor:
-        """See the base: in one pass through its own language model, whose mask is another one."""
-        assert language_model is None
+    def next_logits(self, embeddings: Tensor, mask: Tensor, cache: DynamicCache) -> Tensor:
+        """See the base; its language model's mask is another one."""
         logits: Tensor = self(embeddings, mask, cache, keep=1).logits[:, -1]
         return logits
 
