@@ -271,9 +271,10 @@ class Family:
         return self.declared.get(size or next(iter(self.declared), ""))
 
     def streams_text(self) -> str:
-        """The streams of the default size in words."""
-        declared = next(iter(self.declared.values()), ())
-        return ", ".join(str(each) for each in declared) or self.streams
+        """The streams of the default size in words, with its name where there are several."""
+        size, declared = next(iter(self.declared.items()), ("", ()))
+        text = ", ".join(map(str, declared)) or self.streams
+        return f"{text} ({size})" if size else text
 
     def weights_bytes(
         self, options: Mapping[str, Any], dtype: Dtype = "float32", parameters: int | None = None

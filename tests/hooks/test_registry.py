@@ -38,6 +38,19 @@ def test_a_third_party_cannot_replace_an_embedded_family(monkeypatch: pytest.Mon
     assert known_families()["pi0"] is not impostor
 
 
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("pi0", "backbone 19 layers, expert 19 layers x 10 iterations"),
+        ("openvla", "backbone 33 layers, action 33 layers x 7 action tokens"),
+        ("qwen2.5-vl", "backbone 29 layers, answer 29 layers (7B)"),
+        ("pi0-tiny", "backbone 4 layers, expert 4 layers x 10 iterations"),
+    ],
+)
+def test_streams_in_words_tell_tokens_from_iterations_and_name_the_size(name: str, words: str) -> None:
+    assert known_families()[name].streams_text() == words
+
+
 def test_a_family_that_cannot_be_verified_says_so() -> None:
     with pytest.raises(UsageError, match="pi0-tiny has no full-size"):
         known_families()["pi0-tiny"].function("full_size")

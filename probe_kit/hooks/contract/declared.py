@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from probe_kit.hooks.contract.sites import Stream
+from probe_kit.hooks.contract.summary import layers_text
 
 TEXT = ("language", "special")
 
@@ -20,10 +21,8 @@ class DeclaredStream:
     roles: tuple[str, ...]
 
     def __str__(self) -> str:
-        """The stream in words, such as `expert 19 layers x 10 iterations`."""
-        stream = self.stream
-        times = "" if stream.iterations in (None, 1) else f" x {stream.iterations} iterations"
-        return f"{stream.name} {stream.layers} layers{times}"
+        """The stream in words: `expert 19 layers x 10 iterations`, `action 9 layers x 7 action tokens`."""
+        return layers_text(self.stream, "iterations" if self.tokens > 1 else f"{self.stream.name} tokens")
 
 
 def backbone(

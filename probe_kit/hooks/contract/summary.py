@@ -10,15 +10,15 @@ if TYPE_CHECKING:
     from probe_kit.hooks.contract.sites import Stream
 
 
-def stream_text(stream: "Stream") -> str:
-    """`expert 4 layers x 10 iterations x 64`."""
-    iterations = f" x {stream.iterations} iterations" if stream.iterations else ""
-    return f"{stream.name} {stream.layers} layers{iterations} x {stream.width}"
+def layers_text(stream: "Stream", unit: str = "iterations") -> str:
+    """`expert 4 layers x 10 iterations`. unit: the name of an iteration."""
+    times = "" if stream.iterations in (None, 1) else f" x {stream.iterations} {unit}"
+    return f"{stream.name} {stream.layers} layers{times}"
 
 
 def streams_text(streams: "Iterable[Stream]") -> str:
-    """All streams in one line; `none` if there are none."""
-    return "; ".join(map(stream_text, streams)) or "none"
+    """All streams in one line, such as `expert 4 layers x 10 iterations x 64`; `none` if there are none."""
+    return "; ".join(f"{layers_text(stream)} x {stream.width}" for stream in streams) or "none"
 
 
 def parameters_text(parameters: int) -> str:

@@ -26,7 +26,7 @@ FAMILIES = (
         notes=(
             "Gemma licence; tokenizer google/paligemma-3b-pt-224 is gated. The FAST tokenizer is read as data, "
             "without its remote code. Head and embedding are two: 3.4 billion parameters, 14 GB in float32. The "
-            "base can be captured without acting (--no-act)"
+            "base can be captured without acting (--no-act). A chunk is a variable number of tokens"
         ),
         source="paligemma",
         source_weights=SourceWeights("google/paligemma-3b-pt-224", parameters=2_923_466_480),

@@ -27,7 +27,7 @@ FAMILIES = (
         "XiaomiRobotics/Xiaomi-Robotics-0-SimplerEnv-WidowX",
         "probe_kit.hooks.families.xiaomi.adapter:load_xiaomi",
         embodiment="as the robot of -M robot; bridge: WidowX end-effector delta at 5 Hz",
-        notes="Apache-2.0; 9.4 GB in bfloat16",
+        notes="Apache-2.0; 9.4 GB in bfloat16; the expert's layers renormalise their stream inside",
         outputs="probe_kit.hooks.families.xiaomi.outputs:xiaomi_outputs",
         source="qwen3-vl",
         source_weights=SourceWeights("Qwen/Qwen3-VL-4B-Instruct", parameters=4_437_815_808),
