@@ -2,7 +2,7 @@
 
 from probe_kit.hooks.contract.declared import answering
 from probe_kit.hooks.contract.options import Option
-from probe_kit.hooks.families.shared.kinds import TOKENIZER_FILE, answering_family
+from probe_kit.hooks.families.shared.kinds import TOKENIZER_FOLDER, answering_family
 
 FAMILIES = (
     answering_family(
@@ -30,7 +30,7 @@ FAMILIES = (
             Option(
                 "tiles", str, "1: every picture as one tile; auto: as released.", "auto", choices=("auto", "1")
             ),
-            TOKENIZER_FILE,
+            TOKENIZER_FOLDER,
         ),
     ),
 )

@@ -1,8 +1,7 @@
 """Ovis2.5, native."""
 
 from probe_kit.hooks.contract.declared import answering
-from probe_kit.hooks.contract.options import Option as Option
-from probe_kit.hooks.families.shared.kinds import TOKENIZER_FILE, answering_family
+from probe_kit.hooks.families.shared.kinds import TOKENIZER_FOLDER, answering_family
 
 FAMILIES = (
     answering_family(
@@ -15,6 +14,6 @@ FAMILIES = (
         declared={"": answering(37, 4096, 240)},
         full_size="probe_kit.models.ovis2_5:full_size_ovis2_5",
         parameters={"": 9_174_807_784},
-        options=(TOKENIZER_FILE,),
+        options=(TOKENIZER_FOLDER,),
     ),
 )

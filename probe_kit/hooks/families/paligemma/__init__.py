@@ -2,8 +2,7 @@
 
 from probe_kit.hooks.contract.declared import answering
 from probe_kit.hooks.contract.default_scene import EMBEDDED
-from probe_kit.hooks.contract.options import Option as Option
-from probe_kit.hooks.families.shared.kinds import TOKENIZER_FILE, answering_family
+from probe_kit.hooks.families.shared.kinds import TOKENIZER_FOLDER, answering_family
 
 FAMILIES = (
     answering_family(
@@ -28,6 +27,6 @@ FAMILIES = (
         full_size="probe_kit.models.paligemma:full_size_paligemma",
         parameters={"": 2_923_466_480},
         stored_names="probe_kit.models.paligemma:FILE_NAMES",
-        options=(TOKENIZER_FILE,),
+        options=(TOKENIZER_FOLDER,),
     ),
 )

@@ -1,8 +1,7 @@
 """Qwen2.5-VL, on transformers' own network."""
 
 from probe_kit.hooks.contract.declared import answering
-from probe_kit.hooks.contract.options import Option as Option
-from probe_kit.hooks.families.shared.kinds import TOKENIZER_FILE, answering_family
+from probe_kit.hooks.families.shared.kinds import TOKENIZER_FOLDER, answering_family
 
 FAMILIES = (
     answering_family(
@@ -25,6 +24,6 @@ FAMILIES = (
             ("32B", "Qwen/Qwen2.5-VL-32B-Instruct"),
             ("3B", "Qwen/Qwen2.5-VL-3B-Instruct"),
         ),
-        options=(TOKENIZER_FILE,),
+        options=(TOKENIZER_FOLDER,),
     ),
 )

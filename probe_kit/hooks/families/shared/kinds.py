@@ -39,7 +39,7 @@ MAPS = replace(
 """The same, where a picture becomes maps of several crops."""
 
 _FAMILIES = "probe_kit.hooks.families"
-TOKENIZER_FILE = Option("tokenizer", str, "Folder of another tokenizer.json.", "the checkpoint's", is_path=True)
+TOKENIZER_FOLDER = Option("tokenizer", str, "Folder of another tokenizer.json.", "the checkpoint's", is_path=True)
 
 
 def lerobot_family(name: str, description: str, checkpoint: str | None, adapter: str, **fields: Any) -> Family:

@@ -7,7 +7,7 @@ from probe_kit.hooks.contract.options import Option
 from probe_kit.hooks.contract.protocol import ACT2ANSWER, ProtocolRow
 from probe_kit.hooks.contract.sites import QUANTITIES
 from probe_kit.hooks.contract.state_layout import OPENNESS
-from probe_kit.hooks.families.shared.kinds import MERGED
+from probe_kit.hooks.families.shared.kinds import MERGED, TOKENIZER_FOLDER
 from probe_kit.hooks.family import Family
 
 _EXPERT = ("residual", "attention", "middle", "mlp")
@@ -44,7 +44,7 @@ FAMILIES = (
         options=(
             Option("robot", str, "Robot whose statistics, picture and state are used.", "the only one"),
             Option("steps", int, "Euler steps of the flow.", "5"),
-            Option("tokenizer", str, "Folder of another tokenizer.json.", "the checkpoint's", is_path=True),
+            TOKENIZER_FOLDER,
             Option("openness", str, "release: as Act2Answer's evaluation has it.", "measured", OPENNESS),
         ),
         protocols={
