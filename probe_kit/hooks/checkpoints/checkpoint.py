@@ -19,6 +19,7 @@ from probe_kit.hooks.checkpoints.hub import (
 from probe_kit.models.bounds import check_sizes
 
 CONFIG_FILE, ADAPTER_FILE = "config.json", "adapter_config.json"
+GENERATION_FILE = "generation_config.json"
 WEIGHTS_FILE, INDEX_FILE = "model.safetensors", "model.safetensors.index.json"
 
 # What decides how a model is built and spoken to, and the beginnings of names that hold weights or list them.

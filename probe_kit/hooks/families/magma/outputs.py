@@ -19,6 +19,7 @@ from probe_kit.hooks.capturing.capture_context import ActivationCache
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.hooks.families.magma.adapter import BINS, Magma
 from probe_kit.hooks.families.openvla.actions import ActionTokens
+from probe_kit.hooks.families.shared.tokenizer_file import token_ids_of
 from probe_kit.hooks.verification.outputs import (
     Arrays,
     Outputs,
@@ -79,7 +80,7 @@ class _Reference:
     def _choose(self) -> Choose:
         """The likeliest token that does not end the turn: the recording asked for a fixed number of them."""
         end = self.client.get("special_ids", {}).get("eos", self.model.config.text.eos_token_id)
-        ends = [int(number) for number in (end if isinstance(end, list) else [end]) if number is not None]
+        ends = sorted(token_ids_of(end))
 
         def choose(logits: Tensor) -> Tensor:
             return logits.index_fill(1, torch.tensor(ends, dtype=torch.long), float("-inf")).argmax(dim=-1)

@@ -4,12 +4,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 from probe_kit._system.bounded_files import read_regular_text
-from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import CheckpointError
-from probe_kit.hooks.families.shared.tokenizer_file import TokenizerFile, first_behind, positions_of
+from probe_kit.hooks.checkpoints.checkpoint import GENERATION_FILE
+from probe_kit.hooks.families.shared.tokenizer_file import (
+    TokenizerFile,
+    first_behind,
+    positions_of,
+    token_ids_of,
+    values_of,
+)
 from probe_kit.models.magma import MagmaConfig, chat_text, conversation, picture_question
 
 
@@ -74,11 +79,8 @@ class ChatText(TokenizerFile):
     @cached_property
     def ends(self) -> frozenset[int]:
         """Ids that end the assistant's turn."""
-        file = self.folder / "generation_config.json"
-        stored = load_json(file).get("eos_token_id") if file.is_file() else None
-        stored_ends: list[Any] = [self.config.text.eos_token_id, stored, self.tokenizer.token_to_id("<|eot_id|>")]
-        flat = [number for entry in stored_ends for number in (entry if isinstance(entry, list) else [entry])]
-        return frozenset(int(number) for number in flat if number is not None)
+        stored = values_of(self.folder / GENERATION_FILE).get("eos_token_id")
+        return token_ids_of(self.config.text.eos_token_id, stored, self.tokenizer.token_to_id("<|eot_id|>"))
 
     def prompt(self, question: str, begun: str = "", pictured: bool = True) -> TokenPrompt:
         """The whole prompt of a question about one picture, or in words alone.

@@ -29,13 +29,13 @@ from probe_kit.hooks.families.prismatic.checkpoint import LoadedPrismatic, load_
 from probe_kit.hooks.families.prismatic.frames import TextFrame, frame_of
 from probe_kit.hooks.families.prismatic.tokenizer import ByteTokenizer, TextTokenizer, find_tokenizer, id_behind
 from probe_kit.hooks.families.shared.token_decoder import TokenDecoder
+from probe_kit.hooks.families.shared.tokenizer_file import SETTINGS_FILE, TOKENIZER_FILE, token_ids_of
 from probe_kit.hooks.families.shared.vlm.decoding import Prefill, SpeakingModel
 from probe_kit.models.decoding import Choose, Decoded, greedy
 from probe_kit.models.packing import Packed
 from probe_kit.models.prismatic import PictureSettings, PrismaticNetwork, prepare_picture
 
 DEFAULT_CHECKPOINT = "TRI-ML/prismatic-vlms/prism-dinosiglip-224px+7b"
-_TOKENIZER_FILES = ("tokenizer.json", "tokenizer_config.json")
 
 
 class PrismaticModel(TokenDecoder):
@@ -222,8 +222,7 @@ class Prismatic(PrismaticModel, SpeakingModel):
     @cached_property
     def ends(self) -> frozenset[int]:
         """Ids that end an answer."""
-        end = self.config.text.eos_token_id
-        return frozenset(int(number) for number in (end if isinstance(end, list) else [end]) if number is not None)
+        return token_ids_of(self.config.text.eos_token_id)
 
 
 def load_prismatic(
@@ -249,7 +248,7 @@ def load_prismatic(
     if (
         tokenizer is None
         and elsewhere
-        and not any((folder / "tokenizer.json").is_file() for folder in loaded.folders)
+        and not any((folder / TOKENIZER_FILE).is_file() for folder in loaded.folders)
     ):
-        loaded = replace(loaded, text=checkpoint_folder(elsewhere, _TOKENIZER_FILES))
+        loaded = replace(loaded, text=checkpoint_folder(elsewhere, (TOKENIZER_FILE, SETTINGS_FILE)))
     return Prismatic(loaded, steps, tokenizer)

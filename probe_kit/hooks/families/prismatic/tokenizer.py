@@ -7,7 +7,13 @@ from pathlib import Path
 from typing import Protocol
 
 from probe_kit.errors import CheckpointError
-from probe_kit.hooks.families.shared.tokenizer_file import TokenizerFile, first_behind, positions_of
+from probe_kit.hooks.families.shared.tokenizer_file import (
+    SETTINGS_FILE,
+    TOKENIZER_FILE,
+    TokenizerFile,
+    first_behind,
+    positions_of,
+)
 
 BYTES = "bytes"
 """Asks for `ByteTokenizer`."""
@@ -110,10 +116,10 @@ def find_tokenizer(
         return ByteTokenizer(1 if beginning is None else beginning)
     places = list(folders) if tokenizer is None else [Path(tokenizer).expanduser()]
     for folder in places:
-        if (folder / "tokenizer.json").is_file():
+        if (folder / TOKENIZER_FILE).is_file():
             return FileTokenizer(folder, beginning)
     raise CheckpointError(
-        f"tokenizer.json and tokenizer_config.json are missing in {' and '.join(map(str, places))}. The tokenizer "
+        f"{TOKENIZER_FILE} and {SETTINGS_FILE} are missing in {' and '.join(map(str, places))}. The tokenizer "
         "comes with the checkpoint: copy these files from the model's page, or from the model it was fine-tuned "
         f"from, or name their folder with -M tokenizer=DIR. For a development checkpoint that has none: "
         f"-M tokenizer={BYTES}"

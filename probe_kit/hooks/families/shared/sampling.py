@@ -8,12 +8,12 @@ from torch import Tensor
 
 from probe_kit._system.bounded_json import read_json_object
 from probe_kit.errors import CheckpointError, UsageError
+from probe_kit.hooks.checkpoints.checkpoint import GENERATION_FILE
 from probe_kit.models.decoding import Choose, greedy
 
 # What `generate` of transformers 4 keeps of the distribution by default.
 TOP = 50
 ALL, CHECKPOINT = "all", "checkpoint"
-_GENERATION_FILE = "generation_config.json"
 # Settings of generation that shape the draw and are not followed here, with the values that change nothing.
 _NEUTRAL = {
     "top_p": 1, "min_p": 0, "typical_p": 1, "epsilon_cutoff": 0, "eta_cutoff": 0, "repetition_penalty": 1,
@@ -70,9 +70,7 @@ def top_of(top_k: str, folders: Sequence[Path]) -> int | None:
     if top_k == ALL:
         return None
     if top_k == CHECKPOINT:
-        file = next(
-            (folder / _GENERATION_FILE for folder in folders if (folder / _GENERATION_FILE).is_file()), None
-        )
+        file = next((folder / GENERATION_FILE for folder in folders if (folder / GENERATION_FILE).is_file()), None)
         return TOP if file is None else _stored_top(file)
     if not top_k.isdecimal() or int(top_k) < 1:
         raise UsageError(f"top_k is {top_k!r}; expected a number from 1 on, {ALL} or {CHECKPOINT}")

@@ -118,6 +118,12 @@ def first_behind(before: Sequence[int], extended: Sequence[int], option: str) ->
     return int(extended[count])
 
 
+def token_ids_of(*stored: Any) -> frozenset[int]:
+    """The ids in values of configurations, each of which is an id, a list of them, or None."""
+    flat = [number for value in stored for number in (value if isinstance(value, list) else [value])]
+    return frozenset(int(number) for number in flat if number is not None)
+
+
 def values_of(file: Path) -> dict[str, Any]:
     """A file's values; none without it. Raises CheckpointError for one that is not JSON."""
     if not file.is_file():

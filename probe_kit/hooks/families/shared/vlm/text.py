@@ -7,9 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from probe_kit.errors import CheckpointError
-from probe_kit.hooks.families.shared.tokenizer_file import TokenizerFile, first_behind, positions_of, values_of
-
-GENERATION_FILE = "generation_config.json"
+from probe_kit.hooks.checkpoints.checkpoint import GENERATION_FILE
+from probe_kit.hooks.families.shared.tokenizer_file import (
+    TokenizerFile,
+    first_behind,
+    positions_of,
+    values_of,
+)
 
 
 @dataclass(frozen=True)
