@@ -106,9 +106,11 @@ def show(
     recorded action has an error of 1. `--json` prints every episode too; `probe-kit labels RUN` writes the
     error of every frame. An unfinished run needs --partial for it.
     """
-    from probe_kit.intervene.results.inventory import listed_interventions, unfinished_interventions
+    from probe_kit.intervene.results.inventory import listed_interventions
     from probe_kit.runs import label_run, open_run
     from probe_kit.runs.certificates import input_notes
+    from probe_kit.runs.layout import INTERVENTIONS
+    from probe_kit.runs.results import unfinished_bundles
     from probe_kit.train.commands import facts_table
     from probe_kit.train.results.inventory import inventory
     from probe_kit.train.results.store import how_to_probe
@@ -122,7 +124,7 @@ def show(
         return
     opened = open_run(run, allow_partial=True)
     facts, interventions = inventory(opened), listed_interventions(opened)
-    unfinished = unfinished_interventions(opened.location)
+    unfinished = unfinished_bundles(opened.location, INTERVENTIONS)
     notes = input_notes(opened.certificate) if facts.episodes else []
     if as_json:
         listed = [asdict(intervention) for intervention in interventions]

@@ -233,6 +233,13 @@ def bundle_keys(location: Location, home: str) -> list[str]:
     ]
 
 
+def unfinished_bundles(location: Location, home: str) -> dict[str, int]:
+    """Return by key how many pieces are stored of each bundle whose making was interrupted or failed."""
+    parts = (key.split("/") for key in location.keys(home))
+    names = [path[1] for path in parts if len(path) > 2 and path[1].startswith(".") and path[1].endswith(PARTIAL)]
+    return {name.removeprefix(".").removesuffix(PARTIAL): names.count(name) for name in dict.fromkeys(names)}
+
+
 def complete_key(key: str, stored: Collection[str], location: Location, kind: str) -> str:
     """The stored key that `key` is, or begins. kind: what is stored, in the plural, for messages.
 

@@ -9,10 +9,8 @@ from probe_kit._system.counting import counted
 from probe_kit.intervene.kinds import kind_names, kind_of
 from probe_kit.intervene.outcomes import StoredIntervention, read_interventions, stored_interventions
 from probe_kit.intervene.results.results import effects_of
-from probe_kit.runs.layout import INTERVENTIONS
-from probe_kit.runs.location import Location
 from probe_kit.runs.reader import RunReader
-from probe_kit.runs.results import PARTIAL, Bundle
+from probe_kit.runs.results import Bundle
 from probe_kit.runs.run import Run
 
 COMMON = frozenset(
@@ -67,13 +65,6 @@ def listed_interventions(run: Any) -> list[ListedIntervention]:
     used = {key for reader in readers for key in _used(reader)}
     listed = [_listed(bundle, current, used) for bundle in read_interventions(run.location).values()]
     return sorted(listed, key=lambda intervention: (intervention.created, intervention.key))
-
-
-def unfinished_interventions(location: Location) -> dict[str, int]:
-    """Number of finished items of every intervention that was interrupted, by the key it will have."""
-    parts = (key.split("/") for key in location.keys(INTERVENTIONS))
-    names = [path[1] for path in parts if len(path) > 2 and path[1].startswith(".") and path[1].endswith(PARTIAL)]
-    return {name.removeprefix(".").removesuffix(PARTIAL): names.count(name) for name in dict.fromkeys(names)}
 
 
 def _used(run: RunReader) -> set[str]:

@@ -5,12 +5,12 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
+from probe_kit.runs.layout import PROBES
 from probe_kit.runs.reader import RunReader
-from probe_kit.runs.results import Bundle
+from probe_kit.runs.results import Bundle, unfinished_bundles
 from probe_kit.runs.run import Run
 from probe_kit.train.choices import CORRECT
 from probe_kit.train.results.control_scores import UNTRAINED
-from probe_kit.train.results.resume import unfinished_sweeps
 from probe_kit.train.results.store import (
     is_current,
     load_results,
@@ -88,7 +88,7 @@ def inventory(run: Any) -> Inventory:
         outcomes={str(name): int(count) for name, count in episodes["outcome"].value_counts().items()},
         streams={name: _words(run, name) for name in run.streams},
         probes=tuple(stored_probes(run)),
-        unfinished=unfinished_sweeps(run.location),
+        unfinished=unfinished_bundles(run.location, PROBES),
         wordings={name: len(run.in_wording(name).episodes) for name in run.wordings},
     )
 

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.runs.layout import PROBES
-from probe_kit.runs.results import PARTIAL
 from probe_kit.runs.resume_pieces import Pieces
 from probe_kit.runs.store import Location
 from probe_kit.train.crossval.site_probe import SiteProbe
@@ -52,10 +51,3 @@ class SweepCheckpoint:
     def discard(self) -> None:
         """Remove everything: the sweep is complete."""
         self.pieces.discard()
-
-
-def unfinished_sweeps(run: Location) -> dict[str, int]:
-    """Number of finished sites of every sweep that was interrupted or failed, by the key its results will have."""
-    parts = (key.split("/") for key in run.keys(PROBES))
-    names = [path[1] for path in parts if len(path) > 2 and path[1].startswith(".") and path[1].endswith(PARTIAL)]
-    return {name[1:].removesuffix(PARTIAL): names.count(name) for name in dict.fromkeys(names)}
