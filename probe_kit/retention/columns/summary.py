@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from probe_kit._tables.numbers import Limits, number, points, signed, whole_percent, with_limits
+from probe_kit._tables.numbers import Limits, points, signed, whole_percent, with_limits
 from probe_kit._tables.table import Cell, Heading, Row, Table
 from probe_kit.intervene.results.verdict import describe_readouts
 from probe_kit.retention.columns.findings import finding
@@ -17,6 +17,7 @@ from probe_kit.retention.columns.text import (
     model_name,
     models_p,
     name_of,
+    retention_value,
     title_of,
 )
 from probe_kit.retention.compare.compare import Difference
@@ -115,9 +116,7 @@ def _above(part: StreamPart) -> str:
 def _retention(row: RetentionRow) -> str:
     if any(part.score is None and part.above is None for part in (row.backbone, row.action)):
         return "–"
-    if not row.retention.defined:
-        return "n/a"
-    return with_limits(row.retention.value, row.retention.ci, number)
+    return retention_value(row)
 
 
 # -- runs --------------------------------------------------------------------------------------------------------
