@@ -8,7 +8,7 @@ from probe_kit._tables.numbers import p_text, percent, points, with_limits
 from probe_kit._tables.table import Table
 from probe_kit.retention.columns.text import P_DECIDES, difference_test, models_test
 from probe_kit.retention.compare.common_items import MANY
-from probe_kit.retention.compare.compare import Difference, with_holm
+from probe_kit.retention.compare.compare import Difference, behaviour_once, with_holm
 from probe_kit.retention.compare.known_used import OVERALL, CategoryCounts, KnownUsedTable, without_signal
 from probe_kit.retention.rows.row import MEAN
 from probe_kit.retention.table import RetentionTable
@@ -26,7 +26,7 @@ _FEW = "!"
 
 def difference_table(table: RetentionTable, title: str) -> Table:
     """Differences of success rates, a row per pair and category; the whole comparison is one family of tests."""
-    rows = _tested(_once(table.differences))
+    rows = _tested(behaviour_once(table.differences))
     cells = [
         (
             f"{row.group} − {row.minus}",
@@ -78,7 +78,7 @@ def _remarks(rows: Sequence[Difference]) -> list[str]:
 
 def group_table(table: RetentionTable, title: str) -> Table:
     """Groups of models: the exact p over models first, the interval of these models apart."""
-    rows = _once(table.differences)
+    rows = behaviour_once(table.differences)
     cells = [
         (
             f"{row.group} − {row.minus}",
@@ -201,12 +201,6 @@ def _encoded(join: KnownUsedTable, row: CategoryCounts) -> int | None:
 
 def _count(number: int | None) -> str:
     return "–" if number is None else str(number)
-
-
-def _once(differences: Sequence[Difference]) -> list[Difference]:
-    """Each difference of success rates once, whatever number of views there are."""
-    rows = {(row.group, row.minus, row.category): row for row in reversed(differences) if row.sr is not None}
-    return list(rows.values())[::-1]
 
 
 def _category(name: str) -> str:

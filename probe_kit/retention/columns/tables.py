@@ -25,7 +25,7 @@ from probe_kit.retention.columns.text import (
     probed,
     title_of,
 )
-from probe_kit.retention.compare.compare import Difference
+from probe_kit.retention.compare.compare import Difference, behaviour_once
 from probe_kit.retention.rows.outcome_rules import rule_sentence
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.statistics.significance import detectable
@@ -87,8 +87,7 @@ def _differences(
     if not behaviour:
         views = {row.view for row in rows}
         return [row for row in among if row.view in views and not (row.backbone is None and row.action is None)]
-    once = {(row.group, row.minus, row.category): row for row in reversed(among) if row.sr is not None}
-    return list(once.values())[::-1]
+    return behaviour_once(among)
 
 
 def _table(

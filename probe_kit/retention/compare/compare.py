@@ -147,6 +147,12 @@ def compare(
     return [_with_counts(row, shared) for row in labelled]
 
 
+def behaviour_once(differences: Sequence[Difference]) -> list[Difference]:
+    """Return each difference of success rates once, whatever number of views there are."""
+    once = {(row.group, row.minus, row.category): row for row in reversed(differences) if row.sr is not None}
+    return list(once.values())[::-1]
+
+
 def with_holm(rows: Sequence[Difference]) -> list[Difference]:
     """Return the rows, which are shown together, with `p_holm`.
 
