@@ -192,8 +192,8 @@ class ConceptErasure(Intervention):
     @staticmethod
     def sentence(rows: "Sequence[ErasureEffect]") -> str:
         """Return which erasures take the answer from the action."""
-        tried = [row for row in rows if row.finding != "identity patch"]
-        if tried and all(row.finding == "no baseline effect" for row in tried):
+        tried, has_answer = _tried(rows)
+        if not has_answer:
             return "the unedited action does not go to the correct picture, so that nothing can be lost"
         losses = [f"{row.name} keeps {row.kept:.2f}" for row in tried if row.finding == "effect"]
         counts = count_edits(losses, len(tried))
@@ -203,8 +203,8 @@ class ConceptErasure(Intervention):
     def finding(rows: "Sequence[ErasureEffect]", context: TableContext) -> str:
         """Return whether an erasure takes the answer from the action, and where."""
         del context
-        tried = [row for row in rows if row.finding != "identity patch"]
-        if tried and all(row.finding == "no baseline effect" for row in tried):
+        tried, has_answer = _tried(rows)
+        if not has_answer:
             return "nothing to lose: the unedited action does not go to the correct picture"
         lost = sorted((row for row in tried if row.finding == "effect"), key=lambda row: row.kept or 0.0)
         if not lost:
@@ -412,6 +412,12 @@ def _of_category(
             )
         )
     return rows
+
+
+def _tried(rows: Sequence[ErasureEffect]) -> tuple[list[ErasureEffect], bool]:
+    """Return the erasures but for identity patches, and whether the unedited action has an answer to lose."""
+    tried = [row for row in rows if row.finding != "identity patch"]
+    return tried, not tried or any(row.finding != "no baseline effect" for row in tried)
 
 
 def _percent(share: float | None) -> str:
