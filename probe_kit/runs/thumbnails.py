@@ -4,22 +4,26 @@ They illustrate: no number depends on them. The commit of their episode names th
 who looks at a report believes what it shows. All pictures may be deleted, not single ones.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from io import BytesIO
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from PIL import Image
 
 from probe_kit.errors import RunDamagedError
 from probe_kit.runs.commits import Commit, commit_key, redo, redo_picture
-from probe_kit.runs.layout import CAPTURE_ONLY, DATASET, ENVIRONMENT, FRAME_COLUMNS, FRAMES, FrameChoice
+from probe_kit.runs.layout import CAPTURE_ONLY, FRAME_COLUMNS, FRAMES, FrameChoice, stored_inputs_of
 from probe_kit.runs.reader import RunReader
 from probe_kit.runs.small_frames import SmallFrames, shrink
 from probe_kit.runs.store import Location, locate
 from probe_kit.suite.pictures import decode_bytes
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 _LARGEST_SHEET = 16_383
 """Pixels of the longer side, as WebP has them."""
@@ -70,15 +74,19 @@ def episode_frames(run: RunReader, position: int) -> EpisodeFrames | None:
     sheet = read_sheet(run.location, int(row.get("episode", position)))
     if sheet is not None and sheet.count is not None:
         return EpisodeFrames(sheet.content, sheet.count, "all")
-    cameras = len((run.settings.get(DATASET) or run.settings.get(ENVIRONMENT) or {}).get("cameras", ())) or 1
-    if sheet is not None:  # a model that did not act has no last frame
-        count = 1 if "parse" in row or row["outcome"] == CAPTURE_ONLY else 2
-        return EpisodeFrames(sheet.content, count, "ends", cameras)
+    cameras = len(stored_inputs_of(run.settings).get("cameras", ())) or 1
+    if sheet is not None:
+        return EpisodeFrames(sheet.content, count_ends(row), "ends", cameras)
     if inputs is None or "pixels" not in inputs.kinds:
         return None
     inferences = int((run.control_steps[position] >= 0).sum())
     frames = tuple(np.hstack(list(pictures)) for pictures in inputs.row("pixels", position)[:inferences])
     return EpisodeFrames(as_thumbnail(frames, "all"), len(frames), "inferences", cameras) if frames else None
+
+
+def count_ends(episode: "Mapping[Any, Any] | pd.Series[Any]") -> int:
+    """Return how many frames a picture of the first and last one holds: a model that did not act has no last."""
+    return 1 if "parse" in episode or episode["outcome"] == CAPTURE_ONLY else 2
 
 
 def as_thumbnail(frames: SmallFrames, choice: FrameChoice = "ends") -> bytes:

@@ -5,9 +5,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from probe_kit.runs.layout import CAPTURE_ONLY
 from probe_kit.runs.reader import RunReader
-from probe_kit.runs.thumbnails import read_thumbnail
+from probe_kit.runs.thumbnails import count_ends, read_thumbnail
 
 PICTURES = 4000
 """Episodes a report shows with pictures, over all runs; one full suite of 3,440 makes about 10 MB of them."""
@@ -115,7 +114,7 @@ def _listed(name: str, run: RunReader, stride: int) -> Iterator[_Listed]:
             "answer": row.get("target_concept") or "",
             "unmoved": bool(row.get("never_moved", False)),
             "asked": "parse" in row,
-            "frames": 1 if "parse" in row or row["outcome"] == CAPTURE_ONLY else 2,
+            "frames": count_ends(row),
         }
         yield _Listed(card, rank, picture, str(row.get("first_frame_sha256") or ""))
 
