@@ -7,7 +7,7 @@ from pydantic import ValidationError
 
 _BOUNDS = {"ge": "at least", "le": "at most", "gt": "more than", "lt": "less than"}
 _LONGEST = 60
-"""Characters of a value that a complaint quotes."""
+"""Characters of a name or value that a message quotes."""
 MISSING, UNKNOWN = "is missing", "is unknown"
 
 Complaint = tuple[tuple[int | str, ...], str]
@@ -46,10 +46,11 @@ def _complaint(mistake: Mapping[str, Any]) -> str:
         expected = f"{message[:1].lower()}{message[1:]}"
     if isinstance(value, Mapping):  # a whole table is no help beside what is expected in its place
         return expected if mistake["type"] == "value_error" else f"is a table; {expected}"
-    return f"is {_shortened(repr(value))}; {expected}"
+    return f"is {shortened(repr(value))}; {expected}"
 
 
-def _shortened(text: str) -> str:
+def shortened(text: str) -> str:
+    """Return a text, or the beginning of a long one."""
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"
 
 

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import Any
 
+from probe_kit._system.complaints import shortened
 from probe_kit.errors import UsageError
 
 Place = tuple[str | int, ...]
 _BARE = re.compile(r"[\w.-]+")
-_LONGEST = 60
-"""Characters of a name or value that a message quotes."""
 
 
 @dataclass(frozen=True)
@@ -32,11 +31,6 @@ class Mistake:
 def _key(name: str) -> str:
     """A name on one line, in quotes where it needs them."""
     return shortened(name if _BARE.fullmatch(name) else json.dumps(name))
-
-
-def shortened(text: str) -> str:
-    """The text, or its beginning."""
-    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 1]}…"
 
 
 class StudyFileError(UsageError):
