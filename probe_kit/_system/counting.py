@@ -1,6 +1,6 @@
 """Numbers of things and lists of names in words."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 
 def counted(number: int, noun: str) -> str:
@@ -12,6 +12,12 @@ def counted(number: int, noun: str) -> str:
         return f"1 {noun}"
     ends_in_y = noun.endswith("y") and noun[-2:-1] not in "aeiou"
     return f"{number:,} {noun[:-1]}ies" if ends_in_y else f"{number:,} {noun}s"
+
+
+def spanned(numbers: Collection[int]) -> str:
+    """Return the smallest and the largest of some numbers: `3`, `3 to 7`."""
+    least, most = min(numbers), max(numbers)
+    return f"{least}" if least == most else f"{least} to {most}"
 
 
 def enumerated(names: Sequence[str]) -> str:

@@ -14,7 +14,7 @@ from probe_kit.retention.displays.heat_table import SideTableDisplay
 from probe_kit.retention.table import RetentionTable, retention_table
 from probe_kit.study.mistakes import unknown
 from probe_kit.study.planned_suite import slugs
-from probe_kit.study.rates import domain_scores
+from probe_kit.study.rates import domain_scores, episodes_per_category
 from probe_kit.study.reading import LoadedStudy
 from probe_kit.study.schema import FigureKind, FigureTable
 from probe_kit.study.stored import StoredRuns, stored_runs, study_probes
@@ -151,7 +151,5 @@ def draw_overview(table: RetentionTable) -> "Figure":
     grid[0].set_yticks(range(len(systems)), systems, fontsize=8)
     grid[0].set_ylim(len(systems) - 0.4, -0.6)
     grid[0].set_xlim(-105, 105)
-    counts = sorted({row.success.n_episodes for row in table.rows})
-    episodes = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
-    footer(figure, f"normalised score: 0 guessing, 100 perfection · n = {episodes} episodes per category")
+    footer(figure, f"normalised score: 0 guessing, 100 perfection · n = {episodes_per_category(table)}")
     return figure

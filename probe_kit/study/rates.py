@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from itertools import groupby
 from statistics import fmean
 
+from probe_kit._system.counting import spanned
 from probe_kit._tables.content import Heading, Number
 from probe_kit._tables.numbers import number, percent, with_limits
 from probe_kit._tables.table import Table
@@ -226,13 +227,16 @@ def caption(table: RetentionTable, sentences: Sequence[str]) -> str:
     """Return a caption: sentences, the outcome rule, the captured inference, and episodes per category."""
     acted = any(row.run.mode == "acts" and row.success.sr is not None for row in table.rows)
     calls = sorted({row.run.call for row in table.rows if row.run.call is not None})
-    counts = sorted({row.success.n_episodes for row in table.rows})
     parts = [*sentences]
     parts += [f"outcome rule {table.rule}"] if acted else []
     parts += [f"captured inference {', '.join(map(str, calls))}"] if calls and calls != [0] else []
-    if counts:
-        parts.append(f"{counts[0] if len(counts) == 1 else f'{counts[0]} to {counts[-1]}'} episodes per category")
+    parts += [episodes_per_category(table)] if table.rows else []
     return "; ".join(parts)
+
+
+def episodes_per_category(table: RetentionTable) -> str:
+    """Return how many episodes a category of a table with rows has, in words."""
+    return f"{spanned([row.success.n_episodes for row in table.rows])} episodes per category"
 
 
 # -- columns by category -----------------------------------------------------------------------------------------

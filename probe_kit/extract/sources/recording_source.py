@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._system.counting import spanned
 from probe_kit._terminal.plain_text import terminal_safe
 from probe_kit.errors import ObservationError, RecordingError
 from probe_kit.extract.plan import Row
@@ -375,7 +376,7 @@ class RecordingSource(Source[LeRobotSource]):
         return {
             "data set": self.name + (f"@{folder.revision}" if folder.revision else ""),
             "frames per second": f"{folder.fps:g}",
-            "episodes": f"{len(lengths)} of {len(folder.lengths)}, {_span(lengths)} frames each",
+            "episodes": f"{len(lengths)} of {len(folder.lengths)}, {spanned(lengths)} frames each",
             "frames": f"{sum(-(-length // every) for length in lengths)} of {sum(lengths)} (every:{every})",
             "instructions": "; ".join(texts[:_LONGEST]) + more,
             "cameras": "; ".join(map(self._camera, folder.cameras)) or "none",
@@ -480,11 +481,6 @@ class RecordingPlayer(InputsPlayer):
             self._keep("columns", [self._numbers[name][frame, 0] for name in recording.folder.columns])
         self._keep_pictures(list(pictures.values()), recording.settings.pixels)
         return observation_of(pictures, state, self.row.instruction)
-
-
-def _span(lengths: Sequence[int]) -> str:
-    least, most = min(lengths), max(lengths)
-    return f"{least}" if least == most else f"{least} to {most}"
 
 
 def mapped_cameras(typed: Pairs, model: Sequence[str], recorded: Sequence[str]) -> Pairs:
