@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from zarr.abc.store import Store
 from zarr.core.array_spec import ArrayConfigLike
 
+from probe_kit._system.column_cells import Cell
 from probe_kit.runs.arrays import ROOM, codecs, open_array
 from probe_kit.runs.layout import CLASSES, INPUTS, TRUTHS
 from probe_kit.runs.rows import Rows
@@ -90,3 +91,11 @@ class StoredInputs:
             raise KeyError(name)
         values: NDArray[np.float64] = self.read("columns")[..., self.columns.index(name)]
         return values
+
+    def cell(self, name: str, value: float) -> Cell:
+        """Return a number of a column as its source had it: a number, truth value or text; None if not finite."""
+        if not np.isfinite(value):
+            return None
+        if texts := self.classes.get(name):
+            return texts[int(value)]
+        return bool(value) if name in self.truths and value in (0, 1) else value

@@ -179,14 +179,8 @@ class BuiltinColumns:
 
 def _cells(run: RunReader, name: str, values: NDArray[np.float64]) -> tuple[Cell, ...]:
     """The values (n,) of a column of a run's own source: numbers; truth values or texts where that says so."""
-    cells = [_finite(float(value)) for value in values]
-    if run.inputs is None:
-        return tuple(cells)
-    if texts := run.inputs.classes.get(name):
-        return tuple(None if cell is None else texts[int(cell)] for cell in cells)
-    if name not in run.inputs.truths:
-        return tuple(cells)
-    return tuple(bool(cell) if cell in (0, 1) else cell for cell in cells)
+    assert run.inputs is not None, "a run with such columns stores inputs"
+    return tuple(run.inputs.cell(name, float(value)) for value in values)
 
 
 def prefix_of(run: RunReader) -> str:

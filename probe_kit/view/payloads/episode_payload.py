@@ -74,7 +74,8 @@ def _label_words(viewed: ViewedRun, row: dict[str, Any], position: int) -> dict[
     if inputs is None or not inputs.classes:
         return {}
     first = dict(zip(inputs.columns, inputs.row("columns", position)[0], strict=True))
-    texts = {name: texts[int(first[name])] for name, texts in inputs.classes.items() if first[name] == first[name]}
+    cells = {name: inputs.cell(name, first[name]) for name in inputs.classes}
+    texts = {name: str(cell) for name, cell in cells.items() if cell is not None}
     return {name: str(row[name]) for name in ("picture",) if name in row} | texts
 
 
