@@ -235,6 +235,12 @@ class PatchAttention:
     cameras: NDArray[np.str_]
     boxes: NDArray[np.float32]
 
+    def only(self, selected: NDArray[np.bool_]) -> Self:
+        """Some of the inferences. selected: (N,)."""
+        return replace(
+            self, episodes=self.episodes[selected], calls=self.calls[selected], weights=self.weights[selected]
+        )
+
     def on_frame(self, pictures: int) -> Self:
         """Return it on a frame with the first cameras' pictures side by side: boxes are shares of the frame."""
         first = list(dict.fromkeys(self.cameras.tolist()))[:pictures]

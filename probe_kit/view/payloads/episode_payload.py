@@ -121,17 +121,16 @@ def _attention(viewed: ViewedRun, row: dict[str, Any], position: int, pictures: 
     boxes: packed (P, 4) shares of the frame. weights: packed (B, P) of every inference.
     """
     stored = viewed.patch_attention.get(str(row["category"]))
-    rows = [] if stored is None else np.flatnonzero(stored.episodes == row["episode_id"]).tolist()
-    if stored is None or not rows:
+    if stored is None or not (of_episode := stored.episodes == row["episode_id"]).any():
         return None
-    steps, on_frame = viewed.inference_steps(position), stored.on_frame(pictures)
+    steps, on_frame = viewed.inference_steps(position), stored.only(of_episode).on_frame(pictures)
     # Interventions count inferences of an episode, and name frames of recordings by their number.
-    calls = [int(call) for call in stored.calls[rows]]
+    calls = on_frame.calls.tolist()
     return {
-        "blocks": stored.weights.shape[1],
+        "blocks": on_frame.weights.shape[1],
         "boxes": pack_floats(on_frame.boxes),
         "steps": calls if viewed.run.recorded else [steps[call] for call in calls],
-        "weights": [pack_floats(on_frame.weights[at]) for at in rows],
+        "weights": [pack_floats(weights) for weights in on_frame.weights],
     }
 
 
