@@ -310,17 +310,18 @@ def _open(effect: ImageSwapEffect) -> str:
 
 def more_groups(swap: Swapped, groups: int) -> str:
     """Return about how many groups of items would decide an effect that is undecided with so many."""
-    measures = (
-        (swap.net_follow_rate, swap.net_follow_rate_ci, SMALLEST_EFFECT_OF_INTEREST),
-        (swap.reach_share, swap.reach_share_ci, SMALLEST_SHARE_OF_INTEREST),
+    effects = (
+        (swap.net_follow_rate or 0.0, _width(swap.net_follow_rate_ci), SMALLEST_EFFECT_OF_INTEREST),
+        (swap.reach_share or 0.0, _width(swap.reach_share_ci), SMALLEST_SHARE_OF_INTEREST),
     )
-    effects = []
-    for value, (low, high), bound in ((value, limits or (None, None), bound) for value, limits, bound in measures):
-        width = inf if low is None or high is None else high - low
-        effects.append((value or 0.0, width, bound))
     needed = groups_to_decide(groups, effects)
     number = f"about {ceil(needed)}" if needed <= MANY else f"more than {MANY}"
     return f"{number} groups would tell"
+
+
+def _width(limits: tuple[float | None, float | None] | None) -> float:
+    low, high = limits or (None, None)
+    return inf if low is None or high is None else high - low
 
 
 def _trace(effect: ImageSwapEffect) -> str:
