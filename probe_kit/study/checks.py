@@ -1,6 +1,6 @@
 """Checks of what does not fit together in a study file, all of whose names are known."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from graphlib import CycleError, TopologicalSorter
 
 from probe_kit.errors import ProbeKitError
@@ -321,11 +321,8 @@ def _other_view(study: Study, runs: list[Member], view: str, side: str, path: Pl
         if block.asks and not _stores(block):
             text = f"{side!r} is asked by block {block.name!r} with tokens none, which leaves nothing to compare"
             yield Mistake((*path, "pairs"), text)
-    tables = [
-        table for table in study.probes.values() if table.target == CORRECT and blocks.keys() & set(table.runs)
-    ]
-    views = dict.fromkeys(view for table in tables for view in table.views)
-    if tables and view not in views:
+    views = _probed_views(study, blocks)
+    if views and view not in views:
         text = f"the view {view!r} of {side!r} is not probed; its probes have {', '.join(views)}"
         yield Mistake((*path, "view"), text)
 
@@ -409,6 +406,14 @@ def _unprobed(study: Study, runs: list[str], subject: str, path: Place) -> Itera
         yield Mistake(path, text)
 
 
+def _probed_views(study: Study, blocks: Collection[str]) -> list[str]:
+    """Return the views of the probes that drift and figures of some blocks show, in the order of the file."""
+    tables = (
+        table for table in study.probes.values() if table.target == CORRECT and set(blocks) & set(table.runs)
+    )
+    return list(dict.fromkeys(view for table in tables for view in table.views))
+
+
 def _absent_categories(
     study: Study, runs: list[str], categories: list[str] | None, suite: PlannedSuite, path: Place
 ) -> Iterator[Mistake]:
@@ -442,8 +447,7 @@ def _figures(study: Study, suite: PlannedSuite) -> Iterator[Mistake]:
         if figure.kind != "curves":
             yield Mistake((*path, "view"), f"a figure of kind {figure.kind!r} has no views; leave it out")
             continue
-        tables = [table for table in study.probes.values() if set(table.runs) & set(figure.runs)]
-        views = dict.fromkeys(view for table in tables for view in table.views)
-        if tables and figure.view not in views:
+        views = _probed_views(study, figure.runs)
+        if views and figure.view not in views:
             text = f"the view {figure.view!r} is not probed; the probes of `runs` have {', '.join(views)}"
             yield Mistake((*path, "view"), text)

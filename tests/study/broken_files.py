@@ -225,6 +225,12 @@ MISTAKES: list[tuple[str, str, str]] = [
         "the view 'last' of 'base' is not probed; its probes have mean",
     ),
     (
+        "[tables.success]",
+        '[probes.chosen]\nruns = ["main"]\nviews = ["last"]\ntarget = "side.chosen"\n\n[figures.all]\n'
+        'kind = "curves"\nview = "last"  # here\nruns = ["main"]\n\n[tables.success]',
+        "the view 'last' is not probed; the probes of `runs` have mean",
+    ),
+    (
         "[drift.words]",
         '[tables.drift]\nkind = "drift"\ndrift = "words"\n\n[drift.words]',
         "'reader/p1' is asked by block 'vlms' with tokens none",
