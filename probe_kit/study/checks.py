@@ -396,7 +396,7 @@ def _nothing_to_print(study: Study, table: TableTable, path: Place) -> Iterator[
 
 def _unprobed(study: Study, runs: list[str], subject: str, path: Place) -> Iterator[Mistake]:
     """Yield a mistake for blocks whose probes are to be shown, and no run of which a table of probes names."""
-    probed = {name for table in study.probes.values() if table.target == CORRECT for name in table.runs}
+    probed = {name for table in study.shown_probes.values() for name in table.runs}
     # Blocks share runs, so that a block without probes of its own can show those of another one.
     of_runs, of_probes = (
         {member.run for member in members(study) if member.block.name in blocks} for blocks in (runs, probed)
@@ -408,9 +408,7 @@ def _unprobed(study: Study, runs: list[str], subject: str, path: Place) -> Itera
 
 def _probed_views(study: Study, blocks: Collection[str]) -> list[str]:
     """Return the views of the probes that drift and figures of some blocks show, in the order of the file."""
-    tables = (
-        table for table in study.probes.values() if table.target == CORRECT and set(blocks) & set(table.runs)
-    )
+    tables = (table for table in study.shown_probes.values() if set(blocks) & set(table.runs))
     return list(dict.fromkeys(view for table in tables for view in table.views))
 
 

@@ -259,6 +259,11 @@ class Study(_Table):
         """The folder or URL of the runs."""
         return self.out or f"runs/{self.name}"
 
+    @property
+    def shown_probes(self) -> dict[str, ProbesTable]:
+        """The probes that tables and figures show, by name: those of the side of the correct picture."""
+        return {name: table for name, table in self.probes.items() if table.target == CORRECT}
+
     def block(self, name: str) -> BlockTable:
         """The block of this name."""
         return next(block for block in self.runs if block.name == name)

@@ -20,7 +20,6 @@ from probe_kit.study.failures import Failures
 from probe_kit.study.matching import check_run_of_cell, check_same_items, check_same_weights
 from probe_kit.study.reading import LoadedStudy, load_study, shipped_studies
 from probe_kit.study.schema import ProbesTable
-from probe_kit.train.choices import CORRECT
 from probe_kit.train.probe_sweep import probe_settings
 from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.train.results.store import is_stored, load_results, read_probes, settings_of
@@ -162,7 +161,7 @@ def open_cell(
 ) -> StoredRun:
     """Open the stored run of a cell, restricted to a selection. Raises what `open_stored` raises."""
     run = open_stored(study, cell, partial)
-    of_probes = (cell.selected(table.runs) for table in study.study.probes.values())
+    of_probes = (cell.selected(table.runs) for table in study.study.shown_probes.values())
     fitted = next((of_table for of_table in of_probes if of_table is not None), None)
     part = part_of(run, cell, selection, categories)
     return StoredRun(cell, part, part if fitted is None else part_of(run, cell, fitted))
@@ -199,8 +198,8 @@ def study_probes(study: LoadedStudy, stored: StoredRun, run: "Run", partial: boo
 def _probe_key(study: LoadedStudy, stored: StoredRun, run: "Run", partial: bool) -> str:
     tables = {
         name: table
-        for name, table in study.study.probes.items()
-        if table.target == CORRECT and stored.cell.selected(table.runs) is not None
+        for name, table in study.study.shown_probes.items()
+        if stored.cell.selected(table.runs) is not None
     }
     if not tables or not run.streams:
         return ""

@@ -19,6 +19,7 @@ from probe_kit.study import (
     make_table,
     plan_study,
 )
+from probe_kit.study.stored import open_cell
 from probe_kit.suite import Suite
 from tests.study.small_study import LIGHT, small_study
 
@@ -204,6 +205,42 @@ def test_a_policy_is_loaded_once_for_all_of_its_runs(
     assert [one.model for one in conduct_study(plan_study(load_study(file)), env_workers=0)] == ["broken"]
     assert loaded == ["pi0-tiny"]
     assert states(file)["idle/dark"] == states(file)["idle/short"] == ("whole", 4)
+
+
+TWO_TARGETS = """
+[models.idle]
+family = "idle"
+
+[conditions.short]
+max_steps = 1
+
+[[runs]]
+name = "few"
+models = ["idle"]
+conditions = ["short"]
+items = 10
+
+[[runs]]
+name = "main"
+models = ["idle"]
+conditions = ["short"]
+
+[probes.chosen]
+runs = ["few"]
+target = "side.chosen"
+
+[probes.main]
+runs = ["main"]
+"""
+
+
+@pytest.mark.slow
+def test_a_run_is_probed_in_the_items_of_the_probes_that_tables_show(small_suite: Suite, tmp_path: Path) -> None:
+    study = load_study(small_study(tmp_path, small_suite, TWO_TARGETS))
+    assert conduct_study(plan_study(study), env_workers=0) == []
+    (cell,) = study.cells
+    stored = open_cell(study, cell, cell.selections["few"])
+    assert [run.items.shape[0] for run in (stored.run, stored.probed)] == [10, 12]
 
 
 @pytest.mark.slow
