@@ -7,7 +7,7 @@ to be subtracted.
 """
 
 from collections.abc import Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -278,11 +278,8 @@ def load_internvla(
     if not np.isfinite(guidance) or guidance < 0:
         raise UsageError(f"guidance is {guidance}; expected a scale such as 1.5")
 
-    def build(kind: torch.dtype, device: str) -> InternVLANetwork:
-        return build_internvla(parts.config, kind, device)
-
     loaded = load_network(
-        build,
+        partial(build_internvla, parts.config),
         parts.read,
         name,
         parts.run,

@@ -8,8 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from probe_kit.errors import UsageError, WeightsError
-from probe_kit.hooks.checkpoints.checkpoint import content_hashes, side_files
+from probe_kit.errors import WeightsError
+from probe_kit.hooks.checkpoints.checkpoint import chosen_dtype, content_hashes, side_files
 from probe_kit.hooks.checkpoints.weights import Weights, WeightsAudit, load_weights
 from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.models.initialisation import initialise
@@ -99,14 +99,14 @@ def load_network[Network: nn.Module](
     the device. Raises UsageError for another dtype, WeightsError for weights that are not exactly the network's.
     """
     if random_weights:
-        name = checked_dtype(dtype or "float32")
+        name = chosen_dtype(dtype, None, DTYPES)
         network = build(DTYPES[name], "cpu")
         draw(network, weights_seed)
         weights = Weights(network.state_dict(), f"random twin of {checkpoint}", random=True)
         audit = load_weights(network, weights, weights.tensors)
     else:
         weights = read()
-        name = checked_dtype(dtype or _stored_dtype(weights))
+        name = chosen_dtype(dtype, _stored_dtype(weights), DTYPES)
         network = build(DTYPES[name], "meta")
         tensors = tensors_of(weights) if tensors_of else renamed_tensors(weights, name_in_module)
         audit = assign_weights(network, weights, as_dtype(tensors, DTYPES[name]), name_in_module)
@@ -167,13 +167,6 @@ def _check_filled(network: nn.Module, source: str) -> None:
     every = {**network.state_dict(), **dict(network.named_buffers())}
     if empty := [name for name, tensor in every.items() if tensor.is_meta]:
         raise WeightsError(f"{source}: {len(empty)} tensors were never filled: {', '.join(empty[:8])}")
-
-
-def checked_dtype(name: str) -> str:
-    """`name`, if it is a dtype on offer. Raises UsageError."""
-    if name not in DTYPES:
-        raise UsageError(f"dtype {name!r} is not one of {', '.join(DTYPES)}")
-    return name
 
 
 def _stored_dtype(weights: Weights) -> str:

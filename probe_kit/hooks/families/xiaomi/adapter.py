@@ -9,7 +9,7 @@ its halves add, gated; `middle` is the normed sum between them.
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, ClassVar, cast
 
 import numpy as np
@@ -268,12 +268,9 @@ def load_xiaomi(
     folder = checkpoint_folder(name)
     config = XiaomiConfig.from_folder(folder)
 
-    def build(kind: torch.dtype, device: str) -> XiaomiNetwork:
-        return build_xiaomi(config, kind, device)
-
     kind = chosen_dtype(dtype, config.dtype, DTYPES) if dtype or config.dtype else None
     loaded = load_network(
-        build,
+        partial(build_xiaomi, config),
         lambda: read_weights(folder),
         name,
         folder,
