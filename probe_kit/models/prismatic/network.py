@@ -37,6 +37,7 @@ class PrismaticNetwork(TokenNetwork):
 
     def __init__(self, config: PrismaticConfig) -> None:
         super().__init__()
+        self.config = config
         self.vision_backbone = VisionBackbone(config.towers)
         self.projector = Projector(self.vision_backbone.width, config.text.hidden_size, config.fused)
         self.language_model: Any = AutoModelForCausalLM.from_config(config.text, trust_remote_code=False)

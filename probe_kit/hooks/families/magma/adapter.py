@@ -78,7 +78,7 @@ class Magma(TokenDecoder, Policy, SpeakingModel):
         steps: int = STEPS,
     ) -> None:
         """statistics: of the data set whose units the actions get, or why there are none: it answers without."""
-        super().__init__(loaded, loaded.network.config, steps)
+        super().__init__(loaded, steps)
         self._units, self.shrink, self.order, self.temperature = statistics, shrink, prompt, temperature
         self.top = top_of(CHECKPOINT, (loaded.folder,)) if temperature else TOP
         self._text_folder = loaded.folder if tokenizer is None else Path(tokenizer).expanduser()

@@ -199,11 +199,12 @@ def load_openvla(
     """
     chooser(temperature, ())
     loaded = load_checkpoint(checkpoint or DEFAULT_CHECKPOINT, device, dtype, random_weights, bits, weights_seed)
-    if loaded.config.model_type != "openvla":
+    config = loaded.network.config
+    if config.model_type != "openvla":
         raise CheckpointError(f"{checkpoint} is a Prismatic model without actions; pass --model prismatic")
-    by_data_set, source = prismatic_statistics(loaded.config, loaded.folders)
+    by_data_set, source = prismatic_statistics(config, loaded.folders)
     statistics = ActionStatistics.choose(by_data_set, unnorm_key, source)
-    template = _template(prompt, loaded.config)
+    template = _template(prompt, config)
     top = top_of(top_k, loaded.folders)
     return OpenVLA(loaded, statistics, template, centre_crop, tokenizer, temperature, resize, top)
 

@@ -46,7 +46,7 @@ class PrismaticModel(TokenDecoder):
     network: PrismaticNetwork
 
     def __init__(self, loaded: LoadedPrismatic, steps: int, tokenizer: str | None = None) -> None:
-        super().__init__(loaded, loaded.config, steps)
+        super().__init__(loaded, steps)
         self._chosen_tokenizer = tokenizer
         self.further_streams = {
             name: Stream(name, len(tower.blocks), int(tower.embed_dim), part="vision", quantities=("residual",))
@@ -244,7 +244,7 @@ def load_prismatic(
     per inference. Raises what `load_checkpoint` raises.
     """
     loaded = load_checkpoint(checkpoint or DEFAULT_CHECKPOINT, device, dtype, random_weights, bits, weights_seed)
-    elsewhere = loaded.config.tokenizer_id
+    elsewhere = loaded.network.config.tokenizer_id
     if (
         tokenizer is None
         and elsewhere

@@ -31,7 +31,6 @@ class LoadedPrismatic(Loaded[PrismaticNetwork]):
     tokenizer that does not come with the checkpoint.
     """
 
-    config: PrismaticConfig
     folders: tuple[Path, ...]
     text: Path | None = None
 
@@ -86,7 +85,7 @@ def load_checkpoint(
             f"not exact: language model in {bits} bits",
         )
         loaded = replace(loaded, dtype=f"{loaded.dtype}, {bits}-bit", exact=False, notes=notes)
-    return LoadedPrismatic(**vars(loaded), config=config, folders=folders)
+    return LoadedPrismatic(**vars(loaded), folders=folders)
 
 
 def _check_other_heads(folders: tuple[Path, ...]) -> None:

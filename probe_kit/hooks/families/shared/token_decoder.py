@@ -33,9 +33,10 @@ class TokenDecoder(Model):
     added: ClassVar[Mapping[str, str]] = MappingProxyType({})
     """See `decoder_tap`."""
 
-    def __init__(self, loaded: Loaded[Any], config: Any, steps: int, captured: int | None = None) -> None:
+    def __init__(self, loaded: Loaded[Any], steps: int, captured: int | None = None) -> None:
         """steps: tokens per inference. captured: those that `output` captures, all by default."""
-        self.loaded, self.network, self.config, self.steps = loaded, loaded.network, config, steps
+        self.loaded, self.network, self.steps = loaded, loaded.network, steps
+        self.config = config = loaded.network.config
         self.decoder: Any = self.network.language_model.model
         layers, width = len(self.decoder.layers) + 1, int(config.text.hidden_size)
         heads = int(config.text.num_attention_heads)

@@ -86,7 +86,7 @@ class SpatialVLA(TokenDecoder, Policy):
         constrained: bool,
         ensemble: bool = False,
     ) -> None:
-        super().__init__(loaded, loaded.config, steps, captured)
+        super().__init__(loaded, steps, captured)
         self.speech, self.statistics = speech, statistics
         self.camera, self.constrained = camera, constrained
         self.ensemble = ENSEMBLE if ensemble else None
