@@ -41,7 +41,8 @@ def build_empty[Network: nn.Module](
 
     device: `meta` for parameters that have names and shapes but no memory, to be filled with
     `load_weights(…, assign=True)`; `cpu` for uninitialised weights. The rotary frequencies, which no
-    checkpoint holds, are then to be computed, for Qwen's with `fill_rotary`.
+    checkpoint holds, are then to be computed, with `fill_decoder_rotary`,
+    for Qwen's with `fill_rotary`.
     """
     before = torch.get_default_dtype()
     torch.set_default_dtype(dtype)
@@ -56,14 +57,21 @@ def build_empty[Network: nn.Module](
     return network.eval()
 
 
-def fill_rotary(vlm: Any) -> None:
-    """Compute the rotary frequencies of a `Qwen…VLForConditionalGeneration` on the CPU, in float32.
+def fill_decoder_rotary(decoder: Any) -> None:
+    """Compute the rotary frequencies of transformers' decoder on the CPU, in float32 whatever the weights are.
 
-    They are buffers that no checkpoint holds, so a network built on the meta device has none; and they are float32
-    whatever the weights are. Tied output weights are tied again.
+    They are buffers that no checkpoint holds, so a network built on the meta device has none.
     """
-    language, visual = vlm.model.language_model, vlm.model.visual
-    language.rotary_emb = type(language.rotary_emb)(config=vlm.config.text_config)
+    decoder.rotary_emb = type(decoder.rotary_emb)(config=decoder.config)
+
+
+def fill_rotary(vlm: Any) -> None:
+    """Compute the rotary frequencies of a `Qwen…VLForConditionalGeneration`; see `fill_decoder_rotary`.
+
+    Tied output weights are tied again.
+    """
+    fill_decoder_rotary(vlm.model.language_model)
+    visual = vlm.model.visual
     vision = vlm.config.vision_config
     visual.rotary_pos_emb = type(visual.rotary_pos_emb)(vision.hidden_size // vision.num_heads // 2)
     vlm.tie_weights()

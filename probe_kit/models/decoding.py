@@ -32,12 +32,6 @@ def needed(mask: Tensor) -> Tensor | None:
     return None if bool(mask.all()) else mask
 
 
-def fill_decoder_rotary(language_model: Any) -> None:
-    """Compute the rotary frequencies, buffers that no checkpoint holds: float32 whatever the weights are."""
-    decoder = language_model.model
-    decoder.rotary_emb = type(decoder.rotary_emb)(config=language_model.config)
-
-
 def last_logits(language_model: Any, embeddings: Tensor, mask: Tensor, cache: DynamicCache) -> Tensor:
     """(B, V) logits behind the last position, in one pass of a language model.
 

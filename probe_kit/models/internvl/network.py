@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from transformers import InternVLConfig, InternVLForConditionalGeneration
 
-from probe_kit.models.building import build_empty
+from probe_kit.models.building import build_empty, fill_decoder_rotary
 from probe_kit.models.naming import LANGUAGE_FIRST
 
 FILE_NAMES = LANGUAGE_FIRST
@@ -25,8 +25,7 @@ _VISION: dict[str, dict[str, Any]] = {
 def build_internvl(config: Any, dtype: torch.dtype, device: str = "meta") -> Any:
     """The network in eval mode; see `build_empty`. Rotary frequencies, which no checkpoint holds, are computed."""
     network: Any = build_empty(lambda: InternVLForConditionalGeneration(config), dtype, device)
-    language = network.model.language_model
-    language.rotary_emb = type(language.rotary_emb)(config=config.text_config)
+    fill_decoder_rotary(network.model.language_model)
     network.tie_weights()
     return network
 

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 from transformers import LlamaForCausalLM
 
-from probe_kit.models.building import build_empty
-from probe_kit.models.decoding import Choose, Decoded, TokenNetwork, fill_decoder_rotary, greedy, last_logits
+from probe_kit.models.building import build_empty, fill_decoder_rotary
+from probe_kit.models.decoding import Choose, Decoded, TokenNetwork, greedy, last_logits
 from probe_kit.models.magma.config import MagmaConfig
 from probe_kit.models.magma.packing import PictureSpan, placeholder
 from probe_kit.models.magma.pictures import Grid, Picture
@@ -126,7 +126,7 @@ def build_magma(config: MagmaConfig, dtype: torch.dtype, device: str = "meta") -
     Raises CheckpointError if the parts do not fit together.
     """
     network = build_empty(lambda: MagmaNetwork(config), dtype, device)
-    fill_decoder_rotary(network.language_model)
+    fill_decoder_rotary(network.language_model.model)
     network.language_model.tie_weights()
     return network.eval()
 

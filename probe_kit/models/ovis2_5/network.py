@@ -9,8 +9,7 @@ import torch
 from torch import Tensor, nn
 from transformers import Qwen3ForCausalLM
 
-from probe_kit.models.building import build_empty
-from probe_kit.models.decoding import fill_decoder_rotary
+from probe_kit.models.building import build_empty, fill_decoder_rotary
 from probe_kit.models.ovis2_5.config import OvisConfig
 from probe_kit.models.ovis2_5.vision import VisionModel
 
@@ -88,7 +87,7 @@ class OvisNetwork(nn.Module):
 def build_ovis2_5(config: OvisConfig, dtype: torch.dtype, device: str = "meta") -> OvisNetwork:
     """The network in eval mode; see `build_empty`. Rotary frequencies, which no checkpoint holds, are computed."""
     network = build_empty(lambda: OvisNetwork(config), dtype, device)
-    fill_decoder_rotary(network.llm)
+    fill_decoder_rotary(network.llm.model)
     network.tie_weights()
     return network
 

@@ -5,7 +5,7 @@ from typing import Any
 import torch
 from transformers import PaliGemmaConfig, PaliGemmaForConditionalGeneration
 
-from probe_kit.models.building import build_empty
+from probe_kit.models.building import build_empty, fill_decoder_rotary
 from probe_kit.models.naming import LANGUAGE_FIRST
 
 FILE_NAMES = LANGUAGE_FIRST
@@ -15,7 +15,7 @@ def build_paligemma(config: Any, dtype: torch.dtype, device: str = "meta") -> An
     """The network in eval mode; see `build_empty`. What no checkpoint holds is computed on the CPU."""
     network: Any = build_empty(lambda: PaliGemmaForConditionalGeneration(config), dtype, device)
     language = network.model.language_model
-    language.rotary_emb = type(language.rotary_emb)(config=config.text_config)
+    fill_decoder_rotary(language)
     embedding = language.embed_tokens
     embedding.embed_scale = torch.tensor(embedding.scalar_embed_scale)
     embeddings = network.model.vision_tower.vision_model.embeddings

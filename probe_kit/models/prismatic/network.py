@@ -9,8 +9,8 @@ import torch
 from torch import Tensor, nn
 from transformers import AutoModelForCausalLM
 
-from probe_kit.models.building import build_empty
-from probe_kit.models.decoding import Choose, Decoded, TokenNetwork, fill_decoder_rotary, greedy
+from probe_kit.models.building import build_empty, fill_decoder_rotary
+from probe_kit.models.decoding import Choose, Decoded, TokenNetwork, greedy
 from probe_kit.models.prismatic.config import PrismaticConfig
 from probe_kit.models.prismatic.vision import VisionBackbone
 from probe_kit.models.prompt_kv import PromptKV
@@ -85,7 +85,7 @@ def build_prismatic(config: PrismaticConfig, dtype: torch.dtype, device: str = "
     `load_weights(…, assign=True)`; `cpu` for one with uninitialised weights.
     """
     network = build_empty(lambda: PrismaticNetwork(config), dtype, device)
-    fill_decoder_rotary(network.language_model)
+    fill_decoder_rotary(network.language_model.model)
     network.language_model.tie_weights()
     return network.eval()
 

@@ -12,8 +12,8 @@ from torch import Tensor, nn
 from transformers import DynamicCache, Gemma2ForCausalLM, SiglipVisionModel, ZoeDepthForDepthEstimation
 
 from probe_kit.errors import UsageError, WeightsError
-from probe_kit.models.building import build_empty
-from probe_kit.models.decoding import Decoded, TokenNetwork, fill_decoder_rotary, greedy
+from probe_kit.models.building import build_empty, fill_decoder_rotary
+from probe_kit.models.decoding import Decoded, TokenNetwork, greedy
 from probe_kit.models.prompt_kv import PromptKV
 from probe_kit.models.sizes_only import builds_sizes_only
 from probe_kit.models.spatialvla.config import SpatialVLAConfig
@@ -197,7 +197,7 @@ def build_spatialvla(config: SpatialVLAConfig, dtype: torch.dtype, device: str =
 def _fill_buffers(network: SpatialVLANetwork) -> None:
     """Fill in constants that no file holds."""
     decoder, tower = network.language_model.model, network.vision_tower.vision_model.embeddings
-    fill_decoder_rotary(network.language_model)
+    fill_decoder_rotary(decoder)
     decoder.embed_tokens.embed_scale = torch.tensor(decoder.embed_tokens.scalar_embed_scale)
     tower.position_ids = torch.arange(tower.num_positions)[None]
     if network.config.depth is not None:
