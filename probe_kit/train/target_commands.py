@@ -3,11 +3,12 @@
 from collections.abc import Iterator
 from math import isfinite
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
 from probe_kit._system.counting import counted
+from probe_kit._tables.numbers import NONE
 from probe_kit._tables.printing import Format, print_table
 from probe_kit._tables.table import Table
 from probe_kit._terminal import options as common
@@ -33,27 +34,23 @@ def targets(
     labels`.
     """
     opened = _open(run, partial, wording)
-    every, columns = list(listed_targets(opened)), ("target", "task", "per", "values")
-    listed = [row for row in every if row[1] != CONSTANT]
-    numbers = [dict(zip((*columns, "too_few_groups"), row, strict=True)) for row in every]
-    rows = [(*cells[:-1], "; ".join(filter(None, (cells[-1], few)))) for *cells, few in listed]
+    every = list(listed_targets(opened))
+    listed = [row for row in every if row.task != CONSTANT]
+    rows = [(row.target, row.task, row.per, row.values_in_words) for row in listed]
+    columns, numbers = ("target", "task", "per", "values"), tuple(row._asdict() for row in every)
     print_table(
-        Table.of(f"{opened.label}: what can be decoded", columns, rows, numbers=tuple(numbers), overflow="wrap"),
-        style,
+        Table.of(f"{opened.label}: what can be decoded", columns, rows, numbers=numbers, overflow="wrap"), style
     )
-    if constant := [name for name, task, *_ in every if task == CONSTANT]:
+    if constant := [row.target for row in every if row.task == CONSTANT]:
         say(marked("one value only, so that there is nothing to decode: {}", ", ".join(constant)))
     # Those that need no further option come first, and what is not possible is never the next step.
-    possible = sorted(
-        (row for row in listed if row[1] == DOUBTFUL or (row[1] != "–" and not row[-1])),
-        key=lambda row: row[1] == DOUBTFUL,
-    )
+    possible = sorted((row for row in listed if row.is_possible), key=lambda row: row.task == DOUBTFUL)
     if not possible:
         say(marked("next: [bold]probe-kit labels {}[/] writes a table to which you add labels of your own", run))
         return
-    name, task, *_, few = possible[0]
-    as_task = f" --task {'continuous' if few else 'classes'}" * (task == DOUBTFUL)
-    options = "" if name == CORRECT else f" --target {name}{as_task}"
+    first = possible[0]
+    as_task = f" --task {'continuous' if first.too_few_groups else 'classes'}" * (first.task == DOUBTFUL)
+    options = "" if first.target == CORRECT else f" --target {first.target}{as_task}"
     say(marked("next: [bold]probe-kit train {}{}[/]", run, options))
 
 
@@ -63,11 +60,31 @@ CONSTANT = "one value"
 """In place of a task, of a column in which there is nothing to decode."""
 
 
-def listed_targets(run: "RunReader") -> Iterator[tuple[str, str, str, str, str]]:
-    """Yield name, task, `episode` or `inference`, classes or range, and groups that are too few, of every target.
+class ListedTarget(NamedTuple):
+    """A target in words. per: `episode` or `inference`. values: classes or range, or why the run has none.
 
-    One that the run cannot give has the reason in place of the classes, one of a single value the task `CONSTANT`.
+    task: `CONSTANT` of a single value. too_few_groups: of its rarest class, empty where there are enough.
     """
+
+    target: str
+    task: str
+    per: str
+    values: str
+    too_few_groups: str = ""
+
+    @property
+    def values_in_words(self) -> str:
+        """Classes or range, and the groups that are too few."""
+        return "; ".join(filter(None, (self.values, self.too_few_groups)))
+
+    @property
+    def is_possible(self) -> bool:
+        """Whether probes can be trained on it, with `--task` where that decides."""
+        return self.task == DOUBTFUL or (self.task not in (NONE, CONSTANT) and not self.too_few_groups)
+
+
+def listed_targets(run: "RunReader") -> Iterator[ListedTarget]:
+    """Yield every target of a run, those too that it cannot give."""
     from probe_kit.train.columns.builtin import BuiltinColumns
     from probe_kit.train.target import Target
 
@@ -77,15 +94,15 @@ def listed_targets(run: "RunReader") -> Iterator[tuple[str, str, str, str, str]]
             if name in SIDES:
                 target, task = Target.of_run(run, name), "binary"
             elif (column := columns.read(name)).is_constant:
-                yield name, CONSTANT, "–", "–", ""
+                yield ListedTarget(name, CONSTANT, NONE, NONE)
                 continue
             else:
                 target, task = _target_and_task(name, column)
         except ProbeKitError as error:
-            yield name, "–", "–", str(error), ""
+            yield ListedTarget(name, NONE, NONE, str(error))
         else:
             per, few = "inference" if target.per_step else "episode", _too_few_groups(run, target)
-            yield name, task, per, target.values_in_words, few
+            yield ListedTarget(name, task, per, target.values_in_words, few)
 
 
 def _too_few_groups(run: "RunReader", target: "Target") -> str:
