@@ -53,11 +53,9 @@ def _can_wrap(table: Content, width: int) -> bool:
 
 def _wrapped(table: Content) -> "RichTable":
     """Return one table whose texts are broken where they do not fit, but neither names nor numbers."""
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table as RichTable
     from rich.text import Text
 
-    wrapped = RichTable(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), show_edge=False)
+    wrapped = _without_columns()
     for at, heading in enumerate(table.headings):
         unbroken = _is_unbroken(table, at)
         justify: Literal["left", "right"] = "right" if unbroken and at >= table.names else "left"
@@ -195,18 +193,23 @@ def _table(table: Content, columns: Sequence[int]) -> "Iterator[RenderableType]"
 
 def _empty(table: Content, columns: Sequence[int], has_headings: bool = True) -> "RichTable":
     """Return a table without rows, whose columns have the same width with and without their headings."""
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table as RichTable
     from rich.text import Text
 
-    needed = _column_widths(table)
-    empty = RichTable(
-        box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), show_edge=False, show_header=has_headings
-    )
+    needed, empty = _column_widths(table), _without_columns(has_headings)
     empty.add_column(Text(_name_heading(table)), no_wrap=True, vertical="bottom", min_width=_name_width(table))
     for at in columns:
         empty.add_column(Text(table.headings[at].text), no_wrap=True, min_width=needed[at] - GAP)
     return empty
+
+
+def _without_columns(has_headings: bool = True) -> "RichTable":
+    """Return a table with the look of all tables."""
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table as RichTable
+
+    return RichTable(
+        box=SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), show_edge=False, show_header=has_headings
+    )
 
 
 def _text(cell: Cell) -> "Text":
