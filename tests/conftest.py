@@ -5,6 +5,7 @@ import gc
 import os
 import signal
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -50,6 +51,19 @@ def _temporary_working_folder(tmp_path_factory: pytest.TempPathFactory) -> Itera
     """Relative paths of commands, such as the default `runs/`, never lead into the checkout."""
     with contextlib.chdir(tmp_path_factory.mktemp("working")):
         yield
+
+
+@pytest.fixture(autouse=True)
+def _modules_of_a_test_end_with_it(request: pytest.FixtureRequest) -> Iterator[None]:
+    """A later test never imports a module, or finds a path, that lies in the folder of this one."""
+    before = set(sys.modules)
+    yield
+    if (folder := request.node.funcargs.get("tmp_path")) is None:
+        return
+    for name in sys.modules.keys() - before:
+        if str(getattr(sys.modules[name], "__file__", "")).startswith(str(folder)):
+            del sys.modules[name]
+    sys.path[:] = [path for path in sys.path if not path.startswith(str(folder))]
 
 
 def _golden(family: str) -> Path:

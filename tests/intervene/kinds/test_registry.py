@@ -2,7 +2,6 @@
 
 import importlib
 import json
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
@@ -39,7 +38,6 @@ def with_entry(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Modu
     kinds.register(NAME, "dimmed_images")
     yield importlib.reload(commands)
     monkeypatch.undo()
-    sys.modules.pop("dimmed_images", None)
     importlib.reload(commands)
 
 
