@@ -27,7 +27,7 @@ _SCRIPT_REFUSES = (
 )  # fmt: skip
 _CAPTURE_REFUSES = ("captured_calls", "execute", "rotation", "video")
 _EMPTY_CAMERA = "empty_camera"
-"""Beginning of the name of a camera that never gets a picture."""
+"""Beginning of the name of a camera that never gets a picture; lerobot names them so (`empty_cameras` of pi0)."""
 
 
 class Act(Task[ExtractSettings, "Policy"]):
@@ -80,6 +80,7 @@ class Act(Task[ExtractSettings, "Policy"]):
 
     def planned(self, settings: ExtractSettings, sizes: PlannedSizes) -> ExtractSettings:
         """Return the settings with the inferences of an episode counted."""
+        # Only a scene has an arm that actions could misfit.
         if not settings.source.command and sizes.outline is not None:
             check_misfit(settings, sizes.outline.misfit(), sizes.outline.checkpoint)
         return settings.with_every_call(settings.task.execute or sizes.execute)
@@ -119,13 +120,14 @@ class Act(Task[ExtractSettings, "Policy"]):
         assert model is not None, "only scripts have no network"
         if not source.own_units:
             check_misfit(settings, model.embodiment_mismatch(), model.card.checkpoint)
+        # The source first: it may give the policy further cameras, and batch and needs are those of that card.
         source, policy = source.check(model, settings.machine.accept_units)
         settings = with_source(settings, source)
         check_fit(policy.card, settings, source)
         check_reachable(settings, policy.card, source)
         controller = PolicyController(policy, source, settings)
         settings, calibration = settings.with_every_call(controller.execute), None
-        if settings.machine.batch == "auto":
+        if settings.machine.batch == "auto":  # last, because it times the controller as the run will use it
             rows = source.rows(settings.seed)
             settings, calibration = calibrated(settings, controller, source, rows)
         return settings, source, controller, calibration

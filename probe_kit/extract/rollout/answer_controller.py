@@ -75,7 +75,7 @@ class AnswerController(ModelController["AnswerModel", "Prompt"]):
         suite = source.suite
         blank = source.example(min(source.instructions))
         self.model, self._settings, self.template = model, settings, settings.task.prompt
-        self._choose_positions()
+        self._choose_positions()  # before `_streams`, whose lengths depend on it
         self._has_sides = suite is not None
         self._phrases = {} if suite is None else phrases(suite, settings.task.query, settings.seed)
         self._item_has_side_word = {} if suite is None else {item.item_id: item.side_word for item in suite.items}
@@ -104,6 +104,7 @@ class AnswerController(ModelController["AnswerModel", "Prompt"]):
             reading = self._read(questions, buffers if order == "original" else {})
             spoken.append(self.model.speak(reading, self.template.tokens))
             forced.append(self._forced(questions, reading, order))
+            # Of one order alone: an episode has one captured inference.
             if buffers and order == "original":
                 self._record_lens(turns, reading)
         first = self._questions(observations, phrases_asked, "original")
@@ -217,7 +218,7 @@ class AnswerController(ModelController["AnswerModel", "Prompt"]):
         if stream is None or reading.option_ids is None:
             return
         for turn, letters, logits in zip(turns, reading.option_ids, reading.option_logits, strict=True):
-            turn.buffers.wait()
+            turn.buffers.wait()  # the residuals are read here, and may still be on their way from a GPU
             pooled = turn.buffers.pooled[stream.name][0]
             residuals = (pooled if stream.iterations is None else pooled[0])[:, stream.views.index("last")]
             turn.buffers.lens_margins = letter_margins(
@@ -282,6 +283,7 @@ class AnswerController(ModelController["AnswerModel", "Prompt"]):
 
     def _sizes(self, questions: Sequence["Prompt"]) -> list[dict[str, int]]:
         """The length of each prompt; its last position can lie outside the backbone's stream."""
+        # Without `whole_prompt` the last position is the stream `answer`, and missing in the backbone's roles.
         rows, after = self._backbone_roles(questions), int(not self.model.whole_prompt)
         return [
             {"prompt_tokens": int(row.valid.sum()) + after, "picture_tokens": int(row.mask("image").sum())}
@@ -329,7 +331,7 @@ class AnswerController(ModelController["AnswerModel", "Prompt"]):
         for number, form in enumerate(forms):
             try:
                 self.model.read([replace(questions[0], options=tuple(form.options), begun=form.begun)])
-            except UsageError:
+            except UsageError:  # an option merges with the prompt, or two begin alike
                 if number == len(forms) - 1:
                     raise
             else:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from probe_kit._system.machine import cores_here
+from probe_kit.env.robot.controller import ACTION_SIZE
 from probe_kit.errors import UsageError
 from probe_kit.extract.plan import Row
 from probe_kit.extract.rollout.controllers import PolicyController
@@ -22,6 +23,7 @@ from probe_kit.extract.sources.player import Ending
 from probe_kit.extract.sources.source import Played, Source
 from probe_kit.hooks.contract.observation import Observation
 
+# These are choices, not measurements: they decide how long a run takes, and no number of it.
 LARGEST = 64
 """Observations per call that are tried at most."""
 BUDGET_S = 30.0
@@ -31,6 +33,7 @@ ENOUGH = 0.95
 GAIN = 1.1
 """A batch that brings less than this over the half of it ends the search."""
 TURNS = 3
+"""Inferences' worth of actions that a simulator is timed over, if its episode lasts so long."""
 
 
 @dataclass(frozen=True)
@@ -94,6 +97,7 @@ def inference_times(infer: Callable[[int], object], most: int) -> dict[int, floa
     while batch <= most:
         try:
             infer(batch)  # the first call of a shape chooses kernels and allocates
+            # The shorter of two: other jobs on the machine can only lengthen a call.
             times[batch] = min(_seconds(partial(infer, batch)) for _ in range(2))
         except MemoryError:
             if batch == 1:
@@ -116,9 +120,10 @@ def choose(inference: Mapping[int, float], turn: float, cores: int) -> Calibrati
     hands = max(1, cores - 1)
 
     def simulating(batch: int) -> float:
-        return turn * -(-batch // hands)
+        return turn * -(-batch // hands)  # a group takes as many turns one after another as its fullest core
 
     def rate(batch: int) -> float:
+        """Observations per second: the slower of model and simulators sets the pace, since they alternate."""
         seconds = inference[batch]
         return batch / (max(seconds, simulating(batch)) if cores > 1 else seconds + batch * turn)
 
@@ -146,8 +151,9 @@ def _turn(settings: ExtractSettings, controller: PolicyController, source: Sourc
         setting_up = _seconds(lambda: player.begin(row, False))
         if controller.capture_only:
             return setting_up
+        # Short enough that the episode does not end while it is timed.
         steps = min(controller.execute, max(1, settings.scene.max_steps // (TURNS + 1)))
-        actions = np.zeros((steps, 7), np.float32)
+        actions = np.zeros((steps, ACTION_SIZE), np.float32)
         began, turns = perf_counter(), 0
         while turns < TURNS:
             turns += 1

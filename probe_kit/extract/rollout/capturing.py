@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
     from probe_kit.hooks import ActivationCache, Model, Roles, Site
 
-# Below this many parameters a second thread costs more than it brings: ten times the time on a busy machine.
 SMALL = 10_000_000
+"""Parameters below which a second thread costs more than it brings: ten times the time on a busy machine."""
 
 RolesByStream = Mapping[str, "Sequence[Roles]"]
 
@@ -53,12 +53,14 @@ class Capturer:
         from probe_kit.hooks.contract.roles import prepare_pool
 
         views = {stream.name: stream.views for stream in self._streams}
+        # Before the model runs: a copy to a GPU inside a hook would stall it.
         for name, own_views in views.items():
             prepare_pool(roles[name], own_views, self._model.card.device)
 
         def pool_rows(site: "Site", activation: "Tensor") -> "Tensor":
             return _pool_rows(activation, roles[site.stream], views[site.stream])
 
+        # Pooled at once, so that the device never holds all tokens of all sites; with --tokens all it has to.
         reduce = None if self._with_tokens else pool_rows
         # The capture is entered last, so that it reads what edits left.
         with around(), capture(self._model, self._model.sites(), reduce) as tape:
@@ -86,6 +88,7 @@ class Capturer:
         def with_hooks() -> NDArray[np.float32]:
             from probe_kit.hooks import capture
 
+            # Hooks that keep nothing: the explanation is about hooks, not about memory.
             with around(), capture(self._model, self._model.sites(), lambda _, activation: activation[:0].clone()):
                 return output_of(infer())
 
@@ -116,6 +119,7 @@ class Capturer:
             values = torch.stack([tape[site][row] for site in stored.stream.sites()])
             if self._with_tokens:
                 valid = torch.from_numpy(stream_roles.valid).to(values.device)
+                # Padding means nothing, and zeros compress well. NaN stays NaN there; readers go by the mask.
                 bits = (values * valid[:, None]).to(torch.bfloat16).view(torch.int16)
                 buffers.keep_tokens(stored.name, bits.reshape(*stored.lead, *bits.shape[1:]))
                 values = torch.stack([_pool_rows(site[None], [stream_roles], stored.views)[0] for site in values])

@@ -47,6 +47,7 @@ def count_lost_words(pack: Callable[[str], Sequence[int] | None], instruction: s
     ids, words = pack(instruction), instruction.split()
     lost = 0
     try:
+        # From the end, because prompts are cut there. One word always stays: no instruction is empty.
         while ids is not None and lost + 1 < len(words) and pack(" ".join(words[: -lost - 1])) == ids:
             lost += 1
     except ProbeKitError:  # a shorter text is no instruction of the model
@@ -154,7 +155,6 @@ class ModelController[Loaded: "Model", Question](ABC):
     def __init__(self, model: Loaded, settings: "Settings", streams: list[StoredStream]) -> None:
         card = model.card
         self.model, self.streams, self._machine = model, streams, settings.machine
-        # Below this size a second thread costs more than it brings.
         self.threads = 1 if card.parameters < SMALL else None
         self.on_gpu = card.device.startswith("cuda")
         self._capturer = Capturer(model, streams, settings.capture.tokens == "all", self.outputs)
@@ -219,6 +219,7 @@ class PolicyController(ModelController["Policy", Observation]):
         """source: as the policy is shown it. Raises UsageError for more actions than a chunk has."""
         task, card, self._source = settings.task, policy.card, source
         with while_acting(settings.model.family, card.checkpoint):
+            # Of all instructions: the store makes room for the longest prompt.
             examples = [source.example(text) for text in source.instructions]
             super().__init__(policy, settings, stored_streams(policy, policy.roles(examples)))
         self.capture_only = task.capture_only and source.executes
@@ -239,6 +240,8 @@ class PolicyController(ModelController["Policy", Observation]):
         with self._acting():
             if self._input_check is None:
                 self._try_inputs(turns[0])
+            # After the check, which draws too. Adapters draw from the seeds they are given; this one is for global
+            # generators that an author's code may use.
             begin_randomness(derive_seed("global", *(turn.derived_seed("call") for turn in turns)))
             chunks = self._captured(turns)
         flags = _own_flags(self.model.flagged, len(turns))
@@ -264,7 +267,7 @@ class PolicyController(ModelController["Policy", Observation]):
         )
 
     def _chunks(self, turns: Sequence[Turn], seeds: Sequence[int]) -> NDArray[np.float32]:
-        """The policy's answer about observations that it may write to, and cannot change later."""
+        """(B, chunk, D): a copy of the policy's answer, which it cannot change later."""
         chunks = self._called([turn.observation for turn in turns], seeds)
         if self._source.own_units:
             check_predictions(chunks, len(turns))
@@ -275,6 +278,7 @@ class PolicyController(ModelController["Policy", Observation]):
     def _called(self, observations: Sequence[Observation], seeds: Sequence[int]) -> Any:
         policy = self.model
         acts = policy.infer_without_acting if self.capture_only else policy.act
+        # Copies: adapters of others may write into what they are given, and a proof of capture reads it again.
         return (policy.predict if self._source.own_units else acts)(copied(observations), list(seeds))
 
     def _try_inputs(self, turn: Turn) -> None:

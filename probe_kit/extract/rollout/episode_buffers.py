@@ -35,7 +35,7 @@ class EpisodeBuffers:
         self, streams: Sequence[StoredStream], calls: int, with_tokens: bool, pinned: bool,
         later_views: LaterViews = "all",
     ) -> None:  # fmt: skip
-        full = calls if later_views == "all" else 1
+        full = calls if later_views == "all" else 1  # `later` has the other calls
         self.later: dict[str, NDArray[np.uint16]] = {
             s.name: _memory((calls - 1, *s.lead, s.width), np.uint16, pinned)
             for s in streams
@@ -76,6 +76,7 @@ class EpisodeBuffers:
 
         call = len(self.roles) - 1
         if call and stream in self.later:
+            # torch knows bfloat16 and numpy does not: the bits travel as integers.
             bits = values[..., self._mean_of[stream], :].to(torch.bfloat16).view(torch.int16)
             self._copy(bits, self.later[stream][call - 1].view(np.int16))
         else:
@@ -123,7 +124,7 @@ def copy_aside(source: "Tensor", target: "Tensor") -> Any:
         target.copy_(source, non_blocking=True)
         arrival = torch.cuda.Event()  # type: ignore[no-untyped-call]
         arrival.record(stream)
-    source.record_stream(stream)
+    source.record_stream(stream)  # else torch would give its memory to the next tensor while it is copied
     return arrival
 
 
@@ -140,6 +141,7 @@ def _memory(shape: tuple[int, ...], dtype: DTypeLike, pinned: bool) -> NDArray[A
         return np.empty(shape, dtype)
     import torch
 
+    # As bytes, so that no type of numpy needs a name in torch.
     size = int(np.prod(shape)) * np.dtype(dtype).itemsize
     locked: NDArray[Any] = torch.empty(size, dtype=torch.uint8, pin_memory=True).numpy()
     return locked.view(dtype).reshape(shape)

@@ -72,8 +72,11 @@ class Failure:
 class EpisodeSlot:
     """One place in a batch: a player and the episode on it, if any.
 
-    following: what its player starts when the episode ends, while the model infers for others. columns: of the
-    outcome. ahead: whether it has so begun the episode that is on.
+    planned: the row of that episode. following: the row that its player starts when the episode ends, while the
+    model infers for others. ahead: whether the player began the episode in that way. seen: the observation that
+    waits for an inference, None while the player simulates. control_steps: actions before each inference so far.
+    steps: actions so far. seconds: of inference. flagged: inferences without a valid action, None where the policy
+    cannot tell. past: the chunks so far, for policies that average them. columns: of the outcome.
     """
 
     def __init__(self, player: AskablePlayer) -> None:
@@ -164,6 +167,7 @@ class EpisodeLoop:
         while any(slot.planned for group in self._groups for slot in group):
             for group in self._groups:
                 yield from self._settle(group)
+                # Returns at once for the players: they simulate while the next turn belongs to the other group.
                 yield from self._infer(group)
 
     def _begin_next(self, slot: EpisodeSlot, *, ended: bool = False) -> None:
@@ -175,6 +179,7 @@ class EpisodeLoop:
         if planned is None:
             slot.leave()
         else:
+            # `take` waits while all buffers are being written: a model cannot outrun the disk.
             slot.start(planned, self._pool.take(), None if begun else self._beginning(planned))
 
     def _beginning(self, planned: Row) -> Request:
@@ -218,11 +223,12 @@ class EpisodeLoop:
         due = [slot for slot in group if slot.seen]
         if not due:
             return
+        # An error here is of the batch: which row caused it is unknown, so all rows are given up and played alone.
         try:
             turns = [slot.turn() for slot in due]
             started = perf_counter()
             inferences = self._controller.infer(turns)
-            seconds = (perf_counter() - started) / len(turns)
+            seconds = (perf_counter() - started) / len(turns)  # its share: a call serves all rows at once
             for slot, turn in zip(due, turns, strict=True):
                 if turn.call == 0:
                     slot.instruction_ids = self._controller.instruction_ids(turn.observation.instruction)

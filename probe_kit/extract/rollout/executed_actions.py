@@ -9,6 +9,7 @@ from probe_kit.env.rotations import from_rpy, to_vector
 from probe_kit.hooks.contract.protocol import PLAIN, Rotation
 
 _TURN = slice(3, 6)
+"""Roll, pitch and yaw among the seven numbers of an action."""
 _GRIPPER_OPEN = 0.5
 
 
@@ -43,6 +44,7 @@ def ensemble(chunks: Sequence[NDArray[np.float32]], exponent: float) -> NDArray[
     majority.
     """
     length = len(chunks[-1])
+    # `reversed` counts ages from the newest chunk; the last [::-1] puts the oldest first again, as weights count.
     plans = np.array([chunk[age] for age, chunk in enumerate(reversed(chunks[-length:]))], np.float64)[::-1]
     weights = np.exp(exponent * np.arange(len(plans)))
     action = np.asarray(weights @ plans / weights.sum(), np.float32)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 Reach = Literal["output", "last layer", "nothing", "not the output", "not tested"]
 """The last thing on the way to the output that changed with an input; "not the output" where no layer was read."""
 MOST_TEXTS = 32
-"""Other instructions that are looked through for one of as many tokens."""
+"""Other instructions that are searched for one with as many tokens; each of them is tokenised."""
 Ids = Callable[[str], tuple[int, ...] | None]
 
 
@@ -74,7 +74,7 @@ def _reach[Question](
     for variant in variants:
         try:
             changed = infer(variant)
-        except InstructionError:
+        except InstructionError:  # the model cannot take this one in; the next may do
             continue
         if not np.array_equal(changed, output, equal_nan=True):
             return "output"
@@ -102,6 +102,7 @@ def varied(
 
 def _without_picture(clean: Observation) -> Iterator[Observation]:
     blank = with_input(clean, PICTURE, blank_of([clean]))
+    # A picture of one colour is its own blank: then nothing would change, and no input could be called dead.
     if not same_input(clean, blank, PICTURE):
         yield blank
 
@@ -130,6 +131,7 @@ def _length(text: str, ids: Ids) -> int | None:
 def check_not_ignored(reaches: Mapping[str, Reach], model: str) -> None:
     """Raise IgnoredInputsError if inputs were tested and none of them changes anything that was read."""
     tested = [name for name, reach in reaches.items() if reach != "not tested"]
+    # One dead input is a finding, which the certificate keeps; only where none arrives a run would be void.
     if len(tested) > 1 and all(reaches[name] in ("nothing", "not the output") for name in tested):
         layer = ", nor of its last layer" if "nothing" in reaches.values() else ""
         raise IgnoredInputsError(

@@ -28,7 +28,7 @@ Fitted = tuple[Settings, Source[Any], Controller, Calibration | None]
 class Task[Chosen: Settings, Loaded: "Model"](ABC):
     """A task, whose settings are of one class and whose models are of one kind.
 
-    names_all_items: whether it needs more of a suite than its chosen items.
+    names_all_items: whether it needs the whole suite besides the chosen items, for the names of other objects.
     """
 
     names_all_items: ClassVar[bool] = False
@@ -82,6 +82,7 @@ class Task[Chosen: Settings, Loaded: "Model"](ABC):
 
 def task_of(settings: Settings) -> Task[Any, Any]:
     """Return the task of some settings."""
+    # By name: the modules of the tasks import this one.
     module, _, name = settings.opens.partition(":")
     task: Task[Any, Any] = getattr(import_module(module), name)()
     return task
@@ -108,6 +109,7 @@ def with_source[Chosen: Settings](settings: Chosen, source: Source[Any]) -> Chos
 
 def check_fit(card: "ModelCard", settings: Settings, source: Source[Any]) -> None:
     """Raise UsageError if a model takes smaller batches, or needs what the source does not show."""
+    # `auto` is measured after this check, and by `largest_batch` never exceeds the card.
     batch = settings.machine.batch if isinstance(settings.machine.batch, int) else 1
     if card.batch is not None and batch > card.batch:
         raise UsageError(

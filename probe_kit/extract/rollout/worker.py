@@ -26,7 +26,7 @@ from probe_kit.runs.origin import ORIGIN, Origin
 from probe_kit.runs.thumbnails import as_thumbnail, thumbnail_key
 from probe_kit.runs.writer import RunWriter
 
-# Buffers beyond those on stage: one is being written while another waits.
+# Buffers beyond one per player: one is being written while another waits.
 SPARE_BUFFERS = 2
 # With fewer episodes than this, starting processes takes longer than they save.
 WORTH_PROCESSES = 8
@@ -57,10 +57,13 @@ class Worker:
     def __enter__(self) -> Self:
         with ExitStack() as stack:
             stack.enter_context(torch_threads(self._controller.threads))
+            # Two groups of players: one simulates while the model infers for the other, see `EpisodeLoop`.
             count = 2 * self._settings.machine.observations
             self._players = [self._open_player(position, stack) for position in range(count)]
             self._ring = BufferPool([self._make_buffers() for _ in range(count + SPARE_BUFFERS)])
+            # One thread: the writer remembers what it wrote of certificate and provenance, without a lock.
             self._thread = stack.enter_context(ThreadPoolExecutor(1, "probe-kit-writer"))
+            # If a line above raised, the stack has closed what was open; from here on `__exit__` does.
             self._opened = stack.pop_all()
         return self
 
@@ -110,8 +113,9 @@ class Worker:
     def _write(self, rollout: Rollout) -> Done:
         """On the writing thread."""
         try:
-            rollout.buffers.wait()
+            rollout.buffers.wait()  # copies from a GPU may still be under way
             with self._writer.location.in_words():
+                # Not before: the certificate holds fire counts and proofs, which the first inference gives.
                 self._writer.write_certificate(self._certificate())
                 self._writer.write(
                     replace(rollout.record, pictures=self._pictures(rollout), frames=self._frame_count(rollout))
@@ -149,7 +153,8 @@ class Worker:
 
 @contextmanager
 def torch_threads(count: int | None) -> Iterator[None]:
-    """Let torch use so many threads in the body; None for its own choice. Other threads, other roundings."""
+    """Let torch use so many threads in the body; None for its own choice."""
+    # The calibration enters it too: another number of threads sums in another order, and rounds otherwise.
     if count is None:
         yield
         return
@@ -169,6 +174,6 @@ def _film(rollout: Rollout) -> tuple[str, bytes]:
     ]
     planned = rollout.planned
     name = f"{planned.index:08d}-{planned.category}-{rollout.outcome['outcome']}.gif"
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as folder:  # `save_gif` writes to paths, and a run may lie in a bucket
         save_gif(Path(folder) / name, frames)
         return f"{VIDEOS}/{name}", (Path(folder) / name).read_bytes()
