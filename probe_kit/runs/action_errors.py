@@ -116,6 +116,7 @@ def compare_actions(run: RunReader) -> ActionErrors:
     recorded, predicted = (inputs.read(kind).astype(np.float64) for kind in ("action", "prediction"))
     first = recorded[:, :, 0]
     constant = np.nanmax(first, axis=(0, 1)) == np.nanmin(first, axis=(0, 1))  # its deviation may not round to 0
+    # Zero marks a number that never changes: nothing can be said in units of its spread.
     deviations = np.where(constant, 0.0, np.nanstd(first, axis=(0, 1)))
     return ActionErrors(run, inputs.names["action"], predicted - recorded, deviations)
 

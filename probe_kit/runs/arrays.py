@@ -29,10 +29,12 @@ ENTRY, CHECKSUM = 16, 4
 index that Zarr writes at the end of every shard."""
 _RESTORE = "Restore the run from a copy, or extract it again"
 _MOST_CHUNKS = 10_000_000
+"""Of an array: ten times `ROOM`. Metadata that claims more was made up; reading by it would fill all memory."""
 _ONE_AT_A_TIME = Lock()
 _BLOSC_SIZE = slice(4, 8)
 """Place of the size, unpacked, in the header of a chunk that blosc wrote."""
 _ABSENT = (1 << 64) - 1
+"""Offset and length of an inner chunk that was never written, as Zarr's sharding has it."""
 ROOM = 1_000_000
 """Episodes that an array has room for; one chunk holds one episode, and no chunk exists before its episode."""
 NOT_A_NUMBER = 0x7FC0
@@ -58,7 +60,7 @@ def create_arrays(
         group.create_array(
             "pooled",
             shape=(ROOM, full, *pooled),
-            chunks=(1, full, *pooled),
+            chunks=(1, full, *pooled),  # one object per episode, which its commit can name and hash
             dtype="float32",
             fill_value=np.nan,
             compressors=codecs(codec, typesize=4),
@@ -96,7 +98,7 @@ def create_arrays(
 
 
 def codecs(name: str, typesize: int) -> list[BytesBytesCodec]:
-    """blosc with its block size set (its own choice at level 1 loses most of the gain), then a checksum."""
+    """Blosc, then a checksum. typesize: bytes of a number, which blosc shuffles before it compresses."""
     if name == "none":
         return [Crc32cCodec()]
     fast = name == "fast"
@@ -105,7 +107,7 @@ def codecs(name: str, typesize: int) -> list[BytesBytesCodec]:
         cname="lz4" if fast else "zstd",
         clevel=1,
         shuffle="bitshuffle" if fast else "shuffle",
-        blocksize=524288,
+        blocksize=524288,  # bytes; blosc's own choice at level 1 is small, and loses most of the gain
     )
     return [blosc, Crc32cCodec()]
 
@@ -172,7 +174,8 @@ def decode_bfloat16(bits: NDArray[np.uint16]) -> NDArray[np.float32]:
 def encode_bfloat16(values: NDArray[np.float32]) -> NDArray[np.uint16]:
     """float32 to the bits of bfloat16, to the nearest and half to even; NaN stays NaN."""
     bits = np.ascontiguousarray(values, np.float32).view(np.uint32)
-    rounded = (bits + (0x7FFF + ((bits >> 16) & 1))) >> 16  # wraps around only for NaN
+    # Half a unit of the kept bits, less one, plus the lowest kept bit: ties go to even. Wraps around for NaN only.
+    rounded = (bits + (0x7FFF + ((bits >> 16) & 1))) >> 16
     encoded: NDArray[np.uint16] = np.where(np.isnan(values), NOT_A_NUMBER, rounded).astype(np.uint16)
     return encoded
 

@@ -37,13 +37,13 @@ if TYPE_CHECKING:
     from obstore.store import ObjectStore
 
 READERS = 32
-"""Small objects that are read side by side, because each of them takes a round trip."""
+"""Small objects that are read side by side, because each of them takes a round trip. A choice, not measured."""
 PATIENCE = timedelta(seconds=60)
 """The time for repeating a request; the last try may then take its own time, 30 s unless AWS_TIMEOUT says so."""
 LONGEST_PAUSE = 5.0
 """Seconds between two requests of the same thing."""
 _QUICK = timedelta(seconds=5)
-"""The same for a store that never answered."""
+"""`PATIENCE` with a store that never answered."""
 _NO_BUCKET = "NoSuchBucket"
 _METADATA_SERVICES = ("169.254.169.254", "169.254.170.2", "metadata.google.internal")
 """Services of cloud machines, where a client looks last for credentials."""
@@ -107,7 +107,7 @@ class Bucket(Location):
                 f"{self._url}/{folder}".rstrip("/"),
                 retry_config={
                     "retry_timeout": _QUICK if quick else PATIENCE,
-                    "max_retries": 10 if quick else 10_000,
+                    "max_retries": 10 if quick else 10_000,  # the timeout is to end it, not the count
                     "backoff": {"max_backoff": timedelta(seconds=LONGEST_PAUSE)},
                 },
             )
@@ -126,7 +126,7 @@ class Bucket(Location):
             while True:
                 try:
                     answer = request(self._patient if self._answered else self._quick)
-                except FileNotFoundError:
+                except FileNotFoundError:  # an answer too: the store is there, the object is not
                     self._answered = True
                     raise
                 except GenericError:
@@ -287,6 +287,7 @@ class Bucket(Location):
                     f"{self} holds the beginning of a run with another {key}: one of other settings, killed early "
                     "or beginning now in another process. Choose another --out, or remove it"
                 )
+        # Tried on a real key, before the run exists: a store that cannot keep writers apart is refused at once.
         self.check_exclusive(next(key for key in objects if key != last))
         self.create(last, objects[last])
 
@@ -303,7 +304,7 @@ class Bucket(Location):
 
 
 def pauses_for(time_to_repeat: timedelta) -> Iterator[float]:
-    """Seconds to wait before every further try, until the time is over."""
+    """Seconds to wait before every further try, doubling up to `LONGEST_PAUSE`, until the time is over."""
     pause, end = 0.1, time.monotonic() + time_to_repeat.total_seconds()
     while time.monotonic() + pause <= end:
         yield pause
@@ -348,6 +349,7 @@ class _PatientStore(WrapperStore[Store]):
         self, key: str, byte_ranges: Sequence[ByteRequest | None], *, prototype: BufferPrototype, **how: Any
     ) -> AsyncIterator[Sequence[tuple[int, Buffer | None]]]:
         """Parts of one."""
+        # Not repeated: parts that were handed on already would come twice.
         with self._bucket.in_words():
             async for group in super().get_ranges(key, byte_ranges, prototype=prototype, **how):
                 yield group

@@ -49,11 +49,13 @@ def input_notes(certificate: Mapping[str, Any]) -> list[str]:
 
 def write_certificate(root: Root, parts: Mapping[str, Any], provenance: Provenance) -> None:
     """Record the checks and loaded parts of one process; `certificate.json` stays from the first one."""
+    # Through JSON, so that the hash is of what a reader will parse: tuples become lists, keys become texts.
     record = json.loads(
         json.dumps({**parts, "provenance": name_of(provenance), "run": root.identity}, default=list)
     )
     key = f"{CERTIFICATES}/{sha256_json(record)[:NAME_DIGITS]}.json"
     root.location.create(key, Certificate.model_validate(record).to_bytes())
+    # `create` never writes over: of several processes that begin at once, the first one's stays.
     if not root.location.exists(CERTIFICATE_FILE):
         root.location.create(CERTIFICATE_FILE, Certificate.model_validate({**record, **provenance}).to_bytes())
 

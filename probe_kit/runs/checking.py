@@ -13,6 +13,7 @@ from probe_kit.runs.arrays import chunk_slices, index_bytes, inner_chunks
 from probe_kit.runs.records import BLOCK_BYTES, Sum, block_digest, digest
 
 _BLOCK = 2 * BLOCK_BYTES
+"""Hex digits of the hash of one inner chunk, of which `Sum.blocks` is a row."""
 
 
 class RecordingStore(WrapperStore[Store]):
@@ -44,6 +45,7 @@ class RecordingStore(WrapperStore[Store]):
 
     def _record(self, key: str, value: Buffer) -> None:
         content = value.to_bytes()
+        # Zarr calls the chunks of an array `ARRAY/c/…`; everything else is metadata, which has no inner chunks.
         count = self.shards.get(key.partition("/c/")[0], 0) if "/c/" in key else 0
         blocks = "".join(block_digest(content[part]) for part in inner_chunks(content, count)) if count else ""
         self.sums[key] = Sum(len(content), digest(content), blocks)
@@ -117,11 +119,13 @@ class CheckedStore(WrapperStore[Store]):
         """One object or a part of it."""
         if key not in self._sums:
             return None
+        # Zarr reads many chunks at once. Without numbers, which of two damaged ones is named would be a race.
         number = next(self._numbers)
         self._underway[number] = key
         try:
             self._check_size(key)
             value = await super().get(key, prototype, byte_range)
+            # The hashes of parts are in the order of the index, which says where each part lies.
             if isinstance(byte_range, RangeByteRequest) and key not in self._indexes:
                 await self._read_index(key, prototype)
             return self._checked(key, value, byte_range)
@@ -140,7 +144,7 @@ class CheckedStore(WrapperStore[Store]):
         return None
 
     async def _read_index(self, key: str, prototype: BufferPrototype) -> None:
-        count = len(self._sums[key].blocks) // _BLOCK - 1
+        count = len(self._sums[key].blocks) // _BLOCK - 1  # the last block is the index itself
         await self.get(key, prototype, SuffixByteRequest(index_bytes(max(count, 0))))
 
     def get_sync(

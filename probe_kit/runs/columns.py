@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
 
 METADATA = "zarr.json"
+"""Name of the metadata of a group or array in Zarr v3."""
 
 
 class Seal(Record):
@@ -138,6 +139,7 @@ def seal_key(stamp: str) -> str:
 def write_seal(root: Root, commits: Mapping[int, Commit], sums: Mapping[str, Sum]) -> None:
     """Note the hashes of the columns, and the episodes they are of, which makes them count."""
     seal = Seal(run=root.identity, stamp=stamp_of(commits), episodes=sorted(commits), objects=dict(sums))
+    # `write`: the same commits are sealed once more after their columns were deleted.
     root.location.write(seal_key(seal.stamp), seal.to_bytes())
 
 
@@ -150,6 +152,7 @@ def _read_seals(root: Root, commits: Mapping[int, Commit]) -> list[Seal]:
         seal = Seal.parse(raw, name, advice, run=root.identity)
         if seal_key(seal.stamp) != key:
             raise RunDamagedError(f"{name} belongs to other episodes. {advice}")
+        # What a seal does not name does not exist for `CheckedStore`: the array would seem never written.
         if lost := _metadata(root) - {*seal.objects}:
             raise RunDamagedError(f"{name} names no hash of {min(lost)}. {advice}")
         _check_lost(root, commits, seal, name, advice)

@@ -121,6 +121,7 @@ def _problems(root: Root, commit: Commit) -> Iterator[str]:
     """Contents of a commit that no commit of this run can have."""
     if not isinstance(commit.outcome.get("outcome"), str):
         yield "says no outcome"
+    # Fewer is no fault: an episode that ends early has fewer inferences than the run captures.
     enough = len(commit.roles) <= root.settings["captured_calls"]
     if not (enough and all(name in call for call in commit.roles for name in root.streams)):
         yield "says no roles of the tokens of every stream"
@@ -135,7 +136,7 @@ def _problems(root: Root, commit: Commit) -> Iterator[str]:
     if trajectory in commit.objects:
         if not root.has_trajectories:
             yield f"names {trajectory}, though the run keeps no trajectories"
-        if type(commit.outcome.get("steps")) is not int:
+        if type(commit.outcome.get("steps")) is not int:  # `isinstance` would take True for a number
             yield "does not say how many steps its trajectory has"
     if strange := [key for key in commit.pictures if not _is_picture(key)]:
         yield f"names {strange[0]!r} as a picture; pictures lie in {' or '.join(ILLUSTRATIONS)}"
@@ -143,6 +144,7 @@ def _problems(root: Root, commit: Commit) -> Iterator[str]:
 
 def _control_step_problem(commit: Commit) -> str | None:
     """The fault in the control steps of the inferences: they rise, and none lies behind the end."""
+    # They say at which action an inference was made: a wrong one would move it in time, silently.
     steps, ended = commit.control_steps, commit.outcome.get("steps")
     last = ended if type(ended) is int else None
     rising = all(before < after for before, after in pairwise(steps))
@@ -180,6 +182,7 @@ def size_problems(root: Root, commits: Mapping[int, Commit]) -> Iterator[str]:
         for key, expected in commit.objects.items():
             size = sizes.get(key)
             problem = expected.size_problem(size)
+            # An object of another size is damage in a copy too; only a missing one can be left out on purpose.
             if problem and not (size is None and is_left_out(key, root.left_out)):
                 yield f"{DATA}/{key} of episode {commit.episode_id} {problem}. {redo(number)}"
 

@@ -40,6 +40,7 @@ def copy_run(
     `open_run` raises.
     """
     run, target = open_run(path, allow_partial), locate(out)
+    # `root.arrays` has the inputs of recordings besides the streams: states and small pictures are left out too.
     arrays = {*run.root.arrays, *(() if trajectories else (TRAJECTORY,))}
     left_out = {*arrays, *(() if directions else (PROBE_DIRECTIONS,))}
     keys = [key for key in _copied_keys(run, arrays, pictures, directions) if run.location.exists(key)]

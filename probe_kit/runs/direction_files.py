@@ -28,6 +28,7 @@ SUFFIXES = (".safetensors", ".npz")
 SAE_WEIGHTS, SAE_SETTINGS, DECODER = "sae_weights.safetensors", "cfg.json", "W_dec"
 Space = Literal["raw", "standardised"]
 _SITE_KEYS = ("site", "hook_name")
+"""Where `cfg.json` may name the site: ours, and the one that SAELens writes."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class FileDirection:
 
     @property
     def basis(self) -> NDArray[np.float32]:
-        """Return (K, D) orthonormal rows that span the vectors."""
+        """Return (K, D) orthonormal rows that span the vectors, by a QR decomposition."""
         return np.asarray(np.linalg.qr(self.vectors.T)[0].T, np.float32)
 
     def check(self, site: str, width: int, weights: str | None) -> None:
@@ -193,6 +194,7 @@ def _rows(values: NDArray[Any], text: str) -> NDArray[np.float64]:
 def _direction(name: str, vectors: NDArray[np.float64], about: Mapping[str, Any]) -> FileDirection:
     digest = hashlib.sha256(np.ascontiguousarray(vectors).tobytes()).hexdigest()[:8]
     plain = "".join(letter if letter.isalnum() or letter in "-." else "-" for letter in name)
+    # A hash in the name: directions of one name in two files, or of a changed file, stay apart in results.
     parts = {part: str(about.get(part) or "") for part in ("site", "role", "weights")}
     parts["site"] = _place_name(parts["site"])
     return FileDirection(f"{plain}-{digest}", vectors, **parts)

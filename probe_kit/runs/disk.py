@@ -5,7 +5,8 @@ from collections.abc import Mapping
 from probe_kit.errors import DiskSpaceError
 from probe_kit.runs.store import Location
 
-# The estimate is of uncompressed bytes; this much more covers file-system blocks.
+# The estimate is of uncompressed bytes; this much more covers file-system blocks. Less would start runs that fill
+# the disk, more would refuse runs that fit.
 HEADROOM = 1.1
 _UNITS = ((1e12, "TB"), (1e9, "GB"), (1e6, "MB"), (1e3, "kB"))
 

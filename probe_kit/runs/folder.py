@@ -22,6 +22,7 @@ from probe_kit.runs.location import Location, check_size
 _DRAFTS = ("*.tmp", "*/*.tmp", f"{DATA}/**/*.partial", f"{COLUMNS}/**/*.partial")
 """Patterns of what a killed process leaves: objects without their final name."""
 _PIECE = 1 << 20
+"""Bytes that are hashed at a time: they stay in the processor's cache."""
 _TRIES = 5
 """Times that a file is written whose folder another process clears or removes meanwhile."""
 _FLUSHERS = 16
@@ -189,6 +190,7 @@ class Folder(Location):
     def begin(self, objects: Mapping[str, bytes], last: str) -> None:
         """Made as a draft and renamed, so that the folder appears with all objects or not at all."""
         with draft_of(self._path) as draft:
+            # The renaming fails where a folder with content lies: another process was first, or it is no run.
             try:
                 for key, content in objects.items():
                     (draft / key).parent.mkdir(parents=True, exist_ok=True)
@@ -212,7 +214,7 @@ class Folder(Location):
             if _alone(file):
                 self._clear_drafts()
                 clear()
-            fcntl.flock(file, fcntl.LOCK_SH)
+            fcntl.flock(file, fcntl.LOCK_SH)  # also turns the exclusive lock of `_alone` into a shared one
             yield
             if _alone(file):
                 self._clear_drafts()

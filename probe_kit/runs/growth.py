@@ -66,6 +66,7 @@ def further_rows(stored: Sequence[Row], requested: Sequence[Row], where: str) ->
 
 def _check_equal(was: Row, now: Row, where: str) -> None:
     """Raise SettingsMismatchError unless an episode is planned as it is stored, but for its number."""
+    # Every part, not the id alone: an item that was edited keeps its id, and has another content.
     for part in sorted((was.keys() | now.keys()) - {_NUMBER}):
         if was.get(part) != now.get(part):
             if part == _CONTENT:

@@ -24,6 +24,7 @@ from probe_kit.runs.layout import CLASSES, INPUTS, TRUTHS
 from probe_kit.runs.rows import Rows
 
 _TYPES = {"columns": "float64", "pixels": "uint8"}
+"""All others are float32. Columns hold timestamps and indices, of which float32 has too few digits."""
 
 
 def create_inputs(store: Store, calls: int, shapes: Mapping[str, list[int]], codec: str) -> None:

@@ -33,6 +33,7 @@ from probe_kit.hooks.contract.sites import QUANTITIES, Part, Site, Stream
 SCHEMA_VERSION = 6
 """The only one that is written and read."""
 TOKEN_BLOCK = 128
+"""Tokens per inner chunk, the least that one role of one layer is read by; stored tokens are padded to it."""
 RUN_FILE, PLANS, CERTIFICATE_FILE = "run.json", "plan", "certificate.json"
 LABEL_FILE, TIMES, LEFT_OUT_FILE = "label.json", "times", "left-out.json"
 COMMITS, FAILED, DATA, COLUMNS, VIDEOS = "commits", "failed", "data.zarr", "columns.zarr", "videos"
@@ -126,6 +127,8 @@ _STREAM_PARTS: Mapping[str, Callable[[Any], bool]] = {
     "sums": _is_flag,
 }
 """Parts of a stream as `run.json` stores it, each with the check of its value."""
+_STORAGE = ("tokens", "views")
+"""Of these, what a run adds to the declared `Stream`."""
 
 
 @dataclass(frozen=True)
@@ -169,16 +172,7 @@ class StoredStream:
     @property
     def stream(self) -> Stream:
         """The stream without its storage."""
-        return Stream(
-            self.name,
-            self.layers,
-            self.width,
-            self.iterations,
-            self.part,
-            self.label,
-            self.quantities,
-            self.probed,
-        )
+        return Stream(**{name: getattr(self, name) for name in _STREAM_PARTS if name not in _STORAGE})
 
     @property
     def lead(self) -> tuple[int, ...]:

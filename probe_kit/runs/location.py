@@ -16,7 +16,10 @@ from zarr.abc.store import Store
 from probe_kit.errors import RunDamagedError, StoreError
 
 MOST_RECORD_BYTES, MOST_OBJECT_BYTES = 256 << 20, 4 << 30
-"""The largest record, and the largest other object, that is read at once."""
+"""The largest record, and the largest other object, that is read at once.
+
+Far above what runs have. They keep a file that was made up, such as a sparse one, from taking all memory.
+"""
 
 
 def check_size(key: str, size: int, where: object) -> None:

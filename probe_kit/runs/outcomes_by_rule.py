@@ -55,7 +55,7 @@ def watch(trajectories: Iterable[Trajectory], sides: Iterable[Side], scene: Mapp
 
     scene: `SceneSpec.to_json()`.
     """
-    default = SceneSpec()
+    default = SceneSpec()  # scenes without these fields have the default ones
     half = scene.get("scoring_side", default.scoring_side) / 2 + scene.get("box_margin", default.box_margin)
     rules = {name: rule_of(name, scene) for name in RULES}
     verdicts: dict[str, list[dict[str, Any]]] = {name: [] for name in rules}

@@ -88,6 +88,7 @@ def grown_record(
         record=len(before.extents),
         selection=dict(selection),
         suite_parent=suite_parent,
+        # A later selection may have shorter instructions only; the arrays of before keep their length.
         tokens={name: max(length, before.tokens.get(name, 0)) for name, length in tokens.items()},
         episodes=[{**row, "episode": numbers[row["episode_id"]]} for row in added],
         order=[numbers[row["episode_id"]] for row in rows],

@@ -30,7 +30,7 @@ DECISIVE = (
     "device",
     "dtype",
     "decoder",
-    *(f"versions.{name}" for name in ("probe-kit", *_LIBRARIES[:3], "pybullet")),
+    *(f"versions.{name}" for name in ("probe-kit", *_LIBRARIES[:3], "pybullet")),  # torch, lerobot, transformers
 )
 """What changes numbers. Cores, workers and threads, the interpreter and the writer's libraries do not."""
 

@@ -279,6 +279,6 @@ def check_call(run: RunReader, call: int) -> None:
 
 def reached_calls(run: RunReader) -> NDArray[np.bool_]:
     """(E, C) whether an episode has a captured inference; all have the only one of a run not made by probe_kit."""
-    if not hasattr(run, "reached"):
+    if not hasattr(run, "reached"):  # `ArrayRun` has one inference per row and no such method
         return np.ones((len(run.episodes), 1), bool)
     return np.stack([run.reached(call) for call in range(run.captured_calls)], axis=1)

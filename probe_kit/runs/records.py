@@ -24,7 +24,9 @@ from probe_kit.errors import RunDamagedError
 from probe_kit.runs.location import Location
 
 HASH = "blake2b"
+"""The part of a record that holds its hash, named as the hash is computed."""
 DIGEST_BYTES, BLOCK_BYTES = 32, 8
+"""Of a record or object, and of one inner chunk, of which a commit has one per layer and 128 tokens."""
 _HEX, _BLOCK_HEX = 2 * DIGEST_BYTES, 2 * BLOCK_BYTES
 _HEXADECIMAL = frozenset("0123456789abcdef")
 NAME_DIGITS = 16
@@ -84,6 +86,7 @@ Sums = dict[str, Annotated[Sum, BeforeValidator(parse_sum), PlainSerializer(Sum.
 class Record(BaseModel):
     """One JSON object of a run. Reading checks type and value of its parts, and refuses unknown ones."""
 
+    # strict: pydantic would otherwise read "3" as 3 and 1 as True.
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, ser_json_inf_nan="constants")
     kind: ClassVar[str] = "record"
     _hash: str = PrivateAttr("")
@@ -96,6 +99,7 @@ class Record(BaseModel):
     @property
     def content(self) -> dict[str, Any]:
         """The values as stored, without their hash."""
+        # Unset parts are left out: with their defaults, a record would not have the hash that it was written with.
         return self.model_dump(mode="json", exclude_unset=True)
 
     def to_bytes(self) -> bytes:

@@ -29,7 +29,9 @@ BUNDLES = (PROBES, INTERVENTIONS, DIAGNOSES)
 _MAKERS = {PROBES: "train", INTERVENTIONS: "intervene", DIAGNOSES: "diagnose"}
 HEAD, TIMES, PARTIAL = "settings.json", "times.json", ".partial"
 _KEY = re.compile(r"[0-9a-f]{12}")
+"""Form of a key: the first digits of the hash of the settings of a result."""
 _SHORT = 8
+"""Digits of its hash in the name of a file that replaces another."""
 
 
 def _parse_file(values: Any) -> tuple[str, Sum]:
@@ -187,6 +189,8 @@ def _write_bundle(
             actual = name if before is None else _renamed(name, content_sum)
             location.write(f"{folder}/{actual}", content)
             files_now[name] = actual, content_sum
+    # Files, then times, then the head that names them, and only then are former files removed: a crash in between
+    # leaves the former result whole.
     location.write(f"{folder}/{TIMES}", Times.model_validate({**times, "key": key, "run": run}).to_bytes())
     stored = {name: [actual, *content_sum.to_json()] for name, (actual, content_sum) in files_now.items()}
     record = Head.model_validate({**head, "key": key, "run": run, "files": stored}).to_bytes()

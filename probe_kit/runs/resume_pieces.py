@@ -60,6 +60,7 @@ class Pieces:
         with ZipFile(file, "a") as archive:
             archive.comment = bytes(_HEX)  # a zip file may end in a comment: that is where the hash goes
         content = file.getvalue()[:-_HEX]
+        # Not flushed: a piece that a power cut takes is computed again, and its hash shows half a one.
         self.run.write(self._key(name), content + self._bound(content, name), durable=False)
 
     def discard(self) -> None:

@@ -58,6 +58,7 @@ _INPUTS = {"inputs": dict, "columns": list, "names": dict}
 _OF_SOURCES = {DATASET: {"meta_blake2b": str, **_INPUTS}, ENVIRONMENT: {"revision": str, **_INPUTS}}
 """The settings of recordings, or of an environment."""
 _CHUNKS = "/c/"
+"""Between the name of an array and the position of a chunk in a key of Zarr v3."""
 
 
 class Card(Record):
@@ -274,6 +275,7 @@ def find_root(location: Location) -> Root | None:
         raw = location.read(RUN_FILE)
     except FileNotFoundError:
         return None
+    # Before the hash: a record of another schema may be whole, and the message should say which version reads it.
     schema = read_plain(raw, name, RESTORE).get("schema_version")
     if type(schema) is not int or schema != SCHEMA_VERSION:
         raise RunDamagedError(
@@ -301,6 +303,7 @@ def _check_settings(settings: Mapping[str, Any], name: str) -> None:
 
 def _read_streams(stored: list[Any], name: str) -> dict[str, StoredStream]:
     try:
+        # The card has no number of tokens unless all are stored; `Root.streams` puts in that of the plan.
         streams = [StoredStream.from_json({"tokens": 1, **entry}) for entry in stored]
     except (TypeError, ValueError, KeyError) as error:
         raise RunDamagedError(f"{name} describes its streams wrongly: {error!r}. {RESTORE}") from error

@@ -18,6 +18,7 @@ Spans = Sequence[tuple[str, int, int]]
 _BLOCK_BYTES = 1 << 24
 """Rows that are read in order come this many bytes at a time: beginning a request takes longer than reading."""
 _DAMAGE = (ChunkNotFoundError, ValueError, RuntimeError)
+"""What Zarr and its codecs raise for missing and for changed bytes."""
 
 
 @dataclass(frozen=True)

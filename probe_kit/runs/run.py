@@ -85,6 +85,7 @@ def open_run(path: Path | str | Location, allow_partial: bool = False) -> "Run":
     is another one, a committed object is missing, or plan, metadata or any record is not what was written.
     """
     run = read_run(locate(path))
+    # At the opening, so that damage is met before hours of work, and not in the middle of a table.
     run.check_records()
     committed = len(run.episodes)
     if committed < run.planned and not allow_partial:
@@ -101,7 +102,7 @@ def read_run(location: Location) -> "Run":
 
     def read() -> Run:
         run = Run(location)
-        _ = run.stamp
+        _ = run.stamp  # reads the commits now, beside the plan they belong to
         return run
 
     return while_growing(location, read)
@@ -117,7 +118,7 @@ class Run:
 
     rule: str = DEFAULT_RULE
     last_steps: int = 1
-    score: str = "text"
+    score: str = "text"  # of a run of questions; see `retention/behaviour/vlm_answers.py` for others
     control_features: Mapping[str, NDArray[np.floating]] = MappingProxyType({})
 
     def __init__(
@@ -350,6 +351,7 @@ class Run:
 
         def read() -> Run:
             run = self._showing(self.wording, self.item_ids)
+            # Fills the cache of `cached_property`: a commit never changes, so only new ones are read.
             run.__dict__["_commits"] = read_commits(run.root, self._commits)
             return run
 
@@ -406,6 +408,7 @@ class Run:
         """The rows of the columns, which hold every committed episode, that are those of `episodes`."""
         if self.wording is None and self.item_ids is None:
             return slice(None)
+        # In the order in which `seal` wrote them, which is that of the whole plan.
         sealed = [planned["episode"] for planned in self.root.plan if planned["episode"] in self._commits]
         return np.flatnonzero(np.isin(sealed, self._numbers))
 
@@ -507,7 +510,7 @@ class Run:
         """The same run with its outcomes by another rule, for tables and figures; see `judged`."""
         if (check_rule(rule), last_steps) == (self.rule, self.last_steps):
             return self
-        judged = copy(self)
+        judged = copy(self)  # shares what was read; of the cache only `episodes` depends on the rule
         judged.rule, judged.last_steps = rule, last_steps
         judged.__dict__["episodes"] = with_outcomes(self.episodes, self.judged(rule, last_steps))
         return judged

@@ -19,8 +19,9 @@ from probe_kit.runs.run import Run, read_run
 from probe_kit.runs.store import Location, locate
 
 EPISODES_PER_CHUNK = 1024
-# What is held in memory at a time; all rows are read once more for every further slab.
+"""A column of no more episodes is one object, which one request reads."""
 SLAB_BYTES = 1 << 30
+"""Bytes that are held in memory at a time; all rows are read once more for every further slab."""
 
 
 def seal(path: Path | str | Location) -> bool:

@@ -57,7 +57,7 @@ def write_seconds(root: Root, number: int, seconds: Seconds) -> None:
     record = SecondsRecord(
         run=root.identity,
         episode=number,
-        inference=round(seconds.inference, 6),
+        inference=round(seconds.inference, 6),  # to microseconds
         simulation=round(seconds.simulation, 6),
     )
     root.location.write(seconds_key(number), record.to_bytes())

@@ -7,7 +7,7 @@ from PIL import Image
 HEIGHT = 120
 """Pixels, where first and last frame are kept; a pair of 4:3 frames is 320 wide and takes about 2 kB."""
 FILM_HEIGHT = 144
-"""Pixels, where every frame is kept; one takes about 4 kB. Drawing costs as many seconds as there are pixels."""
+"""Pixels, where every frame is kept; one takes about 4 kB. The time to draw one grows with its pixels."""
 
 SmallFrames = tuple[NDArray[np.uint8], ...]
 """(h, w, 3) uint8 each: the first and last frame, the first alone where nothing moved, or every one."""

@@ -109,6 +109,7 @@ def decode_frames(content: bytes, count: int) -> SmallFrames:
             content, "the stored frames:", RunDamagedError, "Extract the run again.", largest=_LARGEST_SHEET
         )
     )
+    # The inverse of `hstack` and `vstack`: a grid of cells, then one cell after another, row by row.
     cells = pixels.reshape(rows, pixels.shape[0] // rows, columns, pixels.shape[1] // columns, 3).swapaxes(1, 2)
     return tuple(cells.reshape(-1, *cells.shape[2:])[:count])
 

@@ -37,6 +37,7 @@ from probe_kit.runs.store import Location, locate
 _READERS = min(8, max(4, os.cpu_count() or 1))
 """Objects that are read and hashed at once: both let other threads work."""
 _BATCH = 256
+"""Objects that are handed to the threads at a time."""
 _RESULT_READERS = (
     "probe_kit.train.results.inventory:readers_of_results",
     "probe_kit.intervene.results.inventory:readers_of_results",
@@ -124,7 +125,7 @@ def _audit(location: Location, deep: bool) -> Audit:
     sizes = sizes_of(location, objects)
     problems += filter(None, (stored.problem(sizes.get(stored.key)) for stored in objects))
     problems += _content_problems(location, objects) if deep else _metadata_problems(root)
-    if deep and not problems and planned:
+    if deep and not problems and planned:  # readers of a damaged run would only repeat what is known
         run = Run(location)
         problems += _differences(run) if columns is not None else ()
         problems += _reading_problems(run)

@@ -132,6 +132,7 @@ class RunWriter[PlanT: WrittenPlan]:
         self.location, self.plan = location, plan
         self.provenance = provenance or provenance_here()
         self._begun = self._certified = False
+        # As they will be read again: a tuple would differ from the stored list, and refuse to continue.
         self.settings = json.loads(canonical_json(settings))
         self._label = label or str(self.settings["model"])
         if not location.exists(RUN_FILE):
@@ -267,8 +268,9 @@ class RunWriter[PlanT: WrittenPlan]:
         if self.location.exists(commit_key(number)):
             return
         self._say_who_plays()  # before any commit names it
-        self.write_certificate({})
+        self.write_certificate({})  # unless the player wrote its own: a run without any certificate is damaged
         commit = self._write_objects(episode)
+        # Before the commit: an episode that counts has its seconds, or all were deleted.
         write_seconds(self.root, number, episode.seconds)
         if not write_commit(self.location, commit):
             self._settle(episode, commit)

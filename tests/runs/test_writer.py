@@ -5,7 +5,7 @@ import pytest
 
 from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
 from probe_kit.extract.rollout.episode_loop import Rollout
-from probe_kit.hooks.contract.sites import Site
+from probe_kit.hooks.contract.sites import Site, Stream
 from probe_kit.runs import open_run, seal, verify_run
 from probe_kit.runs.layout import StoredStream
 from probe_kit.runs.store import locate
@@ -32,6 +32,12 @@ def rollout(writer: RunWriter, number: int, language: int) -> Rollout:
     return Rollout(
         writer.plan.episodes[number], {"outcome": "oob"}, buffers, [], control_steps=range(len(buffers.roles))
     )
+
+
+def test_a_stored_stream_gives_back_all_that_the_model_declared() -> None:
+    declared = Stream("expert", 3, 8, 10, "action", "the expert", ("residual", "mlp"), probed=False, sums=False)
+    stored = StoredStream.of(declared, 5, ("mean",))
+    assert stored.stream == StoredStream.from_json(stored.to_json()).stream == declared
 
 
 def test_a_block_of_padding_and_an_empty_row_are_stored_and_not_merely_missing(writer: RunWriter) -> None:

@@ -68,6 +68,7 @@ class ModelCard:
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values, as stored in a run's certificate."""
+        # Not `asdict`: it copies deeply, which read-only mappings refuse.
         plain = {name: getattr(self, name) for name in self.__dataclass_fields__}
         return {
             **plain,

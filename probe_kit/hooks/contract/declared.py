@@ -13,7 +13,8 @@ TEXT = ("language", "special")
 class DeclaredStream:
     """A stream of a family at a released size.
 
-    tokens: at a picture of 640 × 480 and an instruction of ten words, about. roles: what its tokens can be.
+    tokens: at a picture of 640 × 480 and an instruction of ten words, about; sizes of runs are estimated by it.
+    roles: what its tokens can be.
     """
 
     stream: Stream

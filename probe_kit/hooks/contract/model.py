@@ -77,12 +77,13 @@ class Tap:
 
     def select(self, passing: Tensor) -> Tensor:
         """The site's own (B, T, D), a view of what passes, or that itself where all of it is the site's."""
+        # Rows before tokens: a block of the batch has the same positions as the others.
         activation = self.rows.of(passing if self.view is None else self.view(passing))
         return activation if self.tokens == EVERY else activation[:, self.tokens]
 
     def write(self, passing: Tensor, new: Tensor) -> None:
         """Put `new` (B, T, D) where `select` reads."""
-        self.select(passing).copy_(new)
+        self.select(passing).copy_(new)  # in place: the block reads this very tensor
 
 
 @dataclass(frozen=True)
@@ -95,6 +96,7 @@ class HeadsTap(Tap):
 
     def write(self, passing: Tensor, new: Tensor) -> None:
         """Put `new` (B, T, H · E) where `select` reads."""
+        # `flatten` in `select` copies, because heads lie apart in memory; writing there would change nothing.
         by_token = self._by_token(passing)
         by_token.copy_(new.reshape(by_token.shape))
 
@@ -401,6 +403,7 @@ class Reading:
                 )
         ids = np.array(options, np.int64).reshape(len(logits), -1)
         option_logits = np.take_along_axis(logits, ids, axis=1)
+        # Less the largest logit, so that no exponential overflows; the share stays the same.
         shares = np.exp(logits - logits.max(axis=1, keepdims=True))
         peak = np.exp(option_logits - logits.max(axis=1, keepdims=True))
         return cls(option_logits, peak.sum(axis=1) / shares.sum(axis=1), state, ids)
@@ -444,6 +447,7 @@ class AnswerModel(Model):
     def near_ties(self, reading: Reading) -> NDArray[np.bool_]:
         """(B,) whether the two likeliest options are so close that rounding may decide; see `NEAR_TIE`."""
         best = np.sort(reading.option_logits, axis=1)[:, -2:]
+        # An unknown dtype counts as the coarser one: too many ties are said rather than too few.
         limit = NEAR_TIE.get(self.card.dtype, NEAR_TIE["bfloat16"])
         return np.asarray(best[:, -1] - best[:, 0] < limit) if best.shape[1] == 2 else np.zeros(len(best), bool)
 

@@ -7,6 +7,7 @@ from typing import Any
 
 from probe_kit.errors import UsageError
 
+# For text options of kind bool; Python's own `bool("false")` is True.
 _WORDS = {"true": True, "yes": True, "on": True, "1": True, "false": False, "no": False, "off": False, "0": False}
 _EXPECTED = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
 
@@ -49,7 +50,7 @@ class Option:
             if not isinstance(raw, str):
                 raise ValueError
             value = _WORDS[raw.lower()] if self.kind is bool else self.kind(raw)
-            if isinstance(value, int | float) and not abs(value) <= LARGEST:
+            if isinstance(value, int | float) and not abs(value) <= LARGEST:  # `not <=` also catches NaN
                 raise ValueError
             return value
         except (ValueError, KeyError, OverflowError):

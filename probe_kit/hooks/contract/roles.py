@@ -102,6 +102,7 @@ def prepare_pool(roles: Iterable[Roles], views: Sequence[str], device: torch.dev
         _matrix(row_roles, tuple(views), indexed_device)
 
 
+# The weights depend on the packing alone, and a run has few packings.
 @lru_cache(maxsize=1024)
 def _matrix(roles: Roles, views: tuple[str, ...], device: torch.device) -> Tensor:
     """(V, T) float32 weights; pooling runs at every firing of every site, with few different roles."""
@@ -111,7 +112,7 @@ def _matrix(roles: Roles, views: tuple[str, ...], device: torch.device) -> Tenso
 
 def _weights(roles: Roles, view: str) -> NDArray[np.float64]:
     valid = roles.valid
-    if view == "last":
+    if view == "last":  # the last token that is no padding; where padding stands in front, the last position
         weights = np.zeros(len(roles))
         weights[np.flatnonzero(valid)[-1]] = 1
         return weights

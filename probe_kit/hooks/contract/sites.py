@@ -111,6 +111,7 @@ class Stream:
                 f"stream {self.name!r} declares part {self.part!r}; expected one of {', '.join(PARTS)}. Say it in "
                 f"the adapter: Stream({self.name!r}, …, part='action')"
             )
+        # The way to fill in a field of a frozen dataclass.
         object.__setattr__(self, "part", part)
         object.__setattr__(self, "label", self.label or label_of(self.name))
 

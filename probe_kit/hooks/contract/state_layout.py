@@ -9,6 +9,7 @@ OPENNESS = ("measured", "release")
 CLOSED, OPENED = 0.015, 0.037
 """Finger joints of the WidowX in metres."""
 _EMPTY, _GRIPPER = 6, 7
+"""Places in `Observation.state`: a zero that stands for nothing, and the openness."""
 
 
 def laid_out(state: NDArray[np.float32], numbers: int, openness: str = "measured") -> NDArray[np.float32]:

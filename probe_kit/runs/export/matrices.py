@@ -24,7 +24,7 @@ from probe_kit.runs.run import Run
 INDEX = "index.parquet"
 SCALES = "scales.json"
 _READ_AT_ONCE, _INDEXED_AT_ONCE = 1 << 12, 1 << 18
-"""Rows of a matrix, and of its index."""
+"""Rows of a matrix, and of its index. They bound memory: 4,096 rows of 4,096 float32 are 64 MB."""
 
 
 @dataclass(frozen=True)
@@ -69,6 +69,7 @@ def write_sae(
     for choice in choices:
         stream_folder = folder / choice.name
         stream_folder.mkdir()
+        # One order for all sites of a stream, so that row i is one token at every layer, and one index serves all.
         order = np.random.default_rng(derive_seed("export sae", seed)).permutation(count_vectors(run, choice))
         stored = np.dtype(np.float16 if dtype == "float16" else np.uint16)
         rows, files = _write_matrices(run, choice, stream_folder, stored, order)

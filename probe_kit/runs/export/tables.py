@@ -92,6 +92,7 @@ def _table(block: Block, origins: Origins, schema: Any) -> Any:
     columns = origins.columns(positions, inferences, tokens, block.roles * sites)
     columns["site"] = pa.array(np.repeat([str(site) for site in block.choice.sites], count), pa.string())
     columns["view"] = pa.array([block.view] * (sites * count), pa.string())
+    # Arrow's offsets of lists are int32, enough for the vectors of one inference.
     ends = np.arange(0, (sites * count + 1) * width, width, dtype=np.int32)
     columns["vector"] = pa.ListArray.from_arrays(pa.array(ends), pa.array(block.values.ravel()))
     return pa.table([columns[name] for name in schema.names], schema=schema)

@@ -49,9 +49,10 @@ def _fill(file: Any, run: Run, safe: "_SafeFile") -> None:
         dataset.attrs["dtype"] = "float32" if kind == "pooled" else "bfloat16 bits"
         for position, row in enumerate(rows):
             dataset[position] = row
-            if safe.error is not None:
+            if safe.error is not None:  # the library does not know of it and would go through all episodes
                 return
     for name, values in _episodes(run).items():
+        # HDF5 has no column of mixed types, and no null among numbers: such a column becomes text.
         numeric = all(isinstance(value, bool | int | float) for value in values)
         file[f"episodes/{name}"] = values if numeric else ["" if v is None else str(v) for v in values]
 

@@ -55,6 +55,7 @@ class ActionStatistics:
         mask = np.asarray(action.get("mask", np.ones(low.shape, bool)), bool)
         if not low.shape == high.shape == mask.shape or not np.isfinite([low, high]).all():
             raise CheckpointError(f"the action statistics of {key} are not one finite number per dimension")
+        # Of numbers that are scaled: a gripper that stays as it is may have equal bounds.
         check_bounds(low[mask], high[mask], f"the action statistics of {key}")
         return cls(key, low, high, mask)
 

@@ -17,6 +17,8 @@ Note = Callable[[int, int, Tensor], None]
 
 Weights = Callable[[Any, tuple[Any, ...], dict[str, Any], Any], Tensor]
 """Weights of one call: of the module, its inputs, its keywords and its output."""
+_OTHER_STEPS = ("q_norm", "attn_logit_softcapping")
+"""Attributes of attentions of transformers that do more than project, rotate and scale."""
 
 
 @contextmanager
@@ -51,14 +53,17 @@ def recomputed(attention: Any, inputs: tuple[Any, ...], keywords: dict[str, Any]
     Computed once more from the module's inputs and the keys it left. Raises UnsupportedInterventionError for an
     attention of another kind.
     """
-    if getattr(attention, "o_proj", None) is None:
+    # With a norm of queries, as in Qwen3, or a soft cap, as in Gemma 2, these lines would give other weights.
+    other_steps = [name for name in _OTHER_STEPS if getattr(attention, name, None) is not None]
+    if getattr(attention, "o_proj", None) is None or other_steps:
         raise UnsupportedInterventionError(
-            f"{type(attention).__name__} rotates and projects in a way of its own, and its attention cannot be "
-            "computed once more here. Patch `kv` instead"
+            f"{type(attention).__name__} weighs in a way of its own ({', '.join(other_steps) or 'no o_proj'}): "
+            "its attention cannot be computed once more here. Patch `kv` instead"
         )
     states: Tensor = (inputs[0] if inputs else keywords["hidden_states"])[:, -1:]
     cosines, sines = (part[:, None, -1:] for part in keywords["position_embeddings"])
     queries = attention.q_proj(states).unflatten(-1, (-1, attention.head_dim)).transpose(1, 2)
+    # transformers' rotation pairs number i of a head with number i + E/2; so are the keys in the cache.
     below, above = queries.chunk(2, dim=-1)
     queries = queries * cosines + torch.cat([-above, below], dim=-1) * sines
     return shares(

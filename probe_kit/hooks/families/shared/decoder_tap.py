@@ -10,6 +10,7 @@ from probe_kit.hooks.contract.model import EVERY, Tap
 from probe_kit.hooks.contract.sites import HEADS, Site
 
 _PROJECTIONS = ("o_proj", "out_proj", "attn_out", "dense")
+"""Names that networks give to the output projection of an attention."""
 
 
 def decoder_tap(
@@ -28,7 +29,7 @@ def decoder_tap(
     """
     if site.quantity == "final_norm":
         return Tap(norm, fires, "output", tokens)
-    if site.layer == len(layers):
+    if site.layer == len(layers):  # behind the last block: what the final norm reads
         return Tap(norm, fires, tokens=tokens)
     block = layers[site.layer]
     if site.quantity == HEADS:

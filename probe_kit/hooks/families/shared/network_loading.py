@@ -107,10 +107,12 @@ def load_network[Network: nn.Module](
     else:
         weights = read()
         name = chosen_dtype(dtype, _stored_dtype(weights), DTYPES)
+        # On the meta device, without memory: a parameter that no file fills stays empty and is found, and large
+        # models are not held twice.
         network = build(DTYPES[name], "meta")
         tensors = tensors_of(weights) if tensors_of else renamed_tensors(weights, name_in_module)
         audit = assign_weights(network, weights, as_dtype(tensors, DTYPES[name]), name_in_module)
-    network.requires_grad_(False)
+    network.requires_grad_(False)  # a gradient is asked for at activations only
     finish(network)
     seed = weights_seed if random_weights else None
     notes = (audit.adapter,) if audit.adapter else ()

@@ -32,6 +32,7 @@ def chooser(temperature: float, seeds: Sequence[int], top: int | None = TOP, amo
         raise UsageError(f"temperature is {temperature}; expected 0 for the likeliest token, or a positive number")
     if temperature == 0:
         return greedy
+    # On the CPU, one per row: draws do not depend on the device, nor on the other rows of a batch.
     generators = [torch.Generator().manual_seed(seed % 2**63) for seed in seeds]
 
     def draw(logits: Tensor) -> Tensor:
@@ -53,7 +54,7 @@ def seeded_noise(seeds: Sequence[int], shape: tuple[int, ...], device: str) -> T
 
 def _draw(logits: Tensor, temperature: float, top: int | None, generator: torch.Generator) -> Tensor:
     count = logits.shape[0]
-    if top is not None and top < count:
+    if top is not None and top < count:  # ties with the last of them stay in
         count = int((logits >= logits.topk(top).values[-1]).sum())
     best, ids = logits.topk(count)
     drawn = torch.multinomial(torch.softmax(best / temperature, dim=0), 1, generator=generator)

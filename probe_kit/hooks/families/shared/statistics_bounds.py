@@ -43,6 +43,7 @@ class Bounds:
     def restore(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """Network output to physical units, and the gripper to 1 open or 0 closed; (..., D)."""
         metres = np.asarray((values + 1) / 2 * (self.high - self.low) + self.low, np.float32)
+        # From the number of the network itself, which the statistics do not scale.
         metres[..., -1] = values[..., -1] > _OPEN
         return metres
 

@@ -40,6 +40,7 @@ class TokenDecoder(Model):
         self.decoder: Any = self.network.language_model.model
         layers, width = len(self.decoder.layers) + 1, int(config.text.hidden_size)
         heads = int(config.text.num_attention_heads)
+        # The last token is fed back by nothing, so that there are as many positions as tokens.
         self.streams = {
             "backbone": Stream("backbone", layers, width, heads=heads),
             self.output: Stream(self.output, layers, width, captured or steps, part="action", heads=heads),

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+import transformers
 from torch.nn import functional
 from transformers import DynamicCache, LlamaConfig, LlamaModel
 
@@ -72,6 +73,18 @@ def test_xiaomis_weights_on_its_values_are_what_its_attention_reads() -> None:
         again = attention.o_proj((weights @ values).transpose(1, 2).flatten(2))
     torch.testing.assert_close(again, read)
     assert (weights[1, :, :, :2] == 0).all()
+
+
+@pytest.mark.parametrize("network", ["Qwen3", "Gemma2"])
+def test_an_attention_with_a_norm_of_queries_or_a_soft_cap_is_refused_not_recomputed_wrongly(network: str) -> None:
+    config = getattr(transformers, f"{network}Config")(
+        vocab_size=11, hidden_size=32, intermediate_size=16, num_hidden_layers=1, num_attention_heads=4,
+        num_key_value_heads=2, head_dim=8,
+    )  # fmt: skip
+    attention = getattr(transformers, f"{network}Model")(config).layers[0].self_attn
+    step = {"Qwen3": "q_norm", "Gemma2": "attn_logit_softcapping"}[network]
+    with pytest.raises(UnsupportedInterventionError, match=rf"{network}Attention .*{step}.*Patch `kv`"):
+        recomputed(attention, (torch.zeros(1, 1, 32),), {}, None)
 
 
 def test_an_attention_of_another_kind_is_refused() -> None:

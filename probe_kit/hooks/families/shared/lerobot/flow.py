@@ -74,6 +74,7 @@ class LerobotFlow(DenoisingPolicy):
     def __init__(self, network: Any, folder: Path, checkpoint: str) -> None:
         super().__init__(network, folder, checkpoint)
         checked_steps(self.iterations, folder)
+        # Before the streams are asked for: `prompt_kv` is one of them from now on.
         self.passages = attach_prompt_kv(self._joint, len(self.stacks["backbone"].layers))
         self.prompt_kv = kv_stream(len(self.passages.keys), self._kv_width)
 
@@ -148,6 +149,7 @@ def undecorated(method: Callable[..., Any]) -> Callable[..., Any]:
 @contextmanager
 def _with_graph(model: Any) -> Iterator[None]:
     """lerobot's sampling of a flow, without the decorator of its own."""
+    # An attribute of the instance hides the method of its class; `del` uncovers it again.
     model.sample_actions = undecorated(model.sample_actions)
     try:
         yield

@@ -90,6 +90,7 @@ class Normaliser:
             return values
         if self.mode == "MEAN_STD":
             return np.asarray((values - self.low) / (self.high + self.eps), np.float32)
+        # eps where the number never changed, as lerobot has it: any other value then lies far outside [-1, 1].
         span = np.where(self.high == self.low, self.eps, self.high - self.low)
         return np.asarray(2 * (values - self.low) / span - 1, np.float32)
 
@@ -97,13 +98,14 @@ class Normaliser:
         """Network output to physical units; (..., D)."""
         if self.mode == "IDENTITY":
             return values
-        if self.mode == "MEAN_STD":
+        if self.mode == "MEAN_STD":  # without eps, as in lerobot: not quite the inverse of `normalise`
             return np.asarray(values * self.high + self.low, np.float32)
         span = np.where(self.high == self.low, self.eps, self.high - self.low)
         return np.asarray((values + 1) / 2 * span + self.low, np.float32)
 
     def slope(self, numbers: int) -> NDArray[np.float32]:
         """(D,) of `restore`, which is a line in each of the D numbers."""
+        # By two points, so that the slope is that of `restore` in every mode.
         ends = (np.full((1, numbers), value, np.float32) for value in (0, 1))
         low, high = (self.restore(values)[0] for values in ends)
         return np.asarray(high - low, np.float32)

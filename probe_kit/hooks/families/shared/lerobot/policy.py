@@ -67,6 +67,8 @@ UNCOMPARED = ("IDENTITY", "EXCLUDED")
 """Modes of units without statistics: the state is read as it is, or not at all."""
 _DIMENSIONS = 7
 """Of the arm's actions."""
+_EMPTY_CAMERA = "empty_camera"
+"""Beginning of the names that lerobot gives to cameras that never get a picture."""
 TEXT_FILES = (*SMALL_FILES, "policy_*.safetensors")
 """All that packing and tokenising read: of the weights only those of lerobot's processors."""
 _VISION = "vision"
@@ -111,8 +113,7 @@ class LerobotPolicy(Policy):
         self.config, self.evaluation = network.config, network.config.evaluation
         self.stacks = self._stacks()
         self._read_streams()
-        keys = [key.removeprefix(IMAGES) for key in self.config.image_features]
-        self.cameras = tuple(key for key in keys if not key.startswith("empty_camera"))
+        self.cameras = cameras_of(self.config)
         self._show(self.cameras[:1])
 
     def showing(self, cameras: Sequence[str]) -> Self:
@@ -125,7 +126,7 @@ class LerobotPolicy(Policy):
             raise ObservationError(
                 f"cameras {list(cameras)} given; this checkpoint expects {list(self.cameras)}, in order"
             )
-        other = copy(self)
+        other = copy(self)  # shares the network; what `_show` changes is its own
         other.stacks = dict(self.stacks)
         other._show(tuple(cameras))
         needs = frozenset(f"camera.{name}" for name in cameras[1:])
@@ -346,6 +347,7 @@ class LerobotPolicy(Policy):
 
     def restored(self, output: Tensor) -> Tensor:
         """(..., D) float32 actions, bit for bit those of `act`, with the graph of the network's output."""
+        # The numbers of numpy's `restore`, on which a term of value zero hangs that carries the gradient.
         values = output.float()
         plain = values.detach().cpu().numpy()
         actions, slopes = (
@@ -532,7 +534,7 @@ class LerobotPolicy(Policy):
                     f"{text!r} has a word this checkpoint's tokenizer does not know; it would act without "
                     f"reading it. Tokens: {self.tokenizer.convert_ids_to_tokens(row)}"
                 )
-        tokens = torch.full((len(rows), length), self.tokenizer.pad_token_id or 0)
+        tokens = torch.full((len(rows), length), self.tokenizer.pad_token_id or 0)  # masked: any id would do
         mask = torch.zeros((len(rows), length), dtype=torch.bool)
         for index, row in enumerate(rows):
             tokens[index, : len(row)] = torch.tensor(row)
@@ -550,9 +552,7 @@ class LerobotPolicy(Policy):
         text = cls.__new__(cls)
         text.folder, text.evaluation = checkpoint_folder(checkpoint, TEXT_FILES), cls.choice(**options)
         text.config = cls._read_config(text.folder, text.evaluation)
-        text.cameras = text.shown_cameras = tuple(key.removeprefix(IMAGES) for key in text.config.image_features)[
-            :1
-        ]
+        text.cameras = text.shown_cameras = cameras_of(text.config)[:1]
         return text
 
     def window(self, camera: str) -> PictureWindow:
@@ -681,6 +681,12 @@ class LerobotPolicy(Policy):
         """Quantities of a golden reference that only this family has, or has in another form."""
         del run
         return {}
+
+
+def cameras_of(config: Any) -> tuple[str, ...]:
+    """The cameras of lerobot's configuration that a picture can be given for, in its order."""
+    names = (key.removeprefix(IMAGES) for key in config.image_features)
+    return tuple(name for name in names if not name.startswith(_EMPTY_CAMERA))
 
 
 def checked_steps(steps: int, folder: Path) -> int:

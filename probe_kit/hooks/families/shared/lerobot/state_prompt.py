@@ -11,7 +11,7 @@ from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.shared.lerobot.policy import LerobotPolicy
 
 BINS = np.linspace(-1, 1, 256 + 1)[:-1]
-"""Lower edges of the 256 bins of a normalised state."""
+"""Lower edges of the 256 bins of a normalised state, as lerobot's processor step of pi0.5 makes them."""
 _PROMPT = re.compile(
     r"Task: ?(?P<language>.*), ?State: ?(?P<state>[-\d ]*);\s*(?:Action:\s*)?\Z", re.DOTALL | re.IGNORECASE
 )

@@ -78,7 +78,7 @@ class Prefill:
                     use_cache=True,
                     logits_to_keep=1,
                 ).logits[:, -1]
-        finally:
+        finally:  # the network has appended the answer to the cache, also where an error ended it
             self.cache.crop(length)
         return torch.stack(tokens_out, dim=1) if tokens_out else torch.zeros(len(mask), 0, dtype=torch.long)
 

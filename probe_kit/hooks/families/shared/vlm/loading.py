@@ -19,7 +19,8 @@ from probe_kit.models.building import without_precision
 from probe_kit.models.naming import Renames, renamed
 
 Build = Callable[[Any, torch.dtype, str], Any]
-# What Python, torch and transformers raise for numbers and names in a configuration that cannot be.
+# What Python, torch and transformers raise for numbers and names in a configuration that cannot be. Many kinds,
+# because nothing checks a configuration before its numbers reach the layers.
 _OF_VALUES = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RuntimeError, AssertionError)
 
 

@@ -38,7 +38,7 @@ class TokenPrompt:
     """A whole prompt.
 
     text: behind the picture's positions. ids: of everything. question: which of the ids are the question.
-    picture: first and last but one position of the picture; equal where there is none.
+    picture: first position of the picture and the one behind its last; equal where there is none.
     """
 
     text: str
