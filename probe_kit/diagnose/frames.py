@@ -20,7 +20,10 @@ if TYPE_CHECKING:
 
 
 GOLDEN = (5**0.5 - 1) / 2
-"""Multiples of it, without their whole part, cover 0 to 1 evenly: episodes are not all looked at in one phase."""
+"""The golden ratio: its multiples, without their whole part, cover 0 to 1 evenly for any number of them.
+
+Thus episodes are looked at in different phases.
+"""
 
 
 def frames_of(

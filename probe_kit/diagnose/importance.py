@@ -26,7 +26,10 @@ INPUTS_DECIDE = 0.25
 TRACE = 0.01
 """Of the variance: a tenth of the actions' spread. An effect below it does not matter."""
 LEAST_SPREAD = 1e-3
-"""Of the largest spread of a number of the action: numbers with less are constant but for rounding."""
+"""Of the largest spread of a number of the action: numbers with less are constant but for rounding.
+
+Divided by their own spread, such numbers would turn rounding into large changes.
+"""
 
 
 @dataclass(frozen=True)

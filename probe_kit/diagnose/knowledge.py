@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from probe_kit.train import ProbeResults, Target
 
 ALL = "all"
+"""The category that pools all episodes."""
 
 
 def measure_knowledge(run: "Run", target: "Target | str", seed: int = 0) -> Knowledge:

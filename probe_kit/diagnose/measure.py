@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from probe_kit.hooks.contract.observation import Observation
 
 DONORS = 6
-"""For each frame: one donor alone often asks for the same action by chance."""
+"""For each frame: one donor alone often asks for the same action by chance. Inferences grow with their number."""
 Actions = NDArray[np.float32]
 Infer = Callable[[Sequence["Observation"], Sequence[int]], Actions]
 """From observations and seeds to actions (B, chunk, D), in any unit; deterministic for a seed."""
@@ -84,6 +84,7 @@ class InputExchange:
 
         Donors of a frame hold different values of the input, as far as there are so many.
         """
+        # A seed per input, so that the donors of one do not depend on which others are measured.
         rng = np.random.default_rng(derive_seed(self.seed, "donors", name))
         values, pairs = self._values(name), []
         drawn = draw_donors(self.frames, name, rng, len(self.frames))
@@ -96,7 +97,7 @@ class InputExchange:
 
     def first_donors(self, name: str) -> list[tuple[int, int]]:
         """One donor per frame of an input, of those that `donors` draws."""
-        return list(dict(reversed(self.donors(name))).items())
+        return list(dict(reversed(self.donors(name))).items())  # of a key named twice, a dict keeps the last value
 
     @cached_property
     def clean(self) -> Actions:

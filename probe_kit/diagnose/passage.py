@@ -48,10 +48,12 @@ def measure_passage(
         memo: dict[object, object] = {}
         for column, group in enumerate(places):
             differences[row, column] = _relative_difference(group, before, donor)
+            # Elsewhere the patch would put in what is there already: an inference saved, and a share of 0.
             if squares[row] and differences[row, column] > LIKE_NONE:
                 with patched(model, pair, [Cell(group, ALL)], donor, memo=memo):
                     edited = session.act(pair.clean, pair.seed)
                 moved[row, column] = scale.changes(edited[None], clean[None])[0] @ change
+    # A ratio of sums: pairs whose action hardly changes have little weight.
     shares = moved.sum(axis=0) / squares.sum() if squares.any() else np.full(len(places), np.nan)
     return tuple(
         SitePassage(group.name, float(difference), float(share))

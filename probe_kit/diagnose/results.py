@@ -20,7 +20,7 @@ IDLE: tuple[Verdict, ...] = ("no effect", "does not arrive")
 CARRIES = 0.5
 """Share of the change of the action from which a site is said to carry an input."""
 LIKE_NONE = 1e-6
-"""Relative difference of activations that rounding can make."""
+"""Relative difference of activations that rounding can make: some units of the last place of float32."""
 Number = Annotated[
     float,
     BeforeValidator(lambda stored: nan if stored is None else stored),

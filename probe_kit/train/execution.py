@@ -67,7 +67,10 @@ def probe_columns(
 def fit_columns(
     problems: Problems, take: Callable[[], tuple[Key, Samples]], report: Callable[[tuple[Key, Probed]], None]
 ) -> None:
-    """The work of a worker elsewhere: one column after the other, with one BLAS thread."""
+    """The work of a worker elsewhere: one column after the other, with one BLAS thread.
+
+    With more threads each, the workers would wait for the same cores.
+    """
     from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
     with threadpool_limits(1):

@@ -30,7 +30,10 @@ from probe_kit.train.target import Target
 from probe_kit.train.target_samples import TargetSamples, groups_of, target_samples
 
 TOKEN_PERMUTATIONS = 59
-"""Label permutations of token views by default."""
+"""Label permutations of token views by default: every token is a sample, and each permutation costs a full fit.
+
+The smallest p is then 1/60; a site with one permutation that does as well as the labels is still below 0.05.
+"""
 Progress = Callable[[int, int, str], None]
 """Called with (sites done, sites in all, what was just done)."""
 
@@ -231,6 +234,7 @@ class Sweep:
             target=target.name,
             permutations=permutations,
             seed=seed,
+            # 0 where none is probed, so that the option does not change the key of results that it has no part in.
             token_permutations=min(token_permutations, permutations) if any(map(is_token_view, views)) else 0,
             folds=folds,
             incomplete=incomplete,
@@ -323,7 +327,7 @@ class Sweep:
             probes[key] = of_site
             if progress is not None:
                 progress(len(probes), len(self.keys), f"{key[1]} {key[0]}")
-        return {key: probes[key] for key in self.keys}
+        return {key: probes[key] for key in self.keys}  # workers finish in any order
 
 
 def _check_windows(target: Target, window: int | None, align_to: Target | None) -> None:

@@ -35,6 +35,7 @@ from probe_kit.train.target_samples import TargetSamples
 if TYPE_CHECKING:
     import pandas as pd
 
+# Choices, not measurements: stricter ones refuse runs with a few gaps, laxer ones give a p to few free labels.
 MOST_OF_ONE_SIDE = 0.75
 """Share of episodes with the same correct side above which a category is refused; it is 0.5 if none is missing."""
 LEAST_MOVABLE = 0.5
@@ -285,11 +286,14 @@ def _block_folds_and_permutations(
         permutations = 0
     source = exchange_blocks(blocks, kinds, permutations, derive_seed("label exchanges", settings.seed, *scope))
     columns = np.column_stack([labels, labels[source]])
+    # An exchange that leaves a training fold with one value has no probe. The real labels are column 0, and stay.
     columns = columns[:, _trainable(name, columns, folds)]
     least = least_p(columns[:, 0], columns[:, 1:])
     if columns.shape[1] > 1 and (columns == columns[:, :1]).all():
         _warn_of_one_pattern(name, classes, labels, blocks)
-    elif least >= SIGNIFICANCE and least > 1.001 * smallest_p(permutations):
+    elif least >= SIGNIFICANCE and least > 1.001 * smallest_p(
+        permutations
+    ):  # its groups are the reason, not `permutations`
         warnings.warn(
             f"{name}: its groups allow no p below {least:.3f}, so nothing can be below {SIGNIFICANCE}. Label more "
             "groups",
@@ -355,6 +359,7 @@ def _blocks(
         by_item: dict[str, list[int]] = {}
         for row in rows:
             by_item.setdefault(str(items[row]), []).append(row)
+        # By look first, so that the n-th sample of one group corresponds to the n-th of another.
         ordered = sorted((sorted((looks[row], row) for row in of_item), item) for item, of_item in by_item.items())
         chain: list[tuple[Any, int]] = [pair for pairs, _ in ordered for pair in pairs]
         blocks[group] = np.array([position for _, row in chain for position in positions_of[row]], np.intp)

@@ -38,6 +38,7 @@ exchange_groups: groups exchange their labels layout by layout; of the chosen si
 exchange_blocks: groups exchange their labels as blocks, inference by inference; of every other target.
 """
 _MOST_CLASSES = 20
+"""Classes that a line about a target lists; probes take any number."""
 _CLASSES = "; or say that the texts are classes with --task classes or --task binary (task=…)"
 _COUNTED = {INFERENCE: "a captured inference", FRAME: "a frame", SOURCE: "an episode"}
 
@@ -230,7 +231,7 @@ class Target:
             sorted(
                 [episode, inference, classes[int(value)] if classes else value]
                 for episode, inference, value in zip(self.episodes, inferences, values, strict=True)
-                if value == value
+                if value == value  # NaN is a missing label
             )
         )
 

@@ -14,7 +14,10 @@ from probe_kit.train.columns.table import EPISODE, INFERENCE
 from probe_kit.train.target import Target
 
 REACHED = 0.9
-"""Share of the episodes that reach the last inference of the default window."""
+"""Share of the episodes that reach the last inference of the default window.
+
+A choice between long windows and few episodes left out: with 1, one short episode would cut all windows.
+"""
 _TRUE_OR_FALSE = (("False", "True"), ("no", "yes"), ("0", "1"))
 
 
@@ -195,7 +198,7 @@ def _label_grid(run: RunReader, target: Target) -> NDArray[np.float64]:
     for number, name in enumerate(target.episodes):
         row = row_of.get(name)
         if row is None:
-            if name in planned:
+            if name in planned:  # planned and not shown: another wording, category or an unfinished episode
                 continue
             raise UsageError(
                 f"{target.table.where(number)}: {run.location} has no episode {name!r}; it has {len(row_of)}, "

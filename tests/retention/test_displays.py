@@ -309,6 +309,13 @@ def test_final_positions_lie_over_the_tiles_as_seen_from_behind_the_robot(
     assert [(zone.center, zone.radius) for zone in zones] == [((-0.183, 0.397), 0.065), ((0.127, 0.397), 0.065)]
 
 
+def test_an_episode_without_a_position_does_not_lie_beyond_the_frame(tmp_path: Path, outcome_table: Any) -> None:
+    run = placed_run(tmp_path, outcome_table)
+    run.episodes.loc[run.episodes.index[0], ["cube_x", "cube_y"]] = np.nan
+    texts = [text.get_text() for text in FinalPositionsDisplay.from_run(run, "color").plot().ax_.texts]
+    assert "1 beyond the frame" in texts
+
+
 def test_final_positions_need_positions_and_a_scene(tmp_path: Path, outcome_table: Any) -> None:
     bare = ArrayRun(tmp_path, "pi0", "suite", outcome_table(2, 2, 2), {})
     with pytest.raises(UsageError, match="cube_x"):

@@ -17,7 +17,9 @@ from probe_kit.errors import UnknownCategoryError, UnknownSiteError, UsageError
 from probe_kit.retention import retention_table
 from probe_kit.retention.displays import (
     ClassConfusionDisplay,
+    IterationMapDisplay,
     LayerCurveDisplay,
+    ModelDepthDisplay,
     PredictedValuesDisplay,
     StepScoresDisplay,
     collect_figures,
@@ -197,6 +199,14 @@ def test_every_figure_of_a_table_is_drawn_unclipped_and_says_what_it_is_of(run: 
             assert f"target {exhibit.subject}" in figure.caption  # type: ignore[attr-defined]
     with pytest.raises(UsageError, match="has no rows of"):
         collect_figures([run], retention_table([run], target="sim.phase").of_target("nothing"))
+
+
+def test_figures_of_accuracies_refuse_probes_of_a_label(run: Run) -> None:
+    results = load_results(run, target="sim.tool_y")
+    with pytest.raises(UsageError, match=r"is of a side; these probes are of 'sim\.tool_y'"):
+        IterationMapDisplay.from_results(results, "all")
+    with pytest.raises(UsageError, match=r"some probes are of 'sim\.tool_y'"):
+        ModelDepthDisplay.from_results([results])
 
 
 def test_names_of_files_differ_where_columns_do() -> None:

@@ -46,7 +46,7 @@ Slope = Callable[["Tensor"], "Tensor"]
 EVERY_BLOCK = f"{KV_STREAM}.*"
 """The anchor that is all of `kv`."""
 AGREEMENT = 3.0
-"""Factor within which an anchor's estimate must lie of its exact effect."""
+"""Factor within which an anchor's estimate must lie of its exact effect. A choice."""
 LOCALISATION_SHARE = 0.5
 """Share of the whole effect from which a place is called localised."""
 FIRST = 3
@@ -124,6 +124,7 @@ def estimate_patches(
         with capture(model, sites) as cache:
             captured.append((act(model_input, pair.seed), cache))
     (clean, activations), (moved, source) = captured
+    # The clean end alone gives the tangent there; the mean of both ends is the trapezium rule between them.
     slopes = []
     for model_input in (pair.clean, pair.source)[: 1 + (ends == "both")]:
         assert isinstance(model_input, Observation)
@@ -179,7 +180,7 @@ def complete_cuts(model: "Model", places: Sequence[SiteGroup]) -> list[Cell]:
     if model.prompt_kv is not None:
         blocks = resolve_sites(EVERY_BLOCK, model)
         cuts.insert(0, SiteGroup(EVERY_BLOCK, tuple(site for block in blocks for site in block.sites)))
-    elif not cuts:
+    elif not cuts:  # neither `kv` nor a place in the backbone: its embeddings are a complete cut too
         cuts = resolve_sites(f"{next(iter(streams))}.00", model)
     return [Cell(site_group, ALL) for site_group in cuts]
 
@@ -258,7 +259,7 @@ def _compared(anchor: AttributionEffect) -> str:
 
 def _two(value: float | None) -> str:
     """Return two digits, and zero without a sign."""
-    return "–" if value is None else f"{round(value, 2) + 0.0:.2f}"
+    return "–" if value is None else f"{round(value, 2) + 0.0:.2f}"  # -0.0 + 0.0 is 0.0
 
 
 # -- in Python -----------------------------------------------------------------------------------------------
@@ -363,6 +364,7 @@ def _row(cell: Cell, moved: NDArray[np.float64], exact: Sweep, anchors: Sequence
     is_anchor = cell in anchors
     at = anchors.index(cell) if is_anchor else 0
     is_significant = exact.source_p < SIGNIFICANCE
+    # A share of an effect that may be none would be a ratio of noise.
     estimate = share_of_whole(moved, exact.full_effect, exact.groups, DRAWS) if is_significant else None
     return AttributionEffect(
         category="",

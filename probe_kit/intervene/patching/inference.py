@@ -48,6 +48,7 @@ def infer(model: "Model", model_input: Given, seed: int = 0) -> Output:
 
     if isinstance(model_input, Observation):
         if isinstance(model, Policy):
+            # A policy whose actions do not fit the arm still has activations, and a chunk that patches change.
             act = model.act if model.embodiment_mismatch() is None else model.infer_without_acting
             return np.asarray(act([model_input], [seed])[0], np.float32)
         raise UsageError(f"{model.card.family} does not act: give it a question, hooks.Prompt(observation, text)")

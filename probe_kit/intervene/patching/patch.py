@@ -126,6 +126,7 @@ def patched(
     memo = {} if memo is None else memo
     changes: dict[Site, list[tuple[TokenSelection, TokenEdit]]] = {}
     for cell in cells:
+        # Several cells may lie at one site: their edits are collected, so that the site is hooked once.
         tokens = role_tokens(model, pair, cell.site_group.stream, cell.role, memo)
         change = cell.site_group.limit(_change(source, tokens.count, along, complement))
         for site in cell.site_group.sites:
@@ -145,9 +146,10 @@ def as_tuple(cells: Cells) -> tuple[Cell, ...]:
 def _change(source: "ActivationCache", tokens: int, along: Basis | None, complement: bool) -> TokenEdit:
     if along is None:
         if complement:
-            raise UsageError("rest patches all but a subspace; give its orthonormal basis as along")
+            raise UsageError("complement patches all but a subspace; give its orthonormal basis as along")
         return ReplaceWith(source, tokens)
     basis = np.atleast_2d(np.asarray(along, np.float32))
+    # Looser than float32, because bases come from files; rows that are not orthogonal would count a part twice.
     if not np.allclose(basis @ basis.T, np.eye(len(basis)), atol=1e-4):
         raise UsageError(
             f"along has shape {basis.shape} and rows that are not orthonormal; take those of numpy.linalg.qr"

@@ -64,10 +64,11 @@ def find_minimal_set[C](
         best = int(np.argmax(shares))
         if shares[best] >= keep * full:
             have, effect = smaller[best], shares[best]
+            # Delta debugging: after a success as fine as before, but for the part that is gone.
             parts = len(have) if is_singly else max(2, min(parts - 1, len(have)))
         elif parts < len(have):
             parts = min(2 * parts, len(have))
-        else:
+        else:  # no single cell can be left out
             break
     return MinimalSet(have, effect, tried)
 
@@ -147,6 +148,7 @@ def compare_alone_and_without(
     distinct = _several(cells)
     sets = [distinct, *[(cell,) for cell in distinct], *[all_but(distinct, (cell,)) for cell in distinct]]
     swept = sweep_cells(model, pairs, sets, metric)
+    # The family of max-T: cells alone. All cells together, and all but one, are no tests of a cell.
     alone = _only(swept, range(1, 1 + len(distinct)))
     rows = []
     for at, cell in enumerate(distinct):

@@ -40,6 +40,7 @@ def share_of_whole(
     names, group_of = np.unique(groups, return_inverse=True)
     above, below = np.bincount(group_of, moved * full), np.bincount(group_of, full**2)
     times = draw_groups(names.size, units_seed(groups, seed_text))
+    # A draw may hold only groups in which the source moves nothing.
     drawn = (times @ above) / np.maximum(times @ below, np.finfo(float).tiny)
     low, high = np.percentile(drawn, [2.5, 97.5])
     return SwapShare(float(above.sum() / below.sum()), float(low), float(high))
@@ -124,6 +125,7 @@ class Sweep:
 
         moved = self.toward * (self.patched - self.clean)
         seed = derive_seed(DRAWS, "sign flips", *np.unique(self.groups).tolist())
+        # Where the source moves the metric the other way, a patch that follows it is tested in that direction.
         sign = -1.0 if self._source_p_values[1] < SIGNIFICANCE else 1.0
         _, p, p_fwe = max_t(sign * moved, self.items, self.groups, seed)
         shares = [(np.nan,) * 3 if share is None else tuple(share) for share in self.shares]

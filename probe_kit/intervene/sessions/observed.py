@@ -177,4 +177,5 @@ class ObservedSession(ReplaySession):
 def _state_spread(frames: Sequence[Frame]) -> NDArray[np.float64]:
     """Return (D,) the standard deviation of every number of the state, 1 where it has none."""
     spread = np.std([frame.state for frame in frames], axis=0)
+    # 1 where a number never changes: `hardly_changed` then moves it by a hundredth of its unit.
     return np.where(spread > 0, spread, 1.0)

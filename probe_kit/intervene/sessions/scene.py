@@ -119,6 +119,7 @@ class SceneSession(ReplaySession):
             commanded = self.run.trajectory(row).commanded
         except NoTrajectoryError:
             return None
+        # Of averaged chunks only the first action is that of one inference: there is no earlier chunk yet.
         executed = 1 if self.policy.card.ensemble is not None else int(self.run.settings["execute"])
         return np.asarray(commanded[:executed], np.float32)
 
@@ -156,6 +157,7 @@ class SceneSession(ReplaySession):
             return None
         if self.run.wording is None:
             return counterpart.instruction
+        # The counterpart may list the same two pictures in the other order, and then lies in the other layout.
         alike = self.items[item_id].left_pixels_sha256 == counterpart.left_pixels_sha256
         (wording,) = check_wordings([self.run.wording])
         worded = in_words(Episode(counterpart, layout if alike else _OTHER[layout]), wording)

@@ -30,7 +30,10 @@ if TYPE_CHECKING:
     from probe_kit.hooks import Policy
 
 FAR = 0.01
-"""By how much a repeated first action may differ from the stored one; more is another policy or scene."""
+"""By how much a number of a repeated first action may differ from the stored one, in its unit.
+
+Batches of another size, threads and GPUs round otherwise. More is another policy or scene.
+"""
 
 
 class Progress(Protocol):
@@ -133,7 +136,7 @@ class ReplaySession(ABC):
             return nan
         count = min(len(pair.stored), len(chunk))
         largest = float(np.abs(chunk[:count] - pair.stored[:count]).max())
-        if not largest <= FAR:
+        if not largest <= FAR:  # negated, so that NaN is refused too
             raise CaptureChangedActionError(
                 f"the first action of {pair.episode}, inferred again, differs from the stored one by "
                 f"{largest:.3g}; expected the same. The policy has other options than the run's, or is not "

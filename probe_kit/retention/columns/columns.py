@@ -125,7 +125,7 @@ def p_value(key: str, heading: str, meaning: str, **more: Any) -> Column:
 
 
 def _judged(column: Column) -> Column:
-    """The column, empty for a run that keeps no trajectories."""
+    """The column, empty for a run that keeps no trajectories; `sr_idle` is known wherever they are."""
     text = column.text
     return replace(column, text=lambda row: "–" if row.rules.sr_idle is None else text(row))
 
@@ -712,7 +712,7 @@ def all_columns(modes: Modes = "both") -> tuple[Column, ...]:
     """Every column of the tables of such rows once, in order and with their words."""
     tables = [groups for title, groups in TABLES.items() if modes in ("both", _OF_ONE_MODE.get(title, modes))]
     every = [column.worded(modes) for groups in tables for group in groups for column in group.columns]
-    return tuple({column.heading: column for column in every}.values())
+    return tuple({column.heading: column for column in every}.values())  # both tables of behaviour share some
 
 
 def averaged_fields() -> tuple[str, ...]:

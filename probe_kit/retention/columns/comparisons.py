@@ -1,7 +1,7 @@
 """Tables of what was compared: wordings, sizes of the picture, VLM − VLA, and answers with probes and success."""
 
 from collections.abc import Callable, Mapping, Sequence
-from itertools import groupby
+from itertools import chain, count, groupby
 
 from probe_kit._tables.numbers import number, percent, points, with_limits
 from probe_kit._tables.table import Heading, Table
@@ -72,10 +72,11 @@ def size_table(means: Sequence[RetentionRow]) -> list[Table]:
             str(part) for part in (row.answers.picture, row.answers.asked_for) if part not in ("frame", "target")
         ]
         prompt = " · ".join([str(row.answers.prompt), *extras])
-        # Two runs of one model, prompt and size, such as two checkpoints, stand in lines of their own.
-        while str(row.answers.picture_size) in lines.get((name, prompt), {}):
-            name = model_name(row) if name != model_name(row) else f"{name} '"
-        lines.setdefault((name, prompt), {})[str(row.answers.picture_size)] = success_interval(row)
+        size = str(row.answers.picture_size)
+        # Runs of one model, prompt and size, such as two checkpoints, stand in lines of their own.
+        names = chain([name], (model_name(row) + " '" * primes for primes in count()))
+        free = next(name for name in names if size not in lines.get((name, prompt), {}))
+        lines.setdefault((free, prompt), {})[size] = success_interval(row)
     cells = [(*name, *(rates.get(size, "–") for size in sizes)) for name, rates in lines.items()]
     title, note = "Accuracy by prompt and size of the picture", "mean over categories in %, with its 95 % interval"
     return [Table.of(title, ("model", "prompt", *sizes), cells, names=2, notes=[note])]

@@ -21,7 +21,7 @@ from probe_kit.statistics.sufficiency import probe_command
 from probe_kit.train.results.control_scores import RANDOM_FEATURES, UNTRAINED
 
 MOST_WORDS = 25
-"""Of a sentence with the name of its category; a number is a word."""
+"""Of a sentence with the name of its category, as in all texts of the package; a number is a word."""
 MOST_NUMBERS = 2
 _CONTROLS = {RANDOM_FEATURES: "random features", UNTRAINED: "an untrained network"}
 
@@ -76,6 +76,7 @@ def _sentence(head: str, *clauses: str, row: RetentionRow) -> str:
     *before, success = [*clauses, _success(row)]
     guessing = "" if row.success.sr is None else _beside_guessing(row)
     stream = _in_action(row)
+    # From most to least said: the first that is short enough.
     for in_action, guess in ((stream, guessing), (stream, ""), ("", guessing), ("", "")):
         clauses_of = [clause.replace(_READ, f"{_READ}{in_action}") for clause in before]
         sentence = f"{head}: {'; '.join([*clauses_of, success])}{guess}."

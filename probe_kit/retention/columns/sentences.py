@@ -218,6 +218,7 @@ def _items_for_success(success: SuccessRate) -> str:
     """Return with how many items guessing would no longer explain the rate, if it stays; empty for one half."""
     if success.sr is None or not success.chance_margin or not success.n_items or success.sr == 0.5:
         return ""
+    # The margin shrinks with the root of the number of items.
     needed = ceil(success.n_items * (success.chance_margin / (success.sr - 0.5)) ** 2)
     return f": a rate of {whole_percent(success.sr)} % takes about {needed} items" * (needed > success.n_items)
 

@@ -60,6 +60,7 @@ def retention_tables(
         "Retention": probed(rows),
         "Controls": probed(rows) if controlled(rows) else [],
     }
+    # Said once, below the last table that it is about.
     last = next((title for title in reversed(BEHAVIOUR) if rows_of[title]), None)
     tables = {}
     for title, of_table in rows_of.items():

@@ -186,6 +186,7 @@ def name_of(row: RetentionRow) -> str:
 
 def once_per_category(rows: Sequence[RetentionRow]) -> list[RetentionRow]:
     """Success rates do not depend on the view: the first row of each run and category."""
+    # Twice reversed: of a key named twice a dict keeps the first place and the last value.
     return list({(row.run.location, row.category): row for row in reversed(rows)}.values())[::-1]
 
 

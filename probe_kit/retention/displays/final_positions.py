@@ -89,13 +89,15 @@ class FinalPositionsDisplay(Display):
         low, high = _window(self.scene, _reach(rule))
         _draw_table(axes, self.scene, rule)
         inside = ((self.xy >= low) & (self.xy <= high)).all(axis=1)
+        beyond = ~inside & np.isfinite(self.xy).all(axis=1)  # without positions where the simulator broke
         for name, (label, colour, marker) in _OUTCOMES.items():
             of_outcome = (self.outcome == name) & inside
+            # y is to the robot's left, so that it is drawn to the reader's left.
             axes.scatter(
                 -self.xy[of_outcome, 1], self.xy[of_outcome, 0], c=colour, marker=marker, label=label, s=18,
                 alpha=0.65, linewidths=0, zorder=3, rasterized=bool(of_outcome.sum() > _MANY),
             )  # fmt: skip
-        _set_window(axes, low, high, int((~inside).sum()))
+        _set_window(axes, low, high, int(beyond.sum()))
         title = spell(self.category or "all categories")
         axes.set_title(title, fontsize=10, loc="left")
         axes.set_xlabel(self._summary(), fontsize=7.5, color="0.3", labelpad=3)

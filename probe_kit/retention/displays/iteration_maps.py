@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.errors import UnknownSiteError
+from probe_kit.errors import UnknownSiteError, UsageError
 from probe_kit.retention.columns.text import spell
 from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
@@ -54,12 +54,17 @@ class IterationMapDisplay(Display):
         """Read stored probes; view: the first probed one by default; stream: where the action is made.
 
         Raises UnknownSiteError for a view that was not probed or a stream without iterations,
-        UnknownCategoryError for a category that was not probed.
+        UnknownCategoryError for a category that was not probed, UsageError for a target that is no side.
         """
         view = known_view(results, view)
         curve = curve_of(results, category, view)
         scores = scores_of(results, category, view)
         stream = stream or curve.action_stream
+        if not curve.is_side:
+            raise UsageError(
+                f"a map of iterations is of a side; these probes are of {results.settings.target!r}. "
+                "Draw their layer curve with iterations='all'"
+            )
         scores = scores[(scores["stream"] == stream) & scores["iteration"].notna()]
         if scores.empty:
             raise UnknownSiteError(f"stream {stream!r} in view {view!r} has no iterations; see the layer curve")
@@ -173,7 +178,7 @@ def draw_legend(figure: "Figure") -> None:
 
 
 def _ink(value: float, norm: "Normalize") -> str:
-    return "white" if norm(value) > 0.45 else "black"
+    return "white" if norm(value) > 0.45 else "black"  # the colours get dark in their middle
 
 
 def draw_scale(

@@ -103,6 +103,7 @@ class KnowledgeActionDisplay(Display):
         inks = [darker(series(models.index(point.model)).colour) for point in self.points]
         points = [(100 * point.accuracy, 100 * point.sr) for point in self.points]
         bars = [ends for point in self.points for ends in _bars(point)]
+        # `place_labels` knows level and upright lines: the diagonal is a stair of short ones.
         diagonal = [((step, step), (step + 1, step + 1)) for step in range(100)]
         guessing = [((0, 50), (100, 50)), ((50, 0), (50, 100))]
         place_labels(axes, points, words, inks, [*bars, *diagonal, *guessing])

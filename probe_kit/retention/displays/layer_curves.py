@@ -72,6 +72,7 @@ class Ground:
         names = [str(site) for site in curve.sites]
         rows = [names.index(site) for site in stream.sites]
         every = np.broadcast_to(curve.null.ravel(), (len(rows), curve.null.size))
+        # All sites of a side have chance one half, so that one band serves them; a label's chance differs by site.
         null = every if curve.is_side else curve.null[rows]
         ends = np.percentile(null, [2.5, 97.5], axis=1) if curve.null.shape[1] >= _ENOUGH else None
         controls = () if curve.is_side else results.controls.of_stream(category, view, stream.stream)

@@ -70,8 +70,14 @@ class ModelDepthDisplay(Display):
 
         names: what runs are called, in order; by default as when they were probed.
 
-        Raises UnknownSiteError for a view that was not probed, UsageError if no run has that stream.
+        Raises UnknownSiteError for a view that was not probed, UsageError if no run has that stream, or for probes
+        of a target that is no side: other metrics have no common scale.
         """
+        if labels := [probes.settings.target for probes in results if not probes.settings.is_side]:
+            raise UsageError(
+                f"models are compared by accuracies of a side; some probes are of {labels[0]!r}. Draw their layer "
+                "curves"
+            )
         called = [_name(probes) for probes in results] if names is None else names
         every = [(probes, known_view(probes, view), name) for probes, name in zip(results, called, strict=True)]
         with_stream = [entry for entry in every if (entry[0].scores["stream"] == stream).any()]

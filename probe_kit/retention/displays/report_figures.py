@@ -88,6 +88,7 @@ def caption_of(figure: "Figure") -> str:
 def _metadata(suffix: str, exhibit: ReportFigure, caption: str) -> dict[str, str | None]:
     """The caption goes with the file, in what readers of its format show of it."""
     if suffix == ".pdf":
+        # Without its date a figure of the same numbers has the same bytes.
         return {"Title": exhibit.title, "Subject": f"{caption}. {exhibit.reading}", "CreationDate": None}
     return {"Title": exhibit.title, "Description": f"{caption}. {exhibit.reading}"}
 

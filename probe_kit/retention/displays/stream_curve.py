@@ -82,7 +82,7 @@ class StreamCurve:
         best = LayerLine.of(best_rows)
         steps = sorted(int(step) for step in scores["iteration"].dropna().unique())
         each = tuple(LayerLine.of(scores[scores["iteration"] == step], step) for step in steps)
-        tied = scores[excess >= excess.max() - 1e-12]
+        tied = scores[excess >= excess.max() - 1e-12]  # equal but for rounding of sums
         return cls(
             stream=str(scores["stream"].iloc[0]),
             part=str(scores["part"].iloc[0]),

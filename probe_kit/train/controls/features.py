@@ -33,7 +33,7 @@ THUMBNAIL, SIDE = 32, 12
 LAYERS = 5
 """Random layers, whose mean is the reference: one alone is lucky or not, and the best of them is lucky."""
 MOST_BINS = 50
-"""Columns that the step has at most."""
+"""Columns that the step has at most: neighbouring inferences of long windows share one."""
 
 Features = NDArray[np.float32]
 
@@ -231,7 +231,9 @@ def random_layer(parts: Sequence[Features], width: int, seed: int) -> Features:
     generator = np.random.default_rng(seed)
     varying = [_standardised(part) for part in parts]
     mixed = [
-        part @ generator.standard_normal((part.shape[1], width)) / max(1, part.shape[1]) ** 0.5 for part in varying
+        # Divided by the root of its width, so that a thousand pixels do not drown ten words.
+        part @ generator.standard_normal((part.shape[1], width)) / max(1, part.shape[1]) ** 0.5
+        for part in varying
     ]
     outputs: Features = np.tanh(sum(mixed)).astype(np.float32)
     return outputs

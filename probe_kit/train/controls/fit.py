@@ -114,6 +114,7 @@ def add_controls(
     controls = replace(before, left_out={name: why for name, why in missing.items() if name not in before.names})
     seed = results.settings.seed
     for name in prepared.names:
+        # Random layers are made per stream, as wide as it: a wider layer decodes more, whatever it holds.
         features = None if name == RANDOM_FEATURES else Samples.pooled(prepared.inputs.features(name))
         for category, problem in problems.items():
             if features is None:
@@ -139,6 +140,7 @@ def _by_site(probes: Sequence[SiteProbe]) -> dict[Site, SiteProbe]:
 
 def _layer_probes(inputs: ControlInputs, problem: Problem, width: int, seed: int) -> list[SiteProbe]:
     """Probes of the random layers, without label permutations."""
+    # Words of seeds, which numbers depend on: another word would draw other layers.
     kind = "binding" if problem.is_side else "label random features"
     layers = (inputs.layer(problem.positions, width, derive_seed(kind, seed, number)) for number in range(LAYERS))
     return [problem.fit(Samples.pooled(layer)) for layer in layers]

@@ -14,6 +14,11 @@ from probe_kit.train.solver.projection import Projection
 Matrix = NDArray[np.float64]
 
 STRENGTHS: Matrix = np.array([1e-5, 1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0])
+"""The grid of C, ascending, because `LogisticSolver.path` starts from the solution before.
+
+Features are standardised. At the lower end a probe is nearly the direction between the class means, at the upper
+end it is hardly penalised.
+"""
 
 
 @dataclass(frozen=True)

@@ -72,6 +72,7 @@ def _nested(
 def _quantities(samples: Samples, labels: Matrix, fold: Fold) -> Iterator[Matrix]:
     """(m, K) predictions of one fold at each penalty."""
     train = labels[fold.train]
+    # A linear probe extrapolates without bound, and one prediction far outside would decide R².
     low, high = train.min(axis=0), train.max(axis=0)
     for predicted in _fitted(samples, fold).predictions(samples.of(fold.train).repeat(train)):
         yield predicted.clip(low, high)
@@ -89,6 +90,7 @@ def _best_classes(samples: Samples, labels: Matrix, classes: int, fold: Fold) ->
     train = labels[fold.train]
     targets = [(train == number).astype(np.float64) for number in range(classes)]
     counts = np.stack([target.sum(axis=0) for target in targets])
+    # Indicators of rare classes are larger, so that the largest prediction is not always the commonest class.
     scaled = np.hstack([target / np.sqrt(count.clip(1)) for target, count in zip(targets, counts, strict=True)])
     absent = np.where(counts == 0, -np.inf, 0.0)
     shape = (fold.test.size, classes, labels.shape[1])
@@ -98,7 +100,7 @@ def _best_classes(samples: Samples, labels: Matrix, classes: int, fold: Fold) ->
 
 def _largest_of_best(quality: Matrix) -> NDArray[np.intp]:
     """(K,) position of the best of (L, K) along the grid, the larger penalty on ties."""
-    scale = np.abs(quality).max(axis=0) + 1e-300
+    scale = np.abs(quality).max(axis=0) + 1e-300  # not zero
     rounded = (quality / scale).round(12)[::-1]
     best: NDArray[np.intp] = len(quality) - 1 - rounded.argmax(axis=0)
     return best

@@ -128,6 +128,7 @@ def _predict_binary(
     truth = labels == 1
     predictions, fitted = np.empty_like(labels), cross_validate(samples, truth, folds)
     for fold, probe in zip(folds, fitted, strict=True):
+        # Less the log-odds of the training classes: balanced accuracy takes both as equally frequent.
         share = truth[fold.outer.train].mean(axis=0)
         predictions[fold.outer.test] = probe.decisions > np.log(share / (1 - share))
     return predictions, np.array([probe.strengths[0] for probe in fitted]), [probe.inner for probe in fitted]

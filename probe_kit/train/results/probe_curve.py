@@ -241,7 +241,7 @@ class ProbeCurve:
     def depth(self, site: Site) -> float:
         """Layer of `site` as a fraction of its stream: 0 enters the first block, 1 leaves the last."""
         last = max(other.layer for other in self.sites if other.stream == site.stream)
-        return site.layer / max(1, last)
+        return site.layer / max(1, last)  # a stream of one layer has depth 0
 
     def fit_stream(self, rows: NDArray[np.intp]) -> Stream:
         """Return the sites at `rows`, which are one stream or a part of it, for cross-fitted scores.

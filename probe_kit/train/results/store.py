@@ -244,7 +244,7 @@ def _as_array(value: Any) -> Any:
 def _unpack(arrays: Mapping[str, Any]) -> dict[tuple[str, str], ProbeCurve]:
     members: dict[tuple[str, str], dict[str, Any]] = {}
     for name, value in arrays.items():
-        category, view, member = name.rsplit("/", 2)
+        category, view, member = name.rsplit("/", 2)  # from the right: a category of one's own may hold a slash
         members.setdefault((category, view), {})[member] = value
     return {key: ProbeCurve(**_members(stored)) for key, stored in members.items()}
 
@@ -315,7 +315,7 @@ def _read(run: RunReader, bundle: Bundle) -> ProbeResults:
 def _check_foreign(run: RunReader, bundle: Bundle, settings: ProbeSettings) -> None:
     """Raise RunDamagedError for results of another run, or of these episodes as they are no more."""
     stamp, now = _stamp(bundle), run.stamp
-    if stamp == now or not (stamp and now):
+    if stamp == now or not (stamp and now):  # arrays in memory have no commits, and are compared by their settings
         return
     if settings.run_settings != run.settings_sha256 or is_current(settings, run):
         raise RunDamagedError(

@@ -65,4 +65,4 @@ def keep_freed_memory() -> None:
     It learns so from the largest block, up to 32 MB, that was ever freed. Arrays of some megabytes that come and
     go with every step are otherwise mapped anew each time. Costs nothing: the block is never touched.
     """
-    np.empty(2**25 - 2**16, np.uint8)
+    np.empty(2**25 - 2**16, np.uint8)  # below 32 MB, with what glibc adds to a block

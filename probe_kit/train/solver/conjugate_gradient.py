@@ -8,6 +8,7 @@ from probe_kit.train.solver.backend import Array, array_namespace
 from probe_kit.train.solver.design_matrix import Design
 
 MAX_CG_STEPS = 100
+"""Columns that need more are solved by factorising; another number changes times, not optima."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,7 @@ def newton_steps(
     penalty: (R, 1). gradient: (R, K). curvature: (N, K), the diagonals S.
     """
     xp = array_namespace(gradient)
+    # Scaled to length 1: `precision` is relative, and no square underflows in float32.
     size = xp.linalg.norm(gradient, axis=0).clip(np.finfo(float).tiny)
     spectrum = design.spectrum
     penalty, residual, curvature, precision = (

@@ -24,6 +24,7 @@ from probe_kit.train.solver.conjugate_gradient import newton_steps
 from probe_kit.train.solver.design_matrix import Design
 
 MAX_NEWTON_STEPS = 100
+"""After these `ProbeNotConvergedError` is raised: no probe is used that is not at its optimum."""
 MAX_STEPS_BETWEEN = 10
 """Newton steps by products in float32 from one exact point to the next."""
 COARSEST, FINEST = 0.1, 1e-5
@@ -102,6 +103,7 @@ class LogisticSolver:
         self.xp = array_namespace(spectrum)
         self.penalty = self.xp.ones_like(spectrum[:, :1])
         self.penalty[-1] = 0.0
+        # The unit of float64 times the largest norm that Zᵀ · misfit can have: ‖Z‖ · √N.
         self.rounding = 1e-15 * (spectrum.sum(axis=0) * samples.shape[0]) ** 0.5
 
     def path(self, labels: NDArray[np.bool_], strengths: NDArray[np.float64]) -> Iterator[Array]:
@@ -237,7 +239,7 @@ class LogisticSolver:
         length = self.xp.ones_like(slope)
         noise = (EXACT if is_exact else 1e-6) * abs(value)
         weights, decisions = start.weights + step, start.decisions + change
-        while True:
+        while True:  # ends: towards length 0 the value is that of the start, which the noise allows
             loss, misfit = _losses(todo.signs * decisions)
             bound = value + 1e-4 * length * slope + noise
             too_far = self._value(todo.strength, weights, loss) > bound
@@ -274,7 +276,7 @@ def check_single_class(labels: NDArray[np.bool_]) -> None:
 def _losses(margins: Array) -> tuple[Array, Array]:
     """(K,) sums of log(1 + exp(−m)) over (N, K) margins, and each one's negative slope, 1 − P(label)."""
     xp = array_namespace(margins)
-    small = -abs(margins)
+    small = -abs(margins)  # exp of it never overflows, whatever the sign of the margin
     xp.exp(small, out=small)
     loss = (xp.log1p(small) + (-margins).clip(0.0)).sum(axis=0)
     misfit = xp.maximum(small, xp.asarray(margins <= 0, dtype=small.dtype))

@@ -24,6 +24,8 @@ MAX_ROUGH_STEPS = 12
 MAX_NEWTON_STEPS = 60
 MAX_CG_STEPS = 200
 MAX_HALVINGS = 30
+"""Bounds of loops. Rough steps may stop short, as exact ones follow; columns whose conjugate gradients do are
+factorised; after the last Newton step `ProbeNotConvergedError` is raised."""
 
 Rows = NDArray[np.intp]
 TINY = float(np.finfo(np.float32).tiny)

@@ -45,7 +45,7 @@ class RidgeFold:
             return cls(np.zeros(0), np.zeros((0, len(z))), np.zeros((len(t), 0)))
         if len(z) <= z.shape[1]:
             spectrum, axes = eigh(z @ z.T)
-            return cls(spectrum.clip(0.0), axes.T, (t @ z.T) @ axes)
+            return cls(spectrum.clip(0.0), axes.T, (t @ z.T) @ axes)  # rounding can make eigenvalues negative
         spectrum, axes = eigh(z.T @ z)
         return cls(spectrum.clip(0.0), axes.T @ z.T, t @ axes)
 

@@ -48,6 +48,7 @@ class Standardiser:
         the last place of the stored type.
         """
         mean, scale, rounding = Moments.of(features)
+        # Divided by a deviation that is rounding, a constant feature would become noise of size 1.
         varies = scale > rounding
         return cls(varies, mean[varies], scale[varies])
 

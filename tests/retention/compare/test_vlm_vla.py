@@ -161,6 +161,12 @@ def test_a_gap_needs_both_kinds(runs: list[SaidRun]) -> None:
         retention_table(runs[:1], vlm_vla=True)
 
 
+def test_runs_of_one_name_prompt_and_size_have_a_line_each_however_many(tmp_path: Path) -> None:
+    same = [asked(tmp_path / str(seed), by_chance(seed, 0.7), called=f"seed {seed}") for seed in range(4)]
+    (sizes,) = [own for own in retention_table(same).further_tables if own.columns[:2] == ("model", "prompt")]
+    assert len({cells[0] for cells in sizes.texts}) == len(sizes.texts) == 4
+
+
 def test_every_format_shows_answers_sizes_and_gaps(runs: list[SaidRun], tmp_path: Path) -> None:
     larger = asked(tmp_path / "large", by_chance(5, 0.7), called="large", picture_size="560x480")
     other = asked(tmp_path / "other", by_chance(6, 0.7), called="other", prompt="seen")

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
 Picture = tuple[bytes, dict[str, int]]
 """A PNG, and the size in pixels at which a page shows it."""
 
-_DPI = 160
+_DPI = 160  # of the PNG in a notebook; files for print have more, see `ShownFigure`
 _PAGE_DPI = 90  # fewer than the picture has, so that it is sharp on fine screens
 
 

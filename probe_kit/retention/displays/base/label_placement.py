@@ -11,7 +11,8 @@ Point = tuple[float, float]
 Box = tuple[float, float, float, float]
 
 _SIZE = 7.5
-_HEIGHT, _CHARACTER = 1.15 * _SIZE, 0.56 * _SIZE  # of one line of text, in points
+# Of one line of text, in points. Estimated: measured widths exist only once the figure is drawn.
+_HEIGHT, _CHARACTER = 1.15 * _SIZE, 0.56 * _SIZE
 _REACHES = (6.0, 13.0, 22.0, 32.0)  # from the point, in points
 
 
@@ -42,6 +43,7 @@ def place_labels(
     for name, ink, point, (x, y) in zip(names, inks, points, anchors, strict=True):
         width = _CHARACTER * len(name)
         boxes = [(reach, _box(x, y, width, reach, side)) for reach, side in product(_REACHES, _SIDES)]
+        # The least covered area; of equal ones the nearest. Names that were placed before stay where they are.
         reach, box = min(boxes, key=lambda of: (_covered(of[1], occupied) + _outside(of[1], frame), of[0]))
         occupied.append(box)
         start, bottom = in_data(box[0], box[1] + 0.22 * _HEIGHT)
@@ -52,6 +54,7 @@ def place_labels(
 
 
 _SIDES = ((1, 0), (1, 1), (1, -1), (-1, 0), (-1, 1), (-1, -1), (0, 1), (0, -1))
+"""Directions across and up from a point, the preferred ones first: text on the right reads best."""
 
 
 def _box(x: float, y: float, width: float, reach: float, side: tuple[int, int]) -> Box:

@@ -20,6 +20,7 @@ class ShownFigure(Figure):
 
     def draw(self, renderer: Any) -> None:
         """Draw; a `$` in the name of a model or category begins no formula."""
+        # Here and not at once: texts such as tick labels are made while it is drawn.
         for words in self.findobj(Text):
             words.set_parse_math(False)
         super().draw(renderer)

@@ -24,7 +24,10 @@ SKY, PURPLE, BLACK, GREY = "#56B4E9", "#CC79A7", "#000000", "#8C8C8C"
 
 DPI = 150
 ACCURACY = (20.0, 109.0)
-"""Percent along the axis of held-out accuracies, the same in every figure of every run."""
+"""Percent along the axis of held-out accuracies, the same in every figure of every run.
+
+Held-out accuracies below 50 % occur by chance, rarely below 20 %. Carets of the best sites stand above 100 %.
+"""
 ABOVE_CHANCE = (-30.0, 51.0)
 """The same of accuracies above chance, in points."""
 _CAPTION_SIZE = 6.5
@@ -101,10 +104,12 @@ def panels(
 
     across = columns or (2 if count == 4 else min(3, count))
     rows = ceil(count / across)
+    # 1.1 inches for legend and caption; 6.2 is the narrowest that a caption reads well in.
     figure = ShownFigure(figsize=(max(width * across, 6.2), height * rows + 1.1), layout="constrained", dpi=DPI)
     grid = list(figure.subplots(rows, across, sharex=share, sharey=share, squeeze=False).flat)
     for position in range(count, len(grid)):
         grid[position].set_visible(False)
+        # Of shared axes only the lowest row has numbers; above a hidden panel they would be missing.
         grid[position - across].tick_params(labelbottom=True)
     return figure, grid[:count]
 
