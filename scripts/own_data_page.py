@@ -1,4 +1,4 @@
-"""Make the tables and the figure of `docs/own-data.md`: `python scripts/own_data_page.py FOLDER`.
+"""Make the table and the figure of `docs/own-data.md`: `python scripts/own_data_page.py FOLDER`.
 
 FOLDER gets a run of `pi0-tiny` in scenes, the same frames as a LeRobotDataset that lerobot writes, a run on it,
 and a table with a binary, a class and a continuous label, which are the state of the simulation. All figures and
@@ -16,11 +16,10 @@ import pandas as pd
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 import probe_kit as pk
-from probe_kit._tables.numbers import number, with_limits
 from probe_kit.extract.rollout.controllers import Inference, PolicyController, Turn
 from probe_kit.hooks import Observation
 from probe_kit.hooks.contract.sites import label_of
-from probe_kit.retention import RetentionTable, retention_table
+from probe_kit.retention import retention_table
 from probe_kit.retention.displays import collect_figures, layer_curve, save_figures
 from probe_kit.retention.report import write_report
 from probe_kit.train import ProbeResults
@@ -58,7 +57,7 @@ def main() -> None:
     list(save_figures(collect_figures([run], retained), folder / "figures"))
     write_report([run], folder / "report.html", retained)
     layer_curve(results[0], iterations="best").savefig(FIGURE, dpi=FIGURE_DPI)
-    filled = f"{table_of(run, results)}\n\n{retention_of(retained)}"
+    filled = table_of(run, results)
     page = _BLOCK.sub(lambda block: f"{block[1]}\n{filled}\n\n{block[2]}", PAGE.read_text(encoding="utf-8"))
     PAGE.write_text(page, encoding="utf-8")
 
@@ -142,17 +141,6 @@ def table_of(run: pk.Run, results: list[ProbeResults]) -> str:
         "The score is balanced accuracy, or R² for `distance`."
     )
     return "\n".join(rows) + f"\n\n{note}"
-
-
-def retention_of(table: RetentionTable) -> str:
-    """Retention of every label, as Markdown."""
-    rows = ["| label | metric | backbone above chance | action above chance | retention |", "|---" * 5 + "|"]
-    for row in table.rows:
-        above = [with_limits(part.above, part.above_ci, number) for part in (row.backbone, row.action)]
-        retained = row.retention
-        value = with_limits(retained.value, retained.ci, number) if retained.defined else retained.note
-        rows.append(f"| `{row.target}` | {row.metric} | {above[0]} | {above[1]} | {value} |")
-    return "\n".join(rows)
 
 
 if __name__ == "__main__":
