@@ -1,7 +1,7 @@
 """An mkdocs hook: puts the options of every command, as Typer knows them, into the page `commands.md`.
 
-A line `<!-- options of: extract -->` becomes the command's help and a table of its arguments and options,
-`<!-- kinds of intervention -->` a table of the registered kinds.
+The line `<!-- every command -->` becomes a heading per panel of `probe-kit --help`. Below it stand the help of
+every command and a table of its arguments and options, and below `intervene` a table of the registered kinds.
 """
 
 import re
@@ -10,24 +10,31 @@ from typing import Any
 import typer
 
 PAGE = "commands.md"
-_PLACE = re.compile(r"^<!-- options of: (?P<path>[a-z -]+) -->$", re.MULTILINE)
-
-_KINDS = "<!-- kinds of intervention -->"
+_PLACE = "<!-- every command -->"
 _OF_FILE = re.compile(r"<!-- of the file alone -->\n.*?<!-- end of it -->\n+", re.DOTALL)
 """What a reader of the file needs to know, and the built page does not say."""
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Called by mkdocs for every page. Raises KeyError for a command that does not exist."""
+    """Called by mkdocs for every page."""
     if page.file.src_uri != PAGE:
         return markdown
-    markdown = _OF_FILE.sub("", markdown).replace(_KINDS, kinds_markdown())
-    return _PLACE.sub(lambda place: command_markdown(place["path"]), markdown)
+    return _OF_FILE.sub("", markdown).replace(_PLACE, commands_markdown())
 
 
-def command_paths() -> list[str]:
-    """Every command that does something, such as `suite build`."""
-    return [path for path, command in _walk(_root(), "") if not hasattr(command, "commands")]
+def commands_markdown() -> str:
+    """Every command that does something, such as `suite build`, under the panel of `probe-kit --help`."""
+    from probe_kit.cli import PANELS
+
+    sections = []
+    paths = [path for path, command in _walk(_root(), "") if not hasattr(command, "commands")]
+    for panel, names in PANELS.items():
+        sections.append(f"## {panel}")
+        for path in (path for name in names for path in paths if path.split()[0] == name):
+            sections += [f"### probe-kit {path}", command_markdown(path)]
+            if path == "intervene":
+                sections.append(kinds_markdown())
+    return "\n\n".join(sections)
 
 
 def command_markdown(path: str) -> str:
