@@ -87,13 +87,12 @@ def test_every_command_and_option_stands_on_the_page_of_commands(site: Path) -> 
 
 
 @pytest.mark.parametrize("error", ERRORS, ids=lambda error: error.__name__)
-def test_every_error_has_its_exit_code_a_cause_and_a_way_out(error: type[errors.ProbeKitError]) -> None:
+def test_every_error_has_its_exit_code_and_a_cause_or_a_place_to_look(error: type[errors.ProbeKitError]) -> None:
     page = (DOCS / "errors.md").read_text(encoding="utf-8")
     (row,) = re.findall(rf"^\| `{error.__name__}` \|(.*)\|$", page, re.MULTILINE)
-    code, cause, fix = (cell.strip() for cell in re.split(r"(?<!\\)\|", row))
+    code, cause = (cell.strip() for cell in re.split(r"(?<!\\)\|", row))
     assert int(code) == error.exit_code
     assert len(cause) > 20
-    assert len(fix) > 10
 
 
 def test_the_page_of_errors_names_no_error_that_is_none() -> None:
