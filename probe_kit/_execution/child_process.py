@@ -15,6 +15,7 @@ from importlib import import_module
 from multiprocessing.connection import Connection
 
 GRACE_S = 10.0
+"""Time in which a child ends after its parent hung up."""
 
 
 class Child:
@@ -23,6 +24,7 @@ class Child:
     def __init__(self, service: str, environment: Mapping[str, str] | None = None) -> None:
         ours, theirs = socket.socketpair()
         with theirs:
+            # The child imports from wherever this process does, also where a script or notebook changed it.
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "probe_kit._execution.child_process", service, str(theirs.fileno())],
                 pass_fds=[theirs.fileno()],

@@ -86,7 +86,7 @@ class TaskQueue[T]:
     def take(self, slot: int) -> T | None:
         """Return the next task for a worker; None if it should finish what it holds, or wait."""
         tasks = self._held[slot]
-        if any(key in self._failures for key in tasks):
+        if any(key in self._failures for key in tasks):  # it holds a suspect, which takes no other task down
             return None
         self.read_ahead()
         for waiting in (self._fresh, {} if tasks else self._suspects):
@@ -119,7 +119,7 @@ class TaskQueue[T]:
         counts: False for a failure that is no sign against the task.
         """
         task = self._held[slot].pop(key)
-        self._failures[key] += counts
+        self._failures[key] += counts  # an entry, also of 0, makes the task a suspect
         if self._failures[key] < self._tries:
             self._suspects[key] = task
             return True
@@ -163,7 +163,7 @@ def _hand_out(pool: Pool, queue: TaskQueue[Any], idle: set[int]) -> None:
     for slot in sorted(idle):
         task = queue.take(slot)
         idle.discard(slot)
-        if task is not None or queue.holds(slot):
+        if task is not None or queue.holds(slot):  # None: it finishes what it holds
             pool.send(slot, task)
         else:
             pool.stop(slot)

@@ -74,7 +74,7 @@ class ProcessPool:
         connections = [child.connection for child in self._children.values()]
         while not (ready := wait(connections, LONGEST_WAIT_S)):
             pass
-        for slot, child in self._children.copy().items():
+        for slot, child in self._children.copy().items():  # between two messages the executor may start others
             if child.connection not in ready:
                 continue
             try:

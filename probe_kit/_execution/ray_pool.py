@@ -105,6 +105,7 @@ class RayPool:
 
     def stop(self, slot: int) -> None:
         """End an idle worker, which makes room for others."""
+        # Its pending call would end as that of a lost worker.
         self._collecting = {call: other for call, other in self._collecting.items() if other != slot}
         self._ray.kill(self._actors.pop(slot))
 

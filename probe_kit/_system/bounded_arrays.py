@@ -46,7 +46,7 @@ def _check_header(packed: ZipFile, entry: ZipInfo) -> None:
 
     with packed.open(entry) as file:
         if file.read(len(npy.MAGIC_PREFIX)) != npy.MAGIC_PREFIX:
-            return  # numpy gives its bytes
+            return  # no array: numpy gives its bytes as they are
         headers: dict[bytes, Any] = {b"\1\0": npy.read_array_header_1_0, b"\2\0": npy.read_array_header_2_0}
         read = headers.get(file.read(2))
         if read is None:
@@ -60,7 +60,7 @@ def _check_header(packed: ZipFile, entry: ZipInfo) -> None:
     size = math.prod(shape) * dtype.itemsize
     if (
         any(isinstance(axis, bool) or axis < 0 for axis in shape)
-        or (not dtype.itemsize and math.prod(shape))
+        or (not dtype.itemsize and math.prod(shape))  # of values without bytes there can be any number
         or start + size != entry.file_size
     ):
         raise ValueError(

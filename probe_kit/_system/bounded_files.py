@@ -41,7 +41,7 @@ def open_regular(path: Path, most: int = MOST_BYTES) -> BufferedReader:
 def read_regular(path: Path, most: int = MOST_BYTES) -> bytes:
     """Return the bytes of a regular file of at most `most` bytes. Raises OSError for another one."""
     with open_regular(path, most) as file:
-        content = file.read(most + 1)
+        content = file.read(most + 1)  # it may have grown since
     if len(content) > most:
         raise _too_large(path, len(content), most)
     return content
@@ -68,6 +68,7 @@ def _too_large(path: Path, size: int, most: int) -> OSError:
 
 
 MOST_NODES = 1_000_000
+"""Values of a YAML file, where an alias counts as all that it stands for."""
 _MOST_YAML_BYTES = 16 << 20
 
 

@@ -14,6 +14,7 @@ from probe_kit.errors import ProbeKitError
 MOST_VALUES = 1 << 25
 """Values of one text; in Python each takes 8 to 80 bytes, however short it is written."""
 _HALF = re.compile(r"\\u[dD][89a-fA-F]")
+"""An escape of half a surrogate pair, whose other half may be missing."""
 
 
 def parse_json(content: bytes | str, **options: Any) -> Any:
@@ -24,9 +25,11 @@ def parse_json(content: bytes | str, **options: Any) -> Any:
     """
     try:
         text = content.decode("utf-8-sig") if isinstance(content, bytes) else content
+        # Every value but the first comes after one of these signs, which texts may hold as well.
         if len(text) > MOST_VALUES and (most := sum(map(text.count, ",[{"))) > MOST_VALUES:
             raise ValueError(f"it may hold {most:,} values; expected at most {MOST_VALUES:,}")
         value = json.loads(text, object_pairs_hook=_distinct, **options)
+        # Half a pair cannot be encoded; of a text without such escapes that is known without writing it again.
         (json.dumps(value, ensure_ascii=False) if _HALF.search(text) else text).encode()
     except RecursionError:
         raise ValueError("it nests too deeply") from None

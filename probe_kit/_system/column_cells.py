@@ -12,8 +12,11 @@ Where = Callable[[int], str]
 _BOOLEANS = {"true": True, "t": True, "false": False, "f": False}
 _ANSWERS = {"yes": "yes", "y": "yes", "true": "yes", "t": "yes", "no": "no", "n": "no", "false": "no", "f": "no"}
 _FOREIGN = {"ja", "j", "nein", "oui", "non", "si", "sí", "1", "0"}
+"""What may mean yes or no beside one of them, and is not read as either."""
 _COMMA = re.compile(r"[+-]?([0-9]+,[0-9]+|,[0-9]+)([eE][+-]?[0-9]+)?")
+"""A number with a decimal comma."""
 _THOUSAND = re.compile(r"[+-]?[1-9][0-9]{0,2}[,.][0-9]{3}")
+"""A number whose only sign may be a decimal one or a separator of thousands."""
 _PERCENT = re.compile(r"(.*\S)\s*%")
 _UNITS = (
     "%|‰|°|º|°?[CFK]|nm|µm|μm|um|mm|cm|dm|m|km|in|inch|inches|ft|feet|ns|µs|μs|us|ms|s|sec|secs|seconds?|min|mins|"
@@ -25,9 +28,13 @@ _QUANTITY = re.compile(
     rf"[=~≈<>≤≥±(]*\s*[$€£¥]?\s*[+\-‐‑−–—－±]?\s*[$€£¥]?\s*(?:{_DIGITS})(?:[eE][+-]?\d+|\s*[x×·*]\s*10\^?\S+)?"
     rf"\s*(?:{_UNITS})?\)?"
 )
+"""A number with signs, separators or a unit around it, such as `≈ 1 200 mm` or `±0,5 €`."""
 _FRACTION = re.compile(r"[+-]?\d+\s*[/⁄]\s*\d+|\d*[½¼¾⅓⅔⅛]|\d+:\d\d(?::\d\d)?(?:[.,]\d+)?")
+"""A fraction, or a time such as `1:30`."""
 _DECIMAL_AND_WORD = re.compile(r"[+-]?(?:\d+[.,]\d+|[.,]\d+)\s*[^\W\d].*")
+"""Any word is a unit behind a decimal number: names count in whole ones, such as `2 cups`."""
 _NUMBER_AND_WORD = re.compile(r"[+-]?\d+\s*([^\W\d_].*)")
+"""A whole number and a word, which is a unit where all cells have the same one and other numbers."""
 
 
 def values_of(
@@ -62,6 +69,7 @@ def _answers(cells: Sequence[Cell], where: Where) -> list[Cell] | None:
     words = {cell.lower() for cell in cells if isinstance(cell, str)}
     words |= {str(cell).lower() for cell in cells if isinstance(cell, bool)}
     has_numbers = any(isinstance(cell, int | float) and not isinstance(cell, bool) for cell in cells)
+    # In a column with other words too, `y` or `true` may be a class beside yes.
     strange = _FOREIGN if words <= set(_ANSWERS) | _FOREIGN else _FOREIGN | set(_ANSWERS) - {"yes", "no"}
     if words & {"yes", "no"} and (foreign := words & strange):
         row = next(row for row, cell in enumerate(cells) if isinstance(cell, str) and cell.lower() in foreign)

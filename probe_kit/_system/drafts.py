@@ -37,7 +37,7 @@ def write_whole(path: Path, text: str) -> None:
 def move_draft(draft: Path, path: Path) -> None:
     """Give a whole draft its name. Raises UsageError where something lies there meanwhile."""
     if path.is_dir() and not any(path.iterdir()):
-        path.rmdir()
+        path.rmdir()  # nothing is lost, and a file takes its place as well
     if path.exists():
         raise UsageError(f"{path} exists; choose another path or remove it")
     draft.rename(path)

@@ -35,7 +35,7 @@ def csv_of_frame(frame: "pd.DataFrame") -> str:
     for position, (_, column) in enumerate(frame.items()):
         if not (pd.api.types.is_numeric_dtype(column) or pd.api.types.is_datetime64_any_dtype(column)):
             cells = pd.Series([escaped(cell) for cell in column], index=column.index, dtype=object)
-            safe.isetitem(position, cells.array)
+            safe.isetitem(position, cells.array)  # by position: two columns may have one name
     lines = _Lines()
     safe.to_csv(lines, index=False, lineterminator=_Lines.END)
     return lines.getvalue()

@@ -63,7 +63,7 @@ def _of_torch() -> list[str]:
 
 
 def _of_system() -> list[str]:
-    """NVIDIA's driver numbers its GPUs in the order of their addresses, as CUDA does with this setting."""
+    """The devices that the system shows without torch."""
     if sys.platform == "darwin":
         return ["mps"]
     models = [

@@ -13,7 +13,9 @@ MOST_BYTES = 1 << 30
 MOST_VALUES = 1 << 25
 """Numbers and texts of one reading; in Python each takes some 50 bytes."""
 MOST_FILE_BYTES = 1 << 40
+"""Of a file, whose footer says before any cell is read how large its columns are."""
 _ROWS = 4096
+"""Of a batch, or fewer, so that a column of texts takes at most `_BATCH_BYTES` in it."""
 _BATCH_BYTES = 64 << 20
 _WIDTHS = {"BOOLEAN": 1, "INT32": 4, "INT64": 8, "FLOAT": 4, "DOUBLE": 8, "INT96": 12}
 _TEXT = "BYTE_ARRAY"
@@ -65,7 +67,7 @@ def read_parquet(parquet: Any, columns: Sequence[str] | None = None, groups: Seq
         batches.append(pa.RecordBatch.from_arrays(plain, schema=pa.schema(fields, batch.schema.metadata)))
     if batches:
         return pa.Table.from_batches(batches)
-    return parquet.read_row_groups(list(groups), columns=names)
+    return parquet.read_row_groups(list(groups), columns=names)  # no row, and the types of the columns
 
 
 def _check_sizes(metadata: Any, columns: Sequence[str] | None, groups: Sequence[int]) -> int:
@@ -79,11 +81,13 @@ def _check_sizes(metadata: Any, columns: Sequence[str] | None, groups: Sequence[
             if columns is not None and not any(path == name or path.startswith(f"{name}.") for name in columns):
                 continue
             width = _WIDTHS.get(chunk.physical_type, 0)
+            # Uncompressed cells are still encoded: a column of one number in every row has a few bytes.
             size += max(chunk.total_uncompressed_size, width * chunk.num_values)
             values += chunk.num_values
             if path != metadata.schema.column(at).name and chunk.physical_type not in _WIDTHS:
                 # A text inside a list or a struct leaves its dictionary when it is read.
-                longest = max(longest, chunk.total_uncompressed_size * -(-chunk.num_values // group.num_rows))
+                of_row = -(-chunk.num_values // max(group.num_rows, 1))
+                longest = max(longest, chunk.total_uncompressed_size * of_row)
     _check(size, MOST_BYTES, "bytes")
     _check(values, MOST_VALUES, "values")
     return max(1, min(_ROWS, _BATCH_BYTES // longest))

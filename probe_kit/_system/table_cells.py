@@ -28,7 +28,9 @@ _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 _INFINITE = re.compile(r"[+-]?inf(inity)?", re.IGNORECASE)
 _MINUS = re.compile(r"^[‐‑−–—－](?=\s*[0-9.,])")
 _MARK = re.compile(r"^'(?=[+-]?[.,]?[0-9])")
+"""By which spreadsheets keep a number as text."""
 _EDGES = "\u200b\u2060\ufeff"
+"""Signs of no width, which Python does not count as white space."""
 
 
 def plain_cell(text: str) -> str:

@@ -18,6 +18,7 @@ MOST_CHARACTERS = 131_072
 """Of a cell; a picture in a cell needs more."""
 MOST_BYTES = 1 << 30
 _ANY_LENGTH = (1 << 31) - 1
+"""Of a cell of a heading that is tried: with a wrong separator the whole line is one."""
 _DECLARED = re.compile(r'"?sep=(.)"?', re.IGNORECASE)
 _BYTE_ORDER = (
     (b"\xff\xfe\0\0", "UTF-32"),
@@ -204,7 +205,7 @@ def _records(
         if record is None:
             return
         if record:
-            yield before + 1, record
+            yield before + 1, record  # the line in which it begins: a cell in quotes may hold line breaks
         before = reader.line_num
 
 

@@ -44,9 +44,11 @@ GRASP_GAP = 0.003
 QUAD_LIFT = 0.0005
 """How far the picture lies above its box, metres; enough for the depth buffer to tell them apart."""
 _EMPTY_TABLES: dict[tuple[CameraSpec, LightSpec, float], Frame] = {}
-_TILE_PIXELS: dict[tuple[CameraSpec, float, float, float, tuple[XY, ...]], dict[Side, int]] = {}
-_KEPT = 8
 """What scenes of this process saw before anything was on their table; the next like them need not draw it."""
+_TILE_PIXELS: dict[tuple[CameraSpec, float, float, float, tuple[XY, ...]], dict[Side, int]] = {}
+"""Likewise the pixels of their pictures."""
+_KEPT = 8
+"""So many of either."""
 
 
 @dataclass(frozen=True)

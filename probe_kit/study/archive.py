@@ -44,6 +44,7 @@ MOST_NAME_BYTES = 255
 MOST_EXPANSION, FREE_EXPANSION = 200, 64 << 20
 """Bytes that a byte of a zip file may unpack to, and bytes that are free of this bound. JSON gives 10 to 30."""
 _DATE = (1980, 1, 1, 0, 0, 0)
+"""Of every member, the first that a zip file can say: an archive made again has the same bytes."""
 _RESTORE = "Fetch the archive again, or make it anew with `probe-kit study pack`"
 _DEVICE = re.compile(r"(aux|con|nul|prn|(com|lpt)[0-9¹²³]) *(\..*)?", re.IGNORECASE)
 """A name that Windows gives to a device, whatever its ending is."""
@@ -143,7 +144,7 @@ def _unpack(archive: ZipFile, file: Path, folder: Path) -> None:
     if twice := [name for name, count in names.items() if count > 1]:
         raise RunDamagedError(f"{file} has two files called {twice[0]!r}. {_RESTORE}")
     for member in members:
-        kind = stat.S_IFMT(member.external_attr >> 16)
+        kind = stat.S_IFMT(member.external_attr >> 16)  # 0 of a packer that notes no kinds
         if kind not in (0, stat.S_IFREG):
             raise RunDamagedError(f"{file} has {member.filename!r}, which is no regular file. {_RESTORE}")
         _check_name(member.filename, str(file))
@@ -161,7 +162,7 @@ def _unpack(archive: ZipFile, file: Path, folder: Path) -> None:
         )
     for member in members:
         target = folder / member.filename
-        try:
+        try:  # where file systems fold case, two names may be one
             target.parent.mkdir(parents=True, exist_ok=True)
             unpacked_file = target.open("xb")
         except (FileExistsError, NotADirectoryError, IsADirectoryError) as error:

@@ -12,6 +12,7 @@ from probe_kit.hashing import canonical_json, sha256_json
 from probe_kit.study.planned_suite import PlannedSuite
 
 KEY_DIGITS = 8
+"""Of a key in a folder's name; `matching` finds out if two settings ever share them."""
 
 
 @dataclass(frozen=True)
@@ -116,12 +117,12 @@ class Cell:
         decided = {
             **settings.identity(),
             "checkpoint": checkpoint_stamp(settings.model.checkpoint),
-            "options": {name: str(value) for name, value in settings.model.options.items()},
+            "options": {name: str(value) for name, value in settings.model.options.items()},  # some are paths
             "weights_seed": settings.model.weights_seed,
             "protocol": settings.task.protocol,
             "wordings": settings.wordings,
             "scene": settings.scene.to_json(),
-            "suite": self.suite.identity,
+            "suite": self.suite.identity,  # its items are compared one by one when the run is opened
         }
         return sha256_json(json.loads(canonical_json(decided)))[:KEY_DIGITS]
 
@@ -144,7 +145,7 @@ class Cell:
 
 
 def checkpoint_stamp(checkpoint: str | None) -> Any:
-    """Return what tells checkpoints apart without reading them.
+    """Return what tells checkpoints apart without reading gigabytes for every plan.
 
     Of a folder or file, name, size and time of every file; else the hub id.
     """

@@ -153,6 +153,7 @@ def _run_blocks(study: Study, suite: PlannedSuite) -> Iterator[Mistake]:
 
 def _excludes(study: Study, _: PlannedSuite) -> Iterator[Mistake]:
     for position, block in enumerate(study.runs):
+        # `strange` is the part of a rule that names nothing in a block of this kind.
         ways, strange = block.conditions or block.asks or [], "ask" if block.conditions else "condition"
         for rule in block.exclude:
             parts = rule.model_dump(exclude_none=True)
@@ -221,7 +222,7 @@ def _views(path: Place, views: list[str], model: ModelTable) -> Iterator[Mistake
     """Yield a mistake for views that no stream of a model has, or whose form is none where streams are unknown."""
     declared = [view for stream in _declared(model) for view in view_names(stream.roles)]
     for view in views:
-        pooled = view.replace("tokens", "mean", 1)
+        pooled = view.replace("tokens", "mean", 1)  # every token is there of what has a mean
         has_form = view in _POOLED or (view.startswith(_BY_ROLE) and view.partition(":")[2])
         if not has_form or (declared and resolve_view(pooled, declared) not in declared):
             names = ", ".join(dict.fromkeys(declared)) or "mean, last, or mean:ROLE such as mean:language"

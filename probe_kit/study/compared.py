@@ -20,7 +20,7 @@ _TEST = (
     f"{P_DECIDES}"
 )
 FEWEST_GROUPS = 10
-"""Of items, with which a difference is tested."""
+"""Of items, with which a difference is tested, and counts for Holm's correction of the others."""
 _FEW = "!"
 
 
@@ -93,6 +93,7 @@ def group_table(table: RetentionTable, title: str) -> Table:
         "Welch's interval; runs of one model are averaged; the last column is of these models on other items"
     )
     columns = ("groups", "category", "p over models (least)", "these models, points [95 %]")
+    # The p over items is about these models alone, and the table about others like them.
     numbers = tuple({**_number(row), "p": None, "p_holm": None} for row in rows)
     return _of_pairs(title, columns, cells, caption(table, [note]), numbers)
 
@@ -192,7 +193,7 @@ def stages_table(joins: Sequence[KnownUsedTable]) -> Table:
 
 
 def _encoded(join: KnownUsedTable, row: CategoryCounts) -> int | None:
-    """Encoded items of categories whose probes have signal."""
+    """Encoded items of categories whose probes have signal, which the overall row is summed of anew."""
     if row.encoded is None or row.has_signal is False:
         return None
     inside = join.rows if row.category == OVERALL else (row,)

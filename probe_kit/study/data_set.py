@@ -46,7 +46,9 @@ _COLUMNS = {
 TRIES = 5
 """Of an upload that a server refuses for now, or whose connection breaks."""
 _PAUSE = 2.0
+"""Seconds before the second try."""
 _FOR_NOW = (408, 425, 429, 500, 502, 503, 504)
+"""Answers of a server that may be another one a moment later: too slow, too early, too often, out of order."""
 
 
 def write_data_set(
@@ -78,7 +80,7 @@ def write_data_set(
 def _write(study: LoadedStudy, folder: Path, partial: bool, licence: str | None) -> Pack:
     parquet = require("pyarrow.parquet", "export")
     pack = pack_study(study, folder / ARCHIVE, partial)
-    packed = load_study(folder / ARCHIVE)
+    packed = load_study(folder / ARCHIVE)  # card and episodes are of what was packed, not of runs that play on
     table = _episodes(packed)
     arrow = require("pyarrow", "export").Table.from_pandas(table, preserve_index=False)
     parquet.write_table(arrow, folder / EPISODES, compression="zstd")
@@ -194,6 +196,7 @@ def publish_data_set(
         if pull_request and not opened:
             opened.append(api.create_pull_request(repository, f"probe_kit study {version}", repo_type="dataset"))
         if not pull_request:
+            # None, and not False: an organisation may make what is new private by default.
             api.create_repo(repository, repo_type="dataset", private=private or None, exist_ok=True)
         commit = api.upload_folder(
             repo_id=repository,
@@ -220,7 +223,7 @@ def _tried(upload: Callable[[], str], repository: str, pause: float) -> str:
             return upload()
         except (HfHubHTTPError, httpx.TransportError) as error:
             answer = getattr(error, "response", None)
-            status = None if answer is None else answer.status_code
+            status = None if answer is None else answer.status_code  # None: the connection broke
             if status is not None and status not in _FOR_NOW:
                 advice = (
                     "Log in with `hf auth login`" if status in (401, 403) else "Check the name of the repository"

@@ -113,6 +113,7 @@ def measure_drift(
         for run, results in zip((before, after), probes, strict=True)
     ]
     locations = str(before.location), str(after.location)
+    # A run beside itself, with two sets of probes, has no difference; of a pair it is the first minus the second.
     runs, pairs = ([before, after], [locations[::-1]]) if locations[0] != locations[1] else ([before], [])
     keys = [side.results.key for side in sides[: len(runs)]]
     table = retention_table(runs, [view], labels=labels, pairs=pairs, keys=keys)
@@ -171,6 +172,7 @@ def _delivered(run: Any, view: str) -> dict[str, tuple[Any, list[int]]]:
     role, delivered = view.partition(":")[2], {}
     for commit in run.commits():
         spans = [span for span in commit.roles[0]["backbone"] if span[0] != PADDING]
+        # Counted from the first token that is no padding, of which both may have another number in front.
         first = min(start for _, start, _ in spans)
         pooled = [range(start - first, end - first) for name, start, end in spans if role in ("", name)]
         delivered[commit.episode_id] = commit.instruction_ids, [at for span in pooled for at in span]

@@ -110,7 +110,7 @@ def expand(study: Study, suite: PlannedSuite) -> tuple[list[Cell], list[Mistake]
             cells[member.run] = replace(cell, selections={**cell.selections, **selections})
     every = list(cells.values())
     mistakes += [*_same_settings(every), *_without_control(study, every)]
-    return every, list(dict.fromkeys(mistakes))
+    return every, list(dict.fromkeys(mistakes))  # every run of a wrong table repeats its mistake
 
 
 def _ways(study: Study, member: Member) -> tuple[str, Mapping[str, ConditionTable | AskTable]]:
@@ -126,6 +126,7 @@ def _selection(study: Study, block: BlockTable, suite: PlannedSuite) -> Selectio
 def _blamed(study: Study, member: Member, message: str) -> Place:
     """The table whose values a settings error is of, and the key in it that the message names."""
     home, name = _ways(study, member)[0], member.way
+    # If the model's settings are wrong even in a condition without values, the model is to blame.
     try:
         _settings_of(study, member.model, ConditionTable(), None)
     except ProbeKitError:

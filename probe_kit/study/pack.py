@@ -47,7 +47,7 @@ def pack_study(study: LoadedStudy, out: Path, partial: bool = False, extras: Col
     if out.exists():
         raise UsageError(f"{out} exists; choose another --out or remove it")
     with full_disk_in_words(out), draft_of(out) as draft:
-        folder = draft if out.suffix != ".zip" else draft.with_name("pack")
+        folder = draft if out.suffix != ".zip" else draft.with_name("pack")  # beside it, and removed with it
         pack = _pack(study, folder, partial, extras)
         if folder != draft:
             write_zip(folder, draft)
@@ -70,7 +70,10 @@ def _pack(study: LoadedStudy, folder: Path, partial: bool, extras: Collection[Ex
                 **{extra: extra in extras for extra in EXTRAS},
             )
             runs[cell.name] = PackedRun(key=cell.key, settings_sha256=run.settings_sha256)
-        except (SettingsMismatchError, DiskSpaceError):
+        except (
+            SettingsMismatchError,
+            DiskSpaceError,
+        ):  # a wrong run is not a missing one, and a full disk is full
             raise
         except ProbeKitError as error:
             if not partial:

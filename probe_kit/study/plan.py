@@ -123,7 +123,10 @@ class StudyPlan:
 
     @cached_property
     def seconds(self) -> dict[str, float]:
-        """The seconds of missing episodes by run, where the model has stored episodes of the same kind of work."""
+        """The seconds of missing episodes by run, where the model has stored episodes of the same kind of work.
+
+        Conditions of one kind of work share a rate per inference, because episodes of one may have more of them.
+        """
         spent, counts = defaultdict[str, float](float), defaultdict[str, float](float)
         for planned in self.played:
             if planned.seconds is not None:
@@ -260,6 +263,7 @@ def _planned(study: LoadedStudy, cell: Cell) -> PlannedCell:
 
 def _why_new(study: LoadedStudy, cell: Cell) -> str:
     """Return what changed since the newest run of the same model, condition and seed, if there is one."""
+
     former = sorted(_former_runs(study.study.folder, cell), key=lambda file: file.stat().st_mtime_ns)
     if not former:
         return "new"
@@ -305,7 +309,7 @@ def _waiting(cells: list[PlannedCell]) -> Iterator[PlannedCell]:
     failed = {
         planned.cell.model: planned.failure
         for planned in cells
-        if planned.failure and planned.failure.stage != "episodes"
+        if planned.failure and planned.failure.stage != "episodes"  # which end one run, and not its model
     }
     for planned in cells:
         failure = failed.get(planned.cell.model)
@@ -317,7 +321,7 @@ def _waiting(cells: list[PlannedCell]) -> Iterator[PlannedCell]:
 
 
 def _stored_episodes(cell: Cell, run: "Run") -> int:
-    """Count the episodes of the cell's selection that a run holds."""
+    """Count the episodes of the cell's selection that a run holds, which may hold others as well."""
     selected: set[str] = set()
     for category, count in cell.selection.counts(cell.suite).items():
         items = run.items.loc[run.items["category"] == category, "item_id"]
@@ -366,7 +370,7 @@ def bytes_per_episode(cell: Cell, stored: Sequence[StoredStream] | None) -> int 
         if sizes is None:
             return None
         stored = sizes.streams
-    settings = settings.with_every_call(settings.task.execute or 1)
+    settings = settings.with_every_call(settings.task.execute or 1)  # before the model says how many it executes
     space = space_of(stored or (), 1, settings)  # a script has no network, and no stream
     return sum(space.values()) - space["report"]
 

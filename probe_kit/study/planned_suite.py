@@ -12,10 +12,11 @@ from probe_kit.suite.categories import in_order
 
 @dataclass(frozen=True)
 class PlannedSuite:
-    """identity: `name@version`; when a run grows, items are compared by content. items: by category.
+    """A suite as far as a plan needs it.
 
-    folder: None for the embedded suite. source: where the numbers of items are from. contents:
-     hash of every item's content by its id, of a suite in a folder; empty for others.
+    identity: `name@version`; when a run grows, items are compared by content. items: by category. folder: None for
+    the embedded suite. source: where the numbers of items are from. contents: hash of every item's content by its
+    id, of a suite in a folder; empty for others.
     """
 
     identity: str

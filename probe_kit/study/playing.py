@@ -199,6 +199,7 @@ def play_model(task: ModelTask, report: Report) -> None:
     for run in task.runs:
         moved = list[int]()
 
+        # Defaults bind what the loop assigns anew.
         def count(stored: int, planned: int, outcome: str, run: RunTask = run, moved: list[int] = moved) -> None:
             moved.append(stored)
             report(Moved(task.model, run.run, stored, planned, outcome))
@@ -209,7 +210,7 @@ def play_model(task: ModelTask, report: Report) -> None:
         except STOPS_ALL:
             raise
         except EpisodesFailedError as error:
-            some = bool(run.stored or moved)
+            some = bool(run.stored or moved)  # without a single episode it is the model that fails
             report(Failure.of("episodes" if some else "playing", task.model, run.run, error))
             if not some:
                 return
@@ -243,7 +244,7 @@ def play_models(tasks: Sequence[ModelTask], report: Report, slots: int = 0, ray:
     Raises DiskSpaceError and StoreError of any worker, WorkerDiedError if workers die before they begin,
     MissingExtraError without Ray, and UsageError if no cluster answers.
     """
-    tasks = sorted(tasks, key=lambda task: -task.size)
+    tasks = sorted(tasks, key=lambda task: -task.size)  # begun last, the longest would be waited for alone
     if ray is None and not slots:
         for task in tasks:
             play_model(task, report)
@@ -273,7 +274,7 @@ def _note(queue: TaskQueue[ModelTask], slot: int, event: Any, report: Report) ->
         report(Failure.of("playing", model, run, WorkerDiedError(reason)))
         return
     if isinstance(event, Moved):
-        queue.advanced(event.model)
+        queue.advanced(event.model)  # its losses are counted anew: it does not die of one episode
     elif isinstance(event, Made) or event.stage == "episodes":
         task = queue.holds(slot)[event.model]
         runs = tuple(run for run in task.runs if run.run != event.run)

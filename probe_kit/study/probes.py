@@ -1,6 +1,6 @@
 """The probes that a study file names, and whether they are stored with their run."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from math import isclose
 from typing import TYPE_CHECKING, Literal
@@ -12,7 +12,8 @@ from probe_kit.study.failures import Failures
 from probe_kit.study.reading import LoadedStudy
 from probe_kit.study.schema import ProbesTable
 from probe_kit.study.stored import open_matching, part_of, probe_key_of
-from probe_kit.train.results.control_scores import Controls
+from probe_kit.train.results.control_scores import Controls, UntrainedScore
+from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.store import load_results, read_controls, read_probes, settings_of
 
 if TYPE_CHECKING:
@@ -90,12 +91,19 @@ def _why_other_network(
         curves = load_results(run, probe_key_of(table, run)).curves
     except ProbeKitError:
         return "not compared with its untrained network"
-    for score in controls.untrained:
-        curve = curves.get((score.category, score.view))
-        row = -1 if curve is None else [str(site) for site in curve.sites].index(score.untrained_site)
-        if curve is None or not isclose(curve.correct[row].astype(float).mean(), score.untrained_accuracy):
-            return "compared with another untrained network"
+    if not all(is_of_network(score, curves) for score in controls.untrained):
+        return "compared with another untrained network"
     return "" if controls.untrained else "without the control untrained"
+
+
+def is_of_network(score: UntrainedScore, curves: Mapping[tuple[str, str], ProbeCurve]) -> bool:
+    """Whether a comparison may be with the network of these curves, which may lack its category or its site."""
+    curve = curves.get((score.category, score.view))
+    rows = {} if curve is None else {str(site): row for row, site in enumerate(curve.sites)}
+    row = rows.get(score.untrained_site)
+    if curve is None or row is None:
+        return False
+    return isclose(curve.correct[row].astype(float).mean(), score.untrained_accuracy)
 
 
 def _text(value: object) -> str:

@@ -10,7 +10,7 @@ from probe_kit._tables.content import Heading, Number
 from probe_kit._tables.numbers import number, percent, with_limits
 from probe_kit._tables.table import Table
 from probe_kit.retention.behaviour.success_rate import Regime, normalised_score
-from probe_kit.retention.columns.text import published_value, retention_value
+from probe_kit.retention.columns.text import once_per_category, published_value, retention_value
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.retention.table import RetentionTable
 from probe_kit.suite.categories import OWN_DOMAIN, category_of, in_order
@@ -122,7 +122,7 @@ def score_table(
 
     title, source, elsewhere: a further column of numbers that were not measured here, by location of the run.
     """
-    means = [row for row in once_per_run(table.means) if row.success.sr is not None]
+    means = [row for row in once_per_category(table.means) if row.success.sr is not None]
     other_scores = {} if elsewhere is None else elsewhere
     cells = tuple(
         (
@@ -207,11 +207,6 @@ def probing_table(table: RetentionTable) -> Table:
     return Table.of("Probes", columns, cells, names=3, mean=MEAN, notes=notes, numbers=tuple(numbers))
 
 
-def once_per_run(rows: Sequence[RetentionRow]) -> list[RetentionRow]:
-    """Rows of the first view of each run and category; rates do not depend on views."""
-    return list({(row.run.location, row.category): row for row in reversed(rows)}.values())[::-1]
-
-
 def domain_scores(table: RetentionTable) -> dict[str, dict[str, float]]:
     """Return by domain and system the normalised score of the mean over the domain's categories."""
     scores: dict[str, dict[str, float]] = {}
@@ -254,6 +249,7 @@ def _by_category(
         for name in members:
             yield _Column(category_of(name).title, domain, of(name))
         if domain_means and domain and len(members) > 1:
+            # A default binds the members of this domain.
             yield _Column(domain, domain, lambda rows, inside=tuple(members): percent(_mean_of(rows, inside)))  # type: ignore[misc]
     yield _Column(MEAN, "", of(MEAN))
 
@@ -275,7 +271,7 @@ def _mean_of(rows: OfSystem, categories: Sequence[str]) -> float | None:
 def _systems(table: RetentionTable) -> dict[str, OfSystem]:
     """Return rows by label, in order. Labels tell runs apart."""
     systems: dict[str, dict[str, RetentionRow]] = {}
-    for row in once_per_run([*table.rows, *table.means]):
+    for row in once_per_category([*table.rows, *table.means]):
         systems.setdefault(row.run.label, {})[row.category] = row
     return dict(systems)
 
@@ -285,7 +281,7 @@ def _pivot(table: RetentionTable, title: str, note: Sequence[str], columns: Sequ
         (name, *(column.cell(of_system) for column in columns)) for name, of_system in _systems(table).items()
     )
     headings = [Heading("system"), *(Heading(column.heading, group=column.domain) for column in columns)]
-    rows = once_per_run([*table.rows, *table.means])
+    rows = once_per_category([*table.rows, *table.means])
     return Table.of(
         title, headings, cells, notes=[caption(table, note)], numbers=tuple(_number(row) for row in rows)
     )

@@ -24,9 +24,11 @@ from probe_kit.study.planned_suite import PlannedSuite, planned_suite
 from probe_kit.study.references import unknown_names
 
 _MOST_BYTES = 1 << 20
+"""Of a study file, which may come with an archive of anyone."""
 _DEEP_KEY = re.compile(r"""(?:[\w"'-]+\s*\.\s*){64}""")
 """A dotted key of 64 tables; tomllib takes minutes for one of some ten thousands."""
 _NAME_PATTERN = "'^[a-z0-9][a-z0-9._-]{0,59}$'"
+"""As pydantic quotes the pattern of `schema.Name`; a message says in words what it means."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +136,7 @@ def _parsed(file: Path) -> dict[str, Any]:
 
 def _mistakes(error: ValidationError, content: dict[str, Any]) -> list[Mistake]:
     """Return the complaints about the file, by the path that leads to a value of it."""
-    texts: dict[Place, list[str]] = {}
+    texts: dict[Place, list[str]] = {}  # several of one value, where each choice of a union complains
     for whole_path, complaint in complaints_of(error):
         path = part_in_file(whole_path, content)
         if complaint == MISSING:

@@ -80,7 +80,7 @@ def _state(plan: StudyPlan) -> Table:
     cells = [
         (
             planned.cell.model,
-            planned.cell.way + (f", seed {planned.cell.seed}" if planned.cell.seed else ""),
+            planned.run_text,
             ", ".join(planned.cell.selections),
             str(planned.cell.episodes),
             planned.words,

@@ -48,6 +48,7 @@ SeveralNames = Annotated[list[str], Field(min_length=2), AfterValidator(_each_on
 TwoNames = Annotated[list[str], Field(min_length=2, max_length=2), AfterValidator(_each_once)]
 Count = Annotated[int, Field(ge=1, le=1_000_000)]
 Even = Annotated[int, Field(ge=2, le=1_000_000, multiple_of=2)]
+"""Items of a category: an odd number would keep one of two role-exchanged twins and drop the other."""
 Seed = Annotated[int, Field(ge=0, le=2**63 - 1)]
 Size = Annotated[str, Field(pattern=r"^[1-9][0-9]{0,3}x[1-9][0-9]{0,3}$")]
 TableKind = Literal[

@@ -204,7 +204,7 @@ def _probe_key(study: LoadedStudy, stored: StoredRun, run: "Run", partial: bool)
     if not tables or not run.streams:
         return ""
     if keys := _stored_keys(tables.values(), run):
-        return keys[-1]
+        return keys[-1]  # of several, which share the run through two blocks, the last of the file
     if partial or _stored_keys(tables.values(), stored.probed.in_wording()):  # they are fitted to other items
         return ""
     other_keys = [key for key, bundle in read_probes(run.location).items() if settings_of(bundle).is_side]

@@ -132,7 +132,7 @@ def _versions(stored: StoredRuns) -> list[str]:
 
 def _of_kind(study: LoadedStudy, table: TableTable, stored: StoredRuns, name: str, partial: bool) -> Table:
     labels, opened = stored.labels(study), [run.run for run in stored.runs]
-    no_keys = [""] * len(opened)
+    no_keys = [""] * len(opened)  # tables without probes read none
     if table.kind in _OF_RUNS:
         return _OF_RUNS[table.kind](retention_table(opened, labels=labels, pairs=(), keys=no_keys))
     if table.kind == "score":
@@ -218,6 +218,7 @@ def _pairs(comparison: ComparisonTable, runs: Sequence[StoredRun]) -> list[tuple
             if way == other and (model, reference, seed) in by_cell
         ]
     chain = comparison.chain or []
+    # Every step, then the whole way; of two models that is the step itself.
     steps = [*zip(chain[1:], chain, strict=False), *([(chain[-1], chain[0])] if len(chain) > 2 else [])]
     by_model = {(run.cell.model, run.cell.seed): run.location for run in runs}
     return [

@@ -118,6 +118,7 @@ def agreement(first: Direction, second: Direction, features: Features) -> Agreem
     """Return the cosines of the directions of two runs. features: (E, D) of the second run."""
     before, after = first.unit, second.unit
     varied = features - features.mean(axis=0)
+    # Weights of zero, such as of constant features, have no direction and stay zero.
     units = first.weights / np.linalg.norm(first.weights, axis=1, keepdims=True).clip(min=1e-30)
     between = units @ units.T
     folds = len(units)

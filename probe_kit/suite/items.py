@@ -138,7 +138,7 @@ class Episode:
     @property
     def episode_id(self) -> str:
         """`<item_id>:o` or `<item_id>:s`, and `:<wording>` behind it for all but the item's own words."""
-        is_plain = self.wording in (None, "knowledge")
+        is_plain = self.wording in (None, "knowledge")  # `suite.wording` has the name, and imports this module
         return f"{self.item.item_id}:{self.layout[0]}" + ("" if is_plain else f":{self.wording}")
 
     @property

@@ -104,3 +104,10 @@ def test_an_empty_table_has_its_columns(tmp_path: Path) -> None:
     pq.write_table(table().slice(0, 0), tmp_path / "x.parquet")
     with open_parquet(tmp_path / "x.parquet", "export") as parquet:
         assert read_parquet(parquet, ["text", "number"]).to_pydict() == {"text": [], "number": []}
+
+
+def test_a_group_of_no_rows_has_texts_in_lists(tmp_path: Path) -> None:
+    path = tmp_path / "none.parquet"
+    pq.write_table(pa.table({"a": pa.array([], pa.list_(pa.string()))}), path)
+    with open_parquet(path, "export") as file:
+        assert read_parquet(file).num_rows == 0

@@ -13,7 +13,9 @@ from probe_kit.env.simulation.camera import Camera, Picture
 from probe_kit.errors import SceneError
 from probe_kit.suite.pictures import decode_bytes
 
+# All colours and numbers of grain are chosen by eye. Pictures, and all that models make of them, depend on each.
 PLANK_WIDTH = 0.14
+"""Metres."""
 TABLE_END = 0.92
 """x at which the table meets a wall, metres."""
 DARK_WOOD = np.array([118.0, 78.0, 46.0])
@@ -42,7 +44,7 @@ def wooden_table(camera: Camera) -> Picture:
     with np.errstate(divide="ignore", invalid="ignore"):
         to_table = np.where(rays[..., 2] < 0, -eye[2] / rays[..., 2], np.inf)
         to_wall = np.where(rays[..., 0] > 0, (TABLE_END - eye[0]) / rays[..., 0], np.inf)
-    nearest = np.minimum(np.minimum(to_table, to_wall), 10.0)
+    nearest = np.minimum(np.minimum(to_table, to_wall), 10.0)  # a ray may meet neither, and is wall
     points = eye + nearest[..., None] * rays
     color = np.where((to_table < to_wall)[..., None], _wood(points), _wall(points))
     picture = Image.fromarray(np.clip(color, 0, 255).astype(np.uint8))

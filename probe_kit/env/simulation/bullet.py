@@ -14,7 +14,7 @@ from typing import Any
 from probe_kit._system.installing import install_command
 
 _GREETING = b"pybullet build time:"
-_importing = Lock()
+_importing = Lock()  # the descriptor that is exchanged meanwhile is of the whole process
 
 
 def import_pybullet() -> Any:

@@ -75,7 +75,7 @@ class FilmCamera:
 
 
 def _colors(client: BulletClient, body: int) -> list[tuple[int, int, tuple[float, ...]]]:
-    """Link, number of the shape in its link, and colour of every visual shape."""
+    """Link, number of the shape in its link, and colour of every visual shape: what `changeVisualShape` takes."""
     colors: list[tuple[int, int, tuple[float, ...]]] = []
     for shape in client.getVisualShapeData(body):
         number = sum(link == shape[1] for link, *_ in colors)

@@ -228,7 +228,7 @@ def summarise_runs(all_rows: Sequence[RetentionRow]) -> list[RunSummary]:
     means = [row for row in all_rows if row.is_side and row.category == MEAN]
     answers = [row for row in rows if is_vlm(row) and _asks_for_the_answer(row)]
     answer_means = {row.run.location: row for row in means if is_vlm(row)}
-    # A VLM stands beside the policies of its suite, and by itself only where there is none.
+    # A VLM is printed with the policies of its suite, and by itself only where there is none.
     policies = by_run([row for row in rows if not is_vlm(row)])
     suites = {row.run.suite for row in rows if not is_vlm(row)}
     alone = by_run([row for row in rows if is_vlm(row) and row.run.suite not in suites])
