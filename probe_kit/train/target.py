@@ -281,7 +281,8 @@ def _side(
 ) -> Target:
     """Return the side of the correct picture, the chosen one, or the correct one flipped for half of the items.
 
-    Raises UsageError for a run without sides, and for options of other targets.
+    Raises UsageError for a run without sides, for options of other targets, and for `side.chosen` of a run that
+    did not act.
     """
     check_sides(run, f"a probe of the side ({name})")
     options = {"task": task, "group_by": group_by, "exchange_within": exchange_within}
@@ -289,6 +290,11 @@ def _side(
         raise UsageError(
             f"{refused[0]}={options[refused[0]]} with the side {name!r}; expected none, because a side is "
             "binary and its groups are the run's. Leave it out, or take another target"
+        )
+    if name == "side.chosen" and "side_placed" not in run.episodes:
+        raise UsageError(
+            f"the side {name!r} of {run.location}, whose episodes were captured without acting: none chose a "
+            "side. Take another target, or extract without --no-act"
         )
     labels = side_labels(run.episodes, name, seed)
     episodes = tuple(run.episodes[EPISODE].astype(str))

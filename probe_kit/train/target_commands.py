@@ -1,9 +1,9 @@
 """`probe-kit targets` and `probe-kit labels`: what can be probed in a run, and a table to add to."""
 
-from collections.abc import Iterator
-from math import isfinite
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
+from warnings import catch_warnings, simplefilter
 
 import typer
 
@@ -14,7 +14,7 @@ from probe_kit._tables.table import Table
 from probe_kit._terminal import options as common
 from probe_kit._terminal.console import marked, out, say
 from probe_kit.errors import ProbeKitError, UsageError
-from probe_kit.train.choices import CORRECT, SIDES
+from probe_kit.train.choices import CORRECT, SIDES, Task
 
 if TYPE_CHECKING:
     from probe_kit.runs import Run
@@ -36,22 +36,27 @@ def targets(
     opened = _open(run, partial, wording)
     every = list(listed_targets(opened))
     listed = [row for row in every if row.task != CONSTANT]
-    rows = [(row.target, row.task, row.per, row.values_in_words) for row in listed]
+    rows = [(row.target, row.task, row.per, row.values) for row in listed]
     columns, numbers = ("target", "task", "per", "values"), tuple(row._asdict() for row in every)
     print_table(
         Table.of(f"{opened.label}: what can be decoded", columns, rows, numbers=numbers, overflow="wrap"), style
     )
     if constant := [row.target for row in every if row.task == CONSTANT]:
         say(marked("one value only, so that there is nothing to decode: {}", ", ".join(constant)))
-    # Those that need no further option come first, and what is not possible is never the next step.
-    possible = sorted((row for row in listed if row.is_possible), key=lambda row: row.task == DOUBTFUL)
+    refusals: dict[str, list[str]] = {}
+    for row in listed:
+        if row.refused:
+            refusals.setdefault(row.refused, []).append(row.target)
+    for reason, names in refusals.items():
+        say(marked("[yellow]train refuses {}:[/] {}", ", ".join(names), reason))
+    # Those that need no further option come first, and what is refused is never the next step.
+    possible = sorted(
+        (row.options for row in listed if row.options is not None), key=lambda text: "--task" in text
+    )
     if not possible:
         say(marked("next: [bold]probe-kit labels {}[/] writes a table to which you add labels of your own", run))
         return
-    first = possible[0]
-    as_task = f" --task {'continuous' if first.too_few_groups else 'classes'}" * (first.task == DOUBTFUL)
-    options = "" if first.target == CORRECT else f" --target {first.target}{as_task}"
-    say(marked("next: [bold]probe-kit train {}{}[/]", run, options))
+    say(marked("next: [bold]probe-kit train {}{}[/]", run, possible[0]))
 
 
 DOUBTFUL = "classes or continuous"
@@ -63,24 +68,16 @@ CONSTANT = "one value"
 class ListedTarget(NamedTuple):
     """A target in words. per: `episode` or `inference`. values: classes or range, or why the run has none.
 
-    task: `CONSTANT` of a single value. too_few_groups: of its rarest class, empty where there are enough.
+    task: `CONSTANT` of a single value. options: of the command that trains probes on it, None where `train`
+    refuses every one; `refused` is then why.
     """
 
     target: str
     task: str
     per: str
     values: str
-    too_few_groups: str = ""
-
-    @property
-    def values_in_words(self) -> str:
-        """Classes or range, and the groups that are too few."""
-        return "; ".join(filter(None, (self.values, self.too_few_groups)))
-
-    @property
-    def is_possible(self) -> bool:
-        """Whether probes can be trained on it, with `--task` where that decides."""
-        return self.task == DOUBTFUL or (self.task not in (NONE, CONSTANT) and not self.too_few_groups)
+    options: str | None = None
+    refused: str = ""
 
 
 def listed_targets(run: "RunReader") -> Iterator[ListedTarget]:
@@ -93,32 +90,67 @@ def listed_targets(run: "RunReader") -> Iterator[ListedTarget]:
         try:
             if name in SIDES:
                 target, task = Target.of_run(run, name), "binary"
+                trials = dict(_trials_of_a_side(run, target))
             elif (column := columns.read(name)).is_constant:
                 yield ListedTarget(name, CONSTANT, NONE, NONE)
                 continue
             else:
                 target, task = _target_and_task(name, column)
+                trials = dict(_trials_of_a_column(target, task, column))
         except ProbeKitError as error:
             yield ListedTarget(name, NONE, NONE, str(error))
-        else:
-            per, few = "inference" if target.per_step else "episode", _too_few_groups(run, target)
-            yield ListedTarget(name, task, per, target.values_in_words, few)
+            continue
+        reasons = {options: _refusal(run, *trial) for options, trial in trials.items()}
+        options = next((options for options, reason in reasons.items() if not reason), None)
+        refused = "" if options is not None else next(iter(reasons.values()))
+        per = "inference" if target.per_step else "episode"
+        yield ListedTarget(name, task, per, target.values_in_words, options, refused)
 
 
-def _too_few_groups(run: "RunReader", target: "Target") -> str:
-    """Return the groups of the rarest class, where `train` refuses a target with so few; empty for others."""
+Trial = tuple["Target", Sequence[str] | None]
+"""A target and the categories that `train` would be given."""
+
+
+def _trials_of_a_side(run: "RunReader", target: "Target") -> Iterator[tuple[str, Trial]]:
+    """Yield the options that train a side: of all categories, or of those with groups enough."""
     from probe_kit.statistics.sufficiency import GROUPS_FOR_PROBES
 
-    group_of = dict(zip(run.episodes["episode_id"].astype(str), run.episodes["group_id"], strict=True))
-    groups: dict[float, set[str]] = {}
-    for episode, value in zip(target.episodes, target.coded.values, strict=True):
-        if isfinite(value) and episode in group_of:
-            groups.setdefault(value if target.coded.classes else 0.0, set()).add(str(group_of[episode]))
-    rarest = min(groups, key=lambda value: len(groups[value]), default=None)
-    if rarest is None or len(groups[rarest]) >= GROUPS_FOR_PROBES:
-        return ""
-    subject = f"{target.coded.classes[int(rarest)]} in " if target.coded.classes else ""
-    return f"{subject}{counted(len(groups[rarest]), 'group')}, {GROUPS_FOR_PROBES} needed"
+    name = "" if target.name == CORRECT else f" --target {target.name}"
+    yield name, (target, None)
+    groups = run.episodes.groupby("category", sort=False)["group_id"].nunique()
+    enough = [str(category) for category, count in groups.items() if count >= GROUPS_FOR_PROBES]
+    if enough and len(enough) < len(groups):
+        yield f" --categories {','.join(enough)}{name}", (target, enough)
+
+
+def _trials_of_a_column(target: "Target", task: str, column: "BuiltinColumn") -> Iterator[tuple[str, Trial]]:
+    """Yield the options that train a column: with each task that a few integers may have."""
+    from probe_kit.train.target import Target
+
+    if task != DOUBTFUL:
+        yield f" --target {target.name}", (target, None)
+        return
+    tasks: tuple[Task, ...] = ("classes", "continuous")
+    for typed in tasks:
+        of_task = Target.of_column(target.name, column, typed)
+        yield f" --target {target.name} --task {typed}", (of_task, None)
+
+
+def _refusal(run: "RunReader", target: "Target", categories: Sequence[str] | None) -> str:
+    """Return why `train` refuses a target, by what it checks itself before any probe is fitted; empty if not."""
+    from probe_kit.train.execution import ExecutionSettings
+    from probe_kit.train.probe_sweep import Sweep
+
+    try:
+        with catch_warnings():
+            simplefilter("ignore")  # train says them where they matter
+            crew = ExecutionSettings()
+            sweep = Sweep.of(run, target, categories, crew, None, views=("mean",), permutations=0, seed=0)
+            _ = sweep.problems
+    except ProbeKitError as error:
+        # Lines of targets that are refused for one reason are printed as one.
+        return str(error).removeprefix(f"label {target.name!r}: ")
+    return ""
 
 
 def _target_and_task(name: str, column: "BuiltinColumn") -> "tuple[Target, str]":

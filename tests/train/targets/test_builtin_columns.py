@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.env.scoring.trajectory import CHANNELS
-from probe_kit.errors import UsageError
+from probe_kit.errors import ProbeKitError, UsageError
 from probe_kit.runs import open_run
 from probe_kit.train import Target, train_probes
 from probe_kit.train.choices import SIDES
@@ -74,6 +74,42 @@ def test_a_constant_or_unknown_column_is_refused_by_name(labelled_run: Path) -> 
         Target.of_run(run.only(["color"]), "item.category")
     with pytest.raises(UsageError, match=r"no built-in column 'sim.tool_w'; there are: sim.tool_x"):
         Target.of_run(run, "sim.tool_w")
+
+
+def test_a_target_has_options_exactly_where_train_accepts_it(labelled_run: Path, tmp_path: Path) -> None:
+    shutil.copytree(labelled_run, tmp_path / "run")
+    run = open_run(tmp_path / "run")
+    rows = {row.target: row for row in listed_targets(run) if row.options is not None or row.refused}
+    assert rows["side.correct"].options == ""
+    assert rows["sim.held"].options == " --target sim.held"
+    assert rows["side.chosen"].options is None
+    assert "0 independent groups" in rows["side.chosen"].refused
+    for name, row in rows.items():
+        target = Target.of_run(run, name, task="classes" if "--task classes" in (row.options or "") else None)
+        if row.options is None:
+            with pytest.raises(ProbeKitError) as refusal:
+                train_probes(run, target=target, permutations=0, controls=())
+            assert row.refused in str(refusal.value)
+        else:
+            train_probes(run, target=target, permutations=0, controls=())
+
+
+def test_a_category_with_too_few_groups_is_left_out_of_the_command(labelled_run: Path, tmp_path: Path) -> None:
+    shutil.copytree(labelled_run, tmp_path / "run")
+    for commit in sorted((tmp_path / "run" / "commits").iterdir())[-12:]:
+        commit.unlink()
+    for sealed in ("sealed", "columns.zarr"):
+        shutil.rmtree(tmp_path / "run" / sealed)
+    run = open_run(tmp_path / "run", allow_partial=True)
+    assert run.episodes.groupby("category")["group_id"].nunique().to_dict() == {"color": 6, "shape": 3}
+    assert next(iter(listed_targets(run))).options == " --categories color"
+
+
+def test_a_run_that_did_not_act_has_no_chosen_side(labelled_run: Path) -> None:
+    run = open_run(labelled_run)
+    run.episodes.drop(columns=["side_placed"], inplace=True)
+    with pytest.raises(UsageError, match=r"captured without acting"):
+        Target.of_run(run, "side.chosen")
 
 
 def test_a_target_is_added_by_the_entry_that_contributing_shows(
