@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
@@ -14,11 +14,16 @@ from probe_kit._terminal.options import further_option
 from probe_kit.diagnose.choices import FRAMES
 from probe_kit.errors import UsageError
 from probe_kit.extract import command_options as start
+from probe_kit.extract.moved import MOVED, moved_of
 from probe_kit.extract.settings import ExtractSettings
+from probe_kit.intervene.commands import PairTable
 
 if TYPE_CHECKING:
     from probe_kit.diagnose.results import Diagnosis
     from probe_kit.extract.extraction import Extraction
+    from probe_kit.extract.plan import Row
+    from probe_kit.intervene import ReplaySource
+    from probe_kit.intervene.settings import PairRow
     from probe_kit.runs import Run
     from probe_kit.runs.location import Location
 
@@ -28,6 +33,8 @@ _ACTING = frozenset(
 )
 """Options of runs that act, or store more than a diagnosis reads."""
 ModelOrRun = Annotated[str, typer.Argument(metavar="MODEL|RUN", help="Model to diagnose, or folder of a run.")]
+_OF_A_REPLAY = frozenset({"suite", "checkpoint", "model_option", "weights_seed", "device"})
+"""Options of a new run that also say where the model and the suite of a stored one are now."""
 Frames = Annotated[
     int, typer.Option("--frames", min=6, max=1000, metavar="N", help="Number of frames, at least 6.")
 ]
@@ -75,6 +82,7 @@ def diagnose(
     labels: Labels = None,
     base: Base = None,
     paraphrases: Paraphrases = None,
+    pairs: PairTable = None,
     inside: Inside = True,
     out_folder: start.OutFolder = None,
     html: Html = None,
@@ -95,29 +103,35 @@ def diagnose(
     from probe_kit.diagnose.inputs import names_of
     from probe_kit.diagnose.paraphrases import read_paraphrases
     from probe_kit.diagnose.results import check_names
+    from probe_kit.intervene.pairs import read_pairs
     from probe_kit.train.train_options import TargetOptions
 
-    # A camera's name is known once the source is open; any other mistake costs no extraction.
+    # A camera's name is known once the source is open; any other mistake is said before.
     check_names([name.partition(".")[0] for name in require or ()], names_of(()))
     words = {} if paraphrases is None else read_paraphrases(paraphrases)
+    table = () if pairs is None else read_pairs(pairs)
+    if table and frames != FRAMES:
+        raise UsageError("--frames N draws frames, and --pairs names them; leave one of both out")
     options = None if target is None else TargetOptions(target, labels, None, None, None)
     if options is not None:
         options.check(None)
     elif labels is not None:
         raise UsageError(f"--labels {labels} is a table of --target; name the column")
+    request = _Request(frames, tuple(require or ()), table, base)
     if dry_run:
-        _say_cost(_planned(model_or_run, typed, frames, out_folder), frames, inside, base is not None)
+        _say_cost(_planned(model_or_run, typed, request, out_folder), request, inside)
         return
-    run = _run_of(model_or_run, typed, frames, out_folder)
-    check_names(require or (), names_of(run.certificate["policy"]["cameras"]))
+    run = _run_of(model_or_run, typed, request, out_folder)
     with err.status("diagnosing") as status:
         diagnosis = diagnose_run(
             run,
             frames=frames,
             inside=inside,
             paraphrases=words,
+            source=_replay_source(run, typed) if _is_run(model_or_run, typed) else None,
             target=None if options is None else options.read(run),
             base=base,
+            pairs=table,
             progress=lambda text: status.update(text),
         )
     _print(diagnosis, output_format)
@@ -130,75 +144,126 @@ def diagnose(
     raise typer.Exit(diagnosis.exit_code(require or ()))
 
 
+class _Request(NamedTuple):
+    """Options of a diagnosis that are checked against its run before that is made, as far as it is known."""
+
+    frames: int
+    require: tuple[str, ...]
+    pairs: "tuple[PairRow, ...]"
+    base: str | None
+
+    def check_cameras(self, cameras: Sequence[str]) -> None:
+        """Raise UsageError for a required input that a model with these cameras does not have."""
+        from probe_kit.diagnose.inputs import names_of
+        from probe_kit.diagnose.results import check_names
+
+        check_names(self.require, names_of(cameras))
+
+    @property
+    def drawn(self) -> tuple[int, int | None]:
+        """The number of frames, and of pairs of a table; None where donors are drawn."""
+        if not self.pairs:
+            return self.frames, None
+        return len({name for row in self.pairs for name in (row[:2], row[2:])}), len(self.pairs)
+
+
+def _replay_source(run: "Run", typed: Mapping[str, Any]) -> "ReplaySource":
+    """The places of a stored run's model and source, by what was typed of them."""
+    from probe_kit.hooks.contract.options import read_pairs
+    from probe_kit.intervene import ReplaySource
+
+    options = read_pairs(typed.get("model_option", ()))
+    device, seed = typed.get("device", "cpu"), typed.get("weights_seed")
+    return ReplaySource(typed.get("suite"), typed.get("checkpoint"), options, seed, device, moved_of(run, typed))
+
+
 def _is_run(name: str, typed: Mapping[str, Any]) -> bool:
-    """Whether this is a stored run. Raises UsageError for one with settings of a new run."""
+    """Whether this is a stored run. Raises UsageError for one with settings of a new run.
+
+    Places that may have moved since, and the device, are none of a new run.
+    """
     from probe_kit.runs.layout import RUN_FILE
 
     if "/" not in name and not (Path(name) / RUN_FILE).exists():
         return False
-    if typed:
-        option = next(iter(typed)).replace("_", "-")
+    if new := [option for option in typed if option not in MOVED | _OF_A_REPLAY]:
+        option = new[0].replace("_", "-")
         raise UsageError(f"--{option} is a setting of a new run, and {name} is a stored one; leave it out")
     return True
 
 
-def _run_of(name: str, typed: Mapping[str, Any], frames: int, out_folder: str | None) -> "Run":
+def _run_of(name: str, typed: Mapping[str, Any], request: _Request, out_folder: str | None) -> "Run":
     """The stored run of this name, or one that is extracted now."""
     if _is_run(name, typed):
-        return _stored(name)
-    extraction, location = _prepared(name, typed, frames, out_folder, fetch=True)
+        return _stored(name, request)
+    extraction, location = _prepared(name, typed, request, out_folder, fetch=True)
     with progress() as bar:
         return extraction.run(location, progress=counter(bar, "episodes"))
 
 
-def _stored(name: str) -> "Run":
+def _stored(name: str, request: _Request) -> "Run":
     from probe_kit.diagnose.diagnosis import check_network
     from probe_kit.runs import open_run
 
     run = open_run(name)
     check_network(run)
+    request.check_cameras(run.certificate["policy"]["cameras"])
     return run
 
 
 def _prepared(
-    name: str, typed: Mapping[str, Any], frames: int, out_folder: str | None, *, fetch: bool
+    name: str, typed: Mapping[str, Any], request: _Request, out_folder: str | None, *, fetch: bool
 ) -> "tuple[Extraction, Location]":
+    from probe_kit.diagnose.diagnosis import check_base_files
     from probe_kit.extract import prepare
     from probe_kit.extract.commands import print_plan
+    from probe_kit.intervene.pairs import check_pairs
     from probe_kit.runs.store import locate
 
     in_scene = not {"dataset", "env", "pictures"} & set(typed)
     # Of an environment too the first observation of an episode is all that is read.
     captured = {"no_act": True} if in_scene else {"max_steps": 1, "execute": 1} if "env" in typed else {}
     # Twice as many groups as are exchanged: a target is probed in all of them.
-    items = {"items": 2 * frames} if in_scene and "items" not in typed else {}
+    items = {"items": 2 * request.frames} if in_scene and "items" not in typed else {}
     # A policy that ignores both picture and instruction is what is looked for here.
     ignored = {"accept_ignored_inputs": True}
     settings = ExtractSettings.of_command({**typed, **items, "model": name, **captured, **ignored}, None)
     with err.status(f"loading {settings.source.loads} and model"):
-        extraction = prepare(settings, out_folder, fetch=fetch)
+        extraction = prepare(settings, out_folder, fetch=fetch, check_cameras=request.check_cameras)
+    if request.base is not None:
+        model, cameras = settings.model, extraction.source.shown_cameras()
+        check_base_files(model.family, model.checkpoint, request.base, model.options, cameras or (), fetch)
+    check_pairs(request.pairs, _planned_frames(extraction.plan.episodes, in_scene))
     location = locate(out_folder or Path("runs") / f"diagnose-{extraction.default_name()}")
     print_plan(extraction, location)
     return extraction, location
+
+
+def _planned_frames(rows: "Iterable[Row]", in_scene: bool) -> dict[tuple[str, int], None]:
+    """The frames that a run will have, by what a table of pairs may call them; of the scene first frames."""
+    names = ("episode_id",) if in_scene else ("episode_id", "item_id")
+    return {
+        (str(row.columns[name]), number): None for row in rows for number in row.frames or (0,) for name in names
+    }
 
 
 Planned = tuple[str, Sequence[Any], list[str]]
 """The family, the stored streams, and the inputs that can vary."""
 
 
-def _planned(name: str, typed: Mapping[str, Any], frames: int, out_folder: str | None) -> Planned:
+def _planned(name: str, typed: Mapping[str, Any], request: _Request, out_folder: str | None) -> Planned:
     """Return what a diagnosis of this run, or of a planned one, would exchange and patch."""
     from probe_kit.intervene.settings import has_sides
 
     if _is_run(name, typed):
-        run = _stored(name)
+        run = _stored(name, request)
         texts, cameras, in_scene = (
             run.episodes["instruction"],
             run.certificate["policy"]["cameras"],
             has_sides(run),
         )
         return run.model, list(run.streams.values()), _inputs(texts, len(cameras), in_scene)
-    extraction, _ = _prepared(name, typed, frames, out_folder, fetch=False)
+    extraction, _ = _prepared(name, typed, request, out_folder, fetch=False)
     source, rows = extraction.source, extraction.plan.episodes
     cameras = source.example(rows[0].instruction).cameras
     inputs = _inputs((row.instruction for row in rows), 1 + len(cameras), source.suite is not None)
@@ -211,7 +276,7 @@ def _inputs(instructions: Iterable[str], cameras: int, in_scene: bool) -> list[s
     return [*["instruction"] * (len(set(instructions)) > 1), *pictures * cameras, *["state"] * (not in_scene)]
 
 
-def _say_cost(planned: Planned, frames: int, inside: bool, base: bool) -> None:
+def _say_cost(planned: Planned, request: _Request, inside: bool) -> None:
     from probe_kit.diagnose.measure import count_inferences
     from probe_kit.hooks.registry import get_family
 
@@ -221,7 +286,8 @@ def _say_cost(planned: Planned, frames: int, inside: bool, base: bool) -> None:
     # Keys and values are of every block of the backbone, which has one residual site more.
     handed_over = layers["backbone"] - 1 if declared is not None and declared.interventions.prompt_kv else 0
     sites = sum(layers.values()) + handed_over if inside else 0
-    most = count_inferences(frames, len(inputs), sites, base)
+    (frames, pairs), base = request.drawn, request.base is not None
+    most = count_inferences(frames, len(inputs), sites, base, pairs)
     words = ", ".join(dict.fromkeys(inputs))
     say(f"at most {most:,} inferences: {frames} frames, {words}, {sites} sites" + ", and a base" * base)
 

@@ -7,21 +7,25 @@ from copy import copy
 from dataclasses import replace
 from datetime import UTC, datetime
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from probe_kit.diagnose.choices import FRAMES
-from probe_kit.diagnose.frames import frames_of
+from probe_kit.diagnose.frames import frames_of, tabled_frames
+from probe_kit.diagnose.inputs import names_of
 from probe_kit.diagnose.measure import Actions, Infer, InputExchange
 from probe_kit.diagnose.passage import measure_passage
-from probe_kit.diagnose.results import Diagnosis, InputDiagnosis
+from probe_kit.diagnose.results import Diagnosis, InputDiagnosis, check_names
 from probe_kit.errors import ObservationError, UnsupportedInterventionError, UsageError
 from probe_kit.extract.sources.inputs import STATE, with_input
+from probe_kit.hooks.contract.card import EMBEDDED
+from probe_kit.hooks.family import SIZE
 from probe_kit.intervene.pairs import Pair
-from probe_kit.intervene.settings import key_of
+from probe_kit.intervene.settings import PairRow, key_of
 from probe_kit.intervene.tokens import roles_of_tokens
 from probe_kit.runs.layout import DIAGNOSES
+from probe_kit.runs.reader import origin_of
 from probe_kit.runs.records import as_json
 from probe_kit.runs.results import HEAD, read_bundle, write_bundle
 
@@ -45,6 +49,7 @@ def diagnose_run(
     paraphrases: Mapping[str, str] = MappingProxyType({}),
     target: "Target | str | None" = None,
     base: str | None = None,
+    pairs: Sequence[PairRow] = (),
     seed: int = 0,
     source: "ReplaySource | None" = None,
     load: "LoadPolicy | None" = None,
@@ -55,17 +60,21 @@ def diagnose_run(
     frames: how many. inputs: their names, such as `instruction`; empty for all. inside: whether sites are patched.
     paraphrases: by instruction, other words of the same meaning; they are the control of the instruction. target:
     probed at every site, as by `train_probes`. base: the checkpoint that the run's was tuned from, for a
-    comparison on the same pairs. seed: of the draw of donors. source, load: as for `run_intervention`; both load
-    the base too. progress: called with the name of every step.
-    Raises UsageError for a model that does not act, a run with too few groups, an unknown input, or a base with
-    other inputs, and of a target what `train_probes` raises.
+    comparison on the same pairs. pairs: a table of your own in place of drawn donors: episode and frame, and those
+    of the donor; `frames` is then not used. seed: of the draw of donors. source, load: as for `run_intervention`;
+    both load the base too. progress: called with the name of every step.
+    Raises UsageError for a model that does not act, a run with too few groups, an unknown input, a pair of a frame
+    that the run lacks, or a base with other inputs, and of a target what `train_probes` raises.
     """
     from probe_kit.diagnose.knowledge import measure_knowledge
     from probe_kit.intervene.sessions.opening import open_session
     from probe_kit.intervene.sessions.session import ReplaySource
 
     check_network(run)
+    check_names(inputs, names_of(run.certificate["policy"]["cameras"]))
     source = source or ReplaySource()
+    if base is not None and load is None:
+        check_base(run, source, base)
     if target is not None:
         progress("probes")
     knowledge = None if target is None else measure_knowledge(run, target, seed)
@@ -73,7 +82,7 @@ def diagnose_run(
     settings = {
         "format": FORMAT,
         "stamp": run.stamp,
-        "frames": frames,
+        **({"pairs": [list(row) for row in pairs]} if pairs else {"frames": frames}),
         "inputs": list(inputs),
         "inside": inside,
         "paraphrases": dict(paraphrases),
@@ -83,18 +92,22 @@ def diagnose_run(
     key = key_of(settings)
     if run.location.exists(f"{DIAGNOSES}/{key}/{HEAD}"):
         return replace(load_diagnosis(run, key), knowledge=knowledge)
-    with open_session(run, source, load) as session, session.ready():
+    with open_session(run, source, load, table=pairs) as session, session.ready():
         if base_policy is not None:
             base_policy = with_inputs_of(session.policy, base_policy)
         progress("frames")
-        drawn = frames_of(session, frames, paraphrases)
-        exchange = InputExchange(_inference(session), drawn, seed)
+        if pairs:
+            drawn, rows = tabled_frames(session, pairs, paraphrases)
+        else:
+            drawn, rows = frames_of(session, frames, paraphrases), []
+        exchange = InputExchange(_inference(session), drawn, seed, rows)
         diagnosed = _measure(session, exchange, inputs, inside, progress)
         if base_policy is not None:
             progress("inputs of the base")
             diagnosed = exchange.against(_inference(session, base_policy), diagnosed)
-    groups = len({frame.group for frame in drawn})
-    diagnosis = Diagnosis(key, run.label, len(drawn), groups, diagnosed, base or "")
+    clean = [drawn[index] for index in dict(rows)] or drawn
+    groups = len({frame.group for frame in clean})
+    diagnosis = Diagnosis(key, run.label, len(clean), groups, diagnosed, base or "")
     now = datetime.now(UTC).isoformat(timespec="microseconds")
     files = {FILE: as_json(diagnosis.to_json())}
     write_bundle(run.location, DIAGNOSES, key, {"settings": settings}, files, {"created": now})
@@ -118,6 +131,44 @@ def _load_base(run: "Run", source: "ReplaySource", checkpoint: str, load: "LoadP
     from probe_kit.intervene.sessions.session import load_policy_of
 
     return (load or load_policy_of)(run, replace(source, checkpoint=checkpoint))
+
+
+def check_base(run: "Run", source: "ReplaySource", base: str) -> None:
+    """Raise for a base that is not there or has other inputs, as far as the files of both checkpoints say it."""
+    origin = origin_of(run)
+    checkpoint, options = source.checkpoint or origin.checkpoint, {**origin.options, **source.options}
+    check_base_files(run.model, checkpoint, base, options, run.certificate["policy"]["cameras"])
+
+
+def check_base_files(
+    family_name: str,
+    checkpoint: str | None,
+    base: str,
+    options: Mapping[str, Any],
+    cameras: Sequence[str],
+    fetch: bool = True,
+) -> None:
+    """Raise what `Family.check` raises for the base, and UsageError if its files declare other inputs.
+
+    checkpoint, options: of the model that was tuned from it. cameras: those that get a picture. fetch: see
+    `Family.check`. No weights are read.
+    """
+    from probe_kit.hooks.contract.model import Policy
+    from probe_kit.hooks.registry import get_family
+
+    if (family := get_family(family_name)) is None:
+        return
+    # A size stands for a checkpoint, and both are given here.
+    unsized = {name: value for name, value in options.items() if name != SIZE}
+    family.check(base, options=unsized, fetch=fetch)
+    checkpoint = None if checkpoint in ("", EMBEDDED) else checkpoint
+    outlines = (
+        family.outline(checkpoint, options if checkpoint is None else unsized),
+        family.outline(base, unsized),
+    )
+    tuned, before = (None if outline is None else outline.model for outline in outlines)
+    if isinstance(tuned, Policy) and isinstance(before, Policy):
+        with_inputs_of(tuned.with_cameras(cameras), before)
 
 
 def with_inputs_of(tuned: "Policy", base: "Policy") -> "Policy":

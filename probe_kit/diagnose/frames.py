@@ -1,6 +1,6 @@
 """The frames of a run that are diagnosed: first inferences, of as many groups as there are."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import zip_longest
 from types import MappingProxyType
@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
+from probe_kit._system.counting import counted
 from probe_kit.diagnose.choices import LEAST_GROUPS, count_groups
 from probe_kit.errors import UsageError
 from probe_kit.extract.sources.donors import Frame
@@ -17,6 +18,7 @@ from probe_kit.intervene.sessions.observed import ObservedSession
 
 if TYPE_CHECKING:
     from probe_kit.intervene.sessions.session import ReplaySession
+    from probe_kit.intervene.settings import PairRow
 
 
 GOLDEN = (5**0.5 - 1) / 2
@@ -37,13 +39,39 @@ def frames_of(
     """
     listed = _observed(session, count) if isinstance(session, ObservedSession) else _drawn(session, count)
     frames = [_read(frame, paraphrases) for frame in listed]
+    _check_groups(frames, f"{session.run.location} has", "Extract more episodes or items")
+    return frames
+
+
+def tabled_frames(
+    session: "ReplaySession", table: Sequence["PairRow"], paraphrases: Mapping[str, str] = MappingProxyType({})
+) -> tuple[list[Frame], list[tuple[int, int]]]:
+    """Return the frames that a table of pairs names, each once, and its rows as (frame, donor) among them.
+
+    table: of frames that the run has, which `open_session` checks. Of the scene they are first frames.
+    paraphrases: as in `frames_of`. Raises UsageError for clean frames of too few groups.
+    """
+    if isinstance(session, ObservedSession):
+        by_name = session.frames.by_name
+    else:
+        names = {name for row in table for name in (row[0], row[2])}
+        rows = np.flatnonzero(session.run.episodes["episode_id"].isin(names))
+        by_name = {(frame.name, 0): frame for frame in _first_frames(session, rows)}
+    pairs = [(by_name[row[:2]], by_name[row[2:]]) for row in table]
+    # One frame may be named by its episode and by its item.
+    frames = list({frame.name: frame for pair in pairs for frame in pair}.values())
+    at = {frame.name: number for number, frame in enumerate(frames)}
+    _check_groups([clean for clean, _ in pairs], "the table of pairs has", "Add pairs of other groups")
+    numbered = dict.fromkeys((at[clean.name], at[donor.name]) for clean, donor in pairs)
+    return [_read(frame, paraphrases) for frame in frames], sorted(numbered)
+
+
+def _check_groups(frames: Sequence[Frame], subject: str, remedy: str) -> None:
     groups = len({frame.group for frame in frames})
     if groups < LEAST_GROUPS:
         raise UsageError(
-            f"{session.run.location} has frames of {groups} groups; a diagnosis needs at least {LEAST_GROUPS}. "
-            "Extract more episodes or items"
+            f"{subject} frames of {counted(groups, 'group')}; a diagnosis needs at least {LEAST_GROUPS}. {remedy}"
         )
-    return frames
 
 
 def _read(frame: Frame, paraphrases: Mapping[str, str]) -> Frame:
@@ -76,9 +104,16 @@ def _spread(frames: list[Frame], turns: int, phase: float) -> list[Frame]:
 def _drawn(session: "ReplaySession", count: int) -> Iterator[Frame]:
     """First frames of the scene: of every group one of each item, in the same layout; see `count_groups`."""
     episodes = session.run.episodes
-    for row in order_of_first_frames(episodes, count_groups(count))[:count]:
-        for pair in session.pairs(str(episodes.loc[row, "item_id"])):
-            if pair.row == episodes.index.get_loc(row):
+    ordered = order_of_first_frames(episodes, count_groups(count))[:count]
+    yield from _first_frames(session, episodes.index.get_indexer(ordered).tolist())
+
+
+def _first_frames(session: "ReplaySession", rows: Iterable[int]) -> Iterator[Frame]:
+    """The first frames of some of the scene's episodes. rows: their positions in the table of episodes."""
+    episodes = session.run.episodes
+    for row in rows:
+        for pair in session.pairs(str(episodes["item_id"].iloc[row])):
+            if pair.row == row:
                 assert isinstance(pair.clean, Observation), "runs of policies hold observations"
                 yield Frame.of(pair.episode, pair.clean, pair.group or pair.episode, pair.seed)
 

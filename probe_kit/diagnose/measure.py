@@ -29,24 +29,31 @@ Infer = Callable[[Sequence["Observation"], Sequence[int]], Actions]
 """From observations and seeds to actions (B, chunk, D), in any unit; deterministic for a seed."""
 
 
-def count_inferences(frames: int, inputs: int, sites: int = 0, base: bool = False) -> int:
+def count_inferences(
+    frames: int, inputs: int, sites: int = 0, base: bool = False, pairs: int | None = None
+) -> int:
     """Return how many inferences a diagnosis takes at most.
 
-    sites: that are patched, 0 for none. base: whether a base checkpoint is compared.
+    sites: that are patched, 0 for none. base: whether a base checkpoint is compared. pairs: of a table; None for
+    donors that are drawn.
     """
-    checkpoints = 1 + base
+    checkpoints, pairs = 1 + base, frames * DONORS if pairs is None else pairs
     # Clean ones twice and with another seed; per input the donors' value, all of their inputs, control and blank.
-    measured = frames * (3 + inputs * (2 * DONORS + 2)) * checkpoints
+    measured = (3 * frames + inputs * (2 * pairs + 2 * frames)) * checkpoints
     return measured + (frames * inputs * (2 + sites) if sites else 0)
 
 
 @dataclass(frozen=True)
 class InputExchange:
-    """Exchanges of inputs between frames, and what they change. seed: of the draw of donors."""
+    """Exchanges of inputs between frames, and what they change.
+
+    seed: of the draw of donors. table: pairs (frame, donor) of the user's own in order; empty for drawn ones.
+    """
 
     infer: Infer
     frames: Sequence[Frame]
     seed: int = 0
+    table: Sequence[tuple[int, int]] = ()
     _exchanges: dict[str, Exchanges] = field(default_factory=dict, repr=False)
 
     def measure(
@@ -68,7 +75,7 @@ class InputExchange:
 
         base: infers with it. Raises what `measure` raises.
         """
-        other = InputExchange(base, self.frames, self.seed)
+        other = InputExchange(base, self.frames, self.seed, self.table)
         compared = []
         for diagnosed in inputs:
             comparison = None
@@ -80,13 +87,15 @@ class InputExchange:
         return tuple(compared)
 
     def donors(self, name: str) -> list[tuple[int, int]]:
-        """Pairs (frame, donor) of an input, the same at every call; see `draw_donors`.
+        """Pairs (frame, donor) of an input, the same at every call: of the table, or drawn; see `draw_donors`.
 
         Donors of a frame hold different values of the input, as far as there are so many.
         """
+        values = self._values(name)
+        if self.table:
+            return [(index, donor) for index, donor in self.table if values[index] != values[donor]]
         # A seed per input, so that the donors of one do not depend on which others are measured.
-        rng = np.random.default_rng(derive_seed(self.seed, "donors", name))
-        values, pairs = self._values(name), []
+        rng, pairs = np.random.default_rng(derive_seed(self.seed, "donors", name)), []
         drawn = draw_donors(self.frames, name, rng, len(self.frames))
         for index, of_frame in groupby(drawn, key=itemgetter(0)):
             donors = [donor for _, donor in of_frame]
@@ -149,7 +158,8 @@ class InputExchange:
             return InputDiagnosis(name, "not varied", f"all {len(frames)} frames hold one value")
         pairs = self.donors(name)
         if not pairs:
-            return InputDiagnosis(name, "not varied", "no two groups of frames hold different values")
+            of = "pair of the table holds" if self.table else "two groups of frames hold"
+            return InputDiagnosis(name, "not varied", f"no {of} different values")
         rows = np.array([index for index, _ in pairs])
         seeds = [frames[index].seed for index in rows]
         donors = [observations[donor] for _, donor in pairs]

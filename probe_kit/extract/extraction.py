@@ -12,7 +12,7 @@ from probe_kit.errors import EpisodesFailedError, UsageError
 from probe_kit.extract.events import Done, Failed
 from probe_kit.extract.needs import space_needed
 from probe_kit.extract.plan import Plan
-from probe_kit.extract.preparation import Prepared, load, open_checked
+from probe_kit.extract.preparation import CheckCameras, Prepared, load, open_checked
 from probe_kit.extract.rollout.task import task_of
 from probe_kit.extract.settings import AskSettings, ExtractSettings, Settings, run_label
 from probe_kit.extract.workers import play
@@ -126,21 +126,25 @@ def prepare(
     out: Path | str | Location | None = None,
     model: "Model | None" = None,
     fetch: bool = True,
+    check_cameras: CheckCameras | None = None,
 ) -> Extraction:
     """Find the suite, load the model and plan the episodes.
 
     out: where it will be written, if that is known; what is wrong there is then said before the model is loaded.
     model: the policy or answer model of these settings, if it is loaded already; several runs can share it.
     Workers load their own. fetch: False plans with the streams that the family declares, without weights, network
-    or GPU; such an extraction cannot be run.
+    or GPU; such an extraction cannot be run. check_cameras: called with the cameras that get a picture, see
+    `load`.
     Raises what these raise: UnknownModelError, UnknownCategoryError, SuiteError, WeightsError …
     """
     location = None if out is None else locate(out)
     if not settings.machine.elsewhere:
-        return Extraction(**vars(load(settings, location=location, model=model, fetch=fetch)))
+        prepared = load(settings, location=location, model=model, fetch=fetch, check_cameras=check_cameras)
+        return Extraction(**vars(prepared))
     # This process only plans: the GPUs belong to the workers, and each of them calibrates on its own device.
     measures = {"batch": 1} if settings.machine.batch == "auto" else {}
-    planned = load(settings.changed(device="cpu", **measures), location=location, model=model, fetch=fetch)
+    on_cpu = settings.changed(device="cpu", **measures)
+    planned = load(on_cpu, location=location, model=model, fetch=fetch, check_cameras=check_cameras)
     for_workers = planned.settings.changed(device=settings.machine.device, batch=settings.machine.batch)
     return Extraction(for_workers, planned.source, planned.plan, planned.card, None, declared=planned.declared)
 

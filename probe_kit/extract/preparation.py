@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -30,6 +30,8 @@ from probe_kit.runs.writer import RunWriter
 if TYPE_CHECKING:
     from probe_kit.hooks import Model
 
+CheckCameras = Callable[[Sequence[str]], object]
+"""Called with the names of the model's cameras that get a picture; raises UsageError."""
 _OF_THE_CHECKPOINT = ("dtype", "execute", "random_weights", "captured_calls")
 """Settings whose value the loaded model may decide."""
 
@@ -88,6 +90,7 @@ def load(
     location: Location | None = None,
     model: "Model | None" = None,
     fetch: bool = True,
+    check_cameras: CheckCameras | None = None,
 ) -> Prepared:
     """Open the source, load the model and plan the rows.
 
@@ -95,7 +98,8 @@ def load(
     it is looked at before the model is loaded. model: the policy or answer model of these settings, if it is
     loaded already; it may be one of your own, and several runs can share it. fetch: False makes the plan of the
     streams that the model's family declares: without weights, network or GPU. A family that declares none is
-    loaded.
+    loaded. check_cameras: called once they are known, before weights are loaded where the checkpoint's files say
+    it, and again of the loaded model.
     Raises UsageError for a policy of another family or with other weights than the settings name, and what these
     raise: UnknownModelError, UnknownCategoryError, SuiteError, RecordingError, OwnEnvironmentError, WeightsError …
     """
@@ -108,6 +112,8 @@ def load(
         task.check_loaded(settings, model)
     else:
         raise_together(task.early_checks(settings, source, fetch))
+    if check_cameras is not None and (early := source.shown_cameras(task.declared_cameras(settings))) is not None:
+        check_cameras(early)
     if not fetch and (sizes := planned_sizes(settings, source.instructions)) is not None:
         settings = task.planned(settings, sizes)
         plan = _plan(settings, source, rows, sizes.streams, settings.task.execute or sizes.execute)
@@ -115,6 +121,8 @@ def load(
     settings, source, controller, calibration = task.fit(
         settings, source, task.load(settings) if model is None else model
     )
+    if check_cameras is not None and (cameras := source.shown_cameras()) is not None:
+        check_cameras(cameras)
     rows = task.rows(settings, source)  # of the source as the model is shown it
     plan = _plan(settings, source, rows, controller.streams, controller.execute)
     return Prepared(settings, source, plan, controller.identity, controller, calibration)

@@ -13,11 +13,14 @@ from rich.text import Text
 from probe_kit._tables.printing import Format, print_table
 from probe_kit._terminal import options as common
 from probe_kit._terminal.console import counter, marked, out, progress, say, say_note, split
+from probe_kit._terminal.field_options import command_with
 from probe_kit._terminal.options import LISTED, Names, choices, further_option, one_of
 from probe_kit._terminal.panelled_help import PanelledHelp
 from probe_kit.errors import UsageError
+from probe_kit.extract.moved import moved_of, moved_options
 from probe_kit.hooks.contract.interventions import Readout
 from probe_kit.intervene.kinds import every_kind, kind_names, kind_of
+from probe_kit.suite.categories import category_of
 
 if TYPE_CHECKING:
     from probe_kit.intervene.kinds.base import Intervention
@@ -119,13 +122,6 @@ PairTable = Annotated[
         help="Table of pairs of your own, with the columns episode, frame, donor_episode, donor_frame.",
     ),
 ]
-DatasetFolder = Annotated[
-    Path | None, _pairs_option("--dataset", metavar="FOLDER", help="Folder of the recordings, if it was moved.")
-]
-EnvOptions = Annotated[
-    list[str] | None,
-    _pairs_option("--env-option", metavar="NAME=VALUE", help="Option of the environment. Repeat for several."),
-]
 ReadoutName = Annotated[
     Readout,
     further_option(
@@ -136,15 +132,6 @@ ReadoutName = Annotated[
 ]
 WeightsSeed = Annotated[
     int | None, further_option("--weights-seed", help="Seed of the untrained weights. Default: that of the run.")
-]
-SceneFiles = Annotated[
-    list[str] | None,
-    further_option(
-        "--scene-file",
-        metavar="NAME=FILE",
-        help="File of the scene, if the run had one and it was moved: background=FILE or arm_urdf=FILE. Repeat "
-        "for several.",
-    ),
 ]
 
 
@@ -172,7 +159,9 @@ class KindHelp(PanelledHelp):
             )
 
 
+@command_with(moved_options())
 def intervene(
+    typed: Mapping[str, Any],
     run: common.RunFolder,
     kind: KindName = "image-swap",
     categories: common.Categories = None,
@@ -189,12 +178,9 @@ def intervene(
     checkpoint: Checkpoint = None,
     model_options: common.ModelOptions = None,
     weights_seed: WeightsSeed = None,
-    scene_files: SceneFiles = None,
     vary: Vary = None,
     frames: FramesEach = None,
     pairs: PairTable = None,
-    dataset: DatasetFolder = None,
-    env_options: EnvOptions = None,
     wording: common.Wording = None,
     device: common.Device = "cpu",
     style: Format = "table",
@@ -227,11 +213,9 @@ def intervene(
     check_options(kind, kind_options)
     intervention = kind_of(kind).from_options(opened, **of_every_kind, **kind_options)
     intervention.check_run(opened)
-    files = {name: Path(str(path)) for name, path in read_options(scene_files or []).items()}
     source = ReplaySource(
-        suite, checkpoint, read_options(model_options or []), weights_seed, device, files, dataset,
-        read_options(env_options or []),
-    )  # fmt: skip
+        suite, checkpoint, read_options(model_options or []), weights_seed, device, moved_of(opened, typed)
+    )
     result = _run(opened, intervention, source)
     print_result(result, style, details)
     if style == "table":
@@ -266,7 +250,7 @@ def _run(run: "Run", intervention: "Intervention", source: "ReplaySource") -> "I
     was_stored = is_stored(run.location, key_of(settings_of(intervention, run)))
     few = {} if was_stored else too_few_groups(run, intervention)
     if few:
-        counts = ", ".join(f"{name} has {count}" for name, count in few.items())
+        counts = ", ".join(f"{category_of(name).title} has {count}" for name, count in few.items())
         needed = groups_for_not_used()
         say_note(f"“not used” needs {needed} groups of items and cannot be found: {counts}. Extract more items.")
     unread = () if was_stored else unread_sites(run, intervention)

@@ -1,6 +1,6 @@
 """Pairs of inferences: a clean one, and the one from which activations are patched into it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -88,6 +88,22 @@ def read_pairs(path: Path) -> tuple[PairRow, ...]:
     if not rows:
         raise UsageError(f"{path} names no pair; expected a line per pair")
     return tuple(rows)
+
+
+def check_pairs(table: Sequence[PairRow], frames: Collection[tuple[str, int]]) -> None:
+    """Raise UsageError for a row that names none of the `frames`, each an episode and a number."""
+    for episode, number in (part for row in table for part in (row[:2], row[2:])):
+        if (episode, number) not in frames:
+            numbers = sorted(frame for name, frame in frames if name == episode)
+            first = next(iter(frames), ("none", 0))[0]
+            its = f"of that episode {_listed(numbers)}" if numbers else f"episodes such as {first!r}"
+            raise UsageError(
+                f"the run has no frame {number} of {episode!r}, which the table of pairs names; it has {its}"
+            )
+
+
+def _listed(numbers: Sequence[int], most: int = 8) -> str:
+    return ", ".join(map(str, numbers[:most])) + ", …" * (len(numbers) > most)
 
 
 def _episode(text: str) -> str:

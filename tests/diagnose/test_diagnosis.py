@@ -116,6 +116,65 @@ def test_a_camera_that_a_run_has_not_is_refused_before_its_model_is_loaded(folde
     assert (answer.exit_code, "there are instruction, picture, state" in answer.output) == (2, True)
 
 
+def never(*_: object, **__: object) -> Policy:
+    raise AssertionError("no model is loaded for a request that is wrong")
+
+
+@pytest.mark.parametrize("option", [("--require", "picture.wrist"), ("--base", "nowhere"), ("--pairs", "{pairs}")])
+def test_what_is_wrong_with_a_new_run_is_said_before_it_is_played(
+    option: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pairs = tmp_path / "pairs.csv"
+    pairs.write_text("episode,frame,donor_episode,donor_frame\ncolor-000,0,color-001,0\n", encoding="utf-8")
+    if option[0] == "--require":
+        monkeypatch.setattr("probe_kit.hooks.load_policy", never)
+    monkeypatch.setattr("probe_kit.extract.extraction.Extraction.run", never)
+    new = ("--categories", "color", "--items", 12, "--env-workers", 0, "--out", tmp_path / "run")
+    answer = run_command("pi0-tiny", *new, option[0], option[1].format(pairs=pairs))
+    assert answer.exit_code in (2, 3), answer.output
+    reason = {
+        "--require": "there are instruction, picture, state",
+        "--base": "nowhere",
+        "--pairs": "no frame 0 of",
+    }
+    assert reason[option[0]] in " ".join(answer.output.split())
+
+
+def test_pairs_of_a_table_are_the_ones_that_are_exchanged(run: Run) -> None:
+    first = run.episodes.groupby("item_id", sort=False).first().reset_index()
+    names = [str(name) for name in first["episode_id"]]
+    donors = {name: names[(at + 3) % len(names)] for at, name in enumerate(names)}
+    table = tuple((name, 0, donor, 0) for name, donor in donors.items())
+    diagnosis = diagnose_run(run, pairs=table, inputs=["instruction", "state"], inside=False)
+    words, state = diagnosis.inputs
+    texts = dict(zip(run.episodes["episode_id"].astype(str), run.episodes["instruction"], strict=True))
+    assert words.n_pairs == sum(texts[name] != texts[donor] for name, donor in donors.items())
+    assert words.share > 0.3, "words decide Color"
+    assert state.verdict == "not varied"
+    assert diagnosis.n_frames == len(table)
+    assert diagnosis.key != diagnose_run(run, pairs=table[:-1], inputs=["state"], inside=False).key
+
+
+def test_a_pair_of_an_unknown_frame_is_refused_before_the_model_is_loaded(run: Run) -> None:
+    name = str(run.episodes["episode_id"].iloc[0])
+    with pytest.raises(UsageError, match=rf"no frame 3 of '{name}'.* it has of that episode 0"):
+        diagnose_run(run, pairs=[(name, 3, name, 0)], load=never)
+    with pytest.raises(UsageError, match=r"no frame 0 of 'nothing'.* episodes such as 'a2a-embedded-color"):
+        diagnose_run(run, pairs=[("nothing", 0, name, 0)], load=never)
+    with pytest.raises(UsageError, match="no input is called 'words'"):
+        diagnose_run(run, inputs=["words"], load=never)
+
+
+def test_a_table_of_few_groups_and_one_beside_a_number_of_frames_are_refused(folder: Path, tmp_path: Path) -> None:
+    first, second = pk.open_run(folder / "run").episodes["episode_id"].astype(str)[:2]
+    pairs = tmp_path / "pairs.csv"
+    pairs.write_text(f"episode,frame,donor_episode,donor_frame\n{first},0,{second},0\n", encoding="utf-8")
+    answer = run_command(folder / "run", "--pairs", pairs)
+    assert (answer.exit_code, "the table of pairs has frames of 1 group;" in answer.output) == (2, True)
+    answer = run_command(folder / "run", "--pairs", pairs, *FRAMES)
+    assert (answer.exit_code, "leave one of both out" in answer.output) == (2, True)
+
+
 def test_settings_of_a_new_run_are_refused_for_a_stored_one(folder: Path) -> None:
     answer = run_command(folder / "run", "--categories", "color")
     assert answer.exit_code == 2

@@ -1,7 +1,11 @@
 """A diagnosis of a network that is shown two cameras: each is an input of its own."""
 
-import pytest
+from pathlib import Path
 
+import pytest
+from typer.testing import CliRunner
+
+from probe_kit.cli import app
 from probe_kit.diagnose.diagnosis import diagnose_run
 from probe_kit.extract import EnvSource, ExtractSettings, extract_run
 from probe_kit.runs import Run
@@ -9,16 +13,34 @@ from probe_kit.suite import Suite
 from tests.support.acting_checkpoints import FAMILIES
 from tests.support.organisms import ORGANISMS, edited
 
+ENVIRONMENT = "tests.support.reach_env:TwoCameras"
 PICTURES = ("picture.top", "picture.wrist")
 
 
 @pytest.fixture(scope="module")
-def run(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Run:
-    folder = tmp_path_factory.mktemp("two")
-    checkpoint = FAMILIES["smolvla"].made(small_suite, folder / "smolvla")
-    source = EnvSource("tests.support.reach_env:TwoCameras", max_steps=1)
+def checkpoint(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> str | None:
+    return FAMILIES["smolvla"].made(small_suite, tmp_path_factory.mktemp("two") / "smolvla")
+
+
+@pytest.fixture(scope="module")
+def run(checkpoint: str, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    source = EnvSource(ENVIRONMENT, max_steps=1)
     settings = ExtractSettings("smolvla", checkpoint, source=source, execute=1, env_workers=0, accept_units=True)
-    return extract_run(settings, folder / "run")
+    return extract_run(settings, tmp_path_factory.mktemp("played") / "run")
+
+
+@pytest.mark.slow
+def test_a_mistyped_camera_of_a_new_run_is_refused_before_the_model_is_loaded(
+    checkpoint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def never(*_: object, **__: object) -> None:
+        raise AssertionError("no model is loaded")
+
+    monkeypatch.setattr("probe_kit.hooks.load_policy", never)
+    new = ["diagnose", "smolvla", "--checkpoint", checkpoint, "--env", ENVIRONMENT, "--env-workers", "0"]
+    answer = CliRunner().invoke(app, [*new, "--out", str(tmp_path / "run"), "--require", "picture.side"])
+    assert answer.exit_code == 2, answer.output
+    assert "there are instruction, picture.top, picture.wrist, state" in " ".join(answer.output.split())
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 import csv
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +17,13 @@ from probe_kit.cli import app
 from probe_kit.diagnose.diagnosis import diagnose_run
 from probe_kit.errors import ProbeKitError, RecordingError, TooFewGroupsError, UsageError
 from probe_kit.extract import ExtractSettings, PictureFolder, extract_run, prepare
+from probe_kit.extract.moved import moved_of
 from probe_kit.extract.rollout.worker import torch_threads
 from probe_kit.extract.sources.pictures import PictureSource
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks import Observation, Policy
 from probe_kit.intervene import AttentionReadout, InstructionSwap, ReplaySource, run_intervention
+from probe_kit.intervene.sessions.frames import Frames
 from probe_kit.intervene.sessions.observed import ObservedSession
 from probe_kit.intervene.sessions.opening import open_session
 from probe_kit.retention.displays import attention_on_picture
@@ -159,6 +162,20 @@ def test_pictures_are_shown_again_for_interventions_and_diagnoses(
     assert diagnose_run(run, load=lambda *_: pi0_tiny).inputs
 
 
+def test_pictures_that_were_moved_are_given_by_the_options_of_extract(
+    run: pk.Run, folder: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(folder, tmp_path / "photos")
+    moved = pk.open_run(run.path)
+    gone = {"folder": "/nowhere/photos", "table": "/nowhere/table.csv"}
+    moved.__dict__["origins"] = tuple(replace(origin, files=gone) for origin in run.origins)
+    with pytest.raises(UsageError, match="Give it with --pictures"):
+        Frames(moved, ReplaySource())
+    places = moved_of(moved, {"pictures": tmp_path / "photos", "table": tmp_path / "photos" / "table.csv"})
+    frames = Frames(moved, ReplaySource(moved=places))
+    assert len(frames.index) == COUNT
+
+
 @pytest.mark.slow
 def test_the_viewer_shows_a_pictures_run_with_its_attention_over_each_picture(
     run: pk.Run, pi0_tiny: Policy, tmp_path: Path
@@ -258,7 +275,7 @@ def test_a_target_that_train_would_refuse_is_no_next_step(folder: Path, tmp_path
     settings = ExtractSettings("pi0-tiny", source=PictureFolder(folder, tmp_path / "rare.csv"), env_workers=0)
     few = extract_run(settings, tmp_path / "run")
     listed = CliRunner().invoke(app, ["targets", str(few.location)])
-    assert "rare in 3 groups, 5 needed" in " ".join(listed.stdout.replace("│", " ").split())
+    assert "train refuses dataset.kind: the class 'rare' is in 3 of 12 groups" in listed.stderr
     assert "next: probe-kit labels" in listed.stderr.replace("\n", " ")
     with pytest.raises(TooFewGroupsError, match="is in 3 of 12 groups"):
         pk.train_probes(few, target=pk.Target.of_run(few, "dataset.kind"))

@@ -1,5 +1,6 @@
 """Interventions on runs of an environment: pairs of first observations that differ in one input."""
 
+import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -8,8 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from probe_kit.errors import OtherFramesError, SettingsMismatchError
+from probe_kit.errors import OtherFramesError, SettingsMismatchError, UsageError
 from probe_kit.extract import EnvSource, ExtractSettings, prepare
+from probe_kit.extract.moved import moved_of
 from probe_kit.hooks import Observation
 from probe_kit.intervene import AttentionReadout, ImageSwap, InstructionSwap, Interchange, run_intervention
 from probe_kit.intervene.sessions.observed import ObservedSession
@@ -121,6 +123,32 @@ def test_another_version_of_the_environment_is_refused(
         open_session(played, ReplaySource(), lambda *_: pi0_tiny)
 
 
+def test_an_environment_whose_module_was_moved_is_given_by_the_option_of_extract(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pi0_tiny: "Pi0"
+) -> None:
+    """The module is imported by its old name and place once, then it lies elsewhere under another name."""
+    text = (Path(__file__).parents[1] / "support" / "reach_env.py").read_text(encoding="utf-8")
+    for folder, name in (("old", "hand_env"), ("new", "hand_moved")):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / f"{name}.py").write_text(text, encoding="utf-8")
+    monkeypatch.syspath_prepend(str(tmp_path / "old"))
+    source = EnvSource("hand_env:ReachEnv", max_steps=1, options={"count": "6"})
+    settings = ExtractSettings("pi0-tiny", source=source, execute=1, env_workers=0, batch=1)
+    prepare(settings, model=pi0_tiny).run(tmp_path / "run")
+    run = open_run(tmp_path / "run")
+    shutil.rmtree(tmp_path / "old")
+    monkeypatch.delitem(sys.modules, "hand_env")
+    with pytest.raises(UsageError, match=r"environment, which is not here any more. Give it with --env"):
+        open_session(run, ReplaySource(), lambda *_: pi0_tiny)
+    monkeypatch.syspath_prepend(str(tmp_path / "new"))
+    moved = moved_of(run, {"env": "hand_moved:ReachEnv", "device": "cpu"})
+    with open_session(run, ReplaySource(moved=moved), lambda *_: pi0_tiny) as opened:
+        assert isinstance(opened, ObservedSession)
+        assert len(opened.frames.index) == len(run.episodes)
+    with pytest.raises(UsageError, match=r"--dataset does not apply: .* is given with --env, --env-option"):
+        moved_of(run, {"dataset": tmp_path})
+
+
 def test_fewer_episodes_than_the_run_has_are_refused(played: Run, pi0_tiny: "Pi0") -> None:
     with pytest.raises(OtherFramesError, match="has no episode 'reach-04' any more"):
-        open_session(played, ReplaySource(environment_options={"count": "4"}), lambda *_: pi0_tiny)
+        open_session(played, ReplaySource(moved={"options": {"count": "4"}}), lambda *_: pi0_tiny)

@@ -78,6 +78,18 @@ class Act(Task[ExtractSettings, "Policy"]):
         checkpoint = model.checkpoint or model.family
         return [check_instructions, *(() if inputs is None else source.early_checks(*inputs, checkpoint))]
 
+    def declared_cameras(self, settings: ExtractSettings) -> tuple[str, ...] | None:
+        """Return those of a checkpoint in lerobot's layout, else those of the model without its weights."""
+        from probe_kit.hooks.registry import get_family
+
+        model, family = settings.model, get_family(settings.model.family)
+        if family is None:
+            return None
+        if (inputs := _declared_inputs(family, settings)) is not None:
+            return inputs[0]
+        outline = family.outline(model.checkpoint, model.options, model.dtype)
+        return None if outline is None or outline.model is None else outline.model.card.cameras
+
     def planned(self, settings: ExtractSettings, sizes: PlannedSizes) -> ExtractSettings:
         """Return the settings with the inferences of an episode counted."""
         # Only a scene has an arm that actions could misfit.

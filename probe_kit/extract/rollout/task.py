@@ -60,6 +60,11 @@ class Task[Chosen: Settings, Loaded: "Model"](ABC):
         del settings, source, fetch
         return []
 
+    def declared_cameras(self, settings: Chosen) -> tuple[str, ...] | None:
+        """Return the cameras that the files of the checkpoint declare; None where they do not say."""
+        del settings
+        return None
+
     def planned(self, settings: Chosen, sizes: PlannedSizes) -> Chosen:
         """Return the settings of a plan without a model. Raises CheckpointError for a model that cannot do it."""
         del sizes

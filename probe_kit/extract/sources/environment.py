@@ -55,6 +55,10 @@ class EnvSource(SourceSettings):
 
     command: ClassVar[str] = "--env MODULE:CLASS"
     opens: ClassVar[str] = "probe_kit.extract.sources.environment_source:EnvironmentSource"
+    moves: ClassVar[Mapping[str, str]] = {
+        "environment": "The run's environment, if its module was moved or renamed.",
+        "options": "Argument of the environment beside those of the run; repeatable.",
+    }
     subject: ClassVar[str] = "environments"
     loads: ClassVar[str] = "environment"
     refuses: ClassVar[tuple[str, ...]] = (
@@ -88,6 +92,11 @@ class EnvSource(SourceSettings):
         """Return the same values: they name a module, and `find_again` leads to it."""
         del files
         return dict(values)
+
+    @classmethod
+    def with_moved(cls, values: Mapping[str, Any], moved: Mapping[str, Any]) -> dict[str, Any]:
+        """Return settings as values, with another module; arguments are added to those of the run."""
+        return {**values, **moved, "options": {**values["options"], **read_options(moved.get("options", {}))}}
 
     @classmethod
     def find_again(cls, files: Mapping[str, str]) -> None:

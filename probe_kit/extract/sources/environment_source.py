@@ -162,6 +162,12 @@ class EnvironmentSource(Source[EnvSource]):
         self.columns = tuple(sorted(step.facts))
         self.truths = [name for name in self.columns if isinstance(step.facts[name], bool | np.bool_)]
 
+    def shown_cameras(self, declared: Sequence[str] | None = None) -> tuple[str, ...] | None:
+        """The first one, and those that the first observation names: it is looked at where none was yet."""
+        if not self.cameras and declared is not None:
+            self.watched(declared)
+        return tuple(self.cameras) or None
+
     def _with_cameras(self, policy: "Policy", observation: Observation) -> "Policy":
         self.cameras = [*policy.card.cameras[:1], *observation.cameras]
         try:

@@ -27,6 +27,7 @@ from probe_kit.extract.sources.units import predicted_once
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.state_layout import ARM_NUMBERS
+from probe_kit.hooks.contract.views import CAMERA
 from probe_kit.runs.layout import CAPTURE_ONLY, CLASSES, DATASET, OTHER_ACTIONS, RECORDED_EPISODES, TRUTHS
 from probe_kit.suite.pictures import decode_bytes
 
@@ -69,6 +70,10 @@ class PictureFolder(SourceSettings):
     command: ClassVar[str] = "--pictures FOLDER --table FILE"
     shows: ClassVar[str] = "--pictures, of which each is shown once and no action is executed"
     opens: ClassVar[str] = "probe_kit.extract.sources.pictures:PictureSource"
+    moves: ClassVar[Mapping[str, str]] = {
+        "folder": "Folder of the run's pictures, if it was moved.",
+        "table": "Table of the run's pictures, if it was moved.",
+    }
     subject: ClassVar[str] = "pictures"
     loads: ClassVar[str] = "pictures"
     decides: ClassVar[tuple[str, ...]] = ("captured_calls",)
@@ -236,6 +241,10 @@ class PictureSource(Source[PictureFolder]):
         chunk = predicted_once(policy, self.example(self.instructions[0]))
         self.prediction = chunk.shape[0], chunk.shape[1]
         return self, policy
+
+    def shown_cameras(self, declared: Sequence[str] | None = None) -> tuple[str, ...]:
+        """The first one: a row has one picture."""
+        return tuple(declared or (CAMERA,))[:1]
 
     def watched(self, cameras: Sequence[str]) -> Self:
         """Show the pictures to the model's first camera."""

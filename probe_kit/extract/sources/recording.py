@@ -168,6 +168,7 @@ class LeRobotSource(SourceSettings):
 
     command: ClassVar[str] = "--dataset FOLDER"
     opens: ClassVar[str] = "probe_kit.extract.sources.recording_source:RecordingSource"
+    moves: ClassVar[Mapping[str, str]] = {"folder": "Folder of the run's recordings, if it was moved."}
     subject: ClassVar[str] = "recordings"
     loads: ClassVar[str] = "recordings"
     decides: ClassVar[tuple[str, ...]] = ("captured_calls",)

@@ -169,6 +169,11 @@ class RecordingSource(Source[LeRobotSource]):
         """Cameras and the width of the state."""
         return [lambda: self.mapped(cameras), lambda: self.check_state_width(checkpoint, state)]
 
+    def shown_cameras(self, declared: Sequence[str] | None = None) -> tuple[str, ...] | None:
+        """Return those that a feature was mapped to, or would be mapped to."""
+        pairs = self.settings.cameras if declared is None else self.mapped(declared).settings.cameras
+        return tuple(camera for camera, _ in pairs) or None
+
     def mapped(self, cameras: Sequence[str]) -> Self:
         """The same with a feature for the model's cameras. Raises RecordingError where none follows."""
         pairs = mapped_cameras(self.settings.cameras, cameras, self.folder.cameras)

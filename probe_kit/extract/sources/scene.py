@@ -114,6 +114,10 @@ class SceneSettings(SourceSettings):
     scene: Scene
 
     opens: ClassVar[str] = "probe_kit.extract.sources.scene_source:SceneSource"
+    moves: ClassVar[Mapping[str, str]] = {
+        f"{OF_SCENE}background": "Photo of the run's scene, if it was moved.",
+        f"{OF_SCENE}arm_urdf": "URDF file of the run's arm, if it was moved.",
+    }
     subject: ClassVar[str] = "scenes"
     loads: ClassVar[str] = "suite"
 

@@ -19,6 +19,7 @@ from probe_kit.extract.sources.source import Played, Source
 from probe_kit.extract.sources.units import FIRST_EPISODES, check_units, unusual_shares
 from probe_kit.hashing import derive_seed, sha256_json
 from probe_kit.hooks.contract.observation import Observation
+from probe_kit.hooks.contract.views import CAMERA
 from probe_kit.suite import Episode, Suite, default_suite, load_suite
 from probe_kit.suite.build import ITEMS, default_folder
 from probe_kit.suite.validation.sufficiency import Smallest
@@ -167,6 +168,10 @@ class SceneSource(Source[SceneSettings]):
         scene = self.settings.scene
         blank, state = np.zeros((*scene.picture_shape, 3), np.uint8), np.zeros(8, np.float32)
         return Observation(blank, state, instruction, scene.intrinsics)
+
+    def shown_cameras(self, declared: Sequence[str] | None = None) -> tuple[str, ...]:
+        """The first one: the scene has one camera."""
+        return tuple(declared or (CAMERA,))[:1]
 
     def check(self, policy: "Policy", accept_units: bool) -> "tuple[Self, Policy]":
         """Raise UnitsError for a scene whose first states lie outside the statistics of a policy."""

@@ -8,6 +8,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from probe_kit._terminal.field_options import FieldOption, Part, options_of
@@ -29,7 +30,8 @@ class SourceSettings(Part):
     opened. command: the option that a command names it with; empty for the scene. shows: the reason why options of
     other sources do not apply. subject, loads: what its options are about, and what is loaded of it, in words.
     decides: fields of other parts that are the source's
-    own. refuses: fields of other parts that do not apply, some with the only value that does not.
+    own. refuses: fields of other parts that do not apply, some with the only value that does not. moves: fields
+    that a later command may give anew, with what it says of them, because a file or module lies elsewhere.
     """
 
     kind: str
@@ -41,6 +43,7 @@ class SourceSettings(Part):
     loads: ClassVar[str] = ""
     decides: ClassVar[tuple[str, ...]] = ()
     refuses: ClassVar[tuple[str, ...]] = ()
+    moves: ClassVar[Mapping[str, str]] = MappingProxyType({})
 
     @property
     def name(self) -> str:
@@ -88,6 +91,11 @@ class SourceSettings(Part):
     def with_files(cls, values: Mapping[str, Any], files: Mapping[str, str]) -> dict[str, Any]:
         """Return settings as values, with other texts for `files`."""
         return {**values, **files}
+
+    @classmethod
+    def with_moved(cls, values: Mapping[str, Any], moved: Mapping[str, Any]) -> dict[str, Any]:
+        """Return settings as values, with the parts that are given anew."""
+        return {**values, **moved}
 
     @classmethod
     def find_again(cls, files: Mapping[str, str]) -> None:
@@ -196,6 +204,15 @@ class Source[Chosen: SourceSettings](ABC):
         """Checks against the cameras and numbers of the state that a checkpoint declares, before it is loaded."""
         del cameras, state, checkpoint
         return []
+
+    def shown_cameras(self, declared: Sequence[str] | None = None) -> tuple[str, ...] | None:
+        """Return the model's cameras that get a picture, the first one in front; None where only a model can say.
+
+        Of a source that was checked against a model they are those of the model. declared: the cameras of a
+        checkpoint that is not loaded yet, None where its files do not say.
+        """
+        del declared
+        return None
 
     def known_early(self) -> dict[str, Any] | None:
         """The settings of a run that are known before a model is loaded; None where there are none."""

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -27,16 +27,11 @@ class Frames:
 
     def __init__(self, run: Run, source: ReplaySource) -> None:
         """Raises UsageError if files of the source are gone, OtherFramesError for another version of it."""
-        from probe_kit.extract.config_files import source_of_run
-        from probe_kit.extract.sources.kinds import kind_of
+        from probe_kit.extract.moved import source_again
         from probe_kit.extract.sources.source import Played
 
         self.run, inputs = run, stored_inputs_of(run.settings)
-        replaced = {} if source.dataset is None else {"folder": str(source.dataset)}
-        values = source_of_run(run, replaced, {"folder": "--dataset"} if run.recorded else {}) | replaced
-        if source.environment_options:
-            values["options"] = {**values["options"], **source.environment_options}
-        opened = kind_of(values)(**values).open()
+        opened = source_again(run, source.moved).open()
         opened.check_same(run.settings)
         opened.columns = tuple(inputs["columns"])
         self._name, self._rows = opened.name, {row.episode_id: row for row in opened.rows(run.settings["seed"])}
@@ -44,6 +39,12 @@ class Frames:
         self.cameras = tuple(camera if isinstance(camera, str) else camera[0] for camera in inputs["cameras"])
         self._cached = lru_cache(maxsize=CACHED)(self.observe)
         self.index = list(self._listed())
+
+    @cached_property
+    def by_name(self) -> dict[tuple[str, int], Frame]:
+        """The frames by number and episode, or item: a table of pairs may name either."""
+        names = {(frame.item, frame.number): frame for frame in self.index}
+        return names | {(frame.episode, frame.number): frame for frame in self.index}
 
     def observe(self, frame: Frame) -> Observation:
         """Show a frame. Raises OtherFramesError if it is not the run's."""

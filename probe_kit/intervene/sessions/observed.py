@@ -104,12 +104,8 @@ class ObservedSession(ReplaySession):
 
     @cached_property
     def _tabled(self) -> list[tuple[Frame, Frame]]:
-        """Frames and donors of the user's own table. Raises UsageError for a frame that the run does not have."""
-        by_name = {(frame.item, frame.number): frame for frame in self.frames.index}
-        by_name |= {(frame.episode, frame.number): frame for frame in self.frames.index}
-        for episode, number in (part for row in self.table for part in (row[:2], row[2:])):
-            if (episode, number) not in by_name:
-                raise UsageError(f"the run has no frame {number} of {episode!r}, which the table of pairs names")
+        """Frames and donors of the user's own table, which `open_session` has checked."""
+        by_name = self.frames.by_name
         return [(by_name[row[:2]], by_name[row[2:]]) for row in self.table]
 
     def _check_vary(self) -> None:

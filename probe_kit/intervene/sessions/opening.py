@@ -1,9 +1,10 @@
 """Opening the session of a run, and the pairs of one category."""
 
+from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
-from probe_kit.intervene.pairs import Pair
+from probe_kit.intervene.pairs import Pair, check_pairs
 from probe_kit.intervene.sessions.frames import Frames
 from probe_kit.intervene.sessions.observed import ObservedSession
 from probe_kit.intervene.sessions.scene import SceneSession
@@ -14,7 +15,7 @@ from probe_kit.intervene.sessions.session import (
     check_policy,
     load_policy_of,
 )
-from probe_kit.intervene.settings import PairChoice, has_sides, items_of
+from probe_kit.intervene.settings import PairChoice, PairRow, has_sides, items_of
 from probe_kit.runs import Run
 
 if TYPE_CHECKING:
@@ -22,26 +23,35 @@ if TYPE_CHECKING:
 
 
 def open_session(
-    run: Run, source: ReplaySource, load: LoadPolicy | None = None, choice: PairChoice | None = None
+    run: Run,
+    source: ReplaySource,
+    load: LoadPolicy | None = None,
+    choice: PairChoice | None = None,
+    table: Sequence[PairRow] = (),
 ) -> ReplaySession:
     """Load the run's policy and set up its observations.
 
-    load: how the policy is found, if not by its name. choice: of pairs of a run without sides. Raises
-    SettingsMismatchError if it is another one, SuiteError for another suite, SuiteNotFoundError for one that is
-    neither given nor can be drawn again, SceneError for a scene that needs a file which is not given.
+    load: how the policy is found, if not by its name. choice: of pairs of a run without sides. table: pairs of the
+    user's own, by default those of the choice; the frames that it names are looked up before the policy is loaded.
+    Raises SettingsMismatchError if it is another one, SuiteError for another suite, SuiteNotFoundError for one
+    that is neither given nor can be drawn again, SceneError for a scene that needs a file which is not given,
+    UsageError for a table with a frame that the run lacks.
     """
 
     def policy() -> "Policy":
         return (load or load_policy_of)(run, source)
 
+    table = table or (() if choice is None else choice.pairs)
     with ExitStack() as on_failure:
         session: ReplaySession
         if has_sides(run):
+            check_pairs(table, {(str(episode), 0) for episode in run.episodes["episode_id"]})
             session = SceneSession.of(run, source, policy)
             on_failure.callback(session.close)
         else:
             frames = Frames(run, source)
             on_failure.callback(frames.close)
+            check_pairs(table, frames.by_name)
             session = ObservedSession(run, policy().with_cameras(list(frames.cameras)), frames, choice)
         check_policy(run, session.policy)
         on_failure.pop_all()

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.intervene.pairs import Chunk, Pair
 from probe_kit.intervene.sessions.session import ReplaySession, ReplaySource
+from probe_kit.runs.origin import OF_SCENE
 from probe_kit.runs.reader import origin_of
 from probe_kit.runs.run import Run
 from probe_kit.suite.grouping import counterparts_of
@@ -51,7 +53,8 @@ class SceneSession(ReplaySession):
     def of(cls, run: Run, source: ReplaySource, load: "Callable[[], Policy]") -> "SceneSession":
         """Return that of a run. Raises SuiteError, SuiteNotFoundError, SceneError for a missing file."""
         files = {name: path for name, path in origin_of(run).scene_files.items() if path.is_file()}
-        scene = SceneSpec.from_json(run.settings["scene"], {**files, **source.files})
+        moved = {field.removeprefix(OF_SCENE): Path(path) for field, path in source.moved.items()}
+        scene = SceneSpec.from_json(run.settings["scene"], {**files, **moved})
         suite = suite_of(run, source.suite)
         return cls(run, load(), scene, {item.item_id: item for item in suite.items})
 

@@ -49,9 +49,9 @@ class ReplaySource:
 
     suite: folder; None for that of the run, see `suite_of`. checkpoint, options, weights_seed: as for
     `probe-kit extract`; by default those of the run, of a checkpoint its folder if it is still there. Options of
-    the run stay but for those that are named anew. device: of the model. files: of the scene, by field, such as
-    `background`; by default those of the run that are still there. dataset: folder of the recordings.
-    environment_options: of an environment, beside those of the run.
+    the run stay but for those that are named anew. device: of the model. moved: parts of the run's source that lie
+    elsewhere now, by field of its settings: `folder` and `table` of recordings and pictures, `environment` (and
+    `options`, beside those of the run), `scene.background`, `scene.arm_urdf`; by default where the run had them.
     """
 
     suite: Path | None = None
@@ -59,9 +59,7 @@ class ReplaySource:
     options: Mapping[str, Any] = field(default_factory=dict)
     weights_seed: int | None = None
     device: str = "cpu"
-    files: Mapping[str, Path] = field(default_factory=dict)
-    dataset: Path | None = None
-    environment_options: Mapping[str, Any] = field(default_factory=dict)
+    moved: Mapping[str, Any] = field(default_factory=dict)
 
 
 LoadPolicy = Callable[[Run, ReplaySource], "Policy"]
