@@ -1,6 +1,6 @@
 """The frames of a run that are diagnosed: first inferences, of as many groups as there are."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import zip_longest
 from types import MappingProxyType
@@ -39,7 +39,7 @@ def frames_of(
     """
     listed = _observed(session, count) if isinstance(session, ObservedSession) else _drawn(session, count)
     frames = [_read(frame, paraphrases) for frame in listed]
-    _check_groups(frames, f"{session.run.location} has", "Extract more episodes or items")
+    _check_groups(frames, lambda: f"{session.run.location} has", "Extract more episodes or items")
     return frames
 
 
@@ -61,17 +61,16 @@ def tabled_frames(
     # One frame may be named by its episode and by its item.
     frames = list({frame.name: frame for pair in pairs for frame in pair}.values())
     at = {frame.name: number for number, frame in enumerate(frames)}
-    _check_groups([clean for clean, _ in pairs], "the table of pairs has", "Add pairs of other groups")
+    _check_groups([clean for clean, _ in pairs], lambda: "the table of pairs has", "Add pairs of other groups")
     numbered = dict.fromkeys((at[clean.name], at[donor.name]) for clean, donor in pairs)
     return [_read(frame, paraphrases) for frame in frames], sorted(numbered)
 
 
-def _check_groups(frames: Sequence[Frame], subject: str, remedy: str) -> None:
+def _check_groups(frames: Sequence[Frame], subject: Callable[[], str], remedy: str) -> None:
     groups = len({frame.group for frame in frames})
     if groups < LEAST_GROUPS:
-        raise UsageError(
-            f"{subject} frames of {counted(groups, 'group')}; a diagnosis needs at least {LEAST_GROUPS}. {remedy}"
-        )
+        has = f"{subject()} frames of {counted(groups, 'group')}"
+        raise UsageError(f"{has}; a diagnosis needs at least {LEAST_GROUPS}. {remedy}")
 
 
 def _read(frame: Frame, paraphrases: Mapping[str, str]) -> Frame:

@@ -9,7 +9,7 @@ from probe_kit._tables.numbers import number, percent, points, with_limits
 from probe_kit._tables.table import Table
 from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour.vlm_answers import ask_of
-from probe_kit.retention.columns.text import spell
+from probe_kit.retention.columns.text import title_of
 from probe_kit.retention.compare.origins import checkpoint_of, split_checkpoint
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.retention.table import RetentionTable
@@ -88,13 +88,15 @@ def step_table(table: RetentionTable, steps: Mapping[str, int]) -> Table:
     views = {steps[row.run.location]: row.view for row in means if row.view is not None}
     steps_table = Table.of(
         "Training steps", tuple(_COLUMNS), [_cells(row) for row in numbers], names=2, numbers=tuple(numbers),
-        mean=spell(MEAN),
+        mean=title_of(MEAN),
     ).filled("n/a")  # fmt: skip
     notes = [
         *(_COLUMNS[name] for name in steps_table.columns if _COLUMNS[name]),
         "each with its 95 % interval",
         _by_step("view", {step: str(view) for step, view in views.items()}),
-        _by_step("mean over", {steps[row.run.location]: ", ".join(map(spell, row.categories)) for row in means}),
+        _by_step(
+            "mean over", {steps[row.run.location]: ", ".join(map(title_of, row.categories)) for row in means}
+        ),
     ]
     return replace(steps_table, notes=("; ".join(filter(None, notes)),))
 
@@ -135,4 +137,4 @@ def _cells(row: Mapping[str, Any]) -> tuple[str, ...]:
     ratio = with_limits(row["retention"], row["retention_ci"], number)
     lacks = row["retention"] is None and row["backbone"] is not None and row["action"] is not None
     drift = with_limits(row["drift"], row["drift_ci"], points)
-    return (spell(row["category"]), str(row["step"]), *shares, "n/a" if lacks else ratio, drift)
+    return (title_of(row["category"]), str(row["step"]), *shares, "n/a" if lacks else ratio, drift)

@@ -76,12 +76,12 @@ def placed_run(folder: Path, outcome_table: Callable[..., pd.DataFrame]) -> Plac
 
 
 def test_one_panel_per_category_with_both_streams(probed_run: ProbedRun) -> None:
-    results = load_results(probed_run({"color": SIGNAL, "traffic_sign": SIGNAL}))
+    results = load_results(probed_run({"color": SIGNAL, "traffic-sign": SIGNAL}))
     figure = layer_curve(results)
     panels = [axes for axes in figure.axes if axes.get_visible()]
     titles = [axes.get_title(loc="left") for axes in panels if axes.get_title(loc="left")]
     assert titles == [
-        f"{name}: {part}" for name in ("color", "traffic sign") for part in ("backbone", "action expert")
+        f"{name}: {part}" for name in ("Color", "Traffic sign") for part in ("backbone", "action expert")
     ]
     labels = [label for axes in panels for label in axes.get_legend_handles_labels()[1]]
     assert {"backbone", "action expert, by iteration", "iteration 0", "iteration 1", "chance"} <= set(labels)
@@ -241,7 +241,7 @@ def test_the_gap_has_a_point_per_category_and_marks_those_without_signal(probed_
     ]
     assert display.points[0].accuracy == pytest.approx(0.9)
     axes = display.plot().ax_
-    assert {"color", "shape"} <= {text.get_text() for text in axes.texts}
+    assert {"Color", "Shape"} <= {text.get_text() for text in axes.texts}
     words = [text.get_text() for text in axes.figure.legends[0].get_texts()]
     assert words == ["pi0", FILLED, OPEN]
     assert KnowledgeActionDisplay.from_table(table, "expert").points[0].accuracy == table.rows[0].action.score

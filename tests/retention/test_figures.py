@@ -162,8 +162,8 @@ def test_layers_are_whole_numbers_and_the_backbone_stands_beside_the_action(resu
     figure.draw_without_rendering()
     backbone, expert = figure.axes[:2]
     assert [axes.get_title(loc="left") for axes in (backbone, expert)] == [
-        "color: backbone",
-        "color: action expert",
+        "Color: backbone",
+        "Color: action expert",
     ]
     for axes, last in ((backbone, 3), (expert, 2)):
         assert axes.get_xlabel() == "layer"

@@ -124,7 +124,7 @@ def test_side_by_side_every_run_has_a_line_and_a_map_of_its_own(
     (line,) = [line for line in backbone.lines if line.get_label() == "known"]
     np.testing.assert_allclose(line.get_ydata(), [50, 100, 90])
     maps = maps_side_by_side([known, guessed], names, "mean")
-    assert [axes.get_title(loc="left") for axes in drawn(maps.axes)][:2] == [f"color: {name}" for name in names]
+    assert [axes.get_title(loc="left") for axes in drawn(maps.axes)][:2] == [f"Color: {name}" for name in names]
     assert colours(maps) == {(50.0, 100.0)}
 
 

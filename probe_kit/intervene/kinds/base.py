@@ -506,7 +506,7 @@ def effect_table[Row](
 
     rows: list[tuple[Cell | str, ...]] = [
         (
-            *(Cell(text, strong=is_bold(row)) for text in line),
+            *(Cell(text, strong=is_bold(row)) for text in (category_of(line[0]).title, *line[1:])),
             *(text(row) for columns in parts.values() for text in columns.values()),
         )
         for line, row in lines
@@ -518,6 +518,11 @@ def effect_table[Row](
 def lines_of[Row: Effect](rows: Iterable[Row], name: Callable[[Row], str]) -> list[tuple[tuple[str, ...], Row]]:
     """Return rows with the names of their lines: the category, and the name of the row."""
     return [((row.category, name(row)), row) for row in rows]
+
+
+def edit_of(row: EffectRow) -> str:
+    """Return the category and the name of a row, as a sentence begins with them."""
+    return f"{category_of(row.category).title}, {row.name}"
 
 
 def text_of(value: float | None, form: str = ".2f", missing: str = "–") -> str:

@@ -30,6 +30,7 @@ from probe_kit.intervene.kinds.base import (
     capabilities_for,
     common_columns,
     count_edits,
+    edit_of,
     effect_table,
     interval_text,
     lines_of,
@@ -245,7 +246,7 @@ class ClosedLoop(AlongDirection):
         """Return edits that disrupt the task."""
         del measurement
         return [
-            f"{row.category}, {row.name}: the cube is in a zone in {100 * row.in_zone:.0f} % of episodes; the "
+            f"{edit_of(row)}: the cube is in a zone in {100 * row.in_zone:.0f} % of episodes; the "
             "task is disrupted, and this enters no verdict."
             for row in rows
             if row.disrupted

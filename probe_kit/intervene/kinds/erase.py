@@ -27,6 +27,7 @@ from probe_kit.intervene.kinds.base import (
     TableContext,
     common_columns,
     count_edits,
+    edit_of,
     effect_table,
     lines_of,
     mean_of,
@@ -220,14 +221,8 @@ class ConceptErasure(Intervention):
         return [
             "Erasure is weaker evidence than interchange: what is read need not be linear, and may pass "
             "elsewhere. Loss beyond the controls is evidence of use. Absence of loss is not evidence against it.",
-            *(
-                f"{row.category}, {row.name}: the probe is at chance, and the action is as before."
-                for row in blind
-            ),
-            *(
-                f"{row.category}, {row.name}: random subspaces of the same rank disrupt the action too."
-                for row in broken
-            ),
+            *(f"{edit_of(row)}: the probe is at chance, and the action is as before." for row in blind),
+            *(f"{edit_of(row)}: random subspaces of the same rank disrupt the action too." for row in broken),
         ]
 
 

@@ -303,7 +303,11 @@ class ImageSwap(Intervention):
         if context.lacks_sides:
             return input_table(rows, context)
         verdicts = context.verdicts
-        reasons = [f"{name}: {verdict.explanation}" for name, verdict in verdicts.items() if verdict.explanation]
+        reasons = [
+            f"{category_of(name).title}: {verdict.explanation}"
+            for name, verdict in verdicts.items()
+            if verdict.explanation
+        ]
         reaches = [_REACH[row.reach_source].format(100 * row.reach) for row in rows]
         notes = dict.fromkeys((context.legend, *reaches, *(reasons if context.explains else ())))
         return effect_table(

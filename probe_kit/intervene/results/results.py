@@ -23,7 +23,14 @@ from probe_kit.intervene.results.evidence import (
     stored_ties,
     which_layer,
 )
-from probe_kit.intervene.results.verdict import Places, UseVerdict, classify_all, describe_readouts, encoded_in
+from probe_kit.intervene.results.verdict import (
+    Places,
+    UseVerdict,
+    classify_all,
+    describe_readouts,
+    encoded_in,
+    size_of_groups,
+)
 from probe_kit.intervene.settings import PER_STEP
 from probe_kit.runs.reader import RunReader, full_name
 from probe_kit.statistics.paired_tests import smallest_flip_p
@@ -207,7 +214,11 @@ class InterventionResult:
         uses = (self.verdicts.get(row.category) for row in self.effects)
         vary = str(self.settings.get("vary") or "")
         exchange = "image swap" if self.outcomes.has_sides else f"exchange of the {vary}"
-        return TableContext(self.measurement, subject, self.verdicts, describe_readouts(uses), exchange=exchange)
+        swaps = [row for row in self.effects if isinstance(row, ImageSwapEffect)]
+        reasons = (verdict.explanation for verdict in self.verdicts.values())
+        size = size_of_groups(reasons, [(row.n_items, row.n_groups) for row in swaps])
+        legend = "; ".join(filter(None, (describe_readouts(uses), size)))
+        return TableContext(self.measurement, subject, self.verdicts, legend, exchange=exchange)
 
 
 def load_effects(run: RunReader, key: str | None = None, kind: str | None = None) -> InterventionResult:

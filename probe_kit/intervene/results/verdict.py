@@ -316,7 +316,22 @@ def more_groups(swap: Swapped, groups: int) -> str:
     )
     needed = groups_to_decide(groups, effects)
     number = f"about {ceil(needed)}" if needed <= MANY else f"more than {MANY}"
-    return f"{number} groups would tell"
+    return f"{number} {_WOULD_TELL}"
+
+
+_WOULD_TELL = "groups would tell"
+
+
+def size_of_groups(texts: Iterable[str], counts: Iterable[tuple[int, int]]) -> str:
+    """Return how many items a group holds where a text says how many groups would tell; else an empty text.
+
+    counts: items and groups of each category. Tables count items, which are what a user adds.
+    """
+    sizes = sorted({round(items / groups, 1) for items, groups in counts if groups})
+    if not sizes or not any(_WOULD_TELL in text for text in texts):
+        return ""
+    span = f"{sizes[0]:g}" if len(sizes) == 1 else f"{sizes[0]:g} to {sizes[-1]:g}"
+    return f"a group is {span} items that share a picture"
 
 
 def _width(limits: tuple[float | None, float | None] | None) -> float:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 from probe_kit._tables.numbers import Limits, points, signed, whole_percent, with_limits
 from probe_kit._tables.table import Cell, Heading, Row, Table
-from probe_kit.intervene.results.verdict import describe_readouts
+from probe_kit.intervene.results.verdict import describe_readouts, size_of_groups
 from probe_kit.retention.columns.findings import finding
 from probe_kit.retention.columns.sentences import chance_only, describe_category, knows, verdict
 from probe_kit.retention.columns.text import (
@@ -185,7 +185,11 @@ def summary_table(summaries: Sequence[RunSummary], differences: Sequence[Differe
     legends = _LEGENDS | _TESTS
     legend = [legends[name] for name in table.columns if name in legends]
     readouts = describe_readouts(summary.row.image_swap.use for run in summaries for summary in run.categories)
-    return replace(table, notes=(*legend, *filter(None, [readouts]), *_marks(summaries, table)))
+    counts = [(summary.row.success.n_items, summary.row.success.n_groups) for summary in every]
+    size = size_of_groups(
+        (summary.finding for summary in every), [(items or 0, groups or 0) for items, groups in counts]
+    )
+    return replace(table, notes=(*legend, *filter(None, [readouts, size]), *_marks(summaries, table)))
 
 
 def _row(category: CategorySummary, run: str) -> Row:

@@ -167,11 +167,6 @@ def models_p(test: ModelTest) -> str:
 # -- tables --------------------------------------------------------------------------------------------------
 
 
-def spell(category: str) -> str:
-    """Return a category's name as people write it."""
-    return category.replace("_", " ")
-
-
 def title_of(category: str) -> str:
     """Return a category as it is spelt in a table or at the beginning of a sentence."""
     return category_of(category).title

@@ -19,7 +19,7 @@ from probe_kit.intervene.kinds.attention import (
     stored_patch_attention,
 )
 from probe_kit.intervene.places import ALL, TILE_ROLES
-from probe_kit.retention.columns.text import spell
+from probe_kit.retention.columns.text import title_of
 from probe_kit.retention.displays.base.panels import Panelled, in_panels
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure
@@ -93,7 +93,7 @@ class AttentionDisplay(Panelled):
     @property
     def title(self) -> str:
         """The category."""
-        return spell(self.category)
+        return title_of(self.category)
 
     def draw(self, axes: "Axes") -> None:
         """A line for every role, with what iterations and heads there are around it."""

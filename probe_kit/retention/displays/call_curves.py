@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Self
 from probe_kit.env.scoring.events import EVENTS
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import label_of
-from probe_kit.retention.columns.text import spell
+from probe_kit.retention.columns.text import title_of
 from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import (
@@ -113,7 +113,7 @@ class CallCurveDisplay(Display):
             )
         for number, event in enumerate(self.events):
             _draw_event(axes, event, len(self.events) - number)
-        _finish(axes, spell(self.category), "call (captured inference, from 0)")
+        _finish(axes, title_of(self.category), "call (captured inference, from 0)")
         if figure is not None:
             _complete(figure, axes, self.certificate, tested=True)
         self.ax_ = axes
@@ -129,7 +129,7 @@ class CallCurveDisplay(Display):
         axes.axvline(0, color="0.6", lw=0.8)
         for line in self.aligned[event]:
             _draw(axes, line.offsets, line)
-        _finish(axes, f"{spell(self.category)}: {event}", "calls after the last one before it")
+        _finish(axes, f"{title_of(self.category)}: {event}", "calls after the last one before it")
         if figure is not None:
             _complete(figure, axes, self.certificate, tested=False)
         self.ax_ = axes

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import NoInterventionsError
 from probe_kit.intervene.kinds.site_maps import PatchEffect, stored_steering
-from probe_kit.retention.columns.text import spell
+from probe_kit.retention.columns.text import title_of
 from probe_kit.retention.displays.base.panels import Panelled, draw_series, in_panels
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure
@@ -90,7 +90,7 @@ class DoseResponseDisplay(Panelled):
     @property
     def title(self) -> str:
         """The category, and where."""
-        return "\n".join([spell(self.category), *self.position.split(", ")])
+        return "\n".join([title_of(self.category), *self.position.split(", ")])
 
     def draw(self, axes: "Axes") -> None:
         """A line for all episodes and one for either side, over the band of the controls."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from probe_kit.env.scoring.rules import DEFAULT_RULE, Box, Disc, OutcomeRule, ReleasedOnTile, rule_of
 from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour.success_rate import capture_only
-from probe_kit.retention.columns.text import spell
+from probe_kit.retention.columns.text import title_of
 from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure
@@ -98,7 +98,7 @@ class FinalPositionsDisplay(Display):
                 alpha=0.65, linewidths=0, zorder=3, rasterized=bool(of_outcome.sum() > _MANY),
             )  # fmt: skip
         _set_window(axes, low, high, int(beyond.sum()))
-        title = spell(self.category or "all categories")
+        title = title_of(self.category or "all categories")
         axes.set_title(title, fontsize=10, loc="left")
         axes.set_xlabel(self._summary(), fontsize=7.5, color="0.3", labelpad=3)
         if figure is not None:

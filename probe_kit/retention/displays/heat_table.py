@@ -10,7 +10,7 @@ from probe_kit._tables.heat import HEAT, heat_colour
 from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour.success_rate import Regime
 from probe_kit.retention.columns.modes import RATE, Modes, modes_of
-from probe_kit.retention.columns.text import model_name, once_per_category, spell
+from probe_kit.retention.columns.text import model_name, once_per_category, title_of
 from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure, figure_of
@@ -122,7 +122,7 @@ class HeatTableDisplay(Display):
     def _draw_names(self, axes: "Axes") -> None:
         axes.set_xlim(0, len(self.columns))
         axes.set_ylim(len(self.rows), 0)
-        names = [fill(spell(name), 9, break_long_words=False) for name in self.columns]
+        names = [fill(title_of(name), 9, break_long_words=False) for name in self.columns]
         axes.set_xticks([column + 0.5 for column in range(len(names))], names, fontsize=8)
         axes.set_yticks([number + 0.5 for number in range(len(self.rows))], list(self.rows), fontsize=8)
         axes.xaxis.tick_top()

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UnknownSiteError, UsageError
-from probe_kit.retention.columns.text import spell
+from probe_kit.retention.columns.text import title_of
 from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import DOTS, FigureSource, ReportFigure, in_view, view_suffix
@@ -143,7 +143,7 @@ def draw_map(axes: "Axes", display: IterationMapDisplay) -> "ScalarMappable":
         axis.set_ticks(list(labelled), [str(numbers[at]) for at in labelled])
     axes.set_xlabel("layer", fontsize=8.5)
     axes.tick_params(labelsize=8)
-    axes.set_title(spell(display.category), fontsize=10, loc="left")
+    axes.set_title(title_of(display.category), fontsize=10, loc="left")
     return image
 
 

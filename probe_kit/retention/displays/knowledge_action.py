@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Literal, Self
 
 from probe_kit.errors import UsageError
 from probe_kit.retention.columns.modes import RATE, Modes, modes_of
-from probe_kit.retention.columns.text import model_name, spell
+from probe_kit.retention.columns.text import model_name, title_of
 from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.label_placement import place_labels
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
@@ -99,7 +99,7 @@ class KnowledgeActionDisplay(Display):
         caption(figure, *self.certificates)
         if figure is not None:
             figure.draw_without_rendering()  # labels need the final places of points
-        words = [spell(point.category) for point in self.points]
+        words = [title_of(point.category) for point in self.points]
         inks = [darker(series(models.index(point.model)).colour) for point in self.points]
         points = [(100 * point.accuracy, 100 * point.sr) for point in self.points]
         bars = [ends for point in self.points for ends in _bars(point)]

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Self
 
-from probe_kit.retention.columns.text import spell
+from probe_kit.retention.columns.text import title_of
 from probe_kit.retention.compare.known_used import KnownUsedTable
 from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure, figure_of
@@ -75,7 +75,7 @@ class KnownUsedDisplay(Display):
         axes, figure = axes_for(ax, 7.2, 0.36 * len(self.counts) + 2.0)
         for height, counts in enumerate(self.counts.values()):
             _draw_bar(axes, height, counts)
-        axes.set_yticks(range(len(self.counts)), [spell(name) for name in self.counts], fontsize=8)
+        axes.set_yticks(range(len(self.counts)), [title_of(name) for name in self.counts], fontsize=8)
         axes.set_ylim(len(self.counts) - 0.4, -0.6)
         axes.set_xlim(0, 100)
         axes.set_xlabel("items (%)", fontsize=9)

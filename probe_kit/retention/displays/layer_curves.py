@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.retention.choices import Iterations
-from probe_kit.retention.columns.text import spell
+from probe_kit.retention.columns.text import title_of
 from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import (
@@ -160,8 +160,8 @@ class LayerCurveDisplay(Display):
     def name(self) -> str:
         """The category of a side, or the label."""
         if self.is_side:
-            return spell(self.category)
-        return self.target if self.category == EVERYWHERE else f"{self.target}, {spell(self.category)}"
+            return title_of(self.category)
+        return self.target if self.category == EVERYWHERE else f"{self.target}, {title_of(self.category)}"
 
     @property
     def measure(self) -> str:

@@ -6,7 +6,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Self
 
 from probe_kit.retention.behaviour.success_rate import PairedItems, capture_only, paired_items
-from probe_kit.retention.columns.text import spell
+from probe_kit.retention.columns.text import title_of
 from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure, figure_of
@@ -51,7 +51,7 @@ class PairedLayoutsDisplay(Display):
         axes, figure = axes_for(ax, 6.2, 0.33 * len(self.items) + 1.35)
         for row, paired in enumerate(self.items.values()):
             _draw_bar(axes, row, paired)
-        axes.set_yticks(range(len(self.items)), [spell(name) for name in self.items])
+        axes.set_yticks(range(len(self.items)), [title_of(name) for name in self.items])
         axes.set_ylim(len(self.items) - 0.4, -0.6)
         axes.set_xlim(0, 100)
         axes.set_xlabel("items (%)", fontsize=9)

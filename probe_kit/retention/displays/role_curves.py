@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Self
 from probe_kit.errors import UnknownSiteError
 from probe_kit.hooks.contract.sites import label_of
 from probe_kit.retention.choices import Iterations
-from probe_kit.retention.columns.text import spell
+from probe_kit.retention.columns.text import title_of
 from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure
@@ -91,7 +91,7 @@ class RoleCurvesDisplay(Display):
         plain(axes)
         accuracy_axis(axes)
         layer_axis(axes, int(max(curve.layers.max() for curve in self.curves.values())) + 1)
-        axes.set_title(spell(self.category), fontsize=10, loc="left")
+        axes.set_title(title_of(self.category), fontsize=10, loc="left")
         if figure is not None:
             axes.set_ylabel(_label(self.stream), fontsize=9)
             _draw_legend(figure, axes)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from probe_kit.errors import UsageError
 from probe_kit.retention.choices import Iterations
-from probe_kit.retention.columns.text import spell
+from probe_kit.retention.columns.text import title_of
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import (
     DOTS,
@@ -76,7 +76,7 @@ def curves_side_by_side(
         every = [(at, _curve(probes, category, view, part, iterations)) for at, probes in with_view]
         curves = [(at, curve) for at, curve in every if curve is not None]
         _draw_panel(axes, curves, names)
-        axes.set_title(f"{spell(category)}: {PARTS[part]}", fontsize=9, loc="left")
+        axes.set_title(f"{title_of(category)}: {PARTS[part]}", fontsize=9, loc="left")
     handles = legend_handles(*grid)
     order = {name: at for at, name in enumerate(["chance", *names])}
     legend_above(figure, [*(handles[n] for n in sorted(handles, key=order.__getitem__)), *significance_handles()])
@@ -145,7 +145,7 @@ def maps_side_by_side(results: Sequence[ProbeResults], names: Sequence[str], vie
             name, probes = with_maps[at]
             display = IterationMapDisplay.from_results(probes, category, view)
             drawn = draw_map(axes, display)
-            axes.set_title(fill(f"{spell(category)}: {name}", _TITLE_LETTERS), fontsize=8, loc="left")
+            axes.set_title(fill(f"{title_of(category)}: {name}", _TITLE_LETTERS), fontsize=8, loc="left")
             displays.append(display)
     figure.supylabel("iteration", fontsize=9)
     draw_scale(figure, grid, drawn, displays)

@@ -12,7 +12,7 @@ from probe_kit.errors import NoInterventionsError
 from probe_kit.hooks.contract.sites import KV_STREAM
 from probe_kit.intervene.kinds.site_maps import BACKBONE, PatchEffect, stored_site_effects
 from probe_kit.intervene.places import ALL, PlaceName
-from probe_kit.retention.columns.text import spell
+from probe_kit.retention.columns.text import title_of
 from probe_kit.retention.displays.base.panels import Panelled, draw_series, in_panels
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure
@@ -94,7 +94,7 @@ class SiteEffectDisplay(Panelled):
     @property
     def title(self) -> str:
         """The category."""
-        return spell(self.category)
+        return title_of(self.category)
 
     def draw(self, axes: "Axes") -> None:
         """A line for probes, one for every role, one for `kv`."""

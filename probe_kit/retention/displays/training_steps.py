@@ -5,7 +5,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from probe_kit._tables.table import Table
-from probe_kit.retention.columns.text import spell
+from probe_kit.retention.columns.text import title_of
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import ReportFigure
 from probe_kit.retention.displays.base.style import caption, legend_above, panels, plain, series
@@ -75,5 +75,5 @@ def _draw_line(
             axes.plot([step, step], [factor * low, factor * high], color=look.colour, lw=0.8, alpha=0.6)
     axes.plot(
         steps, values, color=look.colour, ls=look.dash, marker=look.marker, ms=4.5, lw=1.3,
-        label=spell(rows[0]["category"]),
+        label=title_of(rows[0]["category"]),
     )  # fmt: skip

@@ -6,7 +6,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from probe_kit.retention.columns.modes import modes_of
-from probe_kit.retention.columns.text import spell
+from probe_kit.retention.columns.text import title_of
 from probe_kit.retention.displays.base.report_figure import ONLY_FILLED, ReportFigure
 from probe_kit.retention.displays.base.style import axes_for, legend_above
 from probe_kit.retention.displays.layer_curves import LayerCurveDisplay
@@ -77,7 +77,7 @@ def opening_curve(row: RetentionRow, table: RetentionTable, position: int) -> Re
     iterations = "best" if table.iterations == "all" else table.iterations
     display = LayerCurveDisplay.from_results(results, row.category, row.view, iterations)
     return ReportFigure(
-        "opening", f"Where the answer can be read: {spell(row.category)}", "summary",
+        "opening", f"Where the answer can be read: {title_of(row.category)}", "summary",
         "How often a linear probe names the side of the correct picture, by layer: in the backbone, and where the "
         f"{output} is made. {ONLY_FILLED}.",
         position, partial(_together, display),

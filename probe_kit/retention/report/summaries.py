@@ -7,7 +7,7 @@ from probe_kit._system.counting import counted
 from probe_kit._tables.numbers import p_text, percent
 from probe_kit.retention.columns.modes import RATE, modes_of
 from probe_kit.retention.columns.sentences import chance_only
-from probe_kit.retention.columns.text import is_vlm, model_name, spell
+from probe_kit.retention.columns.text import is_vlm, model_name, title_of
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.results.control_scores import Exceeds
@@ -35,7 +35,7 @@ def read_run(rows: Sequence[RetentionRow]) -> RunInWords:
         view=mean.view,
         random_weights=mean.run.random_weights,
         warnings=tuple(_warnings(mean, single)),
-        by_category=tuple((spell(row.category), " ".join(read_row(row))) for row in single),
+        by_category=tuple((title_of(row.category), " ".join(read_row(row))) for row in single),
     )
 
 
@@ -156,7 +156,7 @@ def _names(part: Sequence[RetentionRow], rows: Sequence[RetentionRow]) -> str:
     """The shorter of the two lists: those that are in, or those that are not."""
     absent = [row for row in rows if row not in part]
     listed, prefix = (absent, "all but ") if len(absent) < len(part) else (part, "")
-    return prefix + ", ".join(spell(row.category) for row in listed)
+    return prefix + ", ".join(title_of(row.category) for row in listed)
 
 
 def _of(part: Sequence[RetentionRow], rows: Sequence[RetentionRow]) -> str:

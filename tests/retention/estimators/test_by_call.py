@@ -131,7 +131,7 @@ def test_figures_name_events_and_what_they_are_of(by_call: dict[int, ProbeResult
     assert "grasp" in {text.get_text() for text in axes.texts}
     assert axes.get_xlabel().startswith("call (captured inference")
     around = aligned_curves(by_call, "grasp", events=event_calls(watched))
-    assert around.axes[0].get_title(loc="left") == "color: grasp"
+    assert around.axes[0].get_title(loc="left") == "Color: grasp"
     assert "pi0" in around.caption  # type: ignore[attr-defined]
     with pytest.raises(UsageError, match="'release'"):
         aligned_curves(by_call, "release", events=event_calls(watched))

@@ -99,7 +99,7 @@ def test_the_first_screen_is_question_summary_sentences_one_picture_and_one_curv
     picture, curve = [one for one in before if one.tag == "img"]
     assert picture.attributes["src"].startswith("data:image/webp")
     assert curve.attributes["src"].startswith("data:image/svg+xml")
-    assert "color" in curve.attributes["alt"], "the category that has something to show"
+    assert "Color" in curve.attributes["alt"], "the category that has something to show"
 
 
 def test_everything_else_is_folded_under_headings(page: Page) -> None:

@@ -10,7 +10,7 @@ import pytest
 import probe_kit
 from probe_kit.intervene import ImageSwapEffect, classify_all, classify_use
 from probe_kit.intervene.kinds.image_swap import image_swap_effects
-from probe_kit.intervene.results.verdict import classify_behaviour
+from probe_kit.intervene.results.verdict import classify_behaviour, size_of_groups
 from probe_kit.statistics.sufficiency import groups_for_not_used
 from tests.intervene.answers import Cell, follower, habit, outcomes_of
 
@@ -95,6 +95,14 @@ def test_not_used_needs_as_many_groups_as_are_said_beforehand() -> None:
         assert classify_behaviour(of(habit(4 * count), groups=count), "shape").behaviour == behaviour
     too_few = classify_behaviour(of(habit(4 * needed - 4), groups=needed - 1), "shape")
     assert f"about {needed} groups would tell, there are {needed - 1}" in too_few.reason
+
+
+def test_where_groups_would_tell_it_is_said_how_many_items_a_group_is() -> None:
+    open_ = classify_behaviour(of(habit(40), groups=10), "shape").reason
+    assert "groups would tell" in open_
+    assert size_of_groups(["", open_], [(20, 10), (12, 6)]) == "a group is 2 items that share a picture"
+    assert size_of_groups([open_], [(20, 10), (15, 10)]) == "a group is 1.5 to 2 items that share a picture"
+    assert size_of_groups(["used"], [(20, 10)]) == ""
 
 
 # -- by chance -------------------------------------------------------------------------------------------------
