@@ -56,14 +56,16 @@ def _temporary_working_folder(tmp_path_factory: pytest.TempPathFactory) -> Itera
 @pytest.fixture(autouse=True)
 def _modules_of_a_test_end_with_it(request: pytest.FixtureRequest) -> Iterator[None]:
     """A later test never imports a module, or finds a path, that lies in the folder of this one."""
+    if "tmp_path" not in request.fixturenames:
+        yield
+        return
     before = set(sys.modules)
     yield
-    if (folder := request.node.funcargs.get("tmp_path")) is None:
-        return
+    folder = str(request.node.funcargs["tmp_path"])
     for name in sys.modules.keys() - before:
-        if str(getattr(sys.modules[name], "__file__", "")).startswith(str(folder)):
+        if str(getattr(sys.modules[name], "__file__", "")).startswith(folder):
             del sys.modules[name]
-    sys.path[:] = [path for path in sys.path if not path.startswith(str(folder))]
+    sys.path[:] = [path for path in sys.path if not path.startswith(folder)]
 
 
 def _golden(family: str) -> Path:

@@ -86,17 +86,19 @@ ORDERS = 12
 
 
 def hear_one_question(policy: Any) -> None:
-    """Every text is read as the same words, in an order that is drawn anew for every other text.
+    """Before every picture, every text is read as the same words, in an order of its own.
 
     So the instruction of another frame and its control, the same in other letters, are two draws of one kind.
+    No two frames share them: p is over frames, and of few texts with fixed orders some move more than controls.
     """
-    tokenise, words = policy.tokenise, ["put", "the", "cube", "on", "the", "red", "shape"]
+    batch, words = policy.batch, ["put", "the", "cube", "on", "the", "red", "shape"]
 
-    def reordered(text: str) -> str:
-        order = int.from_bytes(sha256(text.encode()).digest()[:8]) % ORDERS
-        return " ".join(np.random.default_rng(order).permutation(words))
+    def reordered(observation: Observation) -> Observation:
+        digest = sha256(observation.image.tobytes() + observation.instruction.encode()).digest()
+        order = np.random.default_rng(int.from_bytes(digest[:8]) % ORDERS)
+        return replace(observation, instruction=" ".join(order.permutation(words)))
 
-    policy.tokenise = lambda texts, state=None: tokenise([reordered(text) for text in texts], state)
+    policy.batch = lambda observations, state=None: batch([*map(reordered, observations)], state)
 
 
 def forget_words(policy: Any, observations: Sequence[Observation], steps: int = 200, batch: int = 16) -> None:
