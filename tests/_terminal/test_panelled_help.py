@@ -63,7 +63,7 @@ def test_help_begins_with_what_is_used_most_and_has_examples(command: str) -> No
     assert len(options_in(text.split("─ Options ─")[1])) <= MOST_OPTIONS + 2
 
 
-@pytest.mark.parametrize("flag", ["--help", HELP_ALL])
+@pytest.mark.parametrize("flag", [pytest.param("--help", marks=pytest.mark.slow), HELP_ALL])
 def test_a_reader_of_help_that_has_enough_is_no_error(flag: str) -> None:
     command = [sys.executable, "-m", "probe_kit", "extract", flag]
     running = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)

@@ -65,6 +65,7 @@ def test_radii_of_a_table_are_metres_from_the_middle_of_the_correct_picture(tmp_
     assert {float(radius): rate for radius, rate in rates.items()} == dict(zip(radii, (0, 0, 1, 1), strict=True))
 
 
+@pytest.mark.slow
 def test_the_square_of_the_released_rule_ends_between_seventeen_and_twenty_two_centimetres(tmp_path: Path) -> None:
     for steps, rate in ((SEVENTEEN_CM, 1), (TWENTY_TWO_CM, 0)):
         assert rules(stopped(tmp_path / str(steps), steps))["sr_by_rule"]["box"] == rate

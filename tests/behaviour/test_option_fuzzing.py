@@ -109,7 +109,7 @@ FUZZED = {"deadline": None, "suppress_health_check": list(HealthCheck), "print_b
 
 
 @given(command_lines())
-@settings(max_examples=40, **FUZZED)
+@settings(max_examples=15, **FUZZED)
 def test_any_command_line_ends_in_a_message(words: list[str]) -> None:
     holds(words)
 

@@ -74,6 +74,7 @@ def verdicts(infer, **settings: object) -> dict[str, str]:  # type: ignore[no-un
     return {one.name: one.verdict for one in InputExchange(infer, frames()).measure(**settings)}
 
 
+@pytest.mark.slow
 def test_the_shares_are_the_total_indices_of_sobol_for_a_policy_that_adds_its_inputs() -> None:
     weights, noise = np.array([1.0, 0.7, 0.4]), 0.5
     measured = InputExchange(linear_policy(weights, noise), frames(600, 150)).measure()

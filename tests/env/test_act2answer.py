@@ -55,7 +55,15 @@ def test_observations_are_in_their_space(shared_env):
     np.testing.assert_allclose(observation["agent_pos"], [*shared_env.scene_spec.home, 0, 0, 0, 0, 1], atol=1e-5)
 
 
-@pytest.mark.parametrize("changes", [{}, {"tile_mass": 0.05, "start_grasped": True, "picture_size": (128, 96)}])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        pytest.param(
+            {"tile_mass": 0.05, "start_grasped": True, "picture_size": (128, 96)}, marks=pytest.mark.slow
+        ),
+    ],
+)
 def test_exchanged_pictures_are_the_other_layouts_bit_for_bit_and_leave_no_trace(make_env, changes):
     """At the start and after the same actions; on tiles that can be pushed as well."""
     watched, other, alone = make_env(**changes), make_env(**changes), make_env(**changes)

@@ -50,6 +50,7 @@ def test_every_place_is_that_of_the_release_in_our_frame():
     np.testing.assert_allclose(released(-0.131, 0.0411, 1.013), (*SPEC.cube_xy, SPEC.cube_z))
 
 
+@pytest.mark.slow
 def test_the_home_joints_lead_where_they_lead_in_the_release(env):
     env.reset(seed=0)
     scene = env.scene
@@ -191,7 +192,7 @@ def test_a_hand_that_closed_before_holds_the_cube_as_one_that_closes_now(arm, st
     assert moved(0) == first
 
 
-@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("mirrored", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_the_expert_puts_the_cube_on_the_tile_from_the_same_pose_with_either_arm(mirrored, arm_env):
     for seed, layout in enumerate(("original", "swapped")):
         arm_env.reset(seed=seed, options={"layout": layout})

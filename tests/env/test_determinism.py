@@ -53,6 +53,7 @@ def test_an_untouched_cube_rests_at_the_same_place_bit_for_bit(env):
     assert len(set(places)) == 1
 
 
+@pytest.mark.slow
 def test_a_reload_of_the_whole_scene_changes_nothing(env, reference):
     env.reset(seed=0)
     env.scene._build()

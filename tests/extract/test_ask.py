@@ -96,6 +96,7 @@ def test_its_streams_are_those_of_the_question_as_it_was_asked(asked: Run) -> No
     assert (asked.episodes["picture_tokens"] == 4).all()
 
 
+@pytest.mark.slow
 def test_who_acts_in_the_same_scene_begins_with_the_same_frame(
     settings: AskSettings, asked: Run, tmp_path: Path
 ) -> None:

@@ -217,6 +217,7 @@ def test_tables_are_of_the_first_inference_unless_a_key_says_otherwise(run: Run)
     assert not any("other episodes" in note for note in table.notes)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*classes are not balanced")
 def test_calls_that_were_fitted_alike_make_a_curve(run: Run) -> None:
     first, *_ = [train_probes(run, ("all",), permutations=5, call=call) for call in range(CALLS)]
@@ -297,6 +298,7 @@ def fit(run: Run, *options: str) -> tuple[int, str]:
     return answer.exit_code, " ".join(answer.stderr.split())
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*classes are not balanced")
 def test_all_inferences_are_those_that_enough_episodes_reached_and_the_others_are_named(early: Run) -> None:
     code, said = fit(early, "--call", "all")

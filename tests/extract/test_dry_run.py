@@ -21,7 +21,7 @@ from probe_kit.hooks.registry import own_families
 from probe_kit.runs.disk import in_units
 from probe_kit.suite import Suite, build_suite, default_suite, load_suite
 from probe_kit.suite.validation.sufficiency import sufficiencies
-from tests.support.every_checkpoint import WRITERS
+from tests.support.every_checkpoint import WRITERS, families
 from tests.support.pi0_checkpoints import write_intact
 from tests.support.pi05_checkpoints import write_pi05
 from tests.support.smolvla_checkpoints import write_smolvla
@@ -115,7 +115,7 @@ def sizes(streams: Any) -> dict[str, tuple[Any, ...]]:
 
 
 @pytest.mark.usefixtures("nowhere")
-@pytest.mark.parametrize("name", DECLARING)
+@pytest.mark.parametrize("name", families(DECLARING))
 def test_a_checkpoint_whose_configuration_is_in_the_cache_is_planned_with_its_own_sizes(
     name: str, tmp_path: Path, small_suite: Suite, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -249,7 +249,7 @@ def test_declared_sizes_are_those_of_the_released_network(name: str, size: str) 
         assert fits, one
 
 
-@pytest.mark.parametrize("name", DECLARING)
+@pytest.mark.parametrize("name", families(DECLARING))
 def test_declared_streams_have_the_names_and_roles_of_the_loaded_model(name: str, tmp_path: Path) -> None:
     """Of a tiny checkpoint; only sizes and the camera's name are others."""
     write, options = WRITERS[name]

@@ -103,6 +103,7 @@ def test_a_mixed_run_says_so(suite: Suite, tmp_path: Path, monkeypatch: pytest.M
         assert "versions.torch" in text.replace("\\_", "_")
 
 
+@pytest.mark.slow
 def test_a_copy_of_a_run_does_not_count_beside_it(suite: Suite, tmp_path: Path) -> None:
     run = extract_run(expert(suite), tmp_path / "run")
     copy = open_run(shutil.copytree(run.path, tmp_path / "copy"))

@@ -50,7 +50,9 @@ def test_a_sound_policy_is_certified_without_a_note(tmp_path: Path, pi0_tiny: Po
     assert "inputs" not in CliRunner().invoke(app, ["run", "show", str(run.path)]).output
 
 
-@pytest.mark.parametrize(("edit", "lost"), [(make_blind, "picture"), (make_deaf, "instruction")])
+@pytest.mark.parametrize(
+    ("edit", "lost"), [pytest.param(make_blind, "picture", marks=pytest.mark.slow), (make_deaf, "instruction")]
+)
 def test_a_blind_and_a_deaf_policy_are_noted(edit: WeightEdit, lost: str, tmp_path: Path) -> None:
     run = extracted(tmp_path / "run", edited(edit))
     assert run.certificate["input_check"] == {**BOTH, lost: "nothing"}
@@ -66,6 +68,7 @@ def test_a_policy_that_is_blind_and_deaf_stops_before_anything_is_committed(tmp_
     assert len(input_notes(run.certificate)) == 2
 
 
+@pytest.mark.slow
 def test_a_run_with_edits_is_checked_with_them(tmp_path: Path, pi0_tiny: Policy) -> None:
     silenced = Edit("zero", tuple(site for site in pi0_tiny.sites() if site.stream == "backbone"))
     settings = SETTINGS.changed(edits=(silenced,), accept_ignored_inputs=True)
@@ -94,6 +97,7 @@ def test_recordings_of_one_instruction_are_checked_too(tmp_path: Path) -> None:
     assert deaf.certificate["input_check"] == {**BOTH, "instruction": "nothing"}
 
 
+@pytest.mark.slow
 def test_questions_are_checked_by_the_logits_of_their_answers(small_suite: Any, tmp_path: Path) -> None:
     folder = write_checkpoint(tmp_path / "tiny", model_type="prismatic")
     settings = AskSettings(

@@ -9,6 +9,7 @@ from probe_kit.cli import app
 from probe_kit.suite import Suite
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("items", "command"), [(4, "retention"), pytest.param(10, "train", marks=pytest.mark.slow)]
 )

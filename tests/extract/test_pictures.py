@@ -266,6 +266,7 @@ def test_the_next_step_is_a_target_that_can_be_probed_and_one_of_few_integers_ha
         pk.train_probes(counted)
 
 
+@pytest.mark.slow
 def test_a_target_that_train_would_refuse_is_no_next_step(folder: Path, tmp_path: Path) -> None:
     lines = (folder / "table.csv").read_text(encoding="utf-8").splitlines()
     rare = [

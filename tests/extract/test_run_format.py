@@ -176,6 +176,7 @@ def test_runs_that_differ_in_their_label_only_are_one_run(small_suite: Suite, tm
     assert files_of(tmp_path / "other") == files_of(tmp_path / "run")
 
 
+@pytest.mark.slow
 def test_a_label_is_changed_and_stored_probes_are_found_under_the_new_one(
     small_suite: Suite, tmp_path: Path
 ) -> None:

@@ -71,6 +71,7 @@ def test_a_policy_that_does_not_know_a_word_refuses(suite):
         prepare(settings)
 
 
+@pytest.mark.slow
 def test_one_wording_of_a_run_is_read_like_a_run(ladder):
     assert ladder.wordings == ("knowledge", "named")
     assert ladder.episodes["wording"].value_counts().to_dict() == {"knowledge": 4, "named": 4}

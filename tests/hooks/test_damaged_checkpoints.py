@@ -17,7 +17,7 @@ from probe_kit.hooks.checkpoints.third_party import while_acting
 from probe_kit.hooks.registry import find_family
 from probe_kit.hooks.testing import example_observations
 from probe_kit.models.embedded.folder import embedded_checkpoint
-from tests.support.every_checkpoint import WRITERS
+from tests.support.every_checkpoint import WRITERS, families
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 REFUSALS = (CheckpointError, WeightsError)
@@ -62,7 +62,7 @@ def _bounded_memory() -> Iterator[None]:
     resource.setrlimit(resource.RLIMIT_AS, before)
 
 
-@pytest.fixture(params=FAMILIES)
+@pytest.fixture(params=families(FAMILIES))
 def family(request: pytest.FixtureRequest) -> str:
     name: str = request.param
     return name

@@ -88,9 +88,15 @@ def test_an_impossible_name_is_refused(name: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "origin"),
     [
-        ("json", "Python's standard library"), ("sys", "Python's standard library"), ("numpy", "numpy"),
-        ("torch", "torch"), ("probe-kit", "probe_kit"), ("safetensors", "safetensors"), ("yaml", "PyYAML"),
+        ("json", "Python's standard library"),
         ("my-local-module", "my_local_module.py"),
+        *(
+            pytest.param(name, origin, marks=pytest.mark.slow)
+            for name, origin in {
+                "sys": "Python's standard library", "numpy": "numpy", "torch": "torch", "probe-kit": "probe_kit",
+                "safetensors": "safetensors", "yaml": "PyYAML",
+            }.items()
+        ),
     ],
 )  # fmt: skip
 def test_the_name_of_a_module_is_refused_because_the_package_would_hide_it(

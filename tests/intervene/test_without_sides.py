@@ -105,6 +105,7 @@ def test_recordings_of_scene_frames_give_the_numbers_of_the_scene_bit_for_bit(
     assert all(row.action_share is not None for row in rows[0])
 
 
+@pytest.mark.slow
 def test_a_swap_of_pictures_is_stored_and_read_again(shown: Run, table: Path, twin: "Policy") -> None:
     asked = ImageSwap(pairs=read_pairs(table))
     result = run_intervention(shown, asked, load=lambda *_: twin)

@@ -71,6 +71,7 @@ def test_the_same_run_gives_the_same_page(probed_run: ProbedRun) -> None:
     assert report_html([run]) == report_html([run])
 
 
+@pytest.mark.slow
 def test_every_link_of_the_contents_leads_somewhere(probed_run: ProbedRun) -> None:
     page = report_html([probed_run({"color": SIGNAL})])
     links = re.findall(r'href="#([\w-]+)"', page)

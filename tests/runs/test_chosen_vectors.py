@@ -71,6 +71,7 @@ def test_recordings_keep_episode_and_frame_of_their_data_set(shown_run: Run, tmp
     assert set(table["frame"]) == {0, 5, 10, 15}
 
 
+@pytest.mark.slow
 def test_a_memory_map_holds_the_stored_bits_and_its_index_leads_back(recorded_run: Run, tmp_path: Path) -> None:
     out = export_run(recorded_run.path, "sae", tmp_path / "sae", sites=["expert.03", "backbone.01"], view="tokens")
     index = pd.read_parquet(out / "expert" / "index.parquet")

@@ -56,6 +56,7 @@ def test_a_kill_at_any_point_of_an_episode_costs_at_most_that_episode(
     assert hashes(run) == hashes(whole)
 
 
+@pytest.mark.slow
 def test_leftovers_of_a_killed_process_are_cleared_by_the_next_owner(
     suite: Suite, whole: Path, tmp_path: Path
 ) -> None:

@@ -24,6 +24,7 @@ def umask(request: pytest.FixtureRequest) -> Iterator[int]:
     os.umask(before)
 
 
+@pytest.mark.slow
 def test_files_and_folders_of_runs_copies_and_exports_follow_the_umask(
     small_suite: Suite, tmp_path: Path, umask: int
 ) -> None:

@@ -151,6 +151,7 @@ def shrink_to_film(frame: np.ndarray) -> np.ndarray:
     return np.asarray(Image.fromarray(frame).resize(size, Image.Resampling.BOX))
 
 
+@pytest.mark.slow
 def test_reports_take_first_and_last_frame_out_of_a_sheet(filmed: Run) -> None:
     sheet = read_sheet(filmed.location, 0)
     assert sheet is not None

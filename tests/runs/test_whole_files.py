@@ -33,6 +33,7 @@ def test_h5_holds_the_numbers_and_the_episodes(recorded_run: Run, tmp_path: Path
         assert file["expert/pooled"].fletcher32
 
 
+@pytest.mark.slow
 def test_parquet_holds_a_row_per_vector(recorded_run: Run, tmp_path: Path) -> None:
     pq = pytest.importorskip("pyarrow.parquet", reason="pyarrow is not installed")
     table = pq.read_table(export_run(recorded_run.path, "parquet", tmp_path / "run.parquet")).to_pandas()

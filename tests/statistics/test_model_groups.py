@@ -49,6 +49,7 @@ def test_p_is_below_five_percent_in_at_most_five_percent_of_equal_groups() -> No
     assert np.mean(np.array(found) <= 0.05) < 0.06
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("models", "categories"), [(3, 1), (3, 12), (5, 1), (5, 12)])
 def test_items_as_the_unit_take_differences_between_models_for_an_effect_of_their_group(
     models: int, categories: int

@@ -133,6 +133,7 @@ def test_a_build_that_breaks_off_leaves_nothing_behind(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_two_builders_of_one_suite_at_once_both_get_it(tmp_path: Path) -> None:
     both_are_about_to_write = Barrier(2, timeout=20)
 

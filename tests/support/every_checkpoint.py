@@ -1,8 +1,10 @@
 """Which writer and which options of loading make each family's tiny checkpoint."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
+
+import pytest
 
 from tests.support import (
     eo1_checkpoints,
@@ -43,3 +45,10 @@ WRITERS: dict[str, tuple[Callable[[Path], Path], dict[str, Any]]] = {
     "internvl": (vlm_checkpoints.write_internvl, {}),
     "ovis2.5": (vlm_checkpoints.write_ovis2_5, {}),
 }
+REPRESENTATIVES = ("pi0", "groot", "openvla", "magma", "qwen2.5-vl")
+"""A family of each kind of checkpoint: lerobot's, nvidia's, Prismatic's, its authors', a VLM's of transformers."""
+
+
+def families(names: Iterable[str] = WRITERS) -> list[Any]:
+    """Return parameters of a test of what one function does for all families: the others' are slow."""
+    return [pytest.param(name, marks=[pytest.mark.slow] * (name not in REPRESENTATIVES)) for name in names]

@@ -62,6 +62,7 @@ def test_processes_give_the_same_numbers_as_this_one() -> None:
     assert_same_numbers(columns_of(ExecutionSettings()), columns_of(ExecutionSettings(jobs=2)))
 
 
+@pytest.mark.slow
 def test_what_a_process_raises_keeps_its_class() -> None:
     of_one_class = replace(PROBLEM, labels=np.ones(20, bool))
     with pytest.raises(TooFewGroupsError, match="same label"):

@@ -97,6 +97,7 @@ def test_power_over_all_sites_is_that_of_an_independent_simulation(items: int, a
     assert found == pytest.approx(expected, abs=3.5 * error + 0.01)
 
 
+@pytest.mark.slow
 def test_the_limit_of_chance_hardly_depends_on_the_seed() -> None:
     """A step of one episode is what is left of it."""
     for groups in (12, 30, 75):

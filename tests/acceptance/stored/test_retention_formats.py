@@ -60,7 +60,7 @@ def test_the_backbones_peak_is_the_best_accuracy_that_train_printed(
             assert row[part]["peak"] == mine[mine["stream"] == stream]["accuracy"].max()
 
 
-@pytest.mark.parametrize("style", ["table", "markdown", "latex"])
+@pytest.mark.parametrize("style", ["table", pytest.param("markdown", marks=pytest.mark.slow), "latex"])
 def test_every_text_format_shows_the_values_of_the_json(
     style: str, runs: StoredRuns, rows: list[dict[str, Any]]
 ) -> None:

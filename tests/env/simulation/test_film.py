@@ -43,6 +43,7 @@ def test_other_pictures_sizes_and_pushed_tiles_are_drawn_anew(make_env):
     np.testing.assert_array_equal(pushed, whole_drawing(scene))
 
 
+@pytest.mark.slow
 def test_tiles_that_settle_on_the_table_are_drawn_within_a_few_pixels(make_env):
     env = make_env("act2answer", arm="panda")
     env.reset(seed=0)

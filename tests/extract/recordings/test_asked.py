@@ -48,7 +48,9 @@ SOURCES = {
 }
 
 
-@pytest.mark.parametrize("source", SOURCES)
+@pytest.mark.parametrize(
+    "source", [pytest.param(source, marks=[pytest.mark.slow] * (source == "environment")) for source in SOURCES]
+)
 def test_a_model_is_asked_about_every_frame_episode_or_picture(source: str, home: Path) -> None:
     options, count = SOURCES[source]
     asked = ask(*options, "--tokens", "pooled", "--out", "asked")
@@ -68,6 +70,7 @@ def test_a_model_is_asked_about_every_frame_episode_or_picture(source: str, home
         pk.retention_table([run])
 
 
+@pytest.mark.slow
 def test_a_run_of_questions_is_repeated_from_its_own_settings(home: Path) -> None:
     options, _ = SOURCES["pictures"]
     assert ask(*options, "--tokens", "pooled", "--out", "asked").exit_code == 0

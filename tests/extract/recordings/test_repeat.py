@@ -29,7 +29,7 @@ FILES = {
 
 @pytest.fixture(
     params=[
-        pytest.param(source, marks=pytest.mark.slow if source in ("scene with a photo", "pictures") else ())
+        pytest.param(source, marks=pytest.mark.slow if source not in ("scene", "recordings") else ())
         for source in SOURCES
     ]
 )
@@ -160,6 +160,7 @@ def test_files_of_the_model_that_were_moved_are_named_and_given_by_their_options
     assert (model.checkpoint, model.options) == ("elsewhere", {"tokenizer": "other", "top_k": "3"})
 
 
+@pytest.mark.slow
 def test_a_source_of_another_kind_needs_no_file_of_the_run(made: tuple[str, Path, Path], tmp_path: Path) -> None:
     source, home, first = made
     home.rename(tmp_path / "gone")
@@ -168,6 +169,7 @@ def test_a_source_of_another_kind_needs_no_file_of_the_run(made: tuple[str, Path
     assert printed["source"]["kind"] == ("lerobot" if source == "environment" else "env")
 
 
+@pytest.mark.slow
 def test_a_photo_that_is_gone_is_named_with_its_option_which_gives_another(tmp_path: Path) -> None:
     for name in ("first.png", "second.png"):
         Image.new("RGB", (640, 480), (90, 90, 90)).save(tmp_path / name)

@@ -42,6 +42,7 @@ def test_the_gripper_stays_open_or_closed() -> None:
     assert ensemble(chunks(2, 0), 0.8)[6] == 0
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the model put out tokens")
 def test_an_episode_is_played_by_the_mean_of_its_plans(
     tmp_path: Path, observation: Observation, small_suite: Suite

@@ -15,7 +15,7 @@ from probe_kit.errors import CheckpointError, MissingExtraError
 from probe_kit.hooks.registry import find_family
 from probe_kit.hooks.testing import example_observations
 from probe_kit.models.pretrained import load_pretrained
-from tests.support.every_checkpoint import WRITERS
+from tests.support.every_checkpoint import WRITERS, families
 from tests.support.parsed import package_nodes
 
 PACKAGE = Path(probe_kit.__file__).parent
@@ -68,7 +68,7 @@ def consent(monkeypatch: pytest.MonkeyPatch) -> Callable[[], int]:
         *(pytest.param(names, id=file, marks=pytest.mark.slow) for file, names in FILES.items()),
     ],
 )
-@pytest.mark.parametrize("family", WRITERS)
+@pytest.mark.parametrize("family", families())
 @pytest.mark.filterwarnings("ignore")
 def test_a_checkpoint_that_names_python_code_acts_without_it_or_is_refused(
     family: str, names: Sequence[str], unknown_classes: bool, tmp_path: Path, consent: Callable[[], int]

@@ -10,7 +10,7 @@ import pytest
 
 from probe_kit.errors import CheckpointError, MissingExtraError, WeightsError
 from probe_kit.hooks.registry import find_family
-from tests.support.every_checkpoint import WRITERS
+from tests.support.every_checkpoint import WRITERS, families
 
 SECONDS = 120
 
@@ -41,7 +41,7 @@ def terabyte(path: Path) -> None:
 
 
 @pytest.mark.parametrize("make", [pipe, endless_device, terabyte], ids=lambda make: make.__name__)
-@pytest.mark.parametrize("family", WRITERS)
+@pytest.mark.parametrize("family", families())
 def test_a_configuration_that_never_ends_is_refused_by_name(
     family: str, make: Callable[[Path], None], tmp_path: Path
 ) -> None:

@@ -19,7 +19,7 @@ from probe_kit.hooks.checkpoints.adapter_files import adapter_in
 from probe_kit.hooks.registry import find_family
 from probe_kit.models.embedded.folder import embedded_checkpoint
 from probe_kit.models.magma import shipped_statistics
-from tests.support.every_checkpoint import WRITERS
+from tests.support.every_checkpoint import WRITERS, families
 
 RANK, ALPHA = 2, 6
 PLACE = "model.paligemma_with_expert.gemma_expert.model.layers.0.self_attn.q_proj"
@@ -68,7 +68,7 @@ def last_linear(network: nn.Module) -> str:
     ][-1]
 
 
-@pytest.mark.parametrize("family", list(WRITERS))
+@pytest.mark.parametrize("family", families())
 def test_an_adapter_is_added_to_the_weights_of_the_base_in_every_family(family: str, tmp_path: Path) -> None:
     write, options = WRITERS[family]
     base = write(tmp_path / "base")
@@ -264,7 +264,7 @@ def test_a_folder_without_an_adapter_has_none(folders: tuple[Path, Path]) -> Non
     assert adapter_in(folders[0]) is None
 
 
-@pytest.mark.parametrize("family", list(WRITERS))
+@pytest.mark.parametrize("family", families())
 def test_an_adapter_alone_is_its_base_plus_what_it_learned_in_every_family(family: str, tmp_path: Path) -> None:
     """As with the base's small files beside it: the same weights, streams and settings."""
     write, options = WRITERS[family]

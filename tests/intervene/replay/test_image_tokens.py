@@ -78,6 +78,7 @@ def test_both_tiles_are_held_against_the_same_plain_patches(
         np.testing.assert_array_equal(mask, role_token_mask(session.policy, replay_input, "backbone", role, {}))
 
 
+@pytest.mark.slow
 def test_tiles_are_exchanged_apart(copy: Run, small_suite: Suite, twin: "Policy") -> None:
     intervention = Interchange(
         categories=("color",), items=1, sites=("backbone.00", "kv.01", "expert.00@0"),

@@ -36,6 +36,7 @@ def effects(copy: Run, small_suite: Suite, twin: "Policy") -> InterventionResult
     return run_intervention(copy, ASKED, ReplaySource(small_suite.folder), load=lambda *_: twin)
 
 
+@pytest.mark.slow
 def test_the_plain_condition_is_the_sum_of_what_the_run_commanded(
     copy: Run, effects: InterventionResult, small_suite: Suite, twin: "Policy"
 ) -> None:

@@ -97,6 +97,7 @@ def test_pairs_of_items_that_answer_apart_count_as_items() -> None:
     assert apart.chance_margin == apart.chance_margin_items
 
 
+@pytest.mark.slow
 def test_a_guesser_with_a_fixed_preference_per_item_is_not_called_knowing() -> None:
     """Over episodes, which repeat the preference, it was in 9 % of categories."""
     generator = np.random.default_rng(0)

@@ -107,6 +107,7 @@ def test_every_row_names_its_previews(compbench_root: Path, tmp_path: Path) -> N
                 assert max(preview.size) <= 160
 
 
+@pytest.mark.slow
 def test_a_spreadsheet_does_as_well(compbench_root: Path, tmp_path: Path) -> None:
     path = tmp_path / "review.csv"
     convert("mllm-compbench", compbench_root, tmp_path / "unreviewed", emit_curation=path)
@@ -191,7 +192,9 @@ def test_a_review_as_json_lines_follows_the_same_rules(tmp_path: Path) -> None:
         read_curation(path)
 
 
-@pytest.mark.parametrize("ending", ["csv", "tsv", "jsonl"])
+@pytest.mark.parametrize(
+    "ending", ["csv", *(pytest.param(ending, marks=pytest.mark.slow) for ending in ("tsv", "jsonl"))]
+)
 def test_a_review_that_cannot_be_read_is_never_written_anew(
     ending: str, compbench_root: Path, tmp_path: Path
 ) -> None:

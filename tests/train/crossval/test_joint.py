@@ -187,6 +187,7 @@ def test_a_small_variation_around_a_large_offset_is_found_by_all_training_sets_t
         np.testing.assert_array_equal(one.decisions[:, 0] > 0, LABELS[fold.outer.test])
 
 
+@pytest.mark.slow
 def test_fewer_samples_than_features_are_left_to_axes_of_their_own() -> None:
     wide = GENERATOR.standard_normal((COUNTS.sum(), COUNTS.sum() + 5)) + 0.1 * SIGNS
     samples = tokens(wide)

@@ -191,6 +191,7 @@ def test_the_same_control_is_the_default_in_python_and_on_the_command_line(fille
     assert by_python.controls == by_command.controls
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("cache")
 def test_a_control_that_is_stored_needs_no_pictures_again(tmp_path: Path) -> None:
     suite = build_suite(tmp_path / "suite", ["color"], 12, seed=1)
@@ -226,6 +227,7 @@ def test_a_damaged_suite_in_the_cache_and_another_suite_are_errors(tmp_path: Pat
         train_probes(run, permutations=1)
 
 
+@pytest.mark.slow
 def test_a_cache_that_cannot_be_written_is_named_as_the_reason(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -170,6 +170,7 @@ def test_a_column_that_a_parquet_file_has_twice_is_refused_and_others_keep_their
         Target.read(tmp_path / "labels.parquet", "z")
 
 
+@pytest.mark.slow
 def test_a_heading_of_a_million_columns_is_read_for_the_few_that_are_asked_for(tmp_path: Path) -> None:
     heading = "episode_id,y," + ",".join(f"x{number}" for number in range(10**6))
     rows = "".join(f"\ne{number},{number / 3}" + "," * 10**6 for number in range(3))

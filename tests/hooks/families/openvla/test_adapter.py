@@ -208,6 +208,7 @@ def test_drawn_actions_repeat_by_their_seed_and_name_actions_only(folder: Path, 
         load_openvla(str(folder), tokenizer="bytes", temperature=-1.0, unnorm_key="bridge_orig")
 
 
+@pytest.mark.slow
 def test_draws_as_the_release_does_are_of_the_50_likeliest_tokens_of_actions(
     folder: Path, observation: Observation
 ) -> None:

@@ -66,6 +66,7 @@ def seen() -> list[Observation]:
 # -- capture ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_first_step_of_a_chunk_is_the_same_whether_the_rest_is_captured(
     folder: Path, plain: SpatialVLA, seen: list[Observation]
 ) -> None:
@@ -213,6 +214,7 @@ def variants(tmp_path: Path) -> dict[str, SpatialVLA]:
     }
 
 
+@pytest.mark.slow
 def test_the_released_variants_differ_in_bins_and_statistics_only(
     variants: dict[str, SpatialVLA], seen: list[Observation]
 ) -> None:

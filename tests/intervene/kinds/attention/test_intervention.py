@@ -106,6 +106,7 @@ def test_attention_on_patches_adds_up_to_the_pictures_share_and_patches_lie_wher
     assert areas.sum() <= 1.2, "patches lie beside each other"
 
 
+@pytest.mark.slow
 def test_every_camera_has_its_patches_where_they_look_and_a_frame_shows_them_side_by_side(tmp_path: Path) -> None:
     cameras = ("top", "wrist")
     policy = SmolVLA.load(str(write_smolvla(tmp_path, cameras=cameras))).showing(cameras)

@@ -102,6 +102,7 @@ def test_a_family_whose_inference_is_one_action_is_marked(worded: InterventionRe
 # -- memory --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_what_every_block_hands_over_is_a_place_and_all_of_it_is_the_exchange(
     copy: Run, source: ReplaySource, twin: "Policy"
 ) -> None:
