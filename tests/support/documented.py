@@ -17,7 +17,6 @@ NOT_COMMANDS = {
     ("docs/architecture.md", "suite ──► env"): "a diagram",
     ("docs/architecture.md", "extract ──► RUN"): "a diagram",
     ("docs/capture.md", "passed   Every stream declares"): "output of check-adapter",
-    ("docs/concepts.md", "suite ──► env ──► extract"): "a diagram",
     ("docs/diagnose.md", "Inputs of pi0-tiny"): "output of diagnose",
     ("docs/storage.md", "RUN/"): "a tree of files",
     ("docs/storage.md", "run.json ── zarr.json"): "a diagram",
