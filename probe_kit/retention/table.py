@@ -343,6 +343,7 @@ def retention_table(
         return _label_table(
             runs, [target] if isinstance(target, str) else target, views, iterations, keys, family, labels
         )
+    # The default itself, and not radii equal to it, means that the caller named none.
     check_epsilons(check_rule(rule), epsilons is not SENSITIVITY_RADII)
     groups = runs if isinstance(runs, Mapping) else {None: runs}
     for run in (of_category for of_group in groups.values() for of_category in of_group):

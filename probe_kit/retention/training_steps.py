@@ -78,7 +78,7 @@ def step_table(table: RetentionTable, steps: Mapping[str, int]) -> Table:
     location. Keys of a row's numbers: `category`, `step`, `run`, `view`, `sr`, `backbone`, `action`, `retention`,
     `drift` (of the backbone) and, for each of them, its limits under the name with `_ci`.
     """
-    first: dict[str, str | None] = {}
+    first: dict[str, str | None] = {}  # the first view of each run, which its rows are of
     rows = [row for row in table.all_rows if first.setdefault(row.run.location, row.view) == row.view]
     drifts = {(gap.run, gap.category): gap for gap in table.differences if gap.view in (*first.values(), None)}
     names = sorted(dict.fromkeys(row.category for row in rows), key=lambda name: name == MEAN)

@@ -43,6 +43,8 @@ PROBE_DIRECTIONS = "directions.npz"
 INTERVENTIONS, DIAGNOSES = "interventions", "diagnoses"
 TRAJECTORY, TRAJECTORY_AXES = "trajectory", 3
 """The array of what happened in episodes, beside those of streams; an episode that did not act has no object."""
+FIRST_FRAME = "first_frame_sha256"
+"""The column of episodes by which runs are known to have begun with the same pictures."""
 TRUTHS = "truth"
 """Among the names of inputs: columns that are truth values."""
 CLASSES = "classes."

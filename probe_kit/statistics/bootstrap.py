@@ -17,6 +17,7 @@ SHARES: Bounds = (0.0, 1.0)
 GAINS: Bounds = (-1.0, 1.0)
 """What the difference of two shares can be."""
 DRAWS = 2000
+"""Of whole groups; with another number every interval by resampling moves a little."""
 
 
 def group_bootstrap(
@@ -122,6 +123,7 @@ def reach(each: NDArray[np.floating], tail: float | Matrix = SIGNIFICANCE / 2) -
 
 def unlike(each: NDArray[np.floating]) -> NDArray[np.int64]:
     """(S,) how many of (G, S) means of groups are not what most of them are."""
+    # Rounded, because means of equal shares differ by the order in which they are summed.
     most = [np.unique(column, return_counts=True)[1].max() for column in each.round(9).T]
     return len(each) - np.array(most, np.int64)
 

@@ -149,7 +149,7 @@ def assign_folds(labels: ArrayLike, groups: ArrayLike, n_folds: int, seed: int) 
     fold_of_group = np.empty(names.size, dtype=np.intp)
     for group in order:
         scarcity = np.round(filled @ shares[group], 12)  # rounded, so that ties do not hang on summation order
-        fold = np.lexsort((filled.sum(axis=1), scarcity))[0]
+        fold = np.lexsort((filled.sum(axis=1), scarcity))[0]  # by scarcity, its last key; of equals the emptiest
         fold_of_group[group] = fold
         filled[fold] += shares[group]
     return fold_of_group[group_of]

@@ -75,8 +75,8 @@ def _every_flip(surplus: NDArray[np.int64]) -> NDArray[np.bool_]:
         keeps &= (np.where(flips[alike], -1, 1) * surplus[alike, None]).sum(axis=0) == surplus[alike].sum()
         mirrored &= bool(surplus[alike].sum() == 0)
     if mirrored:
-        keeps &= ~flips[0]
-    keeps[0] = False
+        keeps &= ~flips[0]  # of every two the one that leaves the first group as it is
+    keeps[0] = False  # which flips nothing
     allowed: NDArray[np.bool_] = flips[:, keeps]
     return allowed
 
@@ -195,7 +195,7 @@ def permutations_for(tests: int = 1) -> int:
 
     tests: the number that p is corrected for.
     """
-    return floor(tests / SIGNIFICANCE + 1e-9)
+    return floor(tests / SIGNIFICANCE + 1e-9)  # 0.05 is not exact in binary
 
 
 def shortage(least_p: float, permutations: int, tests: int = 1) -> Literal["", "permutations", "groups"]:
@@ -206,6 +206,7 @@ def shortage(least_p: float, permutations: int, tests: int = 1) -> Literal["", "
     """
     if round(tests * least_p, 12) < SIGNIFICANCE:
         return ""
+    # Equal up to rounding: as many permutations were made as were asked for.
     return "groups" if least_p > 1.001 * smallest_p(permutations) else "permutations"
 
 

@@ -106,4 +106,5 @@ def _gaps(values: NDArray[np.float64], sums: NDArray[np.float64], size: int) -> 
 
 
 def _slack(values: NDArray[np.float64]) -> float:
+    """Gaps that differ by less are equal up to the rounding of sums."""
     return 1e-12 * max(1.0, float(np.abs(values).max()))

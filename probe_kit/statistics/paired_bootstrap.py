@@ -8,6 +8,7 @@ from probe_kit.statistics.label_permutations import p_value
 Matrix = NDArray[np.float64]
 
 DRAWS = 999
+"""With the observed one 1,000, so that no p is below 0.001."""
 SHARED_PROBE = 1.25
 """Factor of the drawn differences of squared errors.
 

@@ -185,7 +185,7 @@ def max_t(
     spread = np.sqrt(np.maximum(squares / names.size - drawn**2, 0.0) * names.size / max(names.size - 1, 1))
     t = drawn / (spread / root + FLOOR)  # (draws, S); the first draw changes no sign
     observed = t[0]
-    slack = 1e-9 * (1 + np.abs(observed))
+    slack = 1e-9 * (1 + np.abs(observed))  # a T that is equal but for rounding is as large
     p = (t >= observed - slack).mean(axis=0)
     p_fwe = (t.max(axis=1)[:, None] >= observed - slack).mean(axis=0)
     return observed, np.asarray(p), np.asarray(p_fwe)

@@ -65,7 +65,7 @@ def explained_interval(
     relative = deviations / varying if varying > 0 else np.ones(scores.size)
     residuals = np.asarray(np.bincount(group_of, (1 - scores) - missing * relative), dtype=np.float64)
     reach = _reach(residuals, scores.size) * widening / missing
-    low, high = 1 - missing * exp(min(reach, 100.0)), 1 - missing * exp(-reach)
+    low, high = 1 - missing * exp(min(reach, 100.0)), 1 - missing * exp(-reach)  # exp overflows from 710 on
     # The subtractions round: around a score of -5e-17, the limits of groups that all agree would both be 0.
     return min(low, explained), max(high, explained)
 

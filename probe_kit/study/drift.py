@@ -16,6 +16,7 @@ from probe_kit.retention.compare.common_items import common_items, wording_of
 from probe_kit.retention.compare.compare import Difference
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.retention.table import retention_table
+from probe_kit.runs.layout import FIRST_FRAME
 from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.estimates.cka import unbiased_cka
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -23,7 +24,6 @@ from probe_kit.study.transfer import Agreement, ProbedRun, Transfer, agreement, 
 from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.train.results.store import load_results
 
-FRAME = "first_frame_sha256"
 Verdict = Literal["kept", "transfer not shown", "forgotten", "learned", "not shown in either", "not clear"]
 VERDICTS: Mapping[Verdict, str] = {
     "kept": "signal in both, and probes transfer after recentring",
@@ -181,10 +181,10 @@ def _delivered(run: Any, view: str) -> dict[str, tuple[Any, list[int]]]:
 
 def _why_other_frames(before: RunReader, after: RunReader) -> str:
     tables = [run.episodes for run in (before, after)]
-    if not all(FRAME in table for table in tables):
+    if not all(FIRST_FRAME in table for table in tables):
         return "frames unknown"
-    both = tables[0][["episode_id", FRAME]].merge(tables[1][["episode_id", FRAME]], on="episode_id")
-    return "" if len(both) and (both[f"{FRAME}_x"] == both[f"{FRAME}_y"]).all() else "other frames"
+    both = tables[0][["episode_id", FIRST_FRAME]].merge(tables[1][["episode_id", FIRST_FRAME]], on="episode_id")
+    return "" if len(both) and (both[f"{FIRST_FRAME}_x"] == both[f"{FIRST_FRAME}_y"]).all() else "other frames"
 
 
 def _category(

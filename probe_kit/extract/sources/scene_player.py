@@ -14,7 +14,7 @@ from probe_kit.extract.plan import Row
 from probe_kit.extract.sources.player import Answer, Ending, Player
 from probe_kit.extract.sources.source import Played
 from probe_kit.hooks.contract.observation import Observation
-from probe_kit.runs.layout import CAPTURE_ONLY
+from probe_kit.runs.layout import CAPTURE_ONLY, FIRST_FRAME
 from probe_kit.runs.small_frames import FILM_HEIGHT, shrink
 from probe_kit.suite.items import Side
 
@@ -54,14 +54,14 @@ class ScenePlayer(Player):
     def look_swapped(self) -> Seen:
         """Show the item's other layout in the state that this episode is in; facts: its hash alone."""
         observation, frame = self._env.observe_exchanged()
-        return Seen(self._observed(observation), {"first_frame_sha256": frame_sha256(frame)})
+        return Seen(self._observed(observation), {FIRST_FRAME: frame_sha256(frame)})
 
     def _set_up(self, row: Row) -> None:
         options = {"item": row.content.item, "layout": row.content.layout}
         _, start = self._env.reset(seed=row.columns["scene_seed"], options=options)
         frame = self._env.render()
         self._facts = {
-            "first_frame_sha256": frame_sha256(frame),
+            FIRST_FRAME: frame_sha256(frame),
             **{f"visible_{side}": share for side, share in start["tile_visibility"].items()},
         }
         self._small_frames: list[NDArray[np.uint8]] = []

@@ -17,6 +17,7 @@ from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.intervene.pairs import Chunk, Pair
 from probe_kit.intervene.sessions.session import ReplaySession, ReplaySource
+from probe_kit.runs.layout import FIRST_FRAME
 from probe_kit.runs.origin import OF_SCENE
 from probe_kit.runs.reader import origin_of
 from probe_kit.runs.run import Run
@@ -109,7 +110,7 @@ class SceneSession(ReplaySession):
         return self.stage.look(scene_row(0, Episode(item, layout), scene_seed, 0))
 
     def _check_frame(self, record: Any, look: Seen) -> None:
-        stored, drawn = record.get("first_frame_sha256"), look.facts["first_frame_sha256"]
+        stored, drawn = record.get(FIRST_FRAME), look.facts[FIRST_FRAME]
         if stored is not None and stored != drawn:
             raise OtherFramesError(
                 f"the first frame of {record['episode_id']}, drawn again, is {drawn[:12]}; {self.run.location} "

@@ -249,7 +249,7 @@ def paired_items(episodes: "pd.DataFrame") -> PairedItems:
         one=int((right == 1).sum()),
         none=int((right == 0).sum()),
         both_wrong=both_wrong,
-        p=heads_p(int((lead > 0).sum()), int((lead != 0).sum())),
+        p=heads_p(int((lead > 0).sum()), int((lead != 0).sum())),  # groups that favour neither are no tosses
     )
 
 

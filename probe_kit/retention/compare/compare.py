@@ -180,7 +180,10 @@ def _with_counts(row: Difference, items: Mapping[str, CommonItems]) -> Differenc
 def _on_common_items(
     side: Side, items: Mapping[str, CommonItems], runs: Sequence[RunReader], others_too: bool
 ) -> Side:
-    """Return the side on the items in common, with the draws of the first of `runs`."""
+    """Return the side on the items in common, with the draws of the first of `runs`.
+
+    Runs of several suites then have the same groups and are paired. Probes of other items have no part in it.
+    """
     seed_texts = {str(run.location): run.seed_text for run in runs}
     seed_text = runs[0].seed_text
 

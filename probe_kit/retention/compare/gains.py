@@ -44,6 +44,7 @@ class Gains:
         if not mine or set(mine) != set(theirs):
             return None
         gains = [mine[episode] - theirs[episode] for episode in mine]
+        # The exact test counts in whole units, as coarse as the gains allow: its time grows with their number.
         scale = min(_FINEST, lcm(*(gain.denominator for gain in gains)))
         scaled: NDArray[np.int64] = np.array([round(gain * scale) for gain in gains])
         groups = [units[episode] for episode in mine]

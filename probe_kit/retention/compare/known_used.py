@@ -18,6 +18,7 @@ from probe_kit.hashing import derive_seed
 from probe_kit.retention.behaviour.success_rate import units_of
 from probe_kit.retention.behaviour.vlm_answers import ask_of
 from probe_kit.retention.estimators.retention import best_site
+from probe_kit.runs.layout import FIRST_FRAME
 from probe_kit.runs.reader import RunReader, check_sides
 from probe_kit.statistics.paired_tests import (
     clopper_pearson,
@@ -37,7 +38,6 @@ if TYPE_CHECKING:
 Bools = NDArray[np.bool_]
 COIN = 0.25
 """Share of items that a coin gets right in both layouts."""
-FRAME = "first_frame_sha256"
 PAIRS = (("answered", "acted"), ("encoded", "acted"), ("answered", "encoded"))
 OVERALL = "all"
 _MOST_NAMED = 3
@@ -197,7 +197,7 @@ def _check_kinds(vlm: RunReader, policy: RunReader) -> None:
 def _same_questions(vlm: RunReader, policy: RunReader) -> "pd.DataFrame":
     """The episodes of both: columns of the policy run, and `outcome_asked`."""
     for run in (vlm, policy):
-        if FRAME not in run.episodes or run.episodes[FRAME].isna().any():
+        if FIRST_FRAME not in run.episodes or run.episodes[FIRST_FRAME].isna().any():
             raise OtherFramesError(
                 f"{run.location} does not say what its first frames were; it was made before runs kept their "
                 "hash. Make it again with this version"
@@ -209,13 +209,13 @@ def _same_questions(vlm: RunReader, policy: RunReader) -> "pd.DataFrame":
                 f"{run.location} holds an item more than once in a layout, such as in several wordings; join runs "
                 "that ask every item once"
             )
-    answers = vlm.episodes[[*keys, "outcome", FRAME]]
+    answers = vlm.episodes[[*keys, "outcome", FIRST_FRAME]]
     pairs = policy.episodes.merge(answers, on=keys, suffixes=("", "_asked"))
     if pairs.empty:
         raise UsageError(
             f"{vlm.location} and {policy.location} have no question in common; ask about the same suite"
         )
-    other = pairs.loc[pairs[FRAME] != pairs[f"{FRAME}_asked"], "episode_id"]
+    other = pairs.loc[pairs[FIRST_FRAME] != pairs[f"{FIRST_FRAME}_asked"], "episode_id"]
     if len(other):
         raise OtherFramesError(
             f"{len(other)} of {len(pairs)} episodes begin with another frame in {vlm.location} than in "

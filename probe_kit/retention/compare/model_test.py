@@ -72,7 +72,7 @@ def _by_model(
 
     Runs of one model, such as of several seeds, are averaged: they are no further models.
     """
-    if len({len(of_category) for of_category in side}) != 1:
+    if len({len(of_category) for of_category in side}) != 1:  # a run lacks a category
         return None
     values: dict[str, list[float]] = {}
     for of_run in zip(*side, strict=True):

@@ -19,6 +19,7 @@ from probe_kit.retention.compare.common_items import (
 from probe_kit.retention.compare.compare import Difference, Side, compare, with_holm
 from probe_kit.retention.compare.origins import grew_from, origins_of
 from probe_kit.retention.rows.build import RowSettings, RowWithEstimates, run_rows
+from probe_kit.runs.layout import FIRST_FRAME
 from probe_kit.runs.reader import RunReader
 
 if TYPE_CHECKING:
@@ -157,16 +158,15 @@ def _same_frames(
     vlm: RunReader, policy: RunReader, categories: Sequence[str], items: Mapping[str, CommonItems]
 ) -> bool | None:
     """Return whether all episodes of both began with the same frames; None where a run has no hashes."""
-    column = "first_frame_sha256"
-    if column not in vlm.episodes or column not in policy.episodes:
+    if FIRST_FRAME not in vlm.episodes or FIRST_FRAME not in policy.episodes:
         return None
     are_same = []
     for category in categories:
         first, second = (run.episodes[run.episodes["category"] == category] for run in (vlm, policy))
         if category in items:
             first, second = items[category].select(first), items[category].select(second)
-        both = first[["episode_id", column]].merge(second[["episode_id", column]], on="episode_id")
-        are_same.append(bool(len(both) and (both[f"{column}_x"] == both[f"{column}_y"]).all()))
+        both = first[["episode_id", FIRST_FRAME]].merge(second[["episode_id", FIRST_FRAME]], on="episode_id")
+        are_same.append(bool(len(both) and (both[f"{FIRST_FRAME}_x"] == both[f"{FIRST_FRAME}_y"]).all()))
     return all(are_same)
 
 

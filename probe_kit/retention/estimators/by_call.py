@@ -11,6 +11,7 @@ from probe_kit.env.scoring.events import EVENTS, Events
 from probe_kit.errors import TooFewGroupsError, UsageError
 from probe_kit.retention.estimators.retention import best_site
 from probe_kit.retention.estimators.stream_scores import score_streams
+from probe_kit.statistics.estimates.verdict import FEWEST_PERMUTATIONS
 from probe_kit.train.results.control_scores import has_signal
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeResults
@@ -18,7 +19,6 @@ from probe_kit.train.results.probe_results import ProbeResults
 Shares = NDArray[np.float64]
 EventCalls = Mapping[str, Mapping[str, int]]
 """Per event, by episode id, the captured inference before it."""
-_ENOUGH = 20  # label permutations, fewer than which have no 95 % point
 
 
 @dataclass(frozen=True)
@@ -165,7 +165,7 @@ class CallCurves:
         assert peak is not None, "the stream was probed at every call"
         exceeds = self.results[call].controls.exceeds(self.category, self.view, str(peak.site), peak.p_fwe)
         best_null = curve.null[curve.stream(stream)]
-        null = np.percentile(best_null.max(axis=0), 95) if best_null.shape[1] >= _ENOUGH else np.nan
+        null = np.percentile(best_null.max(axis=0), 95) if best_null.shape[1] >= FEWEST_PERMUTATIONS else np.nan
         return (
             *self._accuracy(curve, stream),
             has_signal(exceeds),

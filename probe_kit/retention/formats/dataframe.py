@@ -60,7 +60,7 @@ def _frame(lines: Sequence[_Flat]) -> "pd.DataFrame":
 
 
 def _nullable(dtype: str, has_gaps: bool) -> str:
-    return "boolean" if dtype == "bool" and has_gaps else dtype
+    return "boolean" if dtype == "bool" and has_gaps else dtype  # numpy's has no missing value
 
 
 def _key(row: RetentionRow, by_view: bool) -> _Flat:

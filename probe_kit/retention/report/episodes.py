@@ -5,6 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from probe_kit.runs.layout import FIRST_FRAME
 from probe_kit.runs.reader import RunReader
 from probe_kit.runs.thumbnails import count_ends, read_thumbnail
 
@@ -116,7 +117,7 @@ def _listed(name: str, run: RunReader, stride: int) -> Iterator[_Listed]:
             "asked": "parse" in row,
             "frames": count_ends(row),
         }
-        yield _Listed(card, rank, picture, str(row.get("first_frame_sha256") or ""))
+        yield _Listed(card, rank, picture, str(row.get(FIRST_FRAME) or ""))
 
 
 def _with_pictures(listed: Sequence[_Listed], stride: int) -> list[_Listed]:

@@ -157,6 +157,7 @@ class RunUnderRule:
         if not weights.any():
             return None
         counted = weights > 0
+        # Of an episode judged by several steps the weight is a share too, and success is its part of that.
         right = np.divide(shares_of(episodes, "correct"), weights, out=np.zeros(weights.size), where=counted)
         return Share.of(right.clip(0, 1), group_names(episodes, self.run.seed_text), weights)
 

@@ -153,6 +153,7 @@ def crossfit(
 def _scored(stream: Stream) -> tuple[float, Matrix]:
     """The score of a stream, and (G,) the influence of every group on it."""
     sums, sizes = stream.scores.sums, stream.scores.sizes
+    # One seed for all streams and runs: on equal groups their choices are made in the same resamples.
     times = draw_groups(sizes.size, 0, RESAMPLES).T.astype(np.float64)
     of_group = np.empty(sizes.size)
     of_resample = np.zeros(RESAMPLES)

@@ -6,6 +6,7 @@ import numpy as np
 
 from probe_kit.hashing import sha256_json
 from probe_kit.intervene.kinds.image_swap import swap_responses_by_episode
+from probe_kit.runs.layout import FIRST_FRAME
 from probe_kit.view.payloads.coding import Packed, code_words, pack_log_odds, rounded
 from probe_kit.view.payloads.run_payload import best_places
 from probe_kit.view.viewed_run import ViewedRun
@@ -67,7 +68,7 @@ def _word(value: Any) -> str | None:
 
 def _first_frames(viewed: ViewedRun) -> list[Any]:
     episodes = viewed.run.episodes
-    return list(episodes["first_frame_sha256"]) if "first_frame_sha256" in episodes else [None] * len(episodes)
+    return list(episodes[FIRST_FRAME]) if FIRST_FRAME in episodes else [None] * len(episodes)
 
 
 def _best_log_odds(viewed: ViewedRun, part: str) -> Packed | None:
