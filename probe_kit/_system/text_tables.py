@@ -17,6 +17,7 @@ SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs"}
 MOST_CHARACTERS = 131_072
 """Of a cell; a picture in a cell needs more."""
 MOST_BYTES = 1 << 30
+"""Of a file, whose rows are read one by one."""
 _ANY_LENGTH = (1 << 31) - 1
 """Of a cell of a heading that is tried: with a wrong separator the whole line is one."""
 _DECLARED = re.compile(r'"?sep=(.)"?', re.IGNORECASE)

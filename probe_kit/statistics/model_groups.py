@@ -15,6 +15,7 @@ from probe_kit.statistics.significance import SIGNIFICANCE
 MOST_EXACT = 200_000
 """Ways of exchanging labels that are all tried; beyond, `DRAWS` of them are drawn."""
 DRAWS = 20_000
+"""Of ways, with which no p is below 1 / 20,001."""
 
 
 class ModelsP(NamedTuple):

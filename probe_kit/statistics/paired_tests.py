@@ -164,6 +164,7 @@ FLOOR = 1e-6
 EXACT = 12
 """Up to so many groups every pattern of signs is tried; beyond, `DRAWS` of them."""
 DRAWS = 2000
+"""Of signs, or of places; the observed ones are among them, so that no p is below 1 / 2,000."""
 
 
 def max_t(

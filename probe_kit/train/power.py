@@ -20,6 +20,7 @@ from probe_kit.train.controls.features import LAYERS
 NEIGHBOURS, ALIKE = 0.9, 0.3
 """Assumed correlation of neighbouring sites, and of the episodes of one group."""
 ITEMS_PER_GROUP, LAYOUTS = 2, 2
+"""Of the built suites: an item and its counterpart share pictures, and each is played in both layouts."""
 FEWEST_ITEMS, MOST_ITEMS = OUTER_FOLDS * ITEMS_PER_GROUP, 1000
 """Between these the number of items is searched."""
 SEEDS = 5

@@ -22,6 +22,7 @@ DARK_WOOD = np.array([118.0, 78.0, 46.0])
 LIGHT_WOOD = np.array([190.0, 146.0, 98.0])
 WALL = np.array([196.0, 198.0, 194.0])
 SUPERSAMPLING = 2
+"""Times as many pixels in each direction are drawn and then scaled down, so that seams are smooth."""
 
 
 def load_photo(path: Path, width: int, height: int) -> Picture:

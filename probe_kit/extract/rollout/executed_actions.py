@@ -11,6 +11,7 @@ from probe_kit.hooks.contract.protocol import PLAIN, Rotation
 _TURN = slice(3, 6)
 """Roll, pitch and yaw among the seven numbers of an action."""
 _GRIPPER_OPEN = 0.5
+"""The number of an open gripper is 1, of a closed one 0."""
 
 
 def executed_actions(

@@ -30,6 +30,7 @@ from probe_kit.runs.writer import RunWriter
 SPARE_BUFFERS = 2
 # With fewer episodes than this, starting processes takes longer than they save.
 WORTH_PROCESSES = 8
+# Width and height of a GIF, for people alone: a quarter of the pixels of the default camera.
 _FILM_SIZE = (320, 240)
 
 

@@ -23,6 +23,7 @@ from probe_kit.train.results.control_scores import RANDOM_FEATURES, UNTRAINED
 MOST_WORDS = 25
 """Of a sentence with the name of its category, as in all texts of the package; a number is a word."""
 MOST_NUMBERS = 2
+"""Of a sentence; the rest stands in tables."""
 _CONTROLS = {RANDOM_FEATURES: "random features", UNTRAINED: "an untrained network"}
 
 

@@ -36,6 +36,7 @@ from probe_kit.retention.displays.base.style import (
     significance_handles,
 )
 from probe_kit.retention.displays.stream_curve import LayerLine, StreamCurve
+from probe_kit.statistics.estimates.verdict import FEWEST_PERMUTATIONS
 from probe_kit.train.choices import EVERYWHERE, SIDES
 from probe_kit.train.crossval.task_scores import METRICS
 from probe_kit.train.results.probe_results import ProbeResults
@@ -47,7 +48,7 @@ if TYPE_CHECKING:
     from matplotlib.lines import Line2D
 
 _SIDESTEP = 0.1  # of a layer, so that the bars of two streams on one axes do not hide each other
-_ENOUGH = 20  # label permutations, fewer than which have no 95 % band
+
 _PEAK = "best of its stream (all, where several tie)"
 PERCENT = 100.0
 
@@ -74,7 +75,7 @@ class Ground:
         every = np.broadcast_to(curve.null.ravel(), (len(rows), curve.null.size))
         # All sites of a side have chance one half, so that one band serves them; a label's chance differs by site.
         null = every if curve.is_side else curve.null[rows]
-        ends = np.percentile(null, [2.5, 97.5], axis=1) if curve.null.shape[1] >= _ENOUGH else None
+        ends = np.percentile(null, [2.5, 97.5], axis=1) if curve.null.shape[1] >= FEWEST_PERMUTATIONS else None
         controls = () if curve.is_side else results.controls.of_stream(category, view, stream.stream)
         return cls(
             curve.chance[rows],

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 
 PARTS = {"backbone": "backbone", "action": "where the action is made"}
 _IN_A_ROW = 4
+"""Maps side by side, of 2.4 inches each."""
 _TITLE_LETTERS = 36
 """Letters of a line above a map, which is 2.4 inches wide."""
 _SIDESTEP = 0.08  # of a layer, so that bars do not hide each other

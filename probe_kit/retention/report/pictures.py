@@ -15,6 +15,7 @@ from probe_kit.retention.displays.report_figures import caption_of
 SVG_LIMIT = 150_000
 """Bytes; a figure of more is kept as pixels."""
 PIXELS_PER_INCH = 200
+"""Of figures that are kept as pixels."""
 _SVG, _XLINK = "http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"
 _ROUNDED = ("d", "x", "y")
 """Attributes in points, of which a hundredth cannot be seen."""

@@ -15,6 +15,7 @@ from probe_kit.models.statistics_choice import chosen_name
 DIMENSIONS = 7
 """Of an action: an end-effector's delta, and the gripper last."""
 GRIPPER_OPEN = 0.5
+"""The data sets have 1 for an open gripper and 0 for a closed one."""
 
 
 @dataclass(frozen=True)

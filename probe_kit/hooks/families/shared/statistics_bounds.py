@@ -21,6 +21,7 @@ FILES = ("dataset_statistics.json", "bridge_statistics.json", "statistics.json")
 """Under these names a checkpoint's folder may hold them."""
 _EPS = 1e-8
 _OPEN = 0.5
+"""Of the network's own number for the gripper, which ends in 1 for open and 0 for closed."""
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ Point = tuple[float, float]
 Box = tuple[float, float, float, float]
 
 _SIZE = 7.5
+"""Of letters, in points."""
 # Of one line of text, in points. Estimated: measured widths exist only once the figure is drawn.
 _HEIGHT, _CHARACTER = 1.15 * _SIZE, 0.56 * _SIZE
 _REACHES = (6.0, 13.0, 22.0, 32.0)  # from the point, in points

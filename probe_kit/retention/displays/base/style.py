@@ -23,6 +23,7 @@ BLUE, VERMILION, GREEN, ORANGE = "#0072B2", "#D55E00", "#009E73", "#E69F00"
 SKY, PURPLE, BLACK, GREY = "#56B4E9", "#CC79A7", "#000000", "#8C8C8C"
 
 DPI = 150
+"""On a screen; files are saved at `PRINT_DPI`."""
 ACCURACY = (20.0, 109.0)
 """Percent along the axis of held-out accuracies, the same in every figure of every run.
 
@@ -32,6 +33,7 @@ ABOVE_CHANCE = (-30.0, 51.0)
 """The same of accuracies above chance, in points."""
 _CAPTION_SIZE = 6.5
 _LEGEND_SIZE = 8.0
+"""Both in points."""
 _LETTERS_PER_INCH = 16
 """Letters of a legend's label on an inch, a low estimate."""
 _MARK = 8

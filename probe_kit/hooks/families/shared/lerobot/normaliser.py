@@ -22,6 +22,7 @@ from probe_kit.models.bounds import check_bounds, check_deviations
 from probe_kit.models.lerobot.pi0_keys import STATISTICS
 
 _EPS = 1e-8
+"""In denominators, where the checkpoint says no other: LeRobot's default."""
 USUAL_DEVIATIONS = 5.0
 """From the mean; values further away are unusual."""
 _ROUNDING = 1e-3
@@ -145,7 +146,7 @@ def read_normaliser(folder: Path, pipeline: str, feature: str, kind: str) -> Nor
             if mode == "IDENTITY" or (kind == "STATE" and reads_state_as_it_is(step, feature)):
                 return Normaliser("IDENTITY", np.zeros(0, np.float32), np.zeros(0, np.float32), 0.0, path.name)
             low, high = _statistics(folder, step.state, feature, mode)
-            return Normaliser(mode, low, high, float(step.config.get("eps", 1e-8)), str(step.state))
+            return Normaliser(mode, low, high, float(step.config.get("eps", _EPS)), str(step.state))
     raise CheckpointError(f"{path} has no normaliser step: the units of {feature} are unknown")
 
 
