@@ -33,7 +33,7 @@ def lines(table: Content, width: int) -> "Iterator[RenderableType]":
     yield from [_wrapped(table)] if table.overflow == "wrap" and _can_wrap(table, width) else _tables(table, width)
     notes = [*table.sentences, *[f"With --details or more room: {', '.join(left_out)}."] * bool(left_out)]
     if notes:
-        yield Text(" ".join(notes), style="dim")
+        yield Text("\n".join(notes), style="dim")
     yield Text()
 
 
