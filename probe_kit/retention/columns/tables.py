@@ -252,7 +252,7 @@ def _undefined(rows: Sequence[RetentionRow]) -> list[str]:
     reasons: dict[str, list[str]] = {}
     for row in rows:
         if not row.retention.defined and row.category != MEAN:
-            reasons.setdefault(row.retention.note, []).append(row.category if row.is_side else name_of(row))
+            reasons.setdefault(row.retention.note, []).append(name_of(row))
     means = {row.retention.note for row in rows if row.retention.defined and row.retention.note}
     sentences = [f"{reason}: {', '.join(dict.fromkeys(names))}" for reason, names in reasons.items()]
     return [*sentences, *(f"mean {note}" for note in sorted(means))]
