@@ -9,6 +9,7 @@ from probe_kit.errors import UsageError
 Cell = str | int | float | bool | None
 Where = Callable[[int], str]
 
+# Spellings of truth values, and of answers in a column that has yes or no. 1 and 0 are numbers in either.
 _BOOLEANS = {"true": True, "t": True, "false": False, "f": False}
 _ANSWERS = {"yes": "yes", "y": "yes", "true": "yes", "t": "yes", "no": "no", "n": "no", "false": "no", "f": "no"}
 _FOREIGN = {"ja", "j", "nein", "oui", "non", "si", "sí", "1", "0"}

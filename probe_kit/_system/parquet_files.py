@@ -18,6 +18,7 @@ _ROWS = 4096
 """Of a batch, or fewer, so that a column of texts takes at most `_BATCH_BYTES` in it."""
 _BATCH_BYTES = 64 << 20
 _WIDTHS = {"BOOLEAN": 1, "INT32": 4, "INT64": 8, "FLOAT": 4, "DOUBLE": 8, "INT96": 12}
+"""Bytes of a value in memory, by Parquet's type, of those that have one width."""
 _TEXT = "BYTE_ARRAY"
 
 

@@ -18,6 +18,7 @@ FAILED = frozenset(
     {"#value!", "#ref!", "#div/0!", "#name?", "#num!", "#null!", "#spill!", "#calc!", "#getting_data"}
 )
 """Cells in which a spreadsheet's formula failed, in lower case."""
+# Of a column that holds nothing but true and false; columns of any values have fewer spellings, in `column_cells`.
 TRUE = frozenset({"yes", "y", "true", "t", "1", "1.0"})
 FALSE = frozenset({"no", "n", "false", "f", "0", "0.0"})
 MOST_DIGITS = 400

@@ -69,7 +69,7 @@ def models(
 
 
 def _print_words(name: str | None, run: str | None, as_json: bool) -> None:
-    from probe_kit.extract.rollout.controllers import SCRIPTED
+    from probe_kit.extract.parts import SCRIPTED
     from probe_kit.hooks.registry import find_family, own_families
 
     check_no_others({"--run": run is not None}, "--words")
@@ -111,7 +111,7 @@ def _ready(family: "Family") -> str:
 
 def _model_rows(name: str | None) -> list[dict[str, Any]]:
     from probe_kit.extract.needs import weights_needed
-    from probe_kit.extract.rollout.controllers import SCRIPTED
+    from probe_kit.extract.parts import SCRIPTED
     from probe_kit.hooks.registry import find_family, own_families, third_party_families
 
     families = list(own_families().values())

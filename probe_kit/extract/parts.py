@@ -63,6 +63,14 @@ WeightsDtype = Annotated[
 ]
 
 
+SCRIPTED: Mapping[str, str] = {
+    "expert": "scripted: knows the answer and puts the cube on it; proves environment and scoring",
+    "expert-mirrored": "scripted: knows the answer and puts the cube on the other picture",
+    "idle": "scripted: does nothing; what a rule gives it is owed to no answer",
+}
+"""Policies without a network, which stand in place of a family, and what each does."""
+
+
 class ModelSettings(Part):
     """The model that acts or answers, and its weights.
 

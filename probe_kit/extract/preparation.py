@@ -12,9 +12,10 @@ from probe_kit._system.installing import install_command
 from probe_kit.errors import DiskSpaceError, MissingExtraError, UsageError
 from probe_kit.extract.config_files import CONFIG, portable
 from probe_kit.extract.needs import planned_sizes
+from probe_kit.extract.parts import SCRIPTED
 from probe_kit.extract.plan import Plan, Row
 from probe_kit.extract.rollout.calibration import Calibration
-from probe_kit.extract.rollout.controllers import SCRIPTED, Controller
+from probe_kit.extract.rollout.controllers import Controller
 from probe_kit.extract.rollout.task import task_of
 from probe_kit.extract.settings import Settings, run_label
 from probe_kit.extract.sources.source import Source, raise_together

@@ -37,6 +37,7 @@ from probe_kit.runs.records import RESTORE, Record, Sum, Sums, expect, read_plai
 from probe_kit.runs.run_folders import what_to_open
 
 _SETTINGS = {"model": str, "captured_calls": int, "tokens": str, "codec": str}
+"""The settings of every run, and their types."""
 _FURTHER = {"random_weights": bool, "suite": dict, "later_views": str}
 """Further settings of every extracted run; a run that other code wrote may lack them."""
 _EPISODE = {
@@ -44,6 +45,7 @@ _EPISODE = {
     "item_content_sha256": str,
     "episode": int,
 }
+"""The columns of every planned episode of the scene, and their types."""
 _STRETCH = {
     **dict.fromkeys(("episode_id", "item_id", "category", "group_id", "instruction", "content_blake2b"), str),
     **dict.fromkeys(("episode", "source_episode", "first_frame", "frame_step", "frames"), int),

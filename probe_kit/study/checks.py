@@ -4,6 +4,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from graphlib import CycleError, TopologicalSorter
 
 from probe_kit.errors import ProbeKitError
+from probe_kit.extract.parts import SCRIPTED
 from probe_kit.hooks.contract.declared import DeclaredStream
 from probe_kit.hooks.contract.options import check_options
 from probe_kit.hooks.contract.views import resolve_view, view_names
@@ -11,7 +12,7 @@ from probe_kit.hooks.registry import find_family, get_family
 from probe_kit.runs.store import SCHEMES
 from probe_kit.statistics.label_permutations import permutations_for, smallest_p
 from probe_kit.statistics.significance import SIGNIFICANCE
-from probe_kit.study.expansion import SCRIPTED, Member, acts, answers, excludes, members, of_side
+from probe_kit.study.expansion import Member, acts, answers, excludes, members, of_side
 from probe_kit.study.failures import FOLDER
 from probe_kit.study.mistakes import Mistake, Place
 from probe_kit.study.planned_suite import PlannedSuite, slug, slugs

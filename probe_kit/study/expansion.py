@@ -6,16 +6,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from probe_kit.errors import ProbeKitError
-from probe_kit.extract.parts import ModelSettings
+from probe_kit.extract.parts import SCRIPTED, ModelSettings
 from probe_kit.extract.settings import AskSettings, ExtractSettings, Settings
 from probe_kit.hooks.registry import get_family
 from probe_kit.study.cells import Cell, Selection
 from probe_kit.study.mistakes import Mistake, Place
 from probe_kit.study.planned_suite import PlannedSuite, slugs
 from probe_kit.study.schema import AskTable, BlockTable, ConditionTable, ModelTable, Study
-
-SCRIPTED = ("expert", "expert-mirrored", "idle")
-"""Policies without a network, which stand in place of a family."""
 
 
 def answers(model: ModelTable) -> bool:

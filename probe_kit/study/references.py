@@ -2,8 +2,8 @@
 
 from collections.abc import Iterable, Iterator
 
+from probe_kit.extract.parts import SCRIPTED
 from probe_kit.hooks.registry import family_names
-from probe_kit.study.expansion import SCRIPTED
 from probe_kit.study.mistakes import Mistake, Place, unknown
 from probe_kit.study.planned_suite import PlannedSuite, slugs
 from probe_kit.study.schema import Study

@@ -7,8 +7,9 @@ from probe_kit._system.bounded_files import read_regular
 from probe_kit._system.bounded_json import parse_json
 from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.extract.needs import PlannedSizes
+from probe_kit.extract.parts import SCRIPTED
 from probe_kit.extract.rollout.calibration import calibrated
-from probe_kit.extract.rollout.controllers import SCRIPTED, PolicyController, ScriptedController
+from probe_kit.extract.rollout.controllers import PolicyController, ScriptedController
 from probe_kit.extract.rollout.task import Fitted, Task, check_fit, load_of, with_source
 from probe_kit.extract.settings import ExtractSettings
 from probe_kit.extract.sources.recording import IMAGES, STATE

@@ -32,12 +32,6 @@ if TYPE_CHECKING:
     from probe_kit.extract.settings import Settings
     from probe_kit.hooks import Model, Policy
 
-SCRIPTED = {
-    "expert": "scripted: knows the answer and puts the cube on it; proves environment and scoring",
-    "expert-mirrored": "scripted: knows the answer and puts the cube on the other picture",
-    "idle": "scripted: does nothing; what a rule gives it is owed to no answer",
-}
-
 
 def count_lost_words(pack: Callable[[str], Sequence[int] | None], instruction: str) -> int:
     """Count the words at the end of an instruction that do not reach the network, because its prompt is cut.

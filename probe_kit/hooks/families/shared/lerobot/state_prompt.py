@@ -15,6 +15,7 @@ BINS = np.linspace(-1, 1, 256 + 1)[:-1]
 _PROMPT = re.compile(
     r"Task: ?(?P<language>.*), ?State: ?(?P<state>[-\d ]*);\s*(?:Action:\s*)?\Z", re.DOTALL | re.IGNORECASE
 )
+"""The prompt of pi0.5; its named parts are roles."""
 _LEFT_OUT = (PADDING, "state")
 
 
