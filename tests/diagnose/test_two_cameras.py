@@ -6,12 +6,14 @@ import pytest
 from typer.testing import CliRunner
 
 from probe_kit.cli import app
-from probe_kit.diagnose.diagnosis import diagnose_run
+from probe_kit.diagnose.diagnosis import check_base_files, diagnose_run
+from probe_kit.errors import UsageError
 from probe_kit.extract import EnvSource, ExtractSettings, extract_run
 from probe_kit.runs import Run
 from probe_kit.suite import Suite
 from tests.support.acting_checkpoints import FAMILIES
 from tests.support.organisms import ORGANISMS, edited
+from tests.support.smolvla_checkpoints import write_smolvla
 
 ENVIRONMENT = "tests.support.reach_env:TwoCameras"
 PICTURES = ("picture.top", "picture.wrist")
@@ -61,3 +63,15 @@ def test_a_second_camera_that_is_masked_does_not_arrive_and_ends_behind_the_back
     assert organism.where["picture.wrist"] in wrist.where
     assert {site.stream for site in wrist.passage if site.differs} <= {"vision", "backbone", "kv"}
     assert (diagnosis.exit_code(["picture.wrist"]), run.certificate["policy"]["cameras"]) == (1, ["top", "wrist"])
+
+
+@pytest.mark.slow
+def test_a_base_of_other_cameras_is_refused_by_its_configuration_alone(tmp_path: Path) -> None:
+    tuned = str(write_smolvla(tmp_path / "tuned", ("top", "wrist")))
+    same, other = (str(write_smolvla(tmp_path / name, (name, "wrist"))) for name in ("top", "front"))
+    for folder in (tuned, same, other):
+        for weights in Path(folder).glob("*.safetensors"):
+            weights.write_bytes(b"no weights are read")
+    check_base_files("smolvla", tuned, same, {}, ("top", "wrist"))
+    with pytest.raises(UsageError, match=r"other inputs: its cameras are .*front.*, those of .*tuned .*top"):
+        check_base_files("smolvla", tuned, other, {}, ("top", "wrist"))

@@ -149,6 +149,13 @@ def test_an_environment_whose_module_was_moved_is_given_by_the_option_of_extract
         moved_of(run, {"dataset": tmp_path})
 
 
+def test_a_mistyped_camera_and_an_unknown_frame_are_refused_before_the_model_is_loaded(played: Run) -> None:
+    with pytest.raises(UsageError, match=r"vary is 'picture.wrist'; expected one of instruction, picture,"):
+        open_session(played, ReplaySource(), not_loaded, ImageSwap(vary="picture.wrist"))
+    with pytest.raises(UsageError, match=r"no frame 1 of 'reach-00'.* it has of that episode 0"):
+        open_session(played, ReplaySource(), not_loaded, ImageSwap(pairs=(("reach-00", 1, "reach-01", 0),)))
+
+
 def test_fewer_episodes_than_the_run_has_are_refused(played: Run, pi0_tiny: "Pi0") -> None:
     with pytest.raises(OtherFramesError, match="has no episode 'reach-04' any more"):
         open_session(played, ReplaySource(moved={"options": {"count": "4"}}), lambda *_: pi0_tiny)

@@ -6,8 +6,9 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from probe_kit.errors import OtherFramesError
+from probe_kit.errors import OtherFramesError, UsageError
 from probe_kit.extract.sources.donors import Frame
+from probe_kit.extract.sources.inputs import INSTRUCTION, PICTURE, STATE
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.intervene.sessions.session import ReplaySource
@@ -45,6 +46,12 @@ class Frames:
         """The frames by number and episode, or item: a table of pairs may name either."""
         names = {(frame.item, frame.number): frame for frame in self.index}
         return names | {(frame.episode, frame.number): frame for frame in self.index}
+
+    def check_varied(self, vary: str) -> None:
+        """Raise UsageError for an input that the frames do not have, such as a mistyped camera."""
+        inputs = (INSTRUCTION, PICTURE, *(f"{PICTURE}.{name}" for name in self.cameras), STATE)
+        if vary not in inputs:
+            raise UsageError(f"vary is {vary!r}; expected one of {', '.join(inputs)}")
 
     def observe(self, frame: Frame) -> Observation:
         """Show a frame. Raises OtherFramesError if it is not the run's."""

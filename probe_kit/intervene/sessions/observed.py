@@ -12,13 +12,7 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
 from probe_kit.extract.sources.donors import Frame, draw_donors
-from probe_kit.extract.sources.inputs import (
-    INSTRUCTION,
-    PICTURE,
-    STATE,
-    hardly_changed,
-    with_input,
-)
+from probe_kit.extract.sources.inputs import PICTURE, hardly_changed, with_input
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.checkpoints.containment import copied
 from probe_kit.hooks.checkpoints.third_party import while_acting
@@ -47,7 +41,7 @@ class ObservedSession(ReplaySession):
     """
 
     def __init__(self, run: Run, policy: "Policy", frames: Frames, choice: PairChoice | None = None) -> None:
-        """Raises UsageError for a varied input that the frames do not have, or that no other group varies."""
+        """Raises UsageError for a varied input that no other group varies; see also `Frames.check_varied`."""
         super().__init__(run, policy)
         self.frames = frames
         self.vary, self.frames_each = PICTURE, FRAMES
@@ -109,10 +103,7 @@ class ObservedSession(ReplaySession):
         return [(by_name[row[:2]], by_name[row[2:]]) for row in self.table]
 
     def _check_vary(self) -> None:
-        """Raise UsageError for an input that the frames do not have, or that no frame of another group varies."""
-        inputs = (INSTRUCTION, PICTURE, *(f"{PICTURE}.{name}" for name in self.frames.cameras), STATE)
-        if self.vary not in inputs:
-            raise UsageError(f"vary is {self.vary!r}; expected one of {', '.join(inputs)}")
+        """Raise UsageError for an input that no frame of another group varies."""
         if not any(self._donors(item) for item in self.items):
             raise UsageError(
                 f"no frame of another group has another {self.vary}; extract more episodes, or choose another "

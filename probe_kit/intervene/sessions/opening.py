@@ -52,6 +52,8 @@ def open_session(
             frames = Frames(run, source)
             on_failure.callback(frames.close)
             check_pairs(table, frames.by_name)
+            if choice is not None:
+                frames.check_varied(choice.varied)
             session = ObservedSession(run, policy().with_cameras(list(frames.cameras)), frames, choice)
         check_policy(run, session.policy)
         on_failure.pop_all()
