@@ -203,11 +203,12 @@ def _run_of(name: str, typed: Mapping[str, Any], request: _Request, out_folder: 
 
 def _stored(name: str, request: _Request) -> "Run":
     from probe_kit.diagnose.diagnosis import check_network
+    from probe_kit.diagnose.inputs import cameras_of
     from probe_kit.runs import open_run
 
     run = open_run(name)
     check_network(run)
-    request.check_cameras(run.certificate["policy"]["cameras"])
+    request.check_cameras(cameras_of(run))
     return run
 
 
@@ -253,16 +254,13 @@ Planned = tuple[str, Sequence[Any], list[str]]
 
 def _planned(name: str, typed: Mapping[str, Any], request: _Request, out_folder: str | None) -> Planned:
     """Return what a diagnosis of this run, or of a planned one, would exchange and patch."""
+    from probe_kit.diagnose.inputs import cameras_of
     from probe_kit.intervene.settings import has_sides
 
     if _is_run(name, typed):
         run = _stored(name, request)
-        texts, cameras, in_scene = (
-            run.episodes["instruction"],
-            run.certificate["policy"]["cameras"],
-            has_sides(run),
-        )
-        return run.model, list(run.streams.values()), _inputs(texts, len(cameras), in_scene)
+        inputs = _inputs(run.episodes["instruction"], len(cameras_of(run)), has_sides(run))
+        return run.model, list(run.streams.values()), inputs
     extraction, _ = _prepared(name, typed, request, out_folder, fetch=False)
     source, rows = extraction.source, extraction.plan.episodes
     cameras = source.example(rows[0].instruction).cameras

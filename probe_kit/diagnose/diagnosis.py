@@ -13,7 +13,7 @@ import numpy as np
 
 from probe_kit.diagnose.choices import FRAMES
 from probe_kit.diagnose.frames import frames_of, tabled_frames
-from probe_kit.diagnose.inputs import names_of
+from probe_kit.diagnose.inputs import cameras_of, names_of
 from probe_kit.diagnose.measure import Actions, Infer, InputExchange
 from probe_kit.diagnose.passage import measure_passage
 from probe_kit.diagnose.results import Diagnosis, InputDiagnosis, check_names
@@ -71,7 +71,7 @@ def diagnose_run(
     from probe_kit.intervene.sessions.session import ReplaySource
 
     check_network(run)
-    check_names(inputs, names_of(run.certificate["policy"]["cameras"]))
+    check_names(inputs, names_of(cameras_of(run)))
     source = source or ReplaySource()
     if base is not None and load is None:
         check_base(run, source, base)
@@ -137,7 +137,7 @@ def check_base(run: "Run", source: "ReplaySource", base: str) -> None:
     """Raise for a base that is not there or has other inputs, as far as the files of both checkpoints say it."""
     origin = origin_of(run)
     checkpoint, options = source.checkpoint or origin.checkpoint, {**origin.options, **source.options}
-    check_base_files(run.model, checkpoint, base, options, run.certificate["policy"]["cameras"])
+    check_base_files(run.model, checkpoint, base, options, cameras_of(run))
 
 
 def check_base_files(
@@ -173,11 +173,12 @@ def check_base_files(
 
 def with_inputs_of(tuned: "Policy", base: "Policy") -> "Policy":
     """The base with the cameras of the checkpoint that was tuned from it. Raises UsageError for other inputs."""
-    if base.card.cameras != tuned.card.cameras:
+    cameras = tuned.card.shown_cameras
+    if base.card.shown_cameras != cameras:
         with suppress(ObservationError):
-            base = base.with_cameras(tuned.card.cameras)
+            base = base.with_cameras(cameras)
     for what, now, before in (
-        ("cameras", tuned.card.cameras, base.card.cameras),
+        ("cameras", cameras, base.card.shown_cameras),
         ("numbers of the state", tuned.state_numbers, base.state_numbers),
         ("further inputs", tuned.card.needs, base.card.needs),
         ("absent inputs", tuned.absent_inputs, base.absent_inputs),

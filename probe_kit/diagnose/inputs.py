@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from hashlib import sha256
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,11 @@ from probe_kit.extract.sources.inputs import (
     hardly_changed,
     with_other_stop,
 )
+from probe_kit.hooks.contract.card import shown_cameras
 from probe_kit.hooks.contract.observation import Observation
+
+if TYPE_CHECKING:
+    from probe_kit.runs import Run
 
 
 def inputs_of(frames: Sequence[Frame], camera: str = "") -> tuple[str, ...]:
@@ -28,6 +33,12 @@ def inputs_of(frames: Sequence[Frame], camera: str = "") -> tuple[str, ...]:
     if not frames:
         raise UsageError("the source has no frame; diagnose needs at least two that differ")
     return names_of([camera or "first", *frames[0].observation.cameras])
+
+
+def cameras_of(run: "Run") -> tuple[str, ...]:
+    """Return the cameras of a run's model that got a picture."""
+    policy = run.certificate["policy"]
+    return shown_cameras(policy["cameras"], policy["needs"])
 
 
 def names_of(cameras: Sequence[str]) -> tuple[str, ...]:

@@ -7,8 +7,10 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.diagnose.diagnosis import check_base_files, diagnose_run
+from probe_kit.diagnose.inputs import names_of
 from probe_kit.errors import UsageError
 from probe_kit.extract import EnvSource, ExtractSettings, extract_run
+from probe_kit.hooks.contract.card import shown_cameras
 from probe_kit.runs import Run
 from probe_kit.suite import Suite
 from tests.support.acting_checkpoints import FAMILIES
@@ -29,6 +31,11 @@ def run(checkpoint: str, tmp_path_factory: pytest.TempPathFactory) -> Run:
     source = EnvSource(ENVIRONMENT, max_steps=1)
     settings = ExtractSettings("smolvla", checkpoint, source=source, execute=1, env_workers=0, accept_units=True)
     return extract_run(settings, tmp_path_factory.mktemp("played") / "run")
+
+
+def test_a_camera_that_gets_no_picture_is_no_input() -> None:
+    assert shown_cameras(("top", "wrist"), ["camera.wrist", "state"]) == ("top", "wrist")
+    assert names_of(shown_cameras(("top", "wrist"), [])) == ("instruction", "picture", "state")
 
 
 @pytest.mark.slow

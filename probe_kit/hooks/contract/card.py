@@ -1,6 +1,6 @@
 """The card of a loaded model: family, checkpoint, weights hash, streams and settings. Imports no torch."""
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -66,6 +66,11 @@ class ModelCard:
     source_weights: SourceWeights | None = None
     repositories: Mapping[str, str] = field(default_factory=dict)
 
+    @property
+    def shown_cameras(self) -> tuple[str, ...]:
+        """The cameras that get a picture; a model may have declared further ones, which stay empty."""
+        return shown_cameras(self.cameras, self.needs)
+
     def to_json(self) -> dict[str, Any]:
         """Return plain values, as stored in a run's certificate."""
         # Not `asdict`: it copies deeply, which read-only mappings refuse.
@@ -80,3 +85,8 @@ class ModelCard:
             "needs": sorted(self.needs),
             "source_weights": None if self.source_weights is None else asdict(self.source_weights),
         }
+
+
+def shown_cameras(cameras: Sequence[str], needs: Collection[str]) -> tuple[str, ...]:
+    """Return the cameras that get a picture: the first one, and each that an observation must hold."""
+    return (*cameras[:1], *(name for name in cameras[1:] if f"camera.{name}" in needs))

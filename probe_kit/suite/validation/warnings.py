@@ -89,7 +89,11 @@ def pictures_distinct(suite: Suite) -> Iterator[Finding]:
     for first, second in _near_duplicates([look_of(load_picture(path)) for path in pictures]):
         if items[first].group_id != items[second].group_id:
             names = f"items {items[first].item_id} and {items[second].item_id}"
-            yield warning("W03", names, "show nearly the same picture but are in different groups")
+            yield warning(
+                "W03",
+                names,
+                "show nearly the same picture but are in different groups; give them one group, or other pictures",
+            )
 
 
 def _near_duplicates(looks: Sequence[Look]) -> Iterator[tuple[int, int]]:
