@@ -86,4 +86,4 @@ def _print_answers(runs: "Sequence[Run]") -> None:
         say(marked(f"next: [bold]probe-kit {step}[/]", runs[0].location))
         return
     places = " ".join(str(run.location) for run in runs)
-    say(marked("next: [bold]probe-kit retention {}[/], with policy runs behind", places))
+    say(marked("next: [bold]probe-kit retention {}[/]  add policy runs of the suite", places))

@@ -54,7 +54,7 @@ def targets(
         (row.options for row in listed if row.options is not None), key=lambda text: "--task" in text
     )
     if not possible:
-        say(marked("next: [bold]probe-kit labels {}[/] writes a table to which you add labels of your own", run))
+        say(marked("next: [bold]probe-kit labels {}[/]  writes a table to which you add labels of your own", run))
         return
     say(marked("next: [bold]probe-kit train {}{}[/]", run, possible[0]))
 

@@ -2,11 +2,14 @@
 
 import io
 import json
+import re
+from pathlib import Path
 
 import pytest
 from rich.table import Table
 from rich.text import Text
 
+import probe_kit
 from probe_kit._tables import table as tables
 from probe_kit._terminal.console import SafeConsole, counter, marked, print_json, print_text
 
@@ -87,3 +90,16 @@ def test_json_keeps_every_sign_and_lets_none_out(capsys: pytest.CaptureFixture[s
 def test_other_formats_are_shown_and_not_obeyed(capsys: pytest.CaptureFixture[str]) -> None:
     print_text("a,b\nc\x1b[31m,d")
     assert capsys.readouterr().out == "a,b\nc␛[31m,d\n"
+
+
+def test_a_next_step_can_be_copied_because_two_spaces_end_the_command() -> None:
+    package = Path(probe_kit.__file__).parent
+    sources = {path: path.read_text(encoding="utf-8") for path in package.rglob("*.py")}
+    tails = [
+        (path.name, tail)
+        for path, text in sources.items()
+        for tail in re.findall(r'next: \[bold\][^"]*?\[/\]([^"]*)"', text)
+    ]
+    assert len(tails) > 5
+    # An option that follows is part of the command; a semicolon ends a command of the shell.
+    assert [entry for entry in tails if not re.match(r"$|  \S| --|; ", entry[1])] == []
