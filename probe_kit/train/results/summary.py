@@ -82,11 +82,10 @@ def _title(fitted: Sequence[ProbeResults], several_views: bool) -> Iterator[str]
 
 def _name(results: ProbeResults, category: str, stream: str) -> str:
     """Return the category, and for a target that is no side the stream."""
-    title = category_of(category).title
     if results.settings.is_side:
-        return title
+        return str(category)  # as --categories takes it
     pooled = results.settings.categories == (EVERYWHERE,)
-    return " · ".join(filter(None, ["" if pooled else title, label_of(stream) if stream else ""]))
+    return " · ".join(filter(None, ["" if pooled else str(category), label_of(stream) if stream else ""]))
 
 
 def _cells(results: ProbeResults, row: "pd.Series") -> tuple[str, ...]:

@@ -58,7 +58,7 @@ def test_categories_do_not_mix(results: ProbeResults) -> None:
     assert [row["category"] for row in rows] == ["color", "color", "shape", "shape"]
     assert [round(row["score"], 2) for row in rows] == [0.9, 0.8, 0.7, 0.6]
     assert [row["ties"] for row in rows] == [1, 0, 1, 0]
-    assert [row[0] for row in best_sites_table([both]).texts] == ["Color", "Color", "Shape", "Shape"]
+    assert [row[0] for row in best_sites_table([both]).texts] == ["color", "color", "shape", "shape"]
 
 
 @pytest.mark.parametrize(
