@@ -27,8 +27,6 @@ _FINDINGS = {
     "not varied": "was not tested",
     "not an input": "is no input of this model",
 }
-
-
 _CHANGES = {
     "lost in fine-tuning": "it was lost in fine-tuning",
     "weaker": "it is weaker than in the base",
@@ -81,6 +79,9 @@ def _row(diagnosed: "InputDiagnosis", headings: Sequence[Heading]) -> Sequence[C
     return [Cell(text, alarm=heading.text in alarms) for heading, text in zip(headings, texts, strict=True)]
 
 
+_LENGTH = "; its control does change actions, as another length of the text may"
+
+
 def sentences(diagnosis: "Diagnosis") -> list[str]:
     """Return what became of every input, and of the target."""
     lines = [sentence(diagnosed) for diagnosed in diagnosis.inputs]
@@ -95,5 +96,7 @@ def sentence(diagnosed: "InputDiagnosis") -> str:
     reasoned = diagnosed.verdict in ("not varied", "not an input", "open", "no effect")
     reason = f" ({diagnosed.reason})" if reasoned else ""
     where = f"; {diagnosed.where}" if diagnosed.where else ""
+    # Other words of as many tokens change nothing, and a full stop does: of a deaf policy, texts move positions.
+    control = "" if diagnosed.arrives or not diagnosed.control > 0 else _LENGTH
     base = f"; {_CHANGES[diagnosed.base.change]}" if diagnosed.base is not None else ""
-    return f"{diagnosed.name} {_FINDINGS[diagnosed.verdict]}{reason}{where}{base}."
+    return f"{diagnosed.name} {_FINDINGS[diagnosed.verdict]}{reason}{where}{control}{base}."

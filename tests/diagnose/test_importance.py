@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from probe_kit.diagnose.importance import Exchanges, importance_of
 from probe_kit.diagnose.inputs import PICTURE, STATE
 from probe_kit.diagnose.measure import InputExchange, count_inferences
-from probe_kit.diagnose.results import SitePassage, Verdict, describe_passage, exit_code
+from probe_kit.diagnose.results import InputDiagnosis, SitePassage, Verdict, describe_passage, exit_code
+from probe_kit.diagnose.sentences import sentence
 from probe_kit.errors import InstructionError, UsageError
 from probe_kit.extract.sources.donors import Frame
 from probe_kit.hooks.contract.observation import Observation
@@ -317,3 +318,11 @@ def test_a_loss_is_named_where_the_input_is_shown_to_have_no_effect_and_not_wher
     text = describe_passage(passage, verdict)
     assert text.startswith("it is strongest at backbone.00 (relative difference 0.8) and reaches expert.03")
     assert ("the loss is in the action part" in text) == is_loss
+
+
+@pytest.mark.parametrize(("control", "told"), [(0.08, True), (0.0, False), (float("nan"), False)])
+def test_a_text_of_which_the_length_alone_arrives_is_told_from_one_of_which_nothing_does(
+    control: float, told: bool
+) -> None:
+    deaf = InputDiagnosis("instruction", "does not arrive", "", share=0.0, control=control)
+    assert ("its control does change actions" in sentence(deaf)) is told
