@@ -146,11 +146,15 @@ def _verdict(exchanges: Exchanges, p: float) -> tuple[Verdict, str]:
     groups = exchanges.groups
     above = exchanges.exchanged - (0.0 if exchanges.control is None else exchanges.control)
     if not exchanges.largest.any():
-        changed = int((exchanges.blanked != 0).sum())
-        words = f"no number of any action changed in {exchanges.largest.size} exchanges"
-        # A blank text has fewer tokens: its length arrives where no word does.
-        return "does not arrive", words + f"; a blank changes {changed} of {exchanges.blanked.size}" * bool(
-            changed
+        # A blank and another stop are texts of other lengths: a length arrives where no word does.
+        meaningless = {"a blank": exchanges.blanked, "its control": exchanges.control}
+        changed = [
+            f"{name} does in {np.count_nonzero(changes)} of {changes.size}"
+            for name, changes in meaningless.items()
+            if changes is not None and changes.any()
+        ]
+        return "does not arrive", "; ".join(
+            [f"no number of any action changed in {exchanges.largest.size} exchanges", *changed]
         )
     if unbounded_student_interval(above, groups)[1] < TRACE:
         # No interval holds an effect in rare frames of which none was drawn.

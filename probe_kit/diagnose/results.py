@@ -134,10 +134,10 @@ def describe_passage(passage: Sequence[SitePassage], verdict: Verdict) -> str:
     strongest = max(passage, key=lambda site: site.difference)
     last = passage[-1]
     loss = ": the loss is in the action part itself" if verdict == "no effect" else ""
-    return (
-        f"it is strongest at {strongest.name} (relative difference {strongest.difference:.2g}) and reaches "
-        f"{last.name} ({last.difference:.2g}){loss}"
-    )
+    largest = f"it is strongest at {strongest.name} (relative difference {strongest.difference:.2g})"
+    if strongest is last:
+        return f"{largest}, the last site{': the loss is behind it' if loss else ''}"
+    return f"{largest} and reaches {last.name} ({last.difference:.2g}){loss}"
 
 
 def _streams(sites: Sequence[SitePassage]) -> list[str]:

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 from probe_kit._tables.numbers import p_text, whole_percent, with_limits
 from probe_kit._tables.table import Cell, Heading, Table
+from probe_kit.diagnose.importance import INPUTS_DECIDE
 
 if TYPE_CHECKING:
     from probe_kit.diagnose.results import Diagnosis, InputDiagnosis
@@ -21,9 +22,9 @@ _HEADINGS = (
 _FINDINGS = {
     "decides": "decides the action",
     "moves": "moves the action, is not shown to decide it",
-    "no effect": "arrives and has no effect above that of a change without meaning",
+    "no effect": "arrives and changes the action by less than 1 % more than a change without meaning",
     "open": "arrives; whether it matters is open",
-    "does not arrive": "does not arrive: no action changed",
+    "does not arrive": "does not arrive",
     "not varied": "was not tested",
     "not an input": "is no input of this model",
 }
@@ -79,12 +80,12 @@ def _row(diagnosed: "InputDiagnosis", headings: Sequence[Heading]) -> Sequence[C
     return [Cell(text, alarm=heading.text in alarms) for heading, text in zip(headings, texts, strict=True)]
 
 
-_LENGTH = "; its control does change actions, as another length of the text may"
-
-
 def sentences(diagnosis: "Diagnosis") -> list[str]:
-    """Return what became of every input, and of the target."""
+    """Return what became of every input, whether the seed decides more than they do, and of the target."""
     lines = [sentence(diagnosed) for diagnosed in diagnosis.inputs]
+    together = max((diagnosed.every for diagnosed in diagnosis.inputs if diagnosed.matters is not None), default=1)
+    if together < INPUTS_DECIDE:
+        lines.append(f"all inputs together change {whole_percent(together)} % of the action: the seed decides it.")
     if diagnosis.knowledge is not None:
         decided = any(diagnosed.verdict == "decides" for diagnosed in diagnosis.inputs)
         lines.append(diagnosis.knowledge.describe(decided))
@@ -93,10 +94,8 @@ def sentences(diagnosis: "Diagnosis") -> list[str]:
 
 def sentence(diagnosed: "InputDiagnosis") -> str:
     """Return one sentence: what became of an input, and where."""
-    reasoned = diagnosed.verdict in ("not varied", "not an input", "open", "no effect")
+    reasoned = diagnosed.verdict in ("not varied", "not an input", "open", "no effect", "does not arrive")
     reason = f" ({diagnosed.reason})" if reasoned else ""
     where = f"; {diagnosed.where}" if diagnosed.where else ""
-    # Other words of as many tokens change nothing, and a full stop does: of a deaf policy, texts move positions.
-    control = "" if diagnosed.arrives or not diagnosed.control > 0 else _LENGTH
     base = f"; {_CHANGES[diagnosed.base.change]}" if diagnosed.base is not None else ""
-    return f"{diagnosed.name} {_FINDINGS[diagnosed.verdict]}{reason}{where}{control}{base}."
+    return f"{diagnosed.name} {_FINDINGS[diagnosed.verdict]}{reason}{where}{base}."

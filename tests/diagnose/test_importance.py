@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from probe_kit.diagnose.importance import Exchanges, importance_of
 from probe_kit.diagnose.inputs import PICTURE, STATE
 from probe_kit.diagnose.measure import InputExchange, count_inferences
-from probe_kit.diagnose.results import InputDiagnosis, SitePassage, Verdict, describe_passage, exit_code
-from probe_kit.diagnose.sentences import sentence
+from probe_kit.diagnose.results import Diagnosis, InputDiagnosis, SitePassage, Verdict, describe_passage, exit_code
+from probe_kit.diagnose.sentences import sentence, sentences
 from probe_kit.errors import InstructionError, UsageError
 from probe_kit.extract.sources.donors import Frame
 from probe_kit.hooks.contract.observation import Observation
@@ -320,9 +320,40 @@ def test_a_loss_is_named_where_the_input_is_shown_to_have_no_effect_and_not_wher
     assert ("the loss is in the action part" in text) == is_loss
 
 
-@pytest.mark.parametrize(("control", "told"), [(0.08, True), (0.0, False), (float("nan"), False)])
+def test_a_loss_behind_the_last_site_is_not_looked_for_before_it() -> None:
+    passage = [SitePassage("backbone.00", 0.2, 0.0), SitePassage("expert.03", 0.8, 0.0)]
+    assert describe_passage(passage, "no effect").endswith(
+        "expert.03 (relative difference 0.8), the last site: the loss is behind it"
+    )
+
+
+@pytest.mark.parametrize(("control", "told"), [(0.08, True), (0.0, False), (None, False)])
 def test_a_text_of_which_the_length_alone_arrives_is_told_from_one_of_which_nothing_does(
-    control: float, told: bool
+    control: float | None, told: bool
 ) -> None:
-    deaf = InputDiagnosis("instruction", "does not arrive", "", share=0.0, control=control)
-    assert ("its control does change actions" in sentence(deaf)) is told
+    zeros, groups = np.zeros(12), np.array([f"group {index // 2}" for index in range(12)])
+    deaf = importance_of(
+        "instruction",
+        Exchanges(
+            exchanged=zeros,
+            control=None if control is None else zeros + control,
+            every=zeros + 0.5,
+            groups=groups,
+            frames=np.arange(12),
+            repeated=np.zeros(12, bool),
+            largest=zeros,
+            blanked=zeros,
+        ),
+    )
+    assert deaf.verdict == "does not arrive"
+    assert ("its control does in 12 of 12" in sentence(deaf)) is told
+
+
+@pytest.mark.parametrize(("every", "told"), [(0.05, True), (0.5, False)])
+def test_what_the_seed_decides_is_said(every: float, told: bool) -> None:
+    inputs = (
+        InputDiagnosis("instruction", "moves", "", share=every, every=every),
+        InputDiagnosis("state", "not varied", ""),
+    )
+    lines = sentences(Diagnosis("key", "policy", 24, 12, inputs))
+    assert ("the seed decides it" in lines[-1]) is told

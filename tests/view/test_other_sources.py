@@ -81,7 +81,7 @@ def test_what_is_stored_is_shown_as_the_tables_of_the_commands(catalogue: Catalo
         "diagnosis of the inputs", "intervention image-swap", "probes of dataset.state.x", "predicted actions"
     ]  # fmt: skip
     swap = kinds["intervention image-swap"]
-    assert [cell["text"] for cell in swap["rows"][0]][:2] == ["all", "picture"]
+    assert [cell["text"] for cell in swap["rows"][0]][:2] == ["All", "picture"]
     assert swap["findings"] == ["All  decides: the action follows the picture, by 0.50 of what all inputs do."]
     assert kinds["diagnosis of the inputs"]["rows"][0][2]["text"] == "decides"
     assert [row[0]["text"] for row in kinds["predicted actions"]["rows"]] == ["dx", "grip"]
