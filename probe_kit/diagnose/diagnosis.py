@@ -17,7 +17,7 @@ from probe_kit.diagnose.inputs import cameras_of, names_of
 from probe_kit.diagnose.measure import Actions, Infer, InputExchange
 from probe_kit.diagnose.passage import measure_passage
 from probe_kit.diagnose.results import Diagnosis, InputDiagnosis, check_names
-from probe_kit.errors import ObservationError, UnsupportedInterventionError, UsageError
+from probe_kit.errors import CheckpointError, ObservationError, UnsupportedInterventionError, UsageError
 from probe_kit.extract.sources.inputs import STATE, with_input
 from probe_kit.hooks.contract.card import EMBEDDED
 from probe_kit.hooks.family import SIZE
@@ -160,7 +160,11 @@ def check_base_files(
         return
     # A size stands for a checkpoint, and both are given here.
     unsized = {name: value for name, value in options.items() if name != SIZE}
-    family.check(base, options=unsized, fetch=fetch)
+    try:
+        family.check(base, options=unsized, fetch=fetch)
+    except CheckpointError as error:
+        # Its own advice is about the model of a command, which is the tuned one here.
+        raise type(error)(f"the base: {error}. Give the checkpoint that this one was tuned from") from error
     checkpoint = None if checkpoint in ("", EMBEDDED) else checkpoint
     outlines = (
         family.outline(checkpoint, options if checkpoint is None else unsized),
