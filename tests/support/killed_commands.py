@@ -28,7 +28,7 @@ ORPHANS_END_S = 30
 """Seconds in which the children of a killed command have to end."""
 _TICK_S = 0.02
 _MARK = "PROBE_KIT_TEST_MARK"
-_TIMES = ("created", "asked", "blake2b")
+_TIMES = ("created", "requested", "blake2b")
 """What a result's record of times says of the clock, and the hash over it."""
 _UNFINISHED = (".tmp", ".partial", ".unfinished", ".writing")
 
@@ -189,7 +189,8 @@ def _kill_until_done(
     assert not [one for course in courses for one in orphans(course)]
     found = dict(command.made(place))
     assert found.keys() == expected.keys()
-    assert [name for name in expected if found[name] != expected[name]] == []
+    different = [name for name in expected if found[name] != expected[name]]
+    assert not different, f"{command.name}, killed {len(courses) - 1} times: {different}"
     assert leftovers(place) == []
     return len(courses) - 1
 
