@@ -40,6 +40,7 @@ def count_inferences(
     checkpoints, pairs = 1 + base, frames * DONORS if pairs is None else pairs
     # Clean ones twice and with another seed; per input the donors' value, all of their inputs, control and blank.
     measured = (3 * frames + inputs * (2 * pairs + 2 * frames)) * checkpoints
+    # Of patched sites, per frame and input: clean and donor, and one per site.
     return measured + (frames * inputs * (2 + sites) if sites else 0)
 
 
@@ -61,9 +62,9 @@ class InputExchange:
     ) -> tuple[InputDiagnosis, ...]:
         """Return how much of the action every input decides.
 
-        names: of the inputs; empty for all. absent: inputs that the model is said never to read. camera: the name
-        of the first one. Raises UsageError for an unknown name, fewer than two groups, or a policy that gives
-        other actions for the same observation and seed.
+        names: of the inputs; empty for all. absent: inputs that the model is said never to read, such as
+        by `Model.absent_inputs`. camera: the name of the first one. Raises UsageError for an unknown name, fewer
+        than two groups, or a policy that gives other actions for the same observation and seed.
         """
         available = inputs_of(self.frames, camera)
         check_names(names, available)
@@ -73,7 +74,7 @@ class InputExchange:
     def against(self, base: Infer, inputs: Sequence[InputDiagnosis]) -> tuple[InputDiagnosis, ...]:
         """Return the inputs with their comparison with a base checkpoint, of those that were exchanged.
 
-        base: infers with it. Raises what `measure` raises.
+        base: infers with it. inputs: that `measure` of this object returned. Raises what `measure` raises.
         """
         other = InputExchange(base, self.frames, self.seed, self.table)
         compared = []

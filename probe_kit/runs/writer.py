@@ -91,7 +91,7 @@ class WrittenPlan(Protocol):
 class EpisodeRecord:
     """All that is stored of one episode.
 
-    arrays: by kind (`pooled`, `tokens`) and stream, each shaped like its row in the store.
+    arrays: by kind (`pooled`, `tokens`, `later`) and stream, each shaped like its row in the store.
     roles: per captured inference and stream, the spans of roles. trajectory: (T + 1, C) float32 frames.
     instruction_ids: the instruction as the policy was delivered it. pictures: encoded, by key in the run. frames:
     how many one of them holds, if it holds all of the episode.

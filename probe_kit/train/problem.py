@@ -46,9 +46,9 @@ LEAST_MOVABLE = 0.5
 class Problem:
     """The samples, labels, folds and label permutations that all sites of a category share.
 
-    positions: (E,) places of the category's samples among those of the target. labels: (E,) bool of a side, else
-    coded. permuted_labels: (E, P). token_permutations: how many of them are fitted where every token is a sample.
-    classes: their names, empty for a quantity.
+    positions: (E,) places of the category's samples among those of the target. labels: (E,) bool of a side (true:
+    left), else coded. permuted_labels: (E, P). token_permutations: how many of them are fitted where every token
+    is a sample. classes: their names, empty for a quantity.
     """
 
     task: Task
@@ -109,6 +109,7 @@ class Problem:
             sample_scores=None if self.is_side else np.stack([probe.scores for probe in fitted]),
             inferences=self.samples.inferences.astype(np.int64),
             aligned=None if self.samples.aligned is None else self.samples.aligned.astype(np.int64),
+            # As many permutations as were fitted: fewer where every token is a sample.
             smallest_p=None
             if self.is_side
             else least_p(self.labels, self.permuted_labels[:, : fitted[0].null.size]),
