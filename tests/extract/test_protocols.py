@@ -227,16 +227,3 @@ def test_a_run_names_its_protocol_and_the_report_lists_what_differs(small_suite:
     assert "-M openness release instead of measured" in facts["it differs from the default in"]
     again = prepare(settings.changed(workers=0), tmp_path / "run")
     assert json.loads(json.dumps(again.identity())) == run.root.own_settings
-
-
-def test_the_documented_table_is_that_of_the_registry() -> None:
-    page = (Path(__file__).parents[2] / "docs" / "protocols.md").read_text(encoding="utf-8")
-    for name, family in own_families().items():
-        for row in (row for first in family.protocols.values() for row in first.rows):
-            options = " ".join(f"{key}={value}" for key, value in row.settings().items() if key.startswith("-M"))
-            begin = f"| `{name}` {row.variant}".rstrip()
-            line = next(line for line in page.splitlines() if line.startswith(begin))
-            assert f"`{row.checkpoint}` | {row.execute}" in line
-            assert f"| {row.rotation} |" in line
-            for pair in options.replace("-M ", "").split():
-                assert pair in line, (name, pair)

@@ -200,9 +200,9 @@ def test_the_summary_says_in_words_what_the_rows_say(probed_run: ProbedRun) -> N
     score = table.means[0].backbone.score
     assert score is not None
     assert 0.75 < score < 0.775, "two of 90 % and one that guesses, without the luck of its best site"
-    assert "120 of 200 episodes" in words["color"]
-    assert "not shown to beat chance" in words["shape"]
-    assert "Retention n/a (backbone absent, at most " in words["shape"]
+    assert "120 of 200 episodes" in words["Color"]
+    assert "not shown to beat chance" in words["Shape"]
+    assert "Retention n/a (backbone absent, at most " in words["Shape"]
 
 
 def test_what_fails_against_chance_and_controls_is_said_in_a_sentence_that_can_be_true() -> None:
@@ -224,11 +224,11 @@ def test_why_there_is_no_retention_is_the_reason_that_there_is(probed_run: Probe
     table = retention_table([run])
     note = {row.category: row.retention.note for row in table.rows}
     assert note["shape"] == f"n/a (probes {some.key} are of color)"
-    assert f"n/a (probes {some.key} are of color)" in dict(read_run(table.all_rows).by_category)["shape"]
+    assert f"n/a (probes {some.key} are of color)" in dict(read_run(table.all_rows).by_category)["Shape"]
     untested = {place: replace(curve, null=curve.null[:, :0]) for place, curve in results.curves.items()}
     save_results(replace(results, settings=replace(results.settings, seed=2), curves=untested), run.path)
     words = dict(read_run(retention_table([run]).all_rows).by_category)
-    assert "Retention n/a (no permutations)." in words["color"]
+    assert "Retention n/a (no permutations)." in words["Color"]
 
 
 def test_every_mark_of_evidence_is_said_to_need_the_controls_too(probed_run: ProbedRun) -> None:

@@ -134,13 +134,15 @@ def test_edits_of_sites_are_counted_and_the_largest_are_named(rows: Sequence[Pat
     assert Interchange.sentences(rows, context(None)) == [f"Color: {said}"]
 
 
-@pytest.mark.parametrize("category", ["color", "red · or blue", " · "])
-def test_a_category_of_any_name_stays_in_its_own_column(category: str) -> None:
+@pytest.mark.parametrize(
+    ("category", "title"), [("color", "Color"), ("red · or blue", "Red · or blue"), (" · ", " · ")]
+)
+def test_a_category_of_any_name_stays_in_its_own_column(category: str, title: str) -> None:
     described = context(None)
     described = replace(described, measurement=replace(described.measurement, settings={"kind": "interchange"}))
     table = Interchange.table([replace(patch("kv.01", 0.9, 0.001), category=category)], described)
     (line,) = table.rows
-    assert [cell.text for cell in line.cells[: table.names]] == [category, "kv.01 image"]
+    assert [cell.text for cell in line.cells[: table.names]] == [title, "kv.01 image"]
     assert [heading.text for heading in table.headings[: table.names]] == ["category", "edit"]
 
 
