@@ -107,9 +107,11 @@ def _check_roles(session: ReplaySession, settings: Mapping[str, Any], usual: Seq
     usual: the roles of the kind if none are named, of which one that is there will do.
     """
     roles, sites = settings.get("roles"), settings.get("sites")
-    intervention = [(sites, roles)] if roles and sites else []
-    intervention += [([name.site], [name.role]) for name in map(ConditionName.parse, settings.get("targets", ()))]
-    for patterns, requested in intervention:
+    sites_and_roles = [(sites, roles)] if roles and sites else []
+    sites_and_roles += [
+        ([name.site], [name.role]) for name in map(ConditionName.parse, settings.get("targets", ()))
+    ]
+    for patterns, requested in sites_and_roles:
         streams = [
             site_group.stream for pattern in patterns for site_group in resolve_sites(pattern, session.policy)
         ]
@@ -195,11 +197,11 @@ def outcomes_of(run: Run, conditions: Sequence[str], batch: ReplayBatch) -> Cond
         names = zip(columns["episodes"], batch.steps, strict=True)
         columns["episodes"] = np.array([f"{episode}@{frame}" for episode, frame in names])
     toward, size = _toward(conditions, batch)
-    sided = has_sides(run) or toward is None
+    lateral = has_sides(run) or toward is None  # else toward the action of the source
     return ConditionOutcomes(
         conditions=tuple(conditions),
         **columns,
-        displacement=batch.displacement if sided else toward,
+        displacement=batch.displacement if lateral else toward,
         toward=toward,
         size=size,
         max_action_change=batch.max_action_change,

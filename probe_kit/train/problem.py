@@ -112,7 +112,7 @@ class Problem:
             # As many permutations as were fitted: fewer where every token is a sample.
             smallest_p=None
             if self.is_side
-            else least_p(self.labels, self.permuted_labels[:, : fitted[0].null.size]),
+            else smallest_p_of_labels(self.labels, self.permuted_labels[:, : fitted[0].null.size]),
         )
 
 
@@ -151,7 +151,7 @@ def make_problem(
     )
 
 
-def least_p(labels: NDArray[Any], permuted_labels: NDArray[Any]) -> float:
+def smallest_p_of_labels(labels: NDArray[Any], permuted_labels: NDArray[Any]) -> float:
     """Return the share of (E, P) labellings, the real one (E,) included, that equal it: no p can be lower."""
     same = (permuted_labels == labels[:, None]).all(axis=0)
     return float((1 + same.sum()) / (1 + same.size))
@@ -171,7 +171,7 @@ def _side_folds_and_permutations(
     """Groups flip sides, or exchange chosen ones; folds are balanced by side, for `side.chosen` by layout."""
     table, groups = run.episodes.iloc[samples.rows], samples.groups
     if settings.call > 0 and groups.size == 0:
-        raise TooFewGroupsError(f"category {category!r}: {_reached(0, settings.call)}")
+        raise TooFewGroupsError(f"category {category!r}: {_why_fewer(0, settings.call)}")
     if target.null == "flip_groups":
         _check_balance(labels, category, settings.call)
     try:
@@ -179,7 +179,7 @@ def _side_folds_and_permutations(
     except TooFewGroupsError as error:
         if settings.call > 0:
             reason = (
-                f"{_reached(labels.size, settings.call)}: {np.unique(groups).size} independent groups of items"
+                f"{_why_fewer(labels.size, settings.call)}: {np.unique(groups).size} independent groups of items"
             )
             raise TooFewGroupsError(f"category {category!r}: {reason}, too few for folds") from error
         raise TooFewGroupsError(f"category {category!r}, target {settings.target!r}: {error}") from error
@@ -221,7 +221,7 @@ def _check_balance(labels: NDArray[np.bool_], category: str, call: int) -> None:
     share = chance_level(labels) if labels.size else 0.5
     if share == 0.5:
         return
-    why = "Episodes are missing from the run" if call == 0 else _reached(labels.size, call)
+    why = "Episodes are missing from the run" if call == 0 else _why_fewer(labels.size, call)
     finding = (
         f"category {category!r}: classes are not balanced, chance is {share:.3f}; expected 0.5 with both layouts "
         f"of every item. {why}."
@@ -235,7 +235,7 @@ def _check_balance(labels: NDArray[np.bool_], category: str, call: int) -> None:
     warnings.warn(f"{finding} Leave out the other layout of their items with incomplete='drop'.", stacklevel=4)
 
 
-def _reached(episodes: int, call: int) -> str:
+def _why_fewer(episodes: int, call: int) -> str:
     """Return why there are no more of them at a later inference."""
     number = {0: "no episode", 1: "only 1 episode"}.get(episodes, f"only {episodes} episodes")
     return f"{number} got as far as captured inference {call}, counted from 0, and the others ended before"
@@ -243,10 +243,10 @@ def _reached(episodes: int, call: int) -> str:
 
 def _check_power(count: int, category: str, settings: ProbeSettings) -> None:
     """Warn where the groups allow no result to be significant."""
-    if count < settings.permutations and (least := smallest_p(count)) >= SIGNIFICANCE:
+    if count < settings.permutations and (smallest := smallest_p(count)) >= SIGNIFICANCE:
         warnings.warn(
             f"category {category!r}: its groups allow {count} label permutations, the smallest possible p is "
-            f"{least:.3f}: nothing can be below {SIGNIFICANCE}. Extract more items.",
+            f"{smallest:.3f}: nothing can be below {SIGNIFICANCE}. Extract more items.",
             stacklevel=4,
         )
 
@@ -255,7 +255,7 @@ def _check_power(count: int, category: str, settings: ProbeSettings) -> None:
 
 
 def _block_folds_and_permutations(
-    run: RunReader, target: Target, samples: TargetSamples, labels: Matrix, category: str,
+    run: RunReader, target: Target, samples: TargetSamples, labels: NDArray[Any], category: str,
     settings: ProbeSettings,
 ) -> Drawn:  # fmt: skip
     """Groups exchange their labels as blocks.
@@ -289,15 +289,15 @@ def _block_folds_and_permutations(
     columns = np.column_stack([labels, labels[source]])
     # An exchange that leaves a training fold with one value has no probe. The real labels are column 0, and stay.
     columns = columns[:, _trainable(name, columns, folds)]
-    least = least_p(columns[:, 0], columns[:, 1:])
+    smallest = smallest_p_of_labels(columns[:, 0], columns[:, 1:])
     if columns.shape[1] > 1 and (columns == columns[:, :1]).all():
         _warn_of_one_pattern(name, classes, labels, blocks)
-    elif least >= SIGNIFICANCE and least > 1.001 * smallest_p(
+    elif smallest >= SIGNIFICANCE and smallest > 1.001 * smallest_p(
         permutations
     ):  # its groups are the reason, not `permutations`
         warnings.warn(
-            f"{name}: its groups allow no p below {least:.3f}, so nothing can be below {SIGNIFICANCE}. Label more "
-            "groups",
+            f"{name}: its groups allow no p below {smallest:.3f}, so nothing can be below {SIGNIFICANCE}. Label "
+            "more groups",
             stacklevel=3,
         )
     return folds, columns[:, 1:]

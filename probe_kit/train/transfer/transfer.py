@@ -19,7 +19,7 @@ from probe_kit.train.crossval.task_scores import balanced_scores
 from probe_kit.train.data.samples import Samples, read_samples, sites_of
 from probe_kit.train.execution import ExecutionSettings
 from probe_kit.train.probe_sweep import TOKEN_PERMUTATIONS, Progress, Sweep, check_options, check_run
-from probe_kit.train.problem import Problem, least_p, make_problem
+from probe_kit.train.problem import Problem, make_problem, smallest_p_of_labels
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.solver.row_subset import RowSubset
 from probe_kit.train.target import Target
@@ -103,7 +103,7 @@ def transfer_probes(
         inferences=samples.inferences.astype(np.int64),
         groups=samples.groups,
         curves={view: _curve(other, test, view, transferred) for view in views},
-        smallest_p=least_p(test.labels, test.permuted_labels),
+        smallest_p=smallest_p_of_labels(test.labels, test.permuted_labels),
         trained_on={"samples": train.samples.rows.size, "groups": np.unique(train.samples.groups).size},
         left_out={**samples.left_out, **({"groups that both runs have": shared} if shared else {})},
     )
