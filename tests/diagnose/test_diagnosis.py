@@ -21,7 +21,7 @@ from probe_kit.diagnose.results import Diagnosis
 from probe_kit.env import SceneSpec
 from probe_kit.errors import UsageError
 from probe_kit.extract import ExtractSettings, LeRobotSource, extract_run
-from probe_kit.hooks import Policy
+from probe_kit.hooks import Interventions, Policy
 from probe_kit.hooks.families.pi0.adapter import load_pi0_tiny
 from probe_kit.intervene.sessions.opening import open_session
 from probe_kit.intervene.sessions.session import ReplaySource
@@ -256,6 +256,19 @@ def test_paraphrases_are_read_by_the_rules_of_all_tables_and_do_not_contradict(t
     file.write_text("instruction,other\nlift it,grasp it\nlift it,raise it\n", encoding="utf-8")
     with pytest.raises(UsageError, match="line 3 has 'raise it' for 'lift it', and a line above has 'grasp it'"):
         read_paraphrases(file)
+
+
+@pytest.mark.slow
+def test_a_model_that_cannot_be_patched_is_tested_for_what_arrives_and_matters(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("probe_kit.hooks.families.pi0.adapter.Pi0.interventions", Interventions())
+    diagnosis = diagnose_run(run, frames=8, seed=3)
+    words, picture, _ = diagnosis.inputs
+    for diagnosed in (words, picture):
+        assert diagnosed.share > 0.5
+        assert diagnosed.passage == ()
+        assert diagnosed.where.startswith("sites were not patched: pi0-tiny does not support")
 
 
 # -- knowledge and the base -----------------------------------------------------------------------------------
