@@ -140,7 +140,8 @@ def network_chunk(
     policy: Any, picture: NDArray[np.uint8], state: NDArray[np.float64], text: str, seed: int
 ) -> Any:
     """(chunk, 7) of the bare network: 5 lines of lerobot's own calls, around our adapter."""
-    from probe_kit.hooks.families.shared.lerobot.policy import IMAGES, MASK, STATE, TOKENS
+    from probe_kit.hooks.families.shared.lerobot.features import IMAGES, STATE
+    from probe_kit.hooks.families.shared.lerobot.policy import MASK, TOKENS
 
     tokens, mask = policy.tokenise([text])
     batch = {

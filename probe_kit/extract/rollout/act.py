@@ -12,10 +12,10 @@ from probe_kit.extract.rollout.calibration import calibrated
 from probe_kit.extract.rollout.controllers import PolicyController, ScriptedController
 from probe_kit.extract.rollout.task import Fitted, Task, check_fit, load_of, with_source
 from probe_kit.extract.settings import ExtractSettings
-from probe_kit.extract.sources.recording import IMAGES, STATE
 from probe_kit.extract.sources.source import Source
 from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE
 from probe_kit.hooks.checkpoints.third_party import with_origin
+from probe_kit.hooks.families.shared.lerobot.features import STATE, cameras_of
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
@@ -27,8 +27,6 @@ _SCRIPT_REFUSES = (
     "captured_calls", "options",
 )  # fmt: skip
 _CAPTURE_REFUSES = ("captured_calls", "execute", "rotation", "video")
-_EMPTY_CAMERA = "empty_camera"
-"""Beginning of the name of a camera that never gets a picture; lerobot names them so (`empty_cameras` of pi0)."""
 
 
 class Act(Task[ExtractSettings, "Policy"]):
@@ -151,11 +149,11 @@ def _declared_inputs(family: "Family", settings: ExtractSettings) -> tuple[tuple
     folder = family.folder_here(settings.model.checkpoint, settings.model.options)
     try:
         inputs = parse_json(read_regular(folder / CONFIG_FILE))["input_features"]
-        cameras = [name.removeprefix(IMAGES) for name in inputs if name.startswith(IMAGES)]
+        cameras = cameras_of(inputs)
         state = int(inputs[STATE]["shape"][0]) if STATE in inputs else None
     except (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError):
         return None  # another layout; what it reads is known once it is loaded
-    return tuple(name for name in cameras if not name.startswith(_EMPTY_CAMERA)), state
+    return cameras, state
 
 
 def check_misfit(settings: ExtractSettings, reason: str | None, checkpoint: str) -> None:

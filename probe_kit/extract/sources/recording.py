@@ -11,9 +11,8 @@ from pydantic import BeforeValidator, Field
 
 from probe_kit.errors import UsageError
 from probe_kit.extract.sources.source import SourceSettings
+from probe_kit.hooks.families.shared.lerobot.features import IMAGES
 
-IMAGES = "observation.images."
-STATE, ACTION = "observation.state", "action"
 TURNS = (90, 180, 270)
 """Degrees that pictures can be rotated by, counterclockwise."""
 MOST_EPISODES = 1_000_000

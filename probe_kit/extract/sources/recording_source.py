@@ -18,7 +18,7 @@ from probe_kit.extract.sources.lerobot_folder import MOST_FRAMES, LeRobotFolder,
 from probe_kit.extract.sources.lerobot_frames import LeRobotFrames
 from probe_kit.extract.sources.lerobot_meta import IMAGE
 from probe_kit.extract.sources.player import SIDE, Answer, InputsPlayer, Opens
-from probe_kit.extract.sources.recording import ACTION, IMAGES, STATE, LeRobotSource, Pairs
+from probe_kit.extract.sources.recording import LeRobotSource, Pairs
 from probe_kit.extract.sources.source import Played, Source, raise_together
 from probe_kit.extract.sources.units import (
     MOST_UNUSUAL,
@@ -30,6 +30,7 @@ from probe_kit.extract.sources.units import (
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.state_layout import ARM_NUMBERS
+from probe_kit.hooks.families.shared.lerobot.features import ACTION, IMAGES, STATE
 from probe_kit.runs.layout import CAPTURE_ONLY, DATASET, OTHER_ACTIONS, RECORDED_EPISODES, TRUTHS
 
 if TYPE_CHECKING:

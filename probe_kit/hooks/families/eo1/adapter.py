@@ -21,9 +21,10 @@ from probe_kit.hooks.checkpoints.folders import inside_or_hub
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.eo1 import INTERVENTIONS
+from probe_kit.hooks.families.shared.lerobot.features import IMAGES, STATE
 from probe_kit.hooks.families.shared.lerobot.packed import PackedBatch, PackedPolicy, Tokens, chat_labels
 from probe_kit.hooks.families.shared.lerobot.pipelines import PREPROCESSOR, check_same, saved_steps
-from probe_kit.hooks.families.shared.lerobot.policy import IMAGES, STATE, checked_steps
+from probe_kit.hooks.families.shared.lerobot.policy import checked_steps
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack, TokenStack
 from probe_kit.hooks.families.shared.prompt_kv import kept_prompt
 from probe_kit.models.lerobot.eo1 import build_eo1, chat_step, flow_actions

@@ -15,7 +15,7 @@ from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE
 from probe_kit.hooks.checkpoints.folders import inside_or_hub
 from probe_kit.hooks.families.groot.processor_fields import check_widths, processor_settings, read_state_fields
 from probe_kit.hooks.families.shared.lerobot.evaluation import Evaluation
-from probe_kit.hooks.families.shared.lerobot.policy import IMAGES, STATE
+from probe_kit.hooks.families.shared.lerobot.features import IMAGES, STATE
 from probe_kit.models.lerobot.groot import VLM
 
 _AGAIN = "Download the checkpoint again"

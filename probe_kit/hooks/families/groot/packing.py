@@ -30,8 +30,8 @@ from probe_kit.errors import CheckpointError, InstructionError
 from probe_kit.hooks.checkpoints.checkpoint import shard_name
 from probe_kit.hooks.families.groot.pictures import nvidias_pictures
 from probe_kit.hooks.families.groot.processor_fields import StateFields, processor_settings, read_state_fields
+from probe_kit.hooks.families.shared.lerobot.features import IMAGES, STATE
 from probe_kit.hooks.families.shared.lerobot.packed import PackedRow, chat_labels
-from probe_kit.hooks.families.shared.lerobot.policy import IMAGES, STATE
 from probe_kit.models.pretrained import load_pretrained
 
 _READ = (

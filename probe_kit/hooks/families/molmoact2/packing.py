@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from probe_kit.errors import InstructionError
+from probe_kit.hooks.families.shared.lerobot.features import STATE
 from probe_kit.hooks.families.shared.lerobot.packed import PackedRow
-from probe_kit.hooks.families.shared.lerobot.policy import STATE
 from probe_kit.hooks.families.shared.lerobot.state_prompt import label_groups
 
 _PROMPT = re.compile(

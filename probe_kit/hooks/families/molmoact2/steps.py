@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import CheckpointError
 from probe_kit.hooks.families.molmoact2.units import SAME_FRAME, JointFrame
+from probe_kit.hooks.families.shared.lerobot.features import STATE
 from probe_kit.hooks.families.shared.lerobot.pipelines import MASKED, check_same, every_step
-from probe_kit.hooks.families.shared.lerobot.policy import STATE
 
 _PACK, _CLAMP_STATE, _CLAMP_ACTION = (
     "molmoact2_pack_inputs",

@@ -15,9 +15,9 @@ from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, without_revision
 from probe_kit.hooks.contract.state_layout import ARM_NUMBERS, laid_out
 from probe_kit.hooks.families.pi0.old_layout import current_config, is_old_layout
 from probe_kit.hooks.families.shared.lerobot.evaluation import Picture
+from probe_kit.hooks.families.shared.lerobot.features import STATE
 from probe_kit.hooks.families.shared.lerobot.flow import LerobotFlow
 from probe_kit.hooks.families.shared.lerobot.normaliser import Normaliser, Units
-from probe_kit.hooks.families.shared.lerobot.policy import STATE
 from probe_kit.hooks.families.shared.lerobot.window import PictureWindow, padded_top_left, squashed
 from probe_kit.hooks.families.shared.statistics_bounds import FILES, NO_STATISTICS, StatisticsFile, statistics_in
 

@@ -29,8 +29,8 @@ from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import HEADS, Site, Stream
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.shared.lerobot.evaluation import Evaluation
+from probe_kit.hooks.families.shared.lerobot.features import IMAGES, STATE
 from probe_kit.hooks.families.shared.lerobot.flow import DenoisingPolicy
-from probe_kit.hooks.families.shared.lerobot.policy import IMAGES, STATE
 from probe_kit.hooks.families.shared.lerobot.stacks import Stack
 from probe_kit.hooks.families.xvla import BLOCK, INTERVENTIONS
 from probe_kit.hooks.families.xvla.steps import STEPS, XvlaSteps, read_steps

@@ -13,8 +13,8 @@ from torch import Tensor
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.state_layout import ARM_NUMBERS
+from probe_kit.hooks.families.shared.lerobot.features import IMAGES
 from probe_kit.hooks.families.shared.lerobot.flow import DenoisingPolicy
-from probe_kit.hooks.families.shared.lerobot.policy import IMAGES
 
 Tokens = list[tuple[int, str]]
 """The id and the role of every position of one prompt."""

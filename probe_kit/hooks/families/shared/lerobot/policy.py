@@ -33,6 +33,7 @@ from probe_kit.hooks.contract.state_layout import ARM_NUMBERS
 from probe_kit.hooks.contract.views import PADDING
 from probe_kit.hooks.families.shared.lerobot.config_fields import Inert, check_one_frame, known_values
 from probe_kit.hooks.families.shared.lerobot.evaluation import Evaluation
+from probe_kit.hooks.families.shared.lerobot.features import IMAGES, STATE, cameras_of
 from probe_kit.hooks.families.shared.lerobot.normaliser import (
     Normaliser,
     Units,
@@ -61,14 +62,11 @@ from probe_kit.models.prompt_kv import PromptKV
 
 MOST_TOKENS = 1 << 16
 """Of a prompt: far beyond any policy, and no memory without end."""
-IMAGES, STATE = "observation.images.", "observation.state"
 TOKENS, MASK = "observation.language.tokens", "observation.language.attention_mask"
 UNCOMPARED = ("IDENTITY", "EXCLUDED")
 """Modes of units without statistics: the state is read as it is, or not at all."""
 _DIMENSIONS = 7
 """Of the arm's actions."""
-_EMPTY_CAMERA = "empty_camera"
-"""Beginning of the names that lerobot gives to cameras that never get a picture."""
 TEXT_FILES = (*SMALL_FILES, "policy_*.safetensors")
 """All that packing and tokenising read: of the weights only those of lerobot's processors."""
 _VISION = "vision"
@@ -113,7 +111,7 @@ class LerobotPolicy(Policy):
         self.config, self.evaluation = network.config, network.config.evaluation
         self.stacks = self._stacks()
         self._read_streams()
-        self.cameras = cameras_of(self.config)
+        self.cameras = cameras_of(self.config.image_features)
         self._show(self.cameras[:1])
 
     def showing(self, cameras: Sequence[str]) -> Self:
@@ -552,7 +550,7 @@ class LerobotPolicy(Policy):
         text = cls.__new__(cls)
         text.folder, text.evaluation = checkpoint_folder(checkpoint, TEXT_FILES), cls.choice(**options)
         text.config = cls._read_config(text.folder, text.evaluation)
-        text.cameras = text.shown_cameras = cameras_of(text.config)[:1]
+        text.cameras = text.shown_cameras = cameras_of(text.config.image_features)[:1]
         return text
 
     def window(self, camera: str) -> PictureWindow:
@@ -681,12 +679,6 @@ class LerobotPolicy(Policy):
         """Quantities of a golden reference that only this family has, or has in another form."""
         del run
         return {}
-
-
-def cameras_of(config: Any) -> tuple[str, ...]:
-    """The cameras of lerobot's configuration that a picture can be given for, in its order."""
-    names = (key.removeprefix(IMAGES) for key in config.image_features)
-    return tuple(name for name in names if not name.startswith(_EMPTY_CAMERA))
 
 
 def checked_steps(steps: int, folder: Path) -> int:
