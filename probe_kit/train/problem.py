@@ -19,6 +19,7 @@ from probe_kit.statistics.label_permutations import (
     exchange_groups,
     flip_groups,
     movable_share,
+    shortage,
     smallest_p,
 )
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -243,7 +244,8 @@ def _why_fewer(episodes: int, call: int) -> str:
 
 def _check_power(count: int, category: str, settings: ProbeSettings) -> None:
     """Warn where the groups allow no result to be significant."""
-    if count < settings.permutations and (smallest := smallest_p(count)) >= SIGNIFICANCE:
+    smallest = smallest_p(count)
+    if shortage(smallest, settings.permutations) == "groups":
         warnings.warn(
             f"category {category!r}: its groups allow {count} label permutations, the smallest possible p is "
             f"{smallest:.3f}: nothing can be below {SIGNIFICANCE}. Extract more items.",
@@ -292,9 +294,7 @@ def _block_folds_and_permutations(
     smallest = smallest_p_of_labels(columns[:, 0], columns[:, 1:])
     if columns.shape[1] > 1 and (columns == columns[:, :1]).all():
         _warn_of_one_pattern(name, classes, labels, blocks)
-    elif smallest >= SIGNIFICANCE and smallest > 1.001 * smallest_p(
-        permutations
-    ):  # its groups are the reason, not `permutations`
+    elif shortage(smallest, permutations) == "groups":
         warnings.warn(
             f"{name}: its groups allow no p below {smallest:.3f}, so nothing can be below {SIGNIFICANCE}. Label "
             "more groups",
