@@ -14,7 +14,7 @@ from probe_kit._terminal.options import further_option
 from probe_kit.diagnose.choices import FRAMES
 from probe_kit.errors import UsageError
 from probe_kit.extract import command_options as start
-from probe_kit.extract.moved import MOVED, moved_of
+from probe_kit.extract.moved import MovedOptions, moved_of
 from probe_kit.extract.settings import ExtractSettings
 from probe_kit.intervene.commands import PairTable
 
@@ -186,7 +186,7 @@ def _is_run(name: str, typed: Mapping[str, Any]) -> bool:
 
     if "/" not in name and not (Path(name) / RUN_FILE).exists():
         return False
-    if new := [option for option in typed if option not in MOVED | _OF_A_REPLAY]:
+    if new := [option for option in typed if option not in MovedOptions.model_fields.keys() | _OF_A_REPLAY]:
         option = new[0].replace("_", "-")
         raise UsageError(f"--{option} is a setting of a new run, and {name} is a stored one; leave it out")
     return True

@@ -24,8 +24,7 @@ def _options(kind: "type[SourceSettings]") -> dict[str, FieldOption]:
     return {field: options[field] for field in kind.moves}
 
 
-def moved_options() -> type[Part]:
-    """Return a model of which each field is one option of `extract` that gives a part of a source."""
+def _moved_options() -> type[Part]:
     fields: dict[str, Any] = {}
     for kind in SOURCES:
         for field, option in _options(kind).items():
@@ -36,8 +35,8 @@ def moved_options() -> type[Part]:
     return model
 
 
-MOVED = frozenset(moved_options().model_fields)
-"""The parameters that give a moved part of some source."""
+MovedOptions = _moved_options()
+"""A model of which each field is one option of `extract` that gives a moved part of some source."""
 
 
 def moved_of(run: "Run", typed: Mapping[str, Any]) -> dict[str, Any]:
@@ -49,7 +48,7 @@ def moved_of(run: "Run", typed: Mapping[str, Any]) -> dict[str, Any]:
     options = {} if config is None else _options(kind_of(config["source"]))
     moved = {field: typed[option.parameter] for field, option in options.items() if option.parameter in typed}
     parameters = {option.parameter for option in options.values()}
-    if refused := [name for name in typed if name in MOVED - parameters]:
+    if refused := [name for name in typed if name in MovedOptions.model_fields.keys() - parameters]:
         flags = ", ".join(option.flag for option in options.values()) or "none"
         raise UsageError(
             f"--{refused[0].replace('_', '-')} does not apply: {run.location} is made of {run.source.words}. What "

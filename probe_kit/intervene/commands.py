@@ -17,7 +17,7 @@ from probe_kit._terminal.field_options import command_with
 from probe_kit._terminal.options import LISTED, Names, choices, further_option, one_of
 from probe_kit._terminal.panelled_help import PanelledHelp
 from probe_kit.errors import UsageError
-from probe_kit.extract.moved import moved_of, moved_options
+from probe_kit.extract.moved import MovedOptions, moved_of
 from probe_kit.hooks.contract.interventions import Readout
 from probe_kit.intervene.kinds import every_kind, kind_names, kind_of
 from probe_kit.suite.categories import category_of
@@ -159,7 +159,7 @@ class KindHelp(PanelledHelp):
             )
 
 
-@command_with(moved_options())
+@command_with(MovedOptions)
 def intervene(
     typed: Mapping[str, Any],
     run: common.RunFolder,
