@@ -149,7 +149,7 @@ def _verdict(exchanges: Exchanges, p: float) -> tuple[Verdict, str]:
         # A blank and another stop are texts of other lengths: a length arrives where no word does.
         meaningless = {"a blank": exchanges.blanked, "its control": exchanges.control}
         changed = [
-            f"{name} does in {np.count_nonzero(changes)} of {changes.size}"
+            f"{name} changes some in {np.count_nonzero(changes)} of {changes.size}"
             for name, changes in meaningless.items()
             if changes is not None and changes.any()
         ]

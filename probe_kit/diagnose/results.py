@@ -133,11 +133,12 @@ def describe_passage(passage: Sequence[SitePassage], verdict: Verdict) -> str:
         return f"carried by {', '.join(spans)}" if spans else "no site alone carries half of it"
     strongest = max(passage, key=lambda site: site.difference)
     last = passage[-1]
-    loss = ": the loss is in the action part itself" if verdict == "no effect" else ""
     largest = f"it is strongest at {strongest.name} (relative difference {strongest.difference:.2g})"
     if strongest is last:
-        return f"{largest}, the last site{': the loss is behind it' if loss else ''}"
-    return f"{largest} and reaches {last.name} ({last.difference:.2g}){loss}"
+        reach, loss = ", the last site", "behind it"
+    else:
+        reach, loss = f" and reaches {last.name} ({last.difference:.2g})", "in the action part itself"
+    return f"{largest}{reach}" + f": the loss is {loss}" * (verdict == "no effect")
 
 
 def _streams(sites: Sequence[SitePassage]) -> list[str]:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 from probe_kit._tables.numbers import p_text, whole_percent, with_limits
 from probe_kit._tables.table import Cell, Heading, Table
 from probe_kit.diagnose.importance import INPUTS_DECIDE
+from probe_kit.diagnose.results import MATTERS
 
 if TYPE_CHECKING:
     from probe_kit.diagnose.results import Diagnosis, InputDiagnosis
@@ -94,8 +95,7 @@ def sentences(diagnosis: "Diagnosis") -> list[str]:
 
 def sentence(diagnosed: "InputDiagnosis") -> str:
     """Return one sentence: what became of an input, and where."""
-    reasoned = diagnosed.verdict in ("not varied", "not an input", "open", "no effect", "does not arrive")
-    reason = f" ({diagnosed.reason})" if reasoned else ""
+    reason = "" if diagnosed.verdict in MATTERS else f" ({diagnosed.reason})"
     where = f"; {diagnosed.where}" if diagnosed.where else ""
     base = f"; {_CHANGES[diagnosed.base.change]}" if diagnosed.base is not None else ""
     return f"{diagnosed.name} {_FINDINGS[diagnosed.verdict]}{reason}{where}{base}."

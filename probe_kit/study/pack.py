@@ -70,11 +70,8 @@ def _pack(study: LoadedStudy, folder: Path, partial: bool, extras: Collection[Ex
                 **{extra: extra in extras for extra in EXTRAS},
             )
             runs[cell.name] = PackedRun(key=cell.key, settings_sha256=run.settings_sha256)
-        except (
-            SettingsMismatchError,
-            DiskSpaceError,
-        ):  # a wrong run is not a missing one, and a full disk is full
-            raise
+        except (SettingsMismatchError, DiskSpaceError):
+            raise  # a wrong run is not a missing one, and a full disk is full
         except ProbeKitError as error:
             if not partial:
                 raise RunIncompleteError(
