@@ -24,7 +24,7 @@ from rich.console import Console
 from rich.table import Table
 from threadpoolctl import threadpool_limits
 
-from probe_kit.retention.estimators.stream_scores import Rate
+from probe_kit.retention.estimators import Rate
 from probe_kit.statistics.estimates.crossfit import CrossFit
 from probe_kit.statistics.estimates.retention import retention
 from probe_kit.statistics.estimates.scores import Scores, accuracy_interval

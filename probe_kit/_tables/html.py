@@ -7,8 +7,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from probe_kit._tables.content import Cell, Content
-from probe_kit._tables.heat import heat_colour
+from probe_kit._tables.content import Cell, Content, heat_colour
 from probe_kit._tables.numbers import NONE
 from probe_kit._terminal.plain_text import without_places
 

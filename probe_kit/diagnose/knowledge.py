@@ -7,7 +7,7 @@ from math import nan
 from typing import TYPE_CHECKING
 
 from probe_kit.diagnose.results import Knowledge, Limits, SiteKnowledge
-from probe_kit.retention.rows.label_rows import target_row
+from probe_kit.retention.rows.probe_parts import target_row
 
 if TYPE_CHECKING:
     from probe_kit.runs.run import Run

@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING
 from probe_kit._system.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from probe_kit.retention.behaviour.success_rate import (
+    from probe_kit.retention.behaviour import (
         PairedItems,
         Regime,
         SuccessRate,
         normalised_score,
+        scored,
         sensitivity,
         success_rate,
     )
-    from probe_kit.retention.behaviour.vlm_answers import scored
     from probe_kit.retention.compare.compare import Difference
     from probe_kit.retention.compare.known_used import match_runs
     from probe_kit.retention.displays import (
@@ -34,8 +34,8 @@ if TYPE_CHECKING:
         SuccessTableDisplay,
         layer_curve,
     )
-    from probe_kit.retention.estimators.by_call import event_calls
-    from probe_kit.retention.estimators.retention import Peak, Retention, best_site, measure_retention
+    from probe_kit.retention.displays.call_curves import event_calls
+    from probe_kit.retention.estimators import Peak, Retention, best_site, measure_retention
     from probe_kit.retention.rows.row import RetentionRow
     from probe_kit.retention.table import RetentionTable, retention_table
     from probe_kit.statistics.significance import chance_margin
@@ -78,10 +78,10 @@ __all__ = [
 __getattr__, __dir__ = lazy_names(
     __name__,
     {
-        "scored": "behaviour.vlm_answers",
+        "scored": "behaviour",
         "match_runs": "compare.known_used",
         "CallCurveDisplay": "displays",
-        "event_calls": "estimators.by_call",
+        "event_calls": "displays.call_curves",
         "Difference": "compare.compare",
         "FinalPositionsDisplay": "displays",
         "IterationMapDisplay": "displays",
@@ -89,25 +89,25 @@ __getattr__, __dir__ = lazy_names(
         "LayerCurveDisplay": "displays",
         "ModelDepthDisplay": "displays",
         "OutcomeRulesDisplay": "displays",
-        "PairedItems": "behaviour.success_rate",
+        "PairedItems": "behaviour",
         "PairedLayoutsDisplay": "displays",
-        "Peak": "estimators.retention",
-        "Regime": "behaviour.success_rate",
-        "Retention": "estimators.retention",
+        "Peak": "estimators",
+        "Regime": "behaviour",
+        "Retention": "estimators",
         "RetentionRow": "rows.row",
         "RetentionTable": "table",
         "RetentionTableDisplay": "displays",
         "RoleCurvesDisplay": "displays",
         "SideTableDisplay": "displays",
-        "SuccessRate": "behaviour.success_rate",
+        "SuccessRate": "behaviour",
         "SuccessTableDisplay": "displays",
-        "best_site": "estimators.retention",
+        "best_site": "estimators",
         "chance_margin": "probe_kit.statistics.significance",
         "layer_curve": "displays",
-        "measure_retention": "estimators.retention",
-        "normalised_score": "behaviour.success_rate",
+        "measure_retention": "estimators",
+        "normalised_score": "behaviour",
         "retention_table": "table",
-        "sensitivity": "behaviour.success_rate",
-        "success_rate": "behaviour.success_rate",
+        "sensitivity": "behaviour",
+        "success_rate": "behaviour",
     },
 )

@@ -1,21 +1,246 @@
-"""`probe-kit retention`."""
+"""`probe-kit retention`, and what it prints and writes."""
 
 from collections.abc import Collection, Mapping, Sequence
 from inspect import signature
+from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Literal, cast, get_args
 
+import typer
+
+from probe_kit._system.counting import counted
 from probe_kit._tables.printing import Format, print_table
 from probe_kit._terminal import options as common
-from probe_kit._terminal.console import err, out, print_text, say_note, split
-from probe_kit.errors import UsageError
-from probe_kit.retention import command_options as own
-from probe_kit.retention.output import save_all, say_report
+from probe_kit._terminal.console import (
+    err,
+    marked,
+    out,
+    print_json,
+    print_text,
+    say,
+    say_note,
+    split,
+    whole_number,
+)
+from probe_kit._terminal.options import Names, choices, some_of
+from probe_kit.errors import NoProbesError, UsageError
+from probe_kit.retention.choices import AnswerScore, Family, Section
+from probe_kit.scene_names import RuleName
 
 if TYPE_CHECKING:
-    from probe_kit.retention.choices import Section
+    from probe_kit.retention.choices import Iterations
+    from probe_kit.retention.displays.base.report_figure import ReportFigure
     from probe_kit.retention.table import RetentionTable
     from probe_kit.runs.reader import RunReader
+
+
+RUNS = "Probes"
+RULES = "Outcome rule"
+VLM_RUNS = "VLM runs"
+
+
+class Radii(tuple[float, ...]):
+    """Zone radii in metres."""
+
+    __slots__ = ()
+
+    @classmethod
+    def parse(cls, text: "str | Radii") -> "Radii":
+        """The numbers of a comma-separated text. Raises UsageError for one that is not positive."""
+        return cls(map(_radius, split(text) or ())) if isinstance(text, str) else text
+
+    def __str__(self) -> str:
+        """Return the radii as they are typed."""
+        return ",".join(f"{radius:g}" for radius in self)
+
+
+def _radius(text: str) -> float:
+    try:
+        radius = float(text)
+    except ValueError:
+        raise UsageError(f"{text!r} is not a number of metres") from None
+    if not 0 < radius < inf:
+        raise UsageError(f"a zone radius is {text} m; expected a positive number")
+    return radius
+
+
+def read_iterations(text: str) -> "Iterations":
+    """all, best, last or a number. Raises UsageError for another text."""
+    if (number := whole_number(text)) is not None:
+        return number
+    if text not in ("all", "best", "last"):
+        raise UsageError(f"iterations {text!r}; expected all, best, last or a number")
+    return cast("Iterations", text)
+
+
+# -- runs and probes ---------------------------------------------------------------------------------------------
+
+Runs = Annotated[
+    list[str] | None,
+    typer.Argument(
+        help="Run folders or URLs. Several runs of the same questions are compared. With --compare groups: "
+        "NAME=RUN,RUN per group of models.",
+        metavar="RUN…",
+    ),
+]
+Compare = Annotated[
+    str | None,
+    typer.Option(
+        "--compare",
+        metavar="NAME|groups|vlm-vla|stages|steps",
+        help="What is compared. NAME: every other run with this one; default: the first. groups: every two groups "
+        "of models; groups=NAME: every other with this one. vlm-vla: VLM runs with policy runs. stages: VLM_RUN "
+        "and RUN question by question: answer, probe, success. steps: checkpoints of a training, by the step in "
+        "their folders; steps=N,N: by these steps.",
+    ),
+]
+COMPARISONS = ("groups", "vlm-vla", "stages", "steps")
+
+
+def read_comparison(text: str | None) -> tuple[str, str | None]:
+    """Return the kind of comparison, `run` for that of runs, and what stands behind its `=`; the name of a run."""
+    if text is None:
+        return "run", None
+    kind, separator, value = text.partition("=")
+    if kind not in COMPARISONS:
+        return "run", text
+    if separator and (not value or kind in ("vlm-vla", "stages")):
+        raise UsageError(f"--compare {text}: expected --compare {kind}{'=…' * (kind in ('groups', 'steps'))}")
+    return kind, value or None
+
+
+LabelTargets = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--target",
+        metavar="COLUMN",
+        help="Retention of a label of your own, by its column; repeat for several in one table. Default: of the "
+        "side of the correct picture.",
+        rich_help_panel=RUNS,
+    ),
+]
+LabelFamily = Annotated[
+    Family,
+    typer.Option(
+        "--family",
+        help="With several --target, table corrects p for all of them (Holm).",
+        rich_help_panel=RUNS,
+    ),
+]
+ProbeKeys = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--probes",
+        metavar="RUN=KEY",
+        help="Probe results of a run; `probe-kit run show` lists them. Default: those requested last.",
+        rich_help_panel=RUNS,
+    ),
+]
+Views = Annotated[
+    Names | None,
+    typer.Option(
+        "--views",
+        parser=Names.parse,
+        metavar="A,B,…",
+        help="Token views, comma-separated. Default: all that were probed.",
+        rich_help_panel=RUNS,
+    ),
+]
+IterationChoice = Annotated[
+    str,
+    typer.Option(
+        "--iterations",
+        metavar="all|best|last|N",
+        help="Iterations of the action stream that count. best: layer curves show the best iteration only.",
+        rich_help_panel=RUNS,
+    ),
+]
+AbsentBelow = Annotated[
+    float,
+    typer.Option(
+        "--absent-below",
+        min=0.5,
+        max=1.0,
+        help="Accuracy below which a stream without signal is called absent.",
+        rich_help_panel=RUNS,
+    ),
+]
+
+# -- outcome rule ------------------------------------------------------------------------------------------------
+
+Rule = Annotated[
+    RuleName,
+    typer.Option(
+        "--rule", help="What counts as an answer. box: the released evaluation's.", rich_help_panel=RULES
+    ),
+]
+LastSteps = Annotated[
+    int,
+    typer.Option(
+        "--last-steps",
+        min=1,
+        help="Control steps at the end that are judged. The released evaluation averages 11.",
+        rich_help_panel=RULES,
+    ),
+]
+Epsilons = Annotated[
+    Radii | None,
+    typer.Option(
+        "--epsilons",
+        parser=Radii.parse,
+        metavar="A,B,…",
+        help="Zone radii in metres at which the rule disc is scored again, from stored positions.",
+        rich_help_panel=RULES,
+    ),
+]
+
+# -- VLM runs ----------------------------------------------------------------------------------------------------
+
+Score = Annotated[
+    AnswerScore,
+    typer.Option("--score", help="How the answers of VLM runs are read.", rich_help_panel=VLM_RUNS),
+]
+SideWords = Annotated[
+    bool,
+    typer.Option(
+        "--with-side-words", help="Count items such as 'no left turn sign' too.", rich_help_panel=VLM_RUNS
+    ),
+]
+
+# -- output ------------------------------------------------------------------------------------------------------
+
+Details = Annotated[
+    Names,
+    typer.Option(
+        "--details",
+        parser=some_of((*get_args(Section), "all")),
+        metavar=f"{choices((*get_args(Section), 'all'))},…",
+        help="Tables to print above the summary, comma-separated. all: every table, and every figure of "
+        "--figures.",
+    ),
+]
+NO_DETAILS = Names()
+AsPaper = Annotated[
+    bool,
+    typer.Option(
+        "--as-paper",
+        help="Print the paper's own numbers by its own formulas: regimes by Δ over episodes alone, retention of "
+        "maxima with ε over all categories. No intervals, no controls.",
+    ),
+]
+Html = Annotated[
+    Path | None,
+    typer.Option("--html", metavar="FILE", help="Write a report that needs no network."),
+]
+Figures = Annotated[
+    Path | None,
+    typer.Option(
+        "--figures",
+        metavar="FOLDER",
+        help="Write the main figures as PNG and PDF; with --details all every figure.",
+    ),
+]
+
 
 WITH_STAGES = ("runs", "probes", "views", "wording", "score", "with_side_words", "style", "figures")
 WITH_TARGET = (
@@ -33,26 +258,26 @@ WITH_STEPS = (
 
 
 def retention(
-    runs: own.Runs = None,
-    compare: own.Compare = None,
-    target: own.LabelTargets = None,
-    family: own.LabelFamily = "label",
-    probes: own.ProbeKeys = None,
-    views: own.Views = None,
-    iterations: own.IterationChoice = "all",
-    absent_below: own.AbsentBelow = 0.65,
+    runs: Runs = None,
+    compare: Compare = None,
+    target: LabelTargets = None,
+    family: LabelFamily = "label",
+    probes: ProbeKeys = None,
+    views: Views = None,
+    iterations: IterationChoice = "all",
+    absent_below: AbsentBelow = 0.65,
     wording: common.Wording = None,
     partial: common.Partial = False,
-    rule: own.Rule = "disc",
-    last_steps: own.LastSteps = 1,
-    epsilons: own.Epsilons = None,
-    score: own.Score = "text",
-    with_side_words: own.SideWords = False,
-    details: own.Details = own.NO_DETAILS,
-    as_paper: own.AsPaper = False,
+    rule: Rule = "disc",
+    last_steps: LastSteps = 1,
+    epsilons: Epsilons = None,
+    score: Score = "text",
+    with_side_words: SideWords = False,
+    details: Details = NO_DETAILS,
+    as_paper: AsPaper = False,
     style: Format = "table",
-    html: own.Html = None,
-    figures: own.Figures = None,
+    html: Html = None,
+    figures: Figures = None,
 ) -> None:
     """Print success rates and how much of the backbone's signal reaches the action stream.
 
@@ -65,13 +290,12 @@ def retention(
     values = locals()
     from probe_kit.env.scoring.outcome import SENSITIVITY_RADII
     from probe_kit.retention import retention_table as make_table
-    from probe_kit.retention.behaviour.vlm_answers import scored
+    from probe_kit.retention.behaviour import scored
     from probe_kit.retention.rows.outcome_rules import check_epsilons
-    from probe_kit.retention.stages_command import show_stages
     from probe_kit.retention.training_steps import read_steps
     from probe_kit.runs import open_run
 
-    kind, runs_compared = own.read_comparison(compare)
+    kind, runs_compared = read_comparison(compare)
     if kind == "stages":
         _check_only(values, WITH_STAGES, "compare", "--compare stages")
         common.check_no_others({f"--format {style}": style not in ("table", "json")}, "--compare stages")
@@ -95,7 +319,7 @@ def retention(
         raise UsageError("give run folders, or groups of them as --compare groups NAME=RUN,RUN NAME=RUN,RUN")
     grouped = _groups(runs) if kind == "groups" else {"": tuple(runs)}
     _check_doubles([path for paths in grouped.values() for path in paths])
-    steps = own.read_iterations(iterations)
+    steps = read_iterations(iterations)
     _check_places(html, figures)
     opened = {
         name: [open_run(p, allow_partial=partial).in_wording(wording) for p in paths]
@@ -237,3 +461,76 @@ def _groups(texts: Sequence[str]) -> dict[str, tuple[str, ...]]:
             raise UsageError(f"the group {name!r} is given twice; write all of its runs after one {name}=")
         groups[name] = tuple(filter(None, map(str.strip, paths.split(","))))  # a run given twice is refused
     return groups
+
+
+def save_all(exhibits: "Sequence[ReportFigure]", folder: Path, details: bool = False) -> None:
+    """Draw the main figures into a folder, and say where each is and how many are left out.
+
+    details: draw every figure.
+    """
+    from probe_kit.retention.displays import save_figures
+
+    drawn = [exhibit for exhibit in exhibits if details or not exhibit.is_detail]
+    for path in save_figures(drawn, folder):
+        say(f"figure: {path}")
+    if left_out := len(exhibits) - len(drawn):
+        say(f"{counted(left_out, 'further figure')}: add --details all")
+
+
+def say_report(written: Path) -> None:
+    """Say where a report is, and how large."""
+    from probe_kit.runs.disk import in_units
+
+    say(f"report: {written} ({in_units(written.stat().st_size)})")
+
+
+def show_stages(
+    runs: Sequence[str],
+    views: Sequence[str] | None,
+    key: str | None,
+    wording: str | None,
+    score: "AnswerScore",
+    with_side_words: bool,
+    as_json: bool,
+    figures: Path | None,
+) -> None:
+    """Compare what a VLM answers, a policy encodes and a policy does, question by question.
+
+    Answered: the VLM answers right. Encoded: a probe of the policy reads the answer, above chance and controls.
+    Acted: the cube ends on the correct picture. runs: the VLM's, then the policy's; both need the same first
+    frames. views: at most one, of the policy run's probes; None for the first. key: of its probe results.
+    Raises UsageError for other runs or views, and what `match_runs` raises.
+    """
+    from probe_kit.retention.behaviour import scored
+    from probe_kit.retention.columns.comparisons import known_used_tables
+    from probe_kit.retention.compare.known_used import match_runs
+    from probe_kit.runs import open_run
+    from probe_kit.train.results.store import load_side_results
+
+    if len(runs) != 2:
+        raise UsageError(f"--compare stages compares two runs, and {len(runs)} are given; expected VLM_RUN RUN")
+    if views is not None and len(views) != 1:
+        raise UsageError(
+            f"--compare stages reads probes of one view; --views {','.join(views)} has {len(views)}. Give one"
+        )
+    view = views[0] if views else None
+    vlm = scored(open_run(runs[0]), score, with_side_words)
+    policy = open_run(runs[1]).in_wording(wording)
+    try:
+        results = load_side_results(policy, key)
+    except NoProbesError as error:
+        if view is not None:
+            raise UsageError(f"--views {view}: {error}") from None
+        results = None
+    joined = match_runs(vlm, policy, results, view)
+    if as_json:
+        print_json(joined.to_json())
+    else:
+        for table in known_used_tables(joined):
+            out.print(table)
+        for note in joined.notes:
+            out.print(marked("[yellow]{}[/]", note))
+    if figures is not None:
+        from probe_kit.retention.displays.known_used import known_used_figures
+
+        save_all(list(known_used_figures([joined])), figures)

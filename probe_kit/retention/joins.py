@@ -5,8 +5,7 @@ from dataclasses import dataclass, replace
 from itertools import product
 
 from probe_kit.errors import OtherFramesError, UsageError
-from probe_kit.retention.behaviour.success_rate import capture_only
-from probe_kit.retention.behaviour.vlm_answers import ask_of
+from probe_kit.retention.behaviour import ask_of, capture_only
 from probe_kit.retention.compare.known_used import KnownUsedTable, correct_joins, match_runs
 from probe_kit.retention.rows.outcome_rules import can_be_judged, under_rule
 from probe_kit.retention.table import RetentionTable

@@ -11,15 +11,20 @@ from probe_kit._terminal.plain_text import without_places
 from probe_kit.env.scoring.outcome import SENSITIVITY_RADII
 from probe_kit.env.scoring.rules import DEFAULT_RULE, check_rule
 from probe_kit.errors import NoProbesError, NoTrajectoryError, UsageError
-from probe_kit.retention.behaviour.mixed_settings import chosen_wordings, mixed_episodes, mixed_settings
-from probe_kit.retention.behaviour.run_labels import distinct_labels
-from probe_kit.retention.behaviour.success_rate import capture_only
-from probe_kit.retention.behaviour.vlm_answers import ask_of, left_out, scored
+from probe_kit.retention.behaviour import (
+    ask_of,
+    capture_only,
+    chosen_wordings,
+    distinct_labels,
+    left_out,
+    mixed_episodes,
+    mixed_settings,
+    scored,
+)
 from probe_kit.retention.choices import Family, Iterations, Section
 from probe_kit.retention.columns.columns import averaged_fields
 from probe_kit.retention.columns.comparisons import size_table, vlm_vla_tables, wording_tables
-from probe_kit.retention.columns.findings import next_step
-from probe_kit.retention.columns.summary import RunSummary, summarise_runs, summary_table
+from probe_kit.retention.columns.summary import RunSummary, next_step, summarise_runs, summary_table
 from probe_kit.retention.columns.tables import retention_tables
 from probe_kit.retention.columns.text import model_name
 from probe_kit.retention.compare.compare import Difference
@@ -30,12 +35,10 @@ from probe_kit.retention.compare.pairing import (
     compare_with_vlms,
     compare_wordings,
 )
-from probe_kit.retention.formats.dataframe import frame_of, part_frame, peak_frame
-from probe_kit.retention.formats.json import table_json
-from probe_kit.retention.rows.build import RowSettings, RowWithEstimates, run_rows
-from probe_kit.retention.rows.category_mean import mean_row
-from probe_kit.retention.rows.label_rows import label_notes, label_rows, read_labels
+from probe_kit.retention.formats import frame_of, part_frame, peak_frame, table_json
+from probe_kit.retention.rows.build import RowSettings, RowWithEstimates, mean_row, run_rows
 from probe_kit.retention.rows.outcome_rules import can_be_judged, check_epsilons, under_rule
+from probe_kit.retention.rows.probe_parts import label_notes, label_rows, read_labels
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.runs.location import Location
 from probe_kit.runs.reader import RunReader, check_sides
@@ -254,8 +257,8 @@ class RetentionTable:
 
     @property
     def as_paper(self) -> Table:
-        """The paper's own numbers by its own formulas, see `probe_kit.retention.formats.as_paper`."""
-        from probe_kit.retention.formats.as_paper import paper_table
+        """The paper's own numbers by its own formulas, see `probe_kit.retention.formats`."""
+        from probe_kit.retention.formats import paper_table
 
         steps = f" over the last {self.last_steps} control steps" if self.last_steps > 1 else ""
         return paper_table(self.rows, self.means, f"outcome rule {self.rule}{steps}")

@@ -8,9 +8,9 @@ from probe_kit._system.counting import counted
 from probe_kit._tables.numbers import number, percent, points, with_limits
 from probe_kit._tables.table import Table
 from probe_kit.errors import UsageError
-from probe_kit.retention.behaviour.vlm_answers import ask_of
+from probe_kit.retention.behaviour import ask_of
 from probe_kit.retention.columns.text import title_of
-from probe_kit.retention.compare.origins import checkpoint_of, split_checkpoint
+from probe_kit.retention.compare.models import checkpoint_of, split_checkpoint
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.retention.table import RetentionTable
 from probe_kit.runs.reader import RunReader

@@ -118,7 +118,7 @@ class Run:
 
     rule: str = DEFAULT_RULE
     last_steps: int = 1
-    score: str = "text"  # of a run of questions; see `retention/behaviour/vlm_answers.py` for others
+    score: str = "text"  # of a run of questions; see `retention/behaviour.py` for others
     control_features: Mapping[str, NDArray[np.floating]] = MappingProxyType({})
 
     def __init__(

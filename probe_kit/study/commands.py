@@ -277,7 +277,7 @@ def _print_tables(tables: "dict[str, Table]", style: str, single: bool) -> None:
 
 
 def _write_report(study: "LoadedStudy", html: Path, partial: bool) -> None:
-    from probe_kit.retention.output import say_report
+    from probe_kit.retention.commands import say_report
     from probe_kit.study import write_study_report
 
     if html.is_dir():

@@ -7,8 +7,7 @@ from probe_kit._tables.content import Number
 from probe_kit._tables.numbers import p_text, percent, points, with_limits
 from probe_kit._tables.table import Table
 from probe_kit.retention.columns.text import P_DECIDES, difference_test, models_test
-from probe_kit.retention.compare.common_items import MANY
-from probe_kit.retention.compare.compare import Difference, behaviour_once, with_holm
+from probe_kit.retention.compare.compare import MANY, Difference, behaviour_once, with_holm
 from probe_kit.retention.compare.known_used import OVERALL, CategoryCounts, KnownUsedTable, without_signal
 from probe_kit.retention.rows.row import MEAN
 from probe_kit.retention.table import RetentionTable

@@ -11,9 +11,8 @@ from probe_kit.errors import UsageError
 from probe_kit.extract.vqa.scores import side_expected
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.hooks.contract.views import PADDING
-from probe_kit.retention.behaviour.vlm_answers import ask_of
-from probe_kit.retention.compare.common_items import common_items, wording_of
-from probe_kit.retention.compare.compare import Difference
+from probe_kit.retention.behaviour import ask_of
+from probe_kit.retention.compare.compare import Difference, common_items, wording_of
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.retention.table import retention_table
 from probe_kit.runs.layout import FIRST_FRAME

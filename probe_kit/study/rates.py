@@ -9,7 +9,7 @@ from probe_kit._system.counting import spanned
 from probe_kit._tables.content import Heading, Number
 from probe_kit._tables.numbers import number, percent, with_limits
 from probe_kit._tables.table import Table
-from probe_kit.retention.behaviour.success_rate import Regime, normalised_score
+from probe_kit.retention.behaviour import Regime, normalised_score
 from probe_kit.retention.columns.text import once_per_category, published_value, retention_value
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.retention.table import RetentionTable

@@ -7,10 +7,7 @@ from probe_kit._system.bounded_files import read_regular
 from probe_kit._system.drafts import write_whole
 from probe_kit._tables.table import Table
 from probe_kit.retention.displays.base.report_figure import ReportFigure
-from probe_kit.retention.report.pictures import Picture, data_uri
-from probe_kit.retention.report.provenance import citation, provenance
-from probe_kit.retention.report.render import render
-from probe_kit.retention.report.words import words_of
+from probe_kit.retention.report.parts import Picture, citation, data_uri, provenance, render, words_of
 from probe_kit.study.figures import make_figures
 from probe_kit.study.plan import StudyPlan, plan_study
 from probe_kit.study.reading import LoadedStudy

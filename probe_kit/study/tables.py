@@ -13,7 +13,7 @@ from probe_kit._tables.content import Number
 from probe_kit._tables.table import Table
 from probe_kit.errors import ProbeKitError, RunDamagedError, UsageError
 from probe_kit.retention import retention_table
-from probe_kit.retention.behaviour.vlm_answers import scored
+from probe_kit.retention.behaviour import scored
 from probe_kit.retention.compare.known_used import KnownUsedTable, correct_joins, match_runs
 from probe_kit.retention.table import RetentionTable
 from probe_kit.runs.provenance import differences

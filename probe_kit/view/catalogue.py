@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from probe_kit.hashing import sha256_json
-from probe_kit.retention.columns.glossary import VIEWER_WORDS
+from probe_kit.retention.columns.text import VIEWER_WORDS
 from probe_kit.runs import Run
 from probe_kit.runs.layout import COMMITS, FAILED
 from probe_kit.runs.thumbnails import episode_frames

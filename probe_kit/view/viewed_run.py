@@ -14,7 +14,7 @@ from probe_kit.hooks.contract.sites import Site
 from probe_kit.intervene.kinds.attention import PatchAttention, stored_patch_attention
 from probe_kit.intervene.settings import has_sides
 from probe_kit.retention import RetentionRow, RetentionTable, retention_table
-from probe_kit.retention.behaviour.vlm_answers import ask_of
+from probe_kit.retention.behaviour import ask_of
 from probe_kit.runs import Run
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeResults

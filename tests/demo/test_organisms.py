@@ -28,9 +28,9 @@ from probe_kit.extract import extract_run
 from probe_kit.intervene import ImageSwap, InstructionSwap, UseVerdict, run_intervention
 from probe_kit.intervene.results.verdict import Behaviour
 from probe_kit.retention import RetentionRow
-from probe_kit.retention.behaviour.success_rate import SuccessRate, regime
+from probe_kit.retention.behaviour import SuccessRate, regime
 from probe_kit.retention.columns.sentences import verdict
-from probe_kit.retention.rows.parts import BackbonePart, RunInfo, SwapEffect
+from probe_kit.retention.rows.row import BackbonePart, RunInfo, SwapEffect
 from probe_kit.suite import Suite
 
 

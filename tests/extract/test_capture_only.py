@@ -12,7 +12,7 @@ from probe_kit.env import SceneSpec
 from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.extract import ExtractSettings, extract_run, prepare
 from probe_kit.retention import retention_table
-from probe_kit.retention.behaviour.success_rate import success_rate
+from probe_kit.retention.behaviour import success_rate
 from probe_kit.retention.compare.compare import Side, compare
 from probe_kit.retention.displays.paired_layouts import PairedLayoutsDisplay
 from probe_kit.retention.displays.report_figures import collect_figures

@@ -25,7 +25,7 @@ from probe_kit.extract.rollout.episode_loop import Rollout
 from probe_kit.hooks import Site
 from probe_kit.retention import retention_table
 from probe_kit.retention.displays import collect_figures
-from probe_kit.retention.estimators.by_call import CallCurves
+from probe_kit.retention.displays.call_curves import CallCurves
 from probe_kit.runs import Run, copy_run, export_run, open_run, seal, verify_run
 from probe_kit.runs.layout import LaterViews, StoredStream
 from probe_kit.runs.store import locate

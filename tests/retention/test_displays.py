@@ -17,7 +17,7 @@ from matplotlib.patches import Circle, Rectangle
 from probe_kit.env.spec import SceneSpec
 from probe_kit.errors import UnknownCategoryError, UnknownSiteError, UsageError
 from probe_kit.retention import RetentionTable, layer_curve, retention_table
-from probe_kit.retention.behaviour.success_rate import Regime
+from probe_kit.retention.behaviour import Regime
 from probe_kit.retention.displays import (
     FinalPositionsDisplay,
     IterationMapDisplay,

@@ -14,7 +14,7 @@ from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 from PIL import Image
 
-from probe_kit._tables.heat import HEAT
+from probe_kit._tables.content import HEAT
 from probe_kit.errors import UsageError
 from probe_kit.retention import RetentionTable, layer_curve, retention_table
 from probe_kit.retention.displays import (

@@ -19,10 +19,9 @@ from probe_kit.retention import (
     measure_retention,
     retention_table,
 )
-from probe_kit.retention.behaviour.success_rate import success_share
+from probe_kit.retention.behaviour import success_share
 from probe_kit.retention.displays import LayerCurveDisplay
-from probe_kit.retention.estimators.retention import curve_scores
-from probe_kit.retention.estimators.stream_scores import PooledScores, Rate, limits
+from probe_kit.retention.estimators import PooledScores, Rate, curve_scores, limits
 from probe_kit.statistics.estimates.balanced import GroupSums
 from probe_kit.statistics.estimates.crossfit import crossfit
 from probe_kit.statistics.estimates.retention import retention, retention_difference

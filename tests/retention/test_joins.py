@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from probe_kit.retention import retention_table
-from probe_kit.retention.behaviour.vlm_answers import scored
+from probe_kit.retention.behaviour import scored
 from probe_kit.retention.columns.comparisons import known_used_tables
 from probe_kit.retention.compare.known_used import match_runs
 from probe_kit.retention.displays import KnownUsedDisplay, collect_figures

@@ -22,15 +22,14 @@ from probe_kit.intervene.results.verdict import Behaviour
 from probe_kit.intervene.settings import FORMAT
 from probe_kit.retention import RetentionTable, retention_table
 from probe_kit.retention.columns.columns import all_columns
-from probe_kit.retention.columns.glossary import TERMS
-from probe_kit.retention.columns.modes import Modes
 from probe_kit.retention.columns.sentences import VERDICT_HELP, Readable
 from probe_kit.retention.columns.summary import HEADING_HELP
 from probe_kit.retention.columns.tables import retention_tables
+from probe_kit.retention.columns.text import TERMS, Modes
 from probe_kit.retention.displays.report_figures import collect_figures
 from probe_kit.retention.report import report_html, write_report
 from probe_kit.retention.report.episodes import BLOCK, episode_grid
-from probe_kit.retention.report.provenance import citation
+from probe_kit.retention.report.parts import citation
 from probe_kit.retention.report.summaries import _clear_words, read_run
 from probe_kit.runs.store import locate
 from probe_kit.runs.thumbnails import as_thumbnail, read_thumbnail, thumbnail_key

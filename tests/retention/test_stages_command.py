@@ -10,7 +10,7 @@ from probe_kit.cli import app
 from probe_kit.env import SceneSpec
 from probe_kit.extract import AskSettings, ExtractSettings, ask_run, extract_run
 from probe_kit.extract.vqa.templates import TEMPLATES
-from probe_kit.retention.behaviour.vlm_answers import scored
+from probe_kit.retention.behaviour import scored
 from probe_kit.retention.compare.known_used import match_runs
 from probe_kit.runs import Run
 from probe_kit.suite import Suite

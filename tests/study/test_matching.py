@@ -7,7 +7,7 @@ import pytest
 
 from probe_kit.errors import SettingsMismatchError
 from probe_kit.extract import ExtractSettings
-from probe_kit.retention.compare.common_items import common_items
+from probe_kit.retention.compare.compare import common_items
 from probe_kit.runs import Run, open_run
 from probe_kit.runs.store import locate
 from probe_kit.study.cells import Cell

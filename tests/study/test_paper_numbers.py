@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from probe_kit.retention import RetentionTable, retention_table
-from probe_kit.retention.behaviour.success_rate import Regime, regime
+from probe_kit.retention.behaviour import Regime, regime
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.study.compared import difference_table, group_table, vlm_vla_table
 from probe_kit.study.rates import score_table, sides_table, success_table

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.retention import retention_table
-from probe_kit.retention.behaviour.vlm_answers import scored
+from probe_kit.retention.behaviour import scored
 from probe_kit.retention.compare.known_used import match_runs
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.statistics.paired_tests import holm

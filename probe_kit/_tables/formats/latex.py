@@ -5,8 +5,7 @@ from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import cast
 
-from probe_kit._tables.content import Cell, Content
-from probe_kit._tables.heat import HEAT
+from probe_kit._tables.content import HEAT, Cell, Content
 
 _GREEK = {
     "α": "alpha", "β": "beta", "γ": "gamma", "δ": "delta", "ε": "epsilon", "θ": "theta", "λ": "lambda", "μ": "mu",

@@ -11,11 +11,11 @@ from operator import attrgetter
 from typing import Any
 
 from probe_kit._tables.numbers import number, p_text, percent, points, signed, with_limits
-from probe_kit.retention.behaviour.success_rate import Regime
+from probe_kit.retention.behaviour import Regime
 from probe_kit.retention.choices import Section
-from probe_kit.retention.columns.modes import Modes
 from probe_kit.retention.columns.text import (
     P_DECIDES,
+    Modes,
     above_chance,
     action_place,
     backbone_place,
@@ -30,8 +30,7 @@ from probe_kit.retention.columns.text import (
     verdict_text,
 )
 from probe_kit.retention.compare.compare import Difference
-from probe_kit.retention.rows.parts import StreamPart
-from probe_kit.retention.rows.row import RetentionRow
+from probe_kit.retention.rows.row import RetentionRow, StreamPart
 from probe_kit.statistics.significance import SIGNIFICANCE
 
 Text = Callable[[RetentionRow], str]

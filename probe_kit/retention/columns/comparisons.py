@@ -15,7 +15,7 @@ from probe_kit.retention.columns.text import (
 )
 from probe_kit.retention.compare.compare import Difference
 from probe_kit.retention.compare.known_used import OVERALL, PAIRS, CategoryCounts, Comparison, KnownUsedTable
-from probe_kit.retention.compare.origins import Relation
+from probe_kit.retention.compare.models import Relation
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.runs.reader import full_name
 

@@ -8,18 +8,18 @@ from probe_kit._tables.numbers import span
 from probe_kit._tables.table import Cell, Heading, Row, Table
 from probe_kit.retention.choices import Section
 from probe_kit.retention.columns.columns import TABLES, Column, ColumnGroup, radius_columns
-from probe_kit.retention.columns.glossary import TERMS
-from probe_kit.retention.columns.modes import modes_of
 from probe_kit.retention.columns.sentences import chance_only
 from probe_kit.retention.columns.text import (
     ABOVE_CHANCE,
     P_DECIDES,
+    TERMS,
     by_run,
     call_words,
     controlled,
     difference_name,
     is_vlm,
     model_name,
+    modes_of,
     name_of,
     once_per_category,
     probed,

@@ -1,15 +1,42 @@
-"""The texts of single values of a retention row and of a difference in a table for people."""
+"""The words of a retention table: texts of single values, of modes, and terms that are no column."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Literal
 
 from probe_kit._tables.numbers import NONE, Write, number, p_text, percent, with_limits
-from probe_kit.retention.behaviour.success_rate import Regime
+from probe_kit.retention.behaviour import Regime
 from probe_kit.retention.compare.compare import Difference
-from probe_kit.retention.compare.model_test import ModelTest
-from probe_kit.retention.rows.parts import StreamPart
-from probe_kit.retention.rows.row import RetentionRow
+from probe_kit.retention.compare.models import ModelTest
+from probe_kit.retention.rows.row import RetentionRow, StreamPart
 from probe_kit.suite.categories import category_of
 from probe_kit.train.choices import EVERYWHERE
+
+Modes = Literal["acts", "answers", "both"]
+
+RATE: Mapping[Modes, str] = {
+    "acts": "Success rate",
+    "answers": "Accuracy of answers",
+    "both": "Success rate / accuracy of answers",
+}
+"""The share of right episodes at the head of a table or an axis."""
+_HEADINGS: Mapping[str, str] = {"SR": "accuracy", "outside": "unread", "goes left": "answers left"}
+"""By the first words of a policy's heading, those of a model that was asked."""
+
+
+def modes_of(rows: Iterable[RetentionRow]) -> Modes:
+    """Return what all rows did, `both` for a mixture."""
+    modes = {row.run.mode for row in rows}
+    return "both" if len(modes) > 1 else "answers" if modes == {"answers"} else "acts"
+
+
+def heading(name: str, modes: Modes) -> str:
+    """A policy's heading, such as `SR % [95 %]`, over rows of `modes`."""
+    for acting, asking in _HEADINGS.items():
+        if modes != "acts" and name.startswith(acting):
+            words = asking if modes == "answers" else f"{acting} / {asking}"
+            return f"{words}{name.removeprefix(acting)}"
+    return name
+
 
 NOT_ACTED = "n/a"
 """In place of a success rate, for a model that did not act."""
@@ -206,3 +233,42 @@ def controlled(rows: Sequence[RetentionRow]) -> bool:
 def is_vlm(row: RetentionRow) -> bool:
     """Whether a row is of a VLM run."""
     return row.run.mode == "answers"
+
+
+TERMS = {
+    "call": ("Which inference of an episode was probed, counted from 0: call 0 comes before anything has moved."),
+    "probe": (
+        "A logistic regression that is shown activations of one layer and must name the side of the correct "
+        "picture, in episodes and questions it was not fitted on."
+    ),
+    "reach": (
+        "The distance between the actions of a policy that go left and those that go right: the unit in which the "
+        "image swap moves an action."
+    ),
+    "n/a": (
+        "The backbone's signal is not shown: its best layer is not shown to exceed chance and every control that "
+        "was run. So there may be nothing to retain."
+    ),
+    "B − A": (
+        "Difference of a run and the first one, or that of --compare, on the same questions. They count as pairs, "
+        "with a 95 % interval. Zero inside it: they may be equal."
+    ),
+    "against": ("Before a verdict: the same, away from the correct picture."),
+    "random weights": ("The model is untrained. It shows the numbers of a model that knows nothing."),
+}
+"""Terms that are no column."""
+
+VIEWER_WORDS = {
+    "success": "The cube ends on the correct picture. Guessing reaches 50 %.",
+    "Δ": "How far from 50 % guessing alone may lead. Success is shown beyond it.",
+    "shown": "A stream's best site exceeds chance, family-wise, and every control that was run: its signal.",
+    "not shown": "Neither shown nor absent: the items are too few to tell.",
+    "absent": "For a linear probe of so many items: the best site can be at most as accurate as a stated limit, "
+    "65 % by default, and so many items would have shown a site of that accuracy.",
+    "retention": "Share of the backbone's accuracy above chance that is left where the action is made.",
+    "used": "Swapping the two pictures turns the action: only an intervention shows it.",
+    "log-odds": "How sure the probe is of the correct side in one episode; below zero it reads the other side.",
+    "probe": TERMS["probe"],
+    "call": TERMS["call"],
+}
+"""The words that the viewer explains."""

@@ -7,39 +7,167 @@ are the unit of intervals and of p.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from fractions import Fraction
+from functools import reduce
+from math import lcm
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from probe_kit.retention.behaviour.success_rate import success_share
-from probe_kit.retention.compare.common_items import CommonItems, common_items
-from probe_kit.retention.compare.gains import Gains
-from probe_kit.retention.compare.model_test import (
+from probe_kit.retention.behaviour import shares_of, success_share, units_of
+from probe_kit.retention.compare.models import (
     ModelTest,
+    Relation,
     compare_models,
     retention_of_model,
     success_of_model,
 )
-from probe_kit.retention.compare.origins import Relation
-from probe_kit.retention.estimators.stream_scores import (
-    ACTION,
-    BACKBONE,
-    Limits,
-    PooledScores,
-    Rate,
-    RowEstimates,
-    limits,
-)
+from probe_kit.retention.estimators import ACTION, BACKBONE, Limits, PooledScores, Rate, RowEstimates, limits
 from probe_kit.retention.rows.build import RowWithEstimates
-from probe_kit.retention.rows.parts import Mode
-from probe_kit.retention.rows.row import MEAN
+from probe_kit.retention.rows.row import MEAN, Mode
 from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.estimates.retention import Ratio, retention_difference
 from probe_kit.statistics.estimates.scores import Scores
-from probe_kit.statistics.paired_tests import corrected
+from probe_kit.statistics.paired_tests import corrected, flip_gains_p
 
 if TYPE_CHECKING:
     import pandas as pd
+
+
+MANY = 0.8
+"""Share of items in common below which groups of runs are not paired."""
+OWN_WORDS = "knowledge"
+"""The wording of a run in the items' own words."""
+_CONTENT = "item_content_sha256"
+EpisodeKey = tuple[str, str, str]
+"""Item, layout and content of the item."""
+
+
+@dataclass(frozen=True)
+class CommonItems:
+    """The episodes of one category that several runs have in common.
+
+    episodes: (item, layout) of them. n_items: items of them. of_items: items of any of the runs.
+    is_complete: whether every run has these episodes and no others.
+    """
+
+    episodes: frozenset[tuple[str, str]]
+    n_items: int
+    of_items: int
+    is_complete: bool
+
+    def select(self, episodes: "pd.DataFrame") -> "pd.DataFrame":
+        """The rows of a table of episodes that are among these, with their index."""
+        keys = zip(episodes["item_id"].astype(str), episodes["layout"].astype(str), strict=True)
+        return episodes[[key in self.episodes for key in keys]]
+
+    @property
+    def is_many(self) -> bool:
+        """Whether at least 80 % of the items are in common, and so worth leaving out the others."""
+        return self.n_items >= MANY * self.of_items
+
+
+def common_items(runs: Sequence[RunReader]) -> dict[str, CommonItems]:
+    """Return by category that all runs have the episodes in common, of which there may be none.
+
+    Items are the same where id and content hash are equal. Runs of one suite need no hashes. Nothing is in common
+    of runs of several suites if one of them holds no hashes, as arrays do.
+    """
+    by_content = all(has_item_content(run) for run in runs)
+    if not by_content and len({run.suite for run in runs}) > 1:
+        return {}
+    episodes = [_episodes(run.episodes, by_content) for run in runs]
+    shared = [name for name in episodes[0] if all(name in of_run for of_run in episodes)]
+    return {name: _common([of_run[name] for of_run in episodes]) for name in shared}
+
+
+def has_item_content(run: RunReader) -> bool:
+    """Whether a run says what each of its items holds."""
+    return _CONTENT in run.episodes and not bool(run.episodes[_CONTENT].isna().any())
+
+
+def wording_of(run: RunReader) -> str:
+    """The wordings of a run's episodes, comma-separated."""
+    wordings = run.episodes["wording"].unique() if "wording" in run.episodes else [OWN_WORDS]
+    return ", ".join(map(str, wordings))
+
+
+def _common(of_runs: Sequence[frozenset[EpisodeKey]]) -> CommonItems:
+    common = reduce(frozenset.intersection, of_runs)
+    every = reduce(frozenset.union, of_runs)
+    return CommonItems(
+        frozenset((item, layout) for item, layout, _ in common),
+        len({item for item, _, _ in common}),
+        len({(item, content) for item, _, content in every}),
+        all(episodes == common for episodes in of_runs),
+    )
+
+
+def _episodes(episodes: "pd.DataFrame", by_content: bool) -> Mapping[str, frozenset[EpisodeKey]]:
+    return {
+        str(name): frozenset(
+            zip(
+                table["item_id"].astype(str),
+                table["layout"].astype(str),
+                table[_CONTENT].astype(str) if by_content else [""] * len(table),
+                strict=True,
+            )
+        )
+        for name, table in episodes.groupby("category", sort=False)
+    }
+
+
+_FINEST = 1000
+"""Parts that an outcome is counted in, where several last steps or several runs make shares of it."""
+
+
+@dataclass(frozen=True)
+class Gains:
+    """p: exact and two-sided, of both sides being right equally often, whole groups of items turned together.
+
+    n_groups: groups that it rests on. more, fewer: episodes in which the first side is right more, and less.
+    """
+
+    p: float
+    n_groups: int
+    more: int
+    fewer: int
+
+    @classmethod
+    def of(cls, first: "Sequence[pd.DataFrame]", second: "Sequence[pd.DataFrame]") -> "Gains | None":
+        """Return the test of tables of episodes, each of one run and category; runs of a side count by their mean.
+
+        None unless every run of both sides has the same episodes.
+        """
+        sides = [_of_side(tables) for tables in (first, second)]
+        if None in sides:
+            return None
+        (mine, units), (theirs, _) = (side for side in sides if side is not None)
+        if not mine or set(mine) != set(theirs):
+            return None
+        gains = [mine[episode] - theirs[episode] for episode in mine]
+        # The exact test counts in whole units, as coarse as the gains allow: its time grows with their number.
+        scale = min(_FINEST, lcm(*(gain.denominator for gain in gains)))
+        scaled: NDArray[np.int64] = np.array([round(gain * scale) for gain in gains])
+        groups = [units[episode] for episode in mine]
+        more, fewer = int((scaled > 0).sum()), int((scaled < 0).sum())
+        return cls(flip_gains_p(scaled, groups), len(set(groups)), more, fewer)
+
+
+def _of_side(tables: "Sequence[pd.DataFrame]") -> tuple[dict[str, Fraction], dict[str, str]] | None:
+    """Per episode how much of it was right, averaged over runs, and its group; None if runs differ in episodes."""
+    by_episode: dict[str, list[Fraction]] = {}
+    units: dict[str, str] = {}
+    for table in tables:
+        names = table["item_id"].astype(str) + ":" + table["layout"].astype(str)
+        for name, share, unit in zip(names, shares_of(table, "correct"), units_of(table), strict=True):
+            by_episode.setdefault(name, []).append(Fraction(float(share)).limit_denominator(_FINEST))
+            units[name] = unit
+    runs = {len(shares) for shares in by_episode.values()}
+    if len(runs) > 1:
+        return None
+    return {name: sum(shares, Fraction(0)) / len(shares) for name, shares in by_episode.items()}, units
 
 
 @dataclass(frozen=True)

@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import OtherFramesError, UsageError
 from probe_kit.hashing import derive_seed
-from probe_kit.retention.behaviour.success_rate import units_of
-from probe_kit.retention.behaviour.vlm_answers import ask_of
-from probe_kit.retention.estimators.retention import best_site
+from probe_kit.retention.behaviour import ask_of, units_of
+from probe_kit.retention.estimators import best_site
 from probe_kit.runs.layout import FIRST_FRAME
 from probe_kit.runs.reader import RunReader, check_sides
 from probe_kit.statistics.paired_tests import (

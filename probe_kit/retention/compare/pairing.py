@@ -8,16 +8,18 @@ from typing import TYPE_CHECKING, Any
 
 from probe_kit.env.scoring.rules import DEFAULT_RULE
 from probe_kit.errors import UsageError
-from probe_kit.retention.behaviour.run_labels import full_names
-from probe_kit.retention.behaviour.vlm_answers import ask_of
-from probe_kit.retention.compare.common_items import (
+from probe_kit.retention.behaviour import ask_of, full_names
+from probe_kit.retention.compare.compare import (
     CommonItems,
+    Difference,
+    Side,
     common_items,
+    compare,
     has_item_content,
+    with_holm,
     wording_of,
 )
-from probe_kit.retention.compare.compare import Difference, Side, compare, with_holm
-from probe_kit.retention.compare.origins import grew_from, origins_of
+from probe_kit.retention.compare.models import grew_from, origins_of
 from probe_kit.retention.rows.build import RowSettings, RowWithEstimates, run_rows
 from probe_kit.runs.layout import FIRST_FRAME
 from probe_kit.runs.reader import RunReader

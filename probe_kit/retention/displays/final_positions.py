@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from probe_kit.env.scoring.rules import DEFAULT_RULE, Box, Disc, OutcomeRule, ReleasedOnTile, rule_of
 from probe_kit.errors import UsageError
-from probe_kit.retention.behaviour.success_rate import capture_only
+from probe_kit.retention.behaviour import capture_only
 from probe_kit.retention.columns.text import title_of
 from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine

@@ -6,11 +6,10 @@ from functools import partial
 from textwrap import fill
 from typing import TYPE_CHECKING, ClassVar, Self
 
-from probe_kit._tables.heat import HEAT, heat_colour
+from probe_kit._tables.content import HEAT, heat_colour
 from probe_kit.errors import UsageError
-from probe_kit.retention.behaviour.success_rate import Regime
-from probe_kit.retention.columns.modes import RATE, Modes, modes_of
-from probe_kit.retention.columns.text import model_name, once_per_category, title_of
+from probe_kit.retention.behaviour import Regime
+from probe_kit.retention.columns.text import RATE, Modes, model_name, modes_of, once_per_category, title_of
 from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure, figure_of

@@ -5,8 +5,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, Self
 
 from probe_kit.errors import UsageError
-from probe_kit.retention.columns.modes import RATE, Modes, modes_of
-from probe_kit.retention.columns.text import model_name, title_of
+from probe_kit.retention.columns.text import RATE, Modes, model_name, modes_of, title_of
 from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.label_placement import place_labels
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine

@@ -8,8 +8,7 @@ import numpy as np
 
 from probe_kit.env.scoring.rules import DEFAULT_RULE, RULES
 from probe_kit.errors import UsageError
-from probe_kit.retention.behaviour.run_labels import full_names
-from probe_kit.retention.behaviour.success_rate import shares_of
+from probe_kit.retention.behaviour import full_names, shares_of
 from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure, figure_of

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Self
 
-from probe_kit.retention.behaviour.success_rate import PairedItems, capture_only, paired_items
+from probe_kit.retention.behaviour import PairedItems, capture_only, paired_items
 from probe_kit.retention.columns.text import title_of
 from probe_kit.retention.displays.base.display import Display
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine

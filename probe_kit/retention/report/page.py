@@ -1,34 +1,208 @@
 """The page put together: one HTML file with everything in it, for every target."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from probe_kit._system.counting import enumerated
 from probe_kit._system.drafts import write_whole
-from probe_kit._tables.heat import heat_key
+from probe_kit._tables.content import heat_key
 from probe_kit._tables.table import Table
 from probe_kit._terminal.plain_text import without_places
 from probe_kit.errors import UsageError
 from probe_kit.retention.columns.comparisons import known_used_tables
-from probe_kit.retention.columns.modes import Modes, modes_of
 from probe_kit.retention.columns.tables import SUBJECTS
-from probe_kit.retention.columns.text import model_name
-from probe_kit.retention.displays.base.report_figure import ReportFigure
+from probe_kit.retention.columns.text import Modes, model_name, modes_of, title_of
+from probe_kit.retention.displays.base.report_figure import ONLY_FILLED, ReportFigure
+from probe_kit.retention.displays.base.style import axes_for, legend_above
+from probe_kit.retention.displays.layer_curves import LayerCurveDisplay
 from probe_kit.retention.displays.report_figures import collect_figures
 from probe_kit.retention.joins import joins_of
 from probe_kit.retention.report.episodes import PICTURES, EpisodeGrid, episode_grid
-from probe_kit.retention.report.label_sections import label_sections, stored_label_sections
-from probe_kit.retention.report.opening import Question, opening_curve, opening_question, opening_row
-from probe_kit.retention.report.pictures import Picture, arranged, data_uri
-from probe_kit.retention.report.provenance import citation, provenance
-from probe_kit.retention.report.render import render
+from probe_kit.retention.report.parts import Picture, arranged, citation, data_uri, provenance, render, words_of
 from probe_kit.retention.report.summaries import RunInWords, read_run
-from probe_kit.retention.report.words import words_of
 from probe_kit.retention.rows.outcome_rules import under_rule
+from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.retention.table import RetentionTable, retention_table
 from probe_kit.runs.reader import RunReader
+from probe_kit.train.choices import Task
+from probe_kit.train.crossval.task_scores import METRICS
+from probe_kit.train.results.probe_results import ProbeResults
+from probe_kit.train.results.store import stored_targets
+from probe_kit.train.results.summary import best_sites_sentences, best_sites_table
 from probe_kit.version import __version__
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True)
+class Question:
+    """An episode of the grid. source: its picture as a data URI."""
+
+    card: Mapping[str, Any]
+    source: str
+
+    @property
+    def caption(self) -> str:
+        """Return how it ended, in words."""
+        outcome = (_ANSWERS if self.card["asked"] else _OUTCOMES).get(self.card["outcome"], "it was captured only")
+        answer = f": {self.card['answer']}" if self.card["answer"] else ""
+        frames = "First frame" if self.card["frames"] == 1 else "First and last frame"
+        return f"{frames}. The correct picture lies {_SIDES[self.card['side']]}{answer}; {outcome}."
+
+
+_SIDES = {"left": "on the left", "right": "on the right"}
+_OUTCOMES = {
+    "correct": "the cube ended on it",
+    "wrong": "the cube ended on the other picture",
+    "oob": "the cube ended on neither picture",
+}
+_ANSWERS = {
+    "correct": "the model answers right",
+    "wrong": "the model answers wrong",
+    "oob": "no answer could be read",
+}
+
+
+def opening_row(table: RetentionTable) -> RetentionRow | None:
+    """The category to open with: one that the backbone holds and the action does not, if there is one.
+
+    Of runs with probes the first category with signal is next, and then the first at all; None without rows.
+    """
+    rows = [category.row for run in table.summary for category in run.categories]
+    probed = [row for row in rows if row.backbone.score is not None]
+    lost = [row for row in probed if row.backbone.has_signal and not row.action.has_signal]
+    encoded = [row for row in probed if row.backbone.has_signal]
+    return next(iter((*lost, *encoded, *probed, *rows)), None)
+
+
+def opening_question(row: RetentionRow, name: str, grid: EpisodeGrid) -> Question | None:
+    """The first episode of the row's category with a picture, of this run by its name; None without one."""
+    cards = [card for card in grid.cards if card["run"] == name and card["category"] == row.category]
+    for card in cards:
+        if card["picture"] is not None:
+            return Question(card, f"data:image/webp;base64,{grid.picture(card)}")
+    return None
+
+
+def opening_curve(row: RetentionRow, table: RetentionTable, position: int) -> ReportFigure | None:
+    """Accuracy by layer of the row's category; None where it was not probed. position: of the run."""
+    results = table.results_of(row.run.location)
+    if results is None or row.backbone.score is None:
+        return None
+    output = "answer" if modes_of([row]) == "answers" else "action"
+    iterations = "best" if table.iterations == "all" else table.iterations
+    display = LayerCurveDisplay.from_results(results, row.category, row.view, iterations)
+    return ReportFigure(
+        "opening", f"Where the answer can be read: {title_of(row.category)}", "summary",
+        "How often a linear probe names the side of the correct picture, by layer: in the backbone, and where the "
+        f"{output} is made. {ONLY_FILLED}.",
+        position, partial(_together, display),
+    )  # fmt: skip
+
+
+def _together(display: LayerCurveDisplay) -> "Figure":
+    """All streams on the same axes, with a legend and no more."""
+    axes, figure = axes_for(None, 4.7, 3.1)
+    assert figure is not None
+    display.plot(axes)
+    axes.set_title("", loc="left")
+    axes.set_ylabel("held-out accuracy (%)", fontsize=8.5)
+    legend_above(figure, axes.get_legend_handles_labels()[0])
+    figure.caption = display.certificate.line  # type: ignore[attr-defined]
+    return figure
+
+
+@dataclass(frozen=True)
+class LabelSection:
+    """One label. run: its name, empty where the section is of all runs. measured: task and metric.
+
+    retention, sentences: its rows of the retention table, and what they say. pictures: by kind, see `arranged`.
+    probes: best sites and controls, a table per run. notes: what the probes say, and what was left out.
+    """
+
+    target: str
+    run: str
+    measured: str
+    retention: Table
+    sentences: tuple[str, ...]
+    pictures: list[list[Picture]]
+    probes: tuple[Table, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def tables(self) -> tuple[Table, ...]:
+        """All of them."""
+        return self.retention, *self.probes
+
+
+def label_sections(
+    runs: Sequence[RunReader],
+    table: RetentionTable,
+    exhibits: Sequence[ReportFigure],
+    names: Sequence[str],
+    places: tuple[str, ...],
+    of_one: str = "",
+) -> list[LabelSection]:
+    """Return a section per label of the table.
+
+    exhibits: its figures. names: of the runs. of_one: name of the run where sections are of one.
+    """
+    sections = []
+    for target in table.targets:
+        of_target = table.of_target(target)
+        probes = {name: table.results[str(run.location), target] for name, run in zip(names, runs, strict=True)}
+        several = len(probes) > 1
+        sections.append(
+            LabelSection(
+                target,
+                of_one,
+                _measured(next(iter(probes.values()))),
+                of_target.tables()["Retention"],
+                tuple(category.details for run in of_target.summary for category in run.categories),
+                arranged(exhibits, target, names, places),
+                tuple(
+                    _probes_table(results, f"Best sites and controls{f', {name}' if several else ''}")
+                    for name, results in probes.items()
+                ),
+                tuple(
+                    f"{name}: {sentence}" if several else sentence
+                    for name, results in probes.items()
+                    for sentence in best_sites_sentences(results)
+                ),
+            )
+        )
+    return sections
+
+
+def stored_label_sections(
+    runs: Sequence[RunReader], names: Sequence[str], places: tuple[str, ...]
+) -> list[LabelSection]:
+    """A section per run and label column of which the run has probes; none for other runs."""
+    sections = []
+    for run, name in zip(runs, names, strict=True):
+        of_one = name if len(runs) > 1 else ""
+        if targets := list(stored_targets(run)):
+            table = retention_table([run], target=targets)
+            sections += label_sections([run], table, collect_figures([run], table), [name], places, of_one)
+    return sections
+
+
+def _measured(results: ProbeResults) -> str:
+    settings = results.settings
+    curve = next(iter(results.curves.values()))
+    classes = f" of {len(curve.classes)} classes" if settings.task == "classes" else ""
+    return f"A {_TASKS[settings.task]} label{classes}; the score is {METRICS[settings.task]}."
+
+
+_TASKS: dict[Task, str] = {"binary": "binary", "classes": "categorical", "continuous": "continuous"}
+
+
+def _probes_table(results: ProbeResults, title: str) -> Table:
+    return replace(best_sites_table([results]), title=title)
 
 
 def write_report(

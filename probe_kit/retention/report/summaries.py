@@ -5,9 +5,8 @@ from dataclasses import dataclass
 
 from probe_kit._system.counting import counted
 from probe_kit._tables.numbers import p_text, percent
-from probe_kit.retention.columns.modes import RATE, modes_of
 from probe_kit.retention.columns.sentences import chance_only
-from probe_kit.retention.columns.text import is_vlm, model_name, title_of
+from probe_kit.retention.columns.text import RATE, is_vlm, model_name, modes_of, title_of
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.results.control_scores import Exceeds

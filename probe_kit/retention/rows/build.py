@@ -1,34 +1,48 @@
-"""The rows of one run, with the estimates that averages and differences are made of."""
+"""The rows of one run and their mean, with the estimates that averages and differences are made of."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import isfinite
-from typing import TYPE_CHECKING
+from operator import attrgetter
+from statistics import fmean
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from probe_kit.env.scoring.rules import DEFAULT_RULE
 from probe_kit.errors import UnknownSiteError
-from probe_kit.hooks.contract.sites import first_of
 from probe_kit.intervene.kinds.image_swap import ImageSwapEffect, stored_image_swaps
 from probe_kit.intervene.results.evidence import StoredEvidence, stored_other_readouts, stored_places, stored_ties
 from probe_kit.intervene.results.verdict import Places, UseVerdict, classify_use, control_for
-from probe_kit.retention.behaviour.success_rate import (
+from probe_kit.retention.behaviour import (
     SuccessRate,
+    ask_of,
     capture_only,
+    normalised_score,
+    read_by_clause,
     sensitivity,
     success_rate,
     success_share,
     units_of,
 )
-from probe_kit.retention.behaviour.vlm_answers import ask_of, read_by_clause
 from probe_kit.retention.choices import Iterations
-from probe_kit.retention.estimators.stream_scores import RowEstimates
+from probe_kit.retention.estimators import ACTION, BACKBONE, Limits, Rate, RowEstimates, StreamScores, limits
 from probe_kit.retention.rows.outcome_rules import OutcomeRuleScores, RunUnderRule
-from probe_kit.retention.rows.parts import AnswerStats, RunInfo, SwapEffect
 from probe_kit.retention.rows.probe_parts import number_or_none, with_probes
-from probe_kit.retention.rows.row import RetentionRow
+from probe_kit.retention.rows.row import (
+    MEAN,
+    ActionPart,
+    AnswerStats,
+    BackbonePart,
+    ControlScores,
+    RetentionPart,
+    RetentionRow,
+    RunInfo,
+    SwapEffect,
+)
 from probe_kit.runs.reader import RunReader
+from probe_kit.statistics.estimates.retention import retention
+from probe_kit.statistics.estimates.scores import Scores
 from probe_kit.statistics.estimates.verdict import ABSENT_BELOW
 from probe_kit.train.choices import CORRECT
 from probe_kit.train.results.probe_results import ProbeResults
@@ -127,7 +141,7 @@ def _row(
         view=view,
         target=CORRECT if results is None else results.settings.target,
         group=group,
-        run=run_info(run, results),
+        run=RunInfo.of(run, results),
         success=success,
         rules=rules,
         answers=_answers(run, episodes),
@@ -170,24 +184,6 @@ def add_image_swap(
     return replace(row, image_swap=effect)
 
 
-def run_info(run: RunReader, results: ProbeResults | None) -> RunInfo:
-    """Return the part of a row that names its run."""
-    return RunInfo(
-        location=str(run.location),
-        model=run.model,
-        label=run.label,
-        random_weights=run.random_weights,
-        weights_sha256=run.weights_sha256,
-        suite=run.suite,
-        mode="acts" if ask_of(run) is None else "answers",
-        action_stream=first_of("action", run.streams.values()),
-        settings=run.settings_sha256,
-        probes=None if results is None else results.key,
-        call=None if results is None else results.settings.call,
-        capture_only=capture_only(run.episodes),
-    )
-
-
 def _answers(run: RunReader, episodes: "pd.DataFrame") -> AnswerStats:
     ask = ask_of(run)
     if ask is None:
@@ -218,3 +214,142 @@ def _no_success(episodes: "pd.DataFrame", heard: bool) -> SuccessRate:
     reason = "" if heard else "n/a: the run keeps no trajectories, which this outcome rule needs"
     items, groups = int(episodes["item_id"].nunique()), np.unique(units_of(episodes)).size
     return SuccessRate(n_episodes=len(episodes), n_items=items, n_groups=groups, reason=reason)
+
+
+def mean_row(drawn: Sequence[RowWithEstimates], averaged: Sequence[str]) -> RetentionRow:
+    """The category average of rows of one run and view; retention is the ratio of the mean scores.
+
+    averaged: fields that are averaged over the categories that have them, as `part.field`; the columns declare
+    them, see `probe_kit.retention.columns.columns`. Intervals: of independent
+    categories, see `probe_kit.statistics.estimates`.
+    """
+    rows = [part.row for part in drawn]
+    estimates = [part.estimates for part in drawn]
+    probed = _probed(estimates)
+    first = rows[0]
+    means = _means(rows, averaged)
+    return RetentionRow(
+        category=MEAN,
+        view=first.view,
+        group=first.group,
+        categories=tuple(row.category for row in rows),
+        left_out=_left_out(rows),
+        run=first.run,
+        success=_success(rows, estimates, means["success"]),
+        rules=_rules(rows, estimates, means["rules"]),
+        answers=replace(first.answers, **means["answers"]),
+        backbone=BackbonePart(ci=_accuracy_limits(probed, BACKBONE), **means["backbone"]),
+        action=ActionPart(ci=_accuracy_limits(probed, ACTION), **means["action"]),
+        retention=_retention(rows, probed),
+        controls=ControlScores(
+            baselines=_mean_by_key([row.controls.baselines for row in rows]),
+            missing=_mean_by_key([row.controls.missing for row in rows]),
+            leaks=tuple(dict.fromkeys(name for row in rows for name in row.controls.leaks)),
+            untrained=first.controls.untrained,
+            **means["controls"],
+        ),
+        image_swap=SwapEffect(**means["image_swap"]),
+    )
+
+
+def _probed(estimates: Sequence[RowEstimates]) -> list[StreamScores]:
+    """Scores of the probed categories; none where they are of different streams."""
+    streams_of = [estimate.streams for estimate in estimates if estimate.streams is not None]
+    return streams_of if len({streams.names for streams in streams_of}) == 1 else []
+
+
+def _accuracy_limits(probed: Sequence[StreamScores], name: str) -> Limits | None:
+    if not probed or name not in probed[0].names:
+        return None
+    accuracies = [Rate(streams.accuracy(name), streams.interval(name)) for streams in probed]
+    return limits(Rate.mean(accuracies).interval)
+
+
+_PARTS = ("success", "rules", "answers", "backbone", "action", "controls", "image_swap")
+
+
+def _means(rows: Sequence[RetentionRow], averaged: Sequence[str]) -> dict[str, dict[str, Any]]:
+    """Return by part the averages of its fields."""
+    means: dict[str, dict[str, Any]] = {part: {} for part in _PARTS}
+    for path in averaged:
+        part, _, name = path.partition(".")
+        means[part][name] = _mean(rows, path)
+    return means
+
+
+def _success(
+    rows: Sequence[RetentionRow], estimates: Sequence[RowEstimates], means: dict[str, Any]
+) -> SuccessRate:
+    rates = [row.success.sr for row in rows if row.success.sr is not None]
+    return SuccessRate(
+        n_episodes=sum(row.success.n_episodes for row in rows),
+        n_items=sum(row.success.n_items for row in rows),
+        ci=_rate_limits(estimates, "sr"),
+        normalised_score=normalised_score(rates) if len(rates) == len(rows) else None,
+        **means,
+    )
+
+
+def _rules(
+    rows: Sequence[RetentionRow], estimates: Sequence[RowEstimates], means: dict[str, Any]
+) -> OutcomeRuleScores:
+    rules = [row.rules for row in rows]
+    sides = {of_category.idle_side for of_category in rules}
+    return OutcomeRuleScores(
+        rule=rules[0].rule,
+        rule_words=rules[0].rule_words,
+        last_steps=rules[0].last_steps,
+        n_answered=_sum([of_category.n_answered for of_category in rules]),
+        n_grasped=_sum([of_category.n_grasped for of_category in rules]),
+        sr_answered_ci=_rate_limits(estimates, "sr_answered"),
+        sr_grasped_ci=_rate_limits(estimates, "sr_grasped"),
+        idle_side=sides.pop() if len(sides) == 1 else "both",
+        sr_by_rule=_mean_by_key([of_category.sr_by_rule for of_category in rules]),
+        sr_by_epsilon=_mean_by_key([of_category.sr_by_epsilon for of_category in rules]),
+        behaviour=_mean_by_key([of_category.behaviour for of_category in rules]),
+        **means,
+    )
+
+
+def _left_out(rows: Sequence[RetentionRow]) -> tuple[str, ...]:
+    """Probed categories in which retention is not defined."""
+    return tuple(row.category for row in rows if row.view is not None and not row.retention.defined)
+
+
+def _retention(rows: Sequence[RetentionRow], probed: Sequence[StreamScores]) -> RetentionPart:
+    counted, missing = [row for row in rows if row.retention.defined], _left_out(rows)
+    if not probed or len(probed[0].names) < 2:
+        return RetentionPart(note=rows[0].retention.note)
+    ratio = retention(Scores.mean([streams.scores for streams in probed]))
+    note = f"published ratios without {', '.join(missing)}" if counted and missing else ""
+    return RetentionPart(
+        value=ratio.value,
+        ci=limits(ratio.interval),
+        published=_mean(counted, "retention.published"),
+        defined=bool(counted),
+        note=note if counted else rows[0].retention.note,
+    )
+
+
+def _rate_limits(estimates: Sequence[RowEstimates], name: str) -> Limits | None:
+    shares = [estimate.rates[name] for estimate in estimates if name in estimate.rates]
+    if not shares:
+        return None
+    return limits(Rate.mean([Rate(share.value, share.interval()) for share in shares]).interval)
+
+
+def _mean(rows: Sequence[RetentionRow], path: str) -> Any:
+    """Average of a field, as `part.field`, over the rows that have it; None if none has."""
+    read = attrgetter(path)
+    values = [value for row in rows if (value := read(row)) is not None]
+    return fmean(values) if values else None
+
+
+def _sum(values: Sequence[int | None]) -> int | None:
+    numbers = [value for value in values if value is not None]
+    return sum(numbers) if numbers else None
+
+
+def _mean_by_key(columns: Sequence[dict[str, float]]) -> dict[str, float]:
+    """Average per key, for the keys that all have."""
+    return {key: fmean(column[key] for column in columns) for key in columns[0] if all(key in c for c in columns)}

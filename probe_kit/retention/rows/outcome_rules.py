@@ -8,9 +8,8 @@ import numpy as np
 
 from probe_kit.env.scoring.rules import DEFAULT_RULE, RULES, rule_of
 from probe_kit.errors import UsageError
-from probe_kit.retention.behaviour.success_rate import capture_only, group_names, shares_of
-from probe_kit.retention.behaviour.vlm_answers import ask_of
-from probe_kit.retention.estimators.stream_scores import Limits, limits
+from probe_kit.retention.behaviour import ask_of, capture_only, group_names, shares_of
+from probe_kit.retention.estimators import Limits, limits
 from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.estimates.shares import Share
 

@@ -1,20 +1,248 @@
 """One row per run, category and view: behaviour, probes and retention side by side."""
 
 from dataclasses import dataclass, field
+from typing import Literal, Self
 
-from probe_kit.retention.behaviour.success_rate import SuccessRate
+from probe_kit.hooks.contract.sites import first_of, label_of
+from probe_kit.intervene.results.verdict import UseVerdict
+from probe_kit.retention.behaviour import SuccessRate, ask_of, capture_only
+from probe_kit.retention.estimators import Limits
 from probe_kit.retention.rows.outcome_rules import OutcomeRuleScores
-from probe_kit.retention.rows.parts import (
-    ActionPart,
-    AnswerStats,
-    BackbonePart,
-    ControlScores,
-    RetentionPart,
-    RunInfo,
-    SwapEffect,
-)
+from probe_kit.runs.reader import RunReader, full_name
+from probe_kit.statistics.estimates.verdict import Verdict
 from probe_kit.train.choices import CORRECT, SIDES, Task
 from probe_kit.train.crossval.task_scores import METRICS
+from probe_kit.train.results.control_scores import has_signal
+from probe_kit.train.results.probe_results import ProbeResults
+
+Mode = Literal["answers", "acts"]
+"""What the model of a run does: it answers questions about pictures (a VLM run), or acts (a policy run)."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunInfo:
+    """The run that the numbers of a row are of.
+
+    location: folder or URL. label: what the run is called in tables and legends. settings: sha256 of the run's
+    settings; probes: key of its probe results. action_stream: `expert`, or `action` in a policy without one, whose
+    iterations are action tokens. call: the captured inference that was probed, from 0. capture_only: activations
+    were captured and the model did not act.
+    """
+
+    location: str
+    model: str
+    random_weights: bool
+    weights_sha256: str | None
+    suite: str
+    settings: str
+    probes: str | None
+    mode: Mode = "acts"
+    label: str = ""
+    action_stream: str | None = None
+    call: int | None = None
+    capture_only: bool = False
+
+    @classmethod
+    def of(cls, run: RunReader, results: ProbeResults | None) -> Self:
+        """Return the part of a row that names its run."""
+        return cls(
+            location=str(run.location),
+            model=run.model,
+            label=run.label,
+            random_weights=run.random_weights,
+            weights_sha256=run.weights_sha256,
+            suite=run.suite,
+            mode="acts" if ask_of(run) is None else "answers",
+            action_stream=first_of("action", run.streams.values()),
+            settings=run.settings_sha256,
+            probes=None if results is None else results.key,
+            call=None if results is None else results.settings.call,
+            capture_only=capture_only(run.episodes),
+        )
+
+    @property
+    def name(self) -> str:
+        """The label, marked if the weights are random or the model did not act."""
+        return full_name(self.label or self.model, self.random_weights, self.capture_only)
+
+    @property
+    def action_name(self) -> str:
+        """The name of `action_stream` in a sentence."""
+        return label_of(self.action_stream or "expert")
+
+
+@dataclass(frozen=True, kw_only=True)
+class AnswerStats:
+    """The way in which the model of a VLM run was asked, and what else its answers say; all None for a policy run.
+
+    asked_for: `target`, `distractor` or `absent`. score: by which of its scores `success.sr` is. accuracy_text,
+    accuracy_logits, accuracy_order_balanced: shares that are right by each score. share_unparsable: answers in
+    text that could not be parsed. share_by_clause: those that were found among other words; accuracy_strict:
+    accuracy_text with these as unparsable, where they are many; both None for runs that do not store it.
+    option_mass: mean probability of the admissible answers together. letter_bias: mean logit by which the option
+    named first is preferred. share_near_tie: choices that rounding may have made.
+    """
+
+    prompt: str | None = None
+    picture: str | None = None
+    picture_size: str | None = None
+    asked_for: str | None = None
+    score: str | None = None
+    accuracy_text: float | None = None
+    accuracy_logits: float | None = None
+    accuracy_order_balanced: float | None = None
+    share_unparsable: float | None = None
+    share_by_clause: float | None = None
+    accuracy_strict: float | None = None
+    option_mass: float | None = None
+    letter_bias: float | None = None
+    share_near_tie: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class SwapEffect:
+    """Effect of exchanging the two pictures, if `probe-kit intervene` was run.
+
+    follow_rate, reversal_rate: shares of episodes; net_follow_rate: their difference; reach_share: displacement
+    toward the correct picture in units of the policy's reach; follow_p: exact, one-sided;
+    see `intervene.ImageSwapEffect`. use: the verdict of that, the row's own probes and stored interchanges.
+    """
+
+    follow_rate: float | None = None
+    reversal_rate: float | None = None
+    net_follow_rate: float | None = None
+    net_follow_rate_ci: Limits | None = None
+    reach_share: float | None = None
+    reach_share_ci: Limits | None = None
+    follow_p: float | None = None
+    use: UseVerdict | None = None
+
+    @property
+    def is_used(self) -> bool:
+        """Whether the verdict is *used*, wholly and toward the correct picture."""
+        return self.use is not None and self.use.behaviour == "used" and not self.use.reversed
+
+    @property
+    def explanation(self) -> str:
+        """The evidence of the verdict; empty without one."""
+        return "" if self.use is None else self.use.explanation
+
+
+@dataclass(frozen=True, kw_only=True)
+class StreamPart:
+    """The scores of probes of one stream.
+
+    score: accuracy of the sites that the inner folds choose, on the outer folds; balanced between the sides,
+    so that chance is one half. ci: its 95 % interval. peak: accuracy of the site that is best on all of them,
+    which is too high by the luck of being chosen. at_most: an upper 95 % limit of the best site's accuracy.
+    verdict: `shown` (family-wise above chance, and above every control that was run), `absent` (not shown,
+    `at_most` below a bound, and the bound findable by so many items), or `not shown`. site, layer, depth: the
+    first of the best sites, a place without an interval of its own; ties: how many others are as accurate.
+    p_fwe: of that site, family-wise. exceeds: whether
+    it is better than `chance` and each control; None for one that was not run. selectivity: its accuracy above
+    that of the same probe on random labels of items. minus_untrained: how much more accurate it is than the
+    untrained network's best. remedy: what to do where no p can be below 0.05; empty where one can.
+
+    Of a target that is no side, peak is the metric of the site with the largest score above its own chance, and
+    chance the mean score of the label permutations there. above: score above chance of the sites that the inner
+    folds choose, on the outer folds; above_ci: its 95 % interval, Student's. Score, verdict, at_most, selectivity
+    and minus_untrained are of sides alone.
+    """
+
+    stream: str | None = None
+    score: float | None = None
+    ci: Limits | None = None
+    peak: float | None = None
+    chance: float | None = None
+    above: float | None = None
+    above_ci: Limits | None = None
+    at_most: float | None = None
+    verdict: Verdict | None = None
+    site: str | None = None
+    layer: int | None = None
+    depth: float | None = None
+    ties: int | None = None
+    p_fwe: float | None = None
+    exceeds: dict[str, bool | None] = field(default_factory=dict)
+    selectivity: float | None = None
+    minus_untrained: float | None = None
+    minus_untrained_ci: Limits | None = None
+    remedy: str = ""
+
+    @property
+    def has_signal(self) -> bool:
+        """Whether it is better than chance and than every control that was run."""
+        return bool(self.exceeds) and has_signal(self.exceeds)
+
+    @property
+    def is_controlled(self) -> bool:
+        """Whether its best site was compared with a control, and not with chance alone."""
+        return any(better is not None for name, better in self.exceeds.items() if name != "chance")
+
+    @property
+    def missed(self) -> tuple[str, ...]:
+        """The names of chance and controls that its best site is not shown to exceed."""
+        return tuple(
+            name for name, better in self.exceeds.items() if not better and (better is False or name == "chance")
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class BackbonePart(StreamPart):
+    """The scores of probes of the backbone; see `StreamPart`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ActionPart(StreamPart):
+    """The scores of probes where the action is made; see `StreamPart`.
+
+    iteration: the flow-matching step or action token of the site. first_peak, first_layer: of the best layer at
+    the first iteration, which has seen no action. All three are None where the stream runs once.
+    """
+
+    iteration: int | None = None
+    first_peak: float | None = None
+    first_layer: int | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class RetentionPart:
+    """Share of the backbone's signal that can be read where the action is made.
+
+    value: score of the action above one half over that of the backbone; in a mean the ratio of the mean scores of
+    all probed categories. ci: its 95 % interval, (None, None) where the backbone is not known well enough to
+    divide by. published: the ratio of the peaks; in a mean the mean of these ratios over the categories whose
+    backbone signal is shown; of sides alone. defined: whether the backbone's signal is shown, in a mean in any
+    category; note: why not, in few words. reason: of a target that is no side the same with what was found, what
+    was expected and what to do.
+    """
+
+    value: float | None = None
+    ci: Limits | None = None
+    published: float | None = None
+    defined: bool = False
+    note: str = "n/a (no probes)"
+    reason: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ControlScores:
+    """The scores that those of probes are compared with.
+
+    n_groups: independent groups of items. n_samples: episodes, or inferences of them, that were probed. missing:
+    by side, the share of items without their episode of that side. probe_minus_sr: backbone score − success rate.
+    baselines: accuracy of each control that never sees the model; leaks: those above chance. untrained: name of
+    the untrained network's run.
+    """
+
+    n_groups: int | None = None
+    n_samples: int | None = None
+    missing: dict[str, float] = field(default_factory=dict)
+    probe_minus_sr: float | None = None
+    baselines: dict[str, float] = field(default_factory=dict)
+    leaks: tuple[str, ...] = ()
+    untrained: str | None = None
+
 
 MEAN = "mean"
 """Category of the rows that average over categories."""

@@ -10,7 +10,7 @@ from probe_kit.env.scoring.events import EVENTS, Events
 from probe_kit.env.scoring.rules import RULES, judge, rule_of
 from probe_kit.env.scoring.trajectory import Trajectory
 from probe_kit.errors import RunDamagedError
-from probe_kit.retention.behaviour.vlm_answers import SCORES
+from probe_kit.retention.behaviour import SCORES
 from probe_kit.runs.layout import FRAME_COLUMNS
 from probe_kit.runs.thumbnails import EpisodeFrames, episode_frames
 from probe_kit.suite.pictures import picture_size

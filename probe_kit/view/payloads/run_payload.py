@@ -16,8 +16,8 @@ from probe_kit.retention.columns.columns import (
     USED,
     Column,
 )
-from probe_kit.retention.estimators.stream_scores import Limits
-from probe_kit.retention.rows.parts import StreamPart
+from probe_kit.retention.estimators import Limits
+from probe_kit.retention.rows.row import StreamPart
 from probe_kit.runs.growth import flat_settings
 from probe_kit.statistics.estimates.balanced import CHANCE
 from probe_kit.suite.categories import category_of

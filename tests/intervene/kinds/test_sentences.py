@@ -23,7 +23,7 @@ from probe_kit.intervene.kinds.steer import Steering
 from probe_kit.intervene.outcomes import CLEAN, ConditionOutcomes
 from probe_kit.intervene.patching.attribution import AttributionEffect
 from probe_kit.intervene.results.verdict import UseVerdict, classify_use
-from probe_kit.retention.columns.findings import MOST_NUMBERS, MOST_WORDS, count_words
+from probe_kit.retention.columns.summary import MOST_NUMBERS, MOST_WORDS, count_words
 
 SWAPS = {
     "follows": (0.92, 0.02, (0.6, 1.0), 0.001, 1.0, 0.9, (0.8, 1.0)),

@@ -7,7 +7,7 @@ from scipy.stats import beta, binomtest, t
 
 from probe_kit.errors import SceneError, UsageError
 from probe_kit.retention import Regime, chance_margin, normalised_score, sensitivity, success_rate
-from probe_kit.retention.behaviour.success_rate import paired_items, regime
+from probe_kit.retention.behaviour import paired_items, regime
 
 Outcomes = Callable[..., pd.DataFrame]
 

@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 
 from probe_kit.errors import UsageError
-from probe_kit.retention.behaviour.success_rate import success_rate
+from probe_kit.retention.behaviour import success_rate
 from probe_kit.retention.columns.comparisons import wording_tables
 from probe_kit.retention.compare.compare import Difference
 from probe_kit.retention.compare.pairing import compare_wordings

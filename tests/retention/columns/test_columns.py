@@ -12,7 +12,7 @@ from rich.console import Console
 from probe_kit.retention import Difference, RetentionRow, RetentionTable, retention_table
 from probe_kit.retention.columns.columns import TABLES, Column, ColumnGroup, all_columns, averaged_fields, share
 from probe_kit.retention.columns.tables import retention_tables
-from probe_kit.retention.report.words import words_of
+from probe_kit.retention.report.parts import words_of
 from probe_kit.train import ArrayRun
 
 ProbedRun = Callable[..., ArrayRun]

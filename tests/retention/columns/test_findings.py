@@ -9,10 +9,9 @@ from typing import Any
 import pytest
 
 from probe_kit.intervene.results.verdict import UseVerdict
-from probe_kit.retention.behaviour.success_rate import Regime
-from probe_kit.retention.columns.findings import MOST_NUMBERS, MOST_WORDS, count_words, finding, next_step
-from probe_kit.retention.rows.parts import ActionPart, BackbonePart, SwapEffect
-from probe_kit.retention.rows.row import RetentionRow
+from probe_kit.retention.behaviour import Regime
+from probe_kit.retention.columns.summary import MOST_NUMBERS, MOST_WORDS, count_words, finding, next_step
+from probe_kit.retention.rows.row import ActionPart, BackbonePart, RetentionRow, SwapEffect
 from tests.retention.columns.test_summary import answers, row
 
 

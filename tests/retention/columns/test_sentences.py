@@ -10,11 +10,10 @@ import pytest
 
 from probe_kit.intervene.kinds.image_swap import ImageSwapEffect
 from probe_kit.intervene.results.verdict import Places
-from probe_kit.retention.behaviour.success_rate import Regime, SuccessRate
+from probe_kit.retention.behaviour import Regime, SuccessRate
 from probe_kit.retention.columns.sentences import conclusion, describe_category, verdict
 from probe_kit.retention.rows.build import add_image_swap
-from probe_kit.retention.rows.parts import ActionPart, BackbonePart, RunInfo
-from probe_kit.retention.rows.row import RetentionRow
+from probe_kit.retention.rows.row import ActionPart, BackbonePart, RetentionRow, RunInfo
 
 RUN = RunInfo(
     location="run", model="pi0-tiny", random_weights=False, weights_sha256=None, suite="suite@1", settings="r",

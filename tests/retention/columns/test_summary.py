@@ -9,10 +9,11 @@ from rich.console import Console
 
 from probe_kit.intervene import Behaviour, UseVerdict
 from probe_kit.retention import RetentionRow, RetentionTable
-from probe_kit.retention.behaviour.success_rate import Regime, SuccessRate
+from probe_kit.retention.behaviour import Regime, SuccessRate
 from probe_kit.retention.columns.summary import HEADINGS, MARK, summarise_runs, summary_table
 from probe_kit.retention.report.summaries import read_run
-from probe_kit.retention.rows.parts import (
+from probe_kit.retention.rows.row import (
+    MEAN,
     ActionPart,
     AnswerStats,
     BackbonePart,
@@ -20,7 +21,6 @@ from probe_kit.retention.rows.parts import (
     RunInfo,
     SwapEffect,
 )
-from probe_kit.retention.rows.row import MEAN
 
 
 def row(mode: str, category: str, sr: float | None = 0.5, **run: Any) -> RetentionRow:

@@ -13,7 +13,7 @@ import pytest
 from rich.console import Console
 
 from probe_kit.errors import OtherFramesError, UsageError
-from probe_kit.retention.behaviour.vlm_answers import scored
+from probe_kit.retention.behaviour import scored
 from probe_kit.retention.columns.comparisons import known_used_tables
 from probe_kit.retention.compare.known_used import CategoryCounts, encoded_decisions, match_runs
 from tests.retention.asked_runs import SaidRun, acted, asked, probes

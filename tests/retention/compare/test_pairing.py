@@ -14,7 +14,7 @@ import pytest
 
 from probe_kit.errors import UsageError
 from probe_kit.retention import RetentionTable, retention_table
-from probe_kit.retention.behaviour.run_labels import full_names
+from probe_kit.retention.behaviour import full_names
 from probe_kit.retention.compare.compare import Difference
 from probe_kit.train import ArrayRun, load_results, save_results
 from tests.retention.asked_runs import SUITE, SaidRun, asked, episodes

@@ -15,7 +15,7 @@ from probe_kit.env.scoring.events import EVENTS
 from probe_kit.env.scoring.trajectory import CHANNELS, Trajectory
 from probe_kit.errors import UsageError
 from probe_kit.retention.displays import CallCurveDisplay, aligned_curves, call_curves
-from probe_kit.retention.estimators.by_call import CallCurves, event_calls
+from probe_kit.retention.displays.call_curves import CallCurves, event_calls
 from probe_kit.train import ArrayRun, ProbeCurve, ProbeResults, load_results
 
 EXECUTED = 4

@@ -12,8 +12,7 @@ from scipy import stats
 from probe_kit.errors import UsageError
 from probe_kit.hooks import Site
 from probe_kit.retention import best_site, measure_retention
-from probe_kit.retention.estimators.retention import NO_SCORES, Retention, curve_scores
-from probe_kit.retention.estimators.stream_scores import StreamScores
+from probe_kit.retention.estimators import NO_SCORES, Retention, StreamScores, curve_scores
 from probe_kit.train import ProbeCurve
 
 CurveOf = Callable[..., ProbeCurve]

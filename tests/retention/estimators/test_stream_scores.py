@@ -9,9 +9,8 @@ import pandas as pd
 import pytest
 from scipy import stats
 
-from probe_kit.retention.behaviour.success_rate import success_share
-from probe_kit.retention.estimators.retention import curve_scores
-from probe_kit.retention.estimators.stream_scores import PooledScores, Rate, StreamScores, limits, score_streams
+from probe_kit.retention.behaviour import success_share
+from probe_kit.retention.estimators import PooledScores, Rate, StreamScores, curve_scores, limits, score_streams
 from probe_kit.statistics.estimates.retention import retention, retention_difference
 from probe_kit.statistics.estimates.scores import Scores
 from probe_kit.statistics.estimates.shares import Share

@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 
 from probe_kit.retention import RetentionTable, retention_table
-from probe_kit.retention.behaviour.success_rate import Regime
-from probe_kit.retention.formats.as_paper import EPSILON, paper_regime, paper_retention
-from probe_kit.retention.rows.parts import ActionPart, BackbonePart
+from probe_kit.retention.behaviour import Regime
+from probe_kit.retention.formats import EPSILON, paper_regime, paper_retention
+from probe_kit.retention.rows.row import ActionPart, BackbonePart
 from tests.study.paper_runs import paper, run_of
 
 WORDS = {Regime.KNOWLEDGE: "knowledge", Regime.NO_RELIABLE_KNOWLEDGE: "none", Regime.FAILURE: "failure"}

@@ -11,8 +11,8 @@ import pytest
 from matplotlib.figure import Figure
 
 from probe_kit.retention.displays.base.report_figure import ReportFigure
-from probe_kit.retention.report import pictures
-from probe_kit.retention.report.pictures import compact_svg, data_uri
+from probe_kit.retention.report import parts
+from probe_kit.retention.report.parts import compact_svg, data_uri
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -77,6 +77,6 @@ def test_a_figure_is_vectors_with_a_transparent_ground_and_no_path() -> None:
 
 
 def test_a_large_figure_is_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pictures, "SVG_LIMIT", 1000)
+    monkeypatch.setattr(parts, "SVG_LIMIT", 1000)
     source, _ = data_uri(exhibit())
     assert source.startswith("data:image/webp;base64,")

@@ -17,11 +17,10 @@ from probe_kit.cli import app
 from probe_kit.errors import UnknownSiteError, UsageError
 from probe_kit.hooks import Site
 from probe_kit.retention import measure_retention, retention_table
-from probe_kit.retention.behaviour.success_rate import SuccessRate, capture_only
-from probe_kit.retention.columns.label_sentences import label_finding
-from probe_kit.retention.rows.parts import RunInfo
+from probe_kit.retention.behaviour import SuccessRate, capture_only
+from probe_kit.retention.columns.sentences import label_finding
 from probe_kit.retention.rows.probe_parts import with_corrected_p, with_probes
-from probe_kit.retention.rows.row import RetentionRow
+from probe_kit.retention.rows.row import RetentionRow, RunInfo
 from probe_kit.runs import Run, open_run
 from probe_kit.statistics.estimates.retention import OTHER_TRAINING
 from probe_kit.train import (

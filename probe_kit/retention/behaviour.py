@@ -1,24 +1,105 @@
-"""The success rate of a policy, whether it differs from guessing, and on which side the policy errs."""
+"""The behaviour of a run: its name, success rate and answers, and settings that rows of one table should share."""
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
+from functools import cached_property
+from pathlib import Path
 from statistics import fmean
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from probe_kit.env.scoring.outcome import SENSITIVITY_RADII, success_at
 from probe_kit.errors import UsageError
 from probe_kit.runs.layout import CAPTURE_ONLY
-from probe_kit.runs.reader import check_several_wordings
+from probe_kit.runs.reader import RunReader, check_several_wordings, full_name
 from probe_kit.statistics.estimates.shares import Share
 from probe_kit.statistics.paired_tests import heads_p
 from probe_kit.statistics.significance import chance_margin
+from probe_kit.train.choices import CORRECT, SIDES
+from probe_kit.train.results.probe_results import ProbeResults
+from probe_kit.train.settings import ProbeSettings
 
 if TYPE_CHECKING:
     import pandas as pd
     from numpy.typing import NDArray
+
+
+SCORES: Mapping[str, tuple[str, str]] = {
+    "text": ("outcome", "side_placed"),
+    "logits": ("outcome_logits", "side_logits"),
+    "order-balanced": ("outcome_debiased", "side_debiased"),
+}
+"""By score, the columns of outcome and side."""
+
+
+def ask_of(run: RunReader) -> Mapping[str, Any] | None:
+    """Return how a run was asked, None for one that acts."""
+    ask: Mapping[str, Any] | None = run.settings.get("ask")
+    return ask
+
+
+MANY_BY_CLAUSE = 0.05
+"""Share of answers found among other words from which the accuracy without them is shown too."""
+
+
+def read_by_clause(episodes: "pd.DataFrame", text: "pd.Series[str]") -> tuple[float, float | None]:
+    """The share of answers that were found among other words, and the accuracy with these as unparsable.
+
+    text: outcomes of the answers in text. The accuracy is None where the share is `MANY_BY_CLAUSE` or less.
+    """
+    in_clause = episodes["parse_tier"] == "clause"
+    share = float(in_clause.mean())
+    return share, float(((text == "correct") & ~in_clause).mean()) if share > MANY_BY_CLAUSE else None
+
+
+class ScoredAnswers:
+    """A VLM run, read by one of its scores; everything else is the run's own.
+
+    with_side_words: keep items in whose name a side stands, such as "no left turn sign": answers and
+    names of these are not distinguishable.
+    """
+
+    def __init__(self, run: RunReader, score: str = "text", with_side_words: bool = False) -> None:
+        if score not in SCORES:
+            raise UsageError(f"score is {score!r}; expected one of {', '.join(SCORES)}")
+        self._run, self.score, self._with_side_words = run, score, with_side_words
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._run, name)
+
+    @cached_property
+    def episodes(self) -> "pd.DataFrame":
+        """Return the episodes of the run with `outcome` and `side_placed` by the score; `outcome_text` stays."""
+        episodes = self._run.episodes
+        if not self._with_side_words and "side_word" in episodes:
+            episodes = episodes[~episodes["side_word"].astype(bool)]
+        outcome, side = SCORES[self.score]
+        return episodes.assign(
+            outcome_text=episodes["outcome"], outcome=episodes[outcome], side_placed=episodes[side]
+        )
+
+
+def scored(run: RunReader, score: str, with_side_words: bool = False) -> RunReader:
+    """A VLM run by a score; a policy run as it is. Raises UsageError for an unknown score."""
+    if score not in SCORES:
+        raise UsageError(f"score is {score!r}; expected one of {', '.join(SCORES)}")
+    if ask_of(run) is None:
+        return run
+    wrapped: RunReader = ScoredAnswers(run, score, with_side_words)
+    return wrapped
+
+
+def left_out(runs: Sequence[RunReader]) -> list[str]:
+    """A sentence per VLM run whose items with side words are not counted."""
+    return [
+        f"{run.location}: {missing} episodes are left out because a side stands in the name that was asked for, "
+        "such as 'no left turn sign' (--with-side-words counts them)."
+        for run in runs
+        if isinstance(run, ScoredAnswers) and (missing := len(run._run.episodes) - len(run.episodes))
+    ]
 
 
 class Regime(StrEnum):
@@ -255,3 +336,100 @@ def paired_items(episodes: "pd.DataFrame") -> PairedItems:
 
 def _rate(values: "pd.Series[bool] | pd.Series[float]") -> float | None:
     return float(values.mean()) if len(values) else None
+
+
+_MARKS: Sequence[Callable[[RunReader, int], str]] = (
+    lambda run, _: run.settings_sha256[:6],
+    lambda run, _: run.location.name,
+    lambda _, number: str(number),
+)
+"""What is added to a name that comes twice, one after the other, until none does: settings, folder, number."""
+
+
+def distinct_labels(runs: Sequence[RunReader], names: Mapping[str, str] | None = None) -> dict[str, str]:
+    """Return the label of each run by its location, so that no two full names are equal.
+
+    names: labels by location instead of the runs' own. Runs of one name get the hash of their settings, where that
+    is the same their folders, and else a number. Raises UsageError for a label of a run that is none of these.
+    """
+    labels = {str(run.location): run.label for run in runs}
+    if unknown := sorted((names or {}).keys() - labels.keys()):
+        raise UsageError(f"labels are given for {', '.join(unknown)}; the runs are {', '.join(labels)}")
+    labels |= names or {}
+    for mark in _MARKS:
+        doubles = _doubles(runs, labels)
+        for number, run in enumerate(runs, 1):
+            if str(run.location) in doubles:
+                labels[str(run.location)] += f" · {mark(run, number)}"
+    return labels
+
+
+def full_names(runs: Sequence[RunReader], labels: Mapping[str, str] | None = None) -> list[str]:
+    """The full names of runs, in order; labels: by location, distinct ones by default."""
+    called = distinct_labels(runs) if labels is None else labels
+    return [full_name(called[str(run.location)], run.random_weights, capture_only(run.episodes)) for run in runs]
+
+
+def _doubles(runs: Sequence[RunReader], labels: Mapping[str, str]) -> set[str]:
+    names = full_names(runs, labels)
+    often = Counter(names)
+    return {str(run.location) for run, name in zip(runs, names, strict=True) if often[name] > 1}
+
+
+_COMPARED: Mapping[str, Callable[[ProbeSettings], str]] = {
+    "targets": lambda settings: settings.target,
+    "views": lambda settings: ", ".join(settings.views),
+    "label permutations": lambda settings: str(settings.permutations),
+    "label permutations of token views": lambda settings: str(settings.token_permutations),
+    "captured inferences": lambda settings: str(settings.call),
+    "seeds": lambda settings: str(settings.seed),
+    "categories": lambda settings: ", ".join(settings.categories),
+}
+
+
+def mixed_episodes(runs: Sequence[RunReader]) -> list[str]:
+    """A sentence for every run whose episodes were not all made by the same device kind and versions."""
+    return [
+        f"{run.location} is mixed: its episodes were made with other {', '.join(mixed)}, which changes numbers "
+        "(--allow-mixed)."
+        for run in runs
+        if (mixed := run.mixed)
+    ]
+
+
+def chosen_wordings(runs: Sequence[RunReader]) -> list[str]:
+    """A sentence for every run that was asked in several wordings: which one its rows are of."""
+    return [
+        f"Rows of {run.location} are of the wording {run.episodes['wording'].iloc[0]!r}; it was asked in "
+        f"{', '.join(names)} (--wording)."
+        for run in runs
+        if (names := run.wordings)
+    ]
+
+
+def mixed_settings(results: Mapping[str, ProbeResults], views: Sequence[str] | None = None) -> list[str]:
+    """A sentence if the probes of several runs were not fitted alike, and one for labels that are not the answer.
+
+    views: those that are shown, if not all are; then it does not matter which others there are.
+    """
+    differences = []
+    for name, value in _COMPARED.items():
+        if name == "views" and views is not None:
+            continue
+        runs: dict[str, list[str]] = {}
+        for run, probes in results.items():
+            runs.setdefault(value(probes.settings), []).append(Path(run).name)
+        if len(runs) > 1:
+            parts = (f"{setting} ({', '.join(names)})" for setting, names in runs.items())
+            differences.append(f"{name} {' against '.join(parts)}")
+    labels = {probes.settings.target for probes in results.values()} - {CORRECT}
+    notes = [f"Probes were asked for the target {label!r}: {SIDES[label]}." for label in sorted(labels)]
+    calls = {probes.settings.call for probes in results.values()} - {0}
+    notes += [f"Probes are of captured inference {call}, counted from 0." for call in sorted(calls)]
+    if not differences:
+        return notes
+    return [
+        *notes,
+        f"The rows mix probe settings: {'; '.join(differences)}. Compare them with care, or fit all runs alike; "
+        "`probe-kit run show RUN` lists what a run has, --probes RUN=KEY chooses.",
+    ]

@@ -1,1 +1,0 @@
-"""The behaviour of a run: success rates, answers, wordings."""

@@ -1,1 +1,0 @@
-"""The table as text, Markdown, LaTeX, HTML, JSON and data frame."""
