@@ -37,8 +37,7 @@ from torch import Tensor
 from probe_kit.extract.rollout.capturing import Capturer, stored_streams
 from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
 from probe_kit.hooks import capture, pool
-from probe_kit.hooks.contract.sites import Site
-from probe_kit.hooks.contract.views import view_names
+from probe_kit.hooks.contract.sites import Site, view_names
 
 WAITS = ("cudaStreamSynchronize", "cudaDeviceSynchronize", "cudaEventSynchronize", "aten::item")
 Output = NDArray[np.float32]

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from math import ceil
 
 from probe_kit.env import SceneSpec
-from probe_kit.hooks.contract.views import view_names
+from probe_kit.hooks.contract.sites import view_names
 from probe_kit.hooks.registry import known_families
 from probe_kit.runs.layout import StoredStream
 

@@ -17,7 +17,7 @@ from PIL import Image, ImageDraw
 
 from probe_kit.env import Act2AnswerEnv, SceneSpec, ScriptedExpert
 from probe_kit.env.scene import FLOOR_COLOR, INVISIBLE, TABLE_COLOR, Scene
-from probe_kit.env.simulation.camera import Picture
+from probe_kit.env.simulation import Picture
 
 SPEC = SceneSpec(start_jitter=0.02, start_jitter_yaw=1.5, early_stop=True)
 OBSERVE_EVERY = 5

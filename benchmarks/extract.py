@@ -24,9 +24,9 @@ from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
 from probe_kit.extract.rollout.episode_loop import Rollout
 from probe_kit.hooks import Observation
 from probe_kit.hooks.contract.sites import Site
-from probe_kit.models.embedded import pi0_tiny
-from probe_kit.models.initialisation import initialise
-from probe_kit.models.lerobot.pi0 import GemmaSize, Pi0Size, SiglipSize, build_pi0
+from probe_kit.models.building import initialise
+from probe_kit.models.embedded import tiny
+from probe_kit.models.pi0 import GemmaSize, Pi0Size, SiglipSize, build_pi0
 from probe_kit.runs import open_run, seal
 from probe_kit.runs.layout import CODECS, StoredStream
 from probe_kit.runs.store import locate
@@ -153,11 +153,11 @@ def write_mid_sized(folder: Path) -> None:
         vlm=GemmaSize(width=512, depth=10, mlp_dim=2048, num_heads=8, num_kv_heads=1, head_dim=64),
         expert=GemmaSize(width=384, depth=10, mlp_dim=1536, num_heads=8, num_kv_heads=1, head_dim=64),
         vision=SiglipSize(hidden=256, layers=6, heads=4, inter=1024, patch=16),
-        vocab_size=pi0_tiny.SIZE.vocab_size,
+        vocab_size=tiny.SIZE.vocab_size,
     )
-    policy = build_pi0(pi0_tiny.new_pi0_tiny(0).config, size)
+    policy = build_pi0(tiny.new_pi0_tiny(0).config, size)
     initialise(policy, 0)
-    pi0_tiny.write_checkpoint(folder, policy, pi0_tiny.GUESSED, "random, for a benchmark")
+    tiny.write_checkpoint(folder, policy, tiny.GUESSED, "random, for a benchmark")
     (folder / "dims.json").write_text(json.dumps(size.to_json()), encoding="utf-8")
 
 

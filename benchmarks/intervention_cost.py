@@ -24,8 +24,7 @@ import numpy as np
 from capture_subjects import LARGER, subject
 
 from probe_kit.hooks import Observation, Policy, Site, capture, gradients_at, load_policy
-from probe_kit.hooks.capturing.edit_engine import apply_patch, apply_patches
-from probe_kit.hooks.capturing.token_edits import ReplaceWith, TokenSelection
+from probe_kit.hooks.capturing.edits import ReplaceWith, TokenSelection, apply_patch, apply_patches
 from probe_kit.hooks.contract.sites import KV
 
 EMBEDDED = "pi0-tiny"

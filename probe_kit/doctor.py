@@ -125,7 +125,7 @@ def _disk() -> Finding:
 def draw_scene() -> dict[str, Any]:
     """Draw one picture of the default scene, as an episode does. Raises SceneError if it shows nothing."""
     from probe_kit.env import Act2AnswerEnv
-    from probe_kit.env.simulation.bullet import import_pybullet
+    from probe_kit.env.simulation import import_pybullet
 
     env = Act2AnswerEnv()
     try:

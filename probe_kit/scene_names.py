@@ -7,4 +7,4 @@ SceneName = Literal["bridge", "vl-think", "frontal", "act2answer"]
 ArmName = Literal["panda", "widowx"]
 Rendering = Literal["raw", "visual-matching"]
 RuleName = Literal["disc", "box", "released-on-tile"]
-"""The outcome rules; `probe_kit.env.scoring.rules.RULES` says what each counts."""
+"""The outcome rules; `probe_kit.env.scoring.RULES` says what each counts."""

@@ -47,7 +47,7 @@ def molmoact2() -> dict[str, torch.Tensor]:
     from lerobot.policies.molmoact2.molmoact2_hf_model.configuration_molmoact2 import MolmoAct2Config
     from lerobot.policies.molmoact2.molmoact2_hf_model.modeling_molmoact2 import MolmoAct2ForConditionalGeneration
 
-    from probe_kit.models.lerobot.molmoact2 import RELEASED
+    from probe_kit.hooks.families.molmoact2.adapter import RELEASED
 
     torch.set_default_dtype(torch.bfloat16)  # buffers that are computed in float32 stay so
     network = MolmoAct2ForConditionalGeneration(MolmoAct2Config(**RELEASED))
@@ -68,7 +68,7 @@ def xvla() -> dict[str, torch.Tensor]:
     from lerobot.policies.xvla.configuration_xvla import XVLAConfig
     from lerobot.policies.xvla.modeling_xvla import XVLAPolicy
 
-    from probe_kit.models.lerobot.xvla import FLORENCE_LARGE
+    from probe_kit.hooks.families.xvla.adapter import FLORENCE_LARGE
 
     config = XVLAConfig(
         device="cpu",

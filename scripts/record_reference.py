@@ -29,9 +29,9 @@ from safetensors.torch import load_file
 from torch import Tensor
 from transformers import AutoTokenizer
 
+from probe_kit.hooks.families.pi0_fast.adapter import Pi0FastSize, sized
 from probe_kit.models.building import replaced
-from probe_kit.models.lerobot.pi0 import Pi0Size, resized
-from probe_kit.models.lerobot.pi0_fast import Pi0FastSize, sized
+from probe_kit.models.pi0 import Pi0Size, resized
 
 MODULES: dict[str, Any] = {"pi0": modeling_pi0, "pi05": modeling_pi05, "pi0_fast": modeling_pi0_fast}
 POLICIES: dict[str, Callable[[Any], Any]] = {
@@ -191,7 +191,7 @@ def record_layers(checkpoint: Path, config: Any, seed: int) -> dict[str, np.ndar
     """
     from lerobot.policies.molmoact2.processor_molmoact2 import make_molmoact2_pre_post_processors
 
-    from probe_kit.models.lerobot.molmoact2 import lerobots_policy, network_config
+    from probe_kit.hooks.families.molmoact2.adapter import lerobots_policy, network_config
 
     place, rng = checkpoint / config.checkpoint_path, np.random.default_rng(seed)
     policy = lerobots_policy(config, network_config(place), place)

@@ -16,14 +16,13 @@ from probe_kit._tables.printing import STYLES
 from probe_kit._terminal.options import read_categories
 from probe_kit._terminal.panelled_help import HELP_ALL
 from probe_kit.cli import app, commands_of
-from probe_kit.env.robot.arm_models import ARMS
-from probe_kit.env.scoring.rules import RULES
+from probe_kit.env.arm import ARMS
+from probe_kit.env.scoring import RULES
 from probe_kit.env.spec import PRESETS
 from probe_kit.extract.command_options import Sizes
 from probe_kit.extract.protocols import SCENES
 from probe_kit.extract.vqa.phrases import QUERIES, Picture, Query
-from probe_kit.hooks.contract.interventions import Readout
-from probe_kit.hooks.contract.protocol import ROTATIONS, ProtocolName
+from probe_kit.hooks.contract.declared import ROTATIONS, ProtocolName, Readout
 from probe_kit.hooks.family import Dtype
 from probe_kit.intervene.kinds import kind_names
 from probe_kit.retention.behaviour import SCORES

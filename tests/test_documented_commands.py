@@ -164,7 +164,7 @@ def _stop_with(*asked: Any, **_: Any) -> Any:
     from probe_kit.extract.parts import SCRIPTED
     from probe_kit.extract.preparation import check_meaningless
     from probe_kit.extract.settings import AskSettings, ExtractSettings
-    from probe_kit.hooks.contract.options import check_options
+    from probe_kit.hooks.contract.declared import check_options
     from probe_kit.hooks.registry import find_family
 
     for settings in (one for one in asked if not isinstance(one, str | None)):
@@ -272,7 +272,7 @@ NOT_TYPED = {
     r"with-uv probe-kit demo": "minutes; tests/test_cli.py types it",
     r"with-uv pytest": "is what runs this",
     r"^probe-kit view \S+$": "serves until Ctrl-C; tests/view/test_server.py has the server",
-    r"^python -m probe_kit.hooks.families.internvla.convert RUN OUT": "RUN is a training of InternVLA's",
+    r"^python -m probe_kit.hooks.families.internvla.checkpoint RUN OUT": "RUN is a training of InternVLA's",
     r"^export AWS_|s3://": "needs keys of an object store; tests/runs/test_remote.py has a server of its own",
     r"--model (pi0|magma|openvla|spatialvla|xiaomi-r0|internvla-m1)( |$)": "needs released weights (8 to 18 GB)",
     r"^probe-kit diagnose (pi0|runs/mine) ": "needs released weights, or minutes; tests/diagnose has both",

@@ -38,10 +38,10 @@ MOST_LEVELS = 14
 READS_ONLY = (
     "probe_kit.runs",
     "probe_kit.hooks.contract.sites",
-    "probe_kit.hooks.contract.views",
-    "probe_kit.env.scoring.outcome",
-    "probe_kit.env.scoring.events",
-    "probe_kit.env.scoring.rules",
+    "probe_kit.hooks.contract.sites",
+    "probe_kit.env.scoring",
+    "probe_kit.env.scoring",
+    "probe_kit.env.scoring",
 )
 """All that probes and tables may know of the rooms that hold models and simulators."""
 

@@ -9,11 +9,11 @@ from typing import Any
 
 from probe_kit.errors import UsageError
 from probe_kit.hooks.conformance.check import Outcome, package_of, require, tried
-from probe_kit.hooks.conformance.contract import CONTRACTS
 from probe_kit.hooks.conformance.subject import INSTRUCTIONS, Subject
+from probe_kit.hooks.contract.declared import read_pairs
 from probe_kit.hooks.contract.model import Policy
-from probe_kit.hooks.contract.options import read_pairs
 from probe_kit.hooks.registry import entry_module, find_family
+from probe_kit.hooks.testing import CONTRACTS
 
 _HEAVY = 3
 _LISTED = f"import sys, {{module}}; sys.exit({_HEAVY} if 'torch' in sys.modules else 0)"

@@ -169,7 +169,7 @@ class _Request(NamedTuple):
 
 def _replay_source(run: "Run", typed: Mapping[str, Any]) -> "ReplaySource":
     """The places of a stored run's model and source, by what was typed of them."""
-    from probe_kit.hooks.contract.options import read_pairs
+    from probe_kit.hooks.contract.declared import read_pairs
     from probe_kit.intervene import ReplaySource
 
     options = read_pairs(typed.get("model_option", ()))

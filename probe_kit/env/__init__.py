@@ -8,11 +8,8 @@ Importing this module loads neither the simulator nor torch.
 from gymnasium.envs.registration import register, registry
 
 from probe_kit.env.act2answer import Act2AnswerEnv
-from probe_kit.env.adapters import save_gif, to_lerobot, to_openpi
-from probe_kit.env.scoring.behaviour import Behaviour
-from probe_kit.env.scoring.outcome import Outcome, success_by_radius
-from probe_kit.env.scoring.trajectory import Trajectory
-from probe_kit.env.scripted import Idle, ScriptedExpert
+from probe_kit.env.scoring import Behaviour, Outcome, Trajectory, success_by_radius
+from probe_kit.env.scripted import Idle, ScriptedExpert, save_gif, to_lerobot, to_openpi
 from probe_kit.env.spec import CameraSpec, LightSpec, LimitSpec, PhysicsSpec, SceneSpec
 
 ENV_ID = "probe_kit/Act2Answer-v0"

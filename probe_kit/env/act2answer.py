@@ -1,6 +1,8 @@
 """The environment: two pictures on a table, a cube, an arm, and an instruction that names one picture."""
 
-from typing import Any, ClassVar
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Self
 
 import gymnasium as gym
 import numpy as np
@@ -9,15 +11,146 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 from probe_kit._system.counting import counted
-from probe_kit.env.question import Question
-from probe_kit.env.robot.controller import check_action
-from probe_kit.env.scene import Scene
-from probe_kit.env.scoring.outcome import Outcome
-from probe_kit.env.simulation.camera import Frame, Picture
-from probe_kit.env.spec import SceneSpec
-from probe_kit.env.trial import Trial
+from probe_kit.env.arm import DeltaController, check_action
+from probe_kit.env.rotations import Array
+from probe_kit.env.scene import SIDES, Scene
+from probe_kit.env.scoring import LED_TO, REST_SPEED, Ending, Outcome, Trajectory, distance, zone
+from probe_kit.env.simulation import Frame, Picture
+from probe_kit.env.spec import XY, SceneSpec
 from probe_kit.errors import EpisodeOverError, SceneError
-from probe_kit.suite.items import Item, Side, other_side
+from probe_kit.suite.items import LAYOUTS, Episode, Item, Layout, Side, other_side
+
+_SIDES: tuple[Side, Side] = ("left", "right")
+
+
+@dataclass(frozen=True)
+class Question:
+    """An instruction with the picture of each side in one layout.
+
+    pictures: RGB images by the side they lie on *in this layout*. side_correct: likewise.
+    """
+
+    name: str
+    instruction: str
+    pictures: Mapping[Side, Image.Image]
+    side_correct: Side
+    layout: Layout
+
+    @classmethod
+    def from_item(cls, item: Item, layout: Layout) -> Self:
+        """The question of an item. An item without hashes is taken as it is.
+
+        Raises SuiteError if a picture is missing or broken, or has other pixels than the item says.
+        """
+        from probe_kit.suite.pictures import load_picture
+
+        episode = Episode(item, _checked(layout))
+        left, right = (load_picture(episode.picture(side), episode.pixels_sha256(side) or None) for side in _SIDES)
+        return cls(
+            episode.episode_id, item.instruction, {"left": left, "right": right}, episode.side_correct, layout
+        )
+
+    @classmethod
+    def built_in(cls, layout: Layout = "original") -> Self:
+        """Two plain pictures for trying the environment without a suite: blue is correct, orange is wrong."""
+        side: Side = "left" if _checked(layout) == "original" else "right"
+        blue, orange = (Image.new("RGB", (64, 64), color) for color in ("royalblue", "darkorange"))
+        pictures = {side: blue, other_side(side): orange}
+        return cls(f"built-in:{layout[0]}", "Put the cube on the blue picture", pictures, side, layout)
+
+
+def _checked(layout: Layout) -> Layout:
+    if layout not in LAYOUTS:
+        raise SceneError(f"layout {layout!r} does not exist; expected one of {', '.join(LAYOUTS)}.")
+    return layout
+
+
+FALLEN_BELOW = -0.05
+"""Height of the cube, metres, at which it has left the table."""
+REST_STEPS = 5
+"""Actions it must lie still, once released, for an early stop."""
+
+
+class Trial:
+    """An episode of one question, started in a scene that was just reset.
+
+    executed: the last action (7,) as executed: after the limits, no motion where the arm could
+    not follow, and the gripper that was really commanded. None before the first.
+    """
+
+    def __init__(self, scene: Scene, question: Question) -> None:
+        self.scene = scene
+        self.question = question
+        self.controller = DeltaController(scene.arm, scene.spec.limits, scene.home_q, scene.spec.euler)
+        self.executed: Array | None = None
+        self.steps = 0
+        self.clipped = 0
+        self.ik_error = 0.0
+        self.ending: Ending | None = None
+        self.stopped_early = False
+        self._start = self._cube_xy()
+        self._was_grasped = scene.spec.start_grasped
+        self._steps_at_rest = 0
+
+    @property
+    def over(self) -> bool:
+        """Whether the episode has ended."""
+        return self.stopped_early or self.ending is not None
+
+    def advance(self, action: Array) -> None:
+        """Carry out one checked action (7,)."""
+        move = self.controller.command(action)
+        opening = 0.0 if self.steps < self.scene.spec.forced_closed else move.opening
+        finite = self.scene.advance(move.q_from, move.q_to, opening)
+        self.executed = np.concatenate([move.shift, move.turn, [opening]])
+        self.steps += 1
+        self.clipped += move.clipped
+        self.ik_error = move.ik_error
+        self.ending = self._find_ending(finite)
+        self.stopped_early = self.scene.spec.early_stop and self.ending is None and self._came_to_rest()
+
+    def outcome(self) -> Outcome:
+        """The record of the episode as it stands."""
+        scene, question = self.scene, self.question
+        xy = self._cube_xy()
+        to_correct = distance(xy, scene.tile_xy(question.side_correct))
+        to_wrong = distance(xy, scene.tile_xy(other_side(question.side_correct)))
+        return Outcome(
+            zone=zone(to_correct, to_wrong, scene.spec.zone_radius),
+            layout=question.layout,
+            side_correct=question.side_correct,
+            cube_xy=xy,
+            cube_z=float(scene.cube_state().position[2]),
+            distance_correct=to_correct,
+            distance_wrong=to_wrong,
+            epsilon=scene.spec.zone_radius,
+            cube_moved=distance(xy, self._start) > scene.spec.moved,
+            on_tile=scene.is_on_tile(),
+            is_grasped=scene.is_grasped(),
+            steps=self.steps,
+            clipped=self.clipped,
+            truncation_reason=self.ending,
+        )
+
+    def _find_ending(self, finite: bool) -> Ending | None:
+        if not finite:
+            return "non_finite"
+        if self.scene.cube_state().position[2] < FALLEN_BELOW:
+            return "cube_fell"
+        return "max_steps" if self.steps >= self.scene.spec.max_steps else None
+
+    def _came_to_rest(self) -> bool:
+        """Whether the cube has been in the hand, was let go and has lain still since for long enough."""
+        grasped = self.scene.is_grasped()
+        self._was_grasped |= grasped
+        still = not grasped and self.scene.cube_state().speed < REST_SPEED
+        self._steps_at_rest = self._steps_at_rest + 1 if self._was_grasped and still else 0
+        return self._steps_at_rest >= REST_STEPS
+
+    def _cube_xy(self) -> XY:
+        x, y, _ = self.scene.cube_state().position
+        return (float(x), float(y))
+
 
 Observation = dict[str, Any]
 Info = dict[str, Any]
@@ -261,3 +394,50 @@ def _question(options: dict[str, Any]) -> Question:
     if not isinstance(item, Item):
         raise SceneError(f"reset option 'item' is a {type(item).__name__}; expected an Item of a suite.")
     return Question.from_item(item, layout)
+
+
+class Recorder:
+    """Notes the state of an environment, now and after every action. Looking changes nothing in the simulator.
+
+    env: an Act2AnswerEnv that was just reset, wrapped or not.
+    """
+
+    def __init__(self, env: Act2AnswerEnv) -> None:
+        self._env: Act2AnswerEnv = env.unwrapped
+        self._frames = [np.concatenate([_state(self._env.scene), np.full(LED_TO, np.nan)])]
+
+    def note(self, commanded: ArrayLike) -> None:
+        """After an action (7,) was executed."""
+        trial = self._env.trial
+        assert trial.executed is not None
+        command = np.asarray(commanded, np.float64)
+        self._frames.append(np.concatenate([_state(trial.scene), command, trial.executed, [trial.ik_error]]))
+
+    def trajectory(self) -> Trajectory:
+        """Return the trajectory up to the last noted action."""
+        return Trajectory.of_frames(np.asarray(self._frames, np.float32))
+
+
+def _state(scene: Scene) -> Array:
+    """The state part of a frame; see `trajectory.STATE`."""
+    cube, tiles = scene.cube_state(), [scene.tile_state(side) for side in SIDES]
+    return np.array(
+        [
+            *scene.arm.tool_state(),
+            scene.arm.opening(),
+            *cube.position,
+            *cube.quaternion,
+            cube.speed,
+            *(value for tile in tiles for value in (*tile.position, *tile.quaternion)),
+            *_finger_forces(scene),
+            scene.is_grasped(),
+            *(scene.touches_tile(side) for side in SIDES),
+        ],
+        np.float64,
+    )
+
+
+def _finger_forces(scene: Scene) -> list[float]:
+    """Newtons with which each finger presses on the cube, summed over the points of contact."""
+    contacts = scene.client.getContactPoints(bodyA=scene.arm.body, bodyB=scene.cube)
+    return [sum(contact[9] for contact in contacts if contact[3] == finger) for finger in scene.arm.model.fingers]

@@ -1,7 +1,11 @@
-"""Rotation matrices, roll-pitch-yaw and rotation vectors, all in radians and in numpy.
+"""Rotations, and forward and inverse kinematics of a chain of revolute joints, in plain numpy.
 
-Roll, pitch and yaw turn about the fixed x, y and z axes in this order: R = Rz(yaw) Ry(pitch) Rx(roll).
+We do not use PyBullet's own inverse kinematics: it starts from the measured joints (so the answer depends
+on the tracking error), and with `currentPositions` it is wrong for a base that is not at the origin.
 """
+
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -52,3 +56,102 @@ def to_vector(R: Array) -> Array:
 def yaw_quaternion(yaw: float) -> tuple[float, float, float, float]:
     """Quaternion (x, y, z, w) of a turn about +z."""
     return (0.0, 0.0, float(np.sin(yaw / 2)), float(np.cos(yaw / 2)))
+
+
+DAMPING = 0.02
+"""Largest damping factor; it shrinks with the residual, so that the last steps are Newton steps."""
+MAX_JOINT_STEP = 0.3
+"""Largest joint change of one iteration, radians."""
+POSTURE_PULL = 0.05
+"""Share of the way back to the resting posture taken in the null space, for chains of more than 6 joints."""
+TOLERANCE = 1e-5
+"""Residual (metres and radians together) at which the iteration stops."""
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A position (3,) in metres and a rotation matrix (3, 3), in the world frame."""
+
+    position: Array
+    rotation: Array
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Joint angles (n,) in radians, and what remains to the target: metres and radians."""
+
+    q: Array
+    error: float
+    turn_error: float
+
+
+@dataclass(frozen=True)
+class SerialChain:
+    """A chain of n revolute joints, described by its screws at q = 0 in the world frame.
+
+    axes, points: (n, 3) unit axis of each joint and a point on it.
+    tip: pose of the tool at q = 0.
+    lower, upper: (n,) joint limits in radians.
+    """
+
+    axes: Array
+    points: Array
+    tip: Pose
+    lower: Array
+    upper: Array
+
+    def pose(self, q: Array) -> Pose:
+        """Pose of the tool at joint angles q (n,)."""
+        return self.pose_and_jacobian(q)[0]
+
+    def solve(self, target: Pose, start: Array, posture: Array, iterations: int = 30) -> Solution:
+        """Joint angles that bring the tool to `target`, within the limits, by damped least squares.
+
+        start: (n,) where to begin; pass the last commanded angles for 2 or 3 iterations.
+        posture: (n,) what a redundant chain drifts to while it keeps the tool in place.
+        An unreachable target raises nothing: look at the errors of the solution.
+        """
+        q = start
+        for _ in range(iterations):
+            pose, J = self.pose_and_jacobian(q)
+            residual = _residual(target, pose)
+            size = float(np.linalg.norm(residual))
+            if size < TOLERANCE:
+                break
+            q = np.clip(q + self._step(J, residual, size, posture - q), self.lower, self.upper)
+        remaining = _residual(target, self.pose(q))
+        return Solution(q, float(np.linalg.norm(remaining[:3])), float(np.linalg.norm(remaining[3:])))
+
+    def _step(self, J: Array, residual: Array, size: float, to_posture: Array) -> Array:
+        damped = J @ J.T + min(DAMPING, size) ** 2 * np.eye(6)
+        step = J.T @ np.linalg.solve(damped, residual)
+        if J.shape[1] > 6:
+            pull = POSTURE_PULL * to_posture
+            step += pull - J.T @ np.linalg.solve(damped, J @ pull)
+        return np.asarray(step * min(1.0, MAX_JOINT_STEP / max(np.abs(step).max(), 1e-12)))
+
+    def pose_and_jacobian(self, q: Array) -> tuple[Pose, Array]:
+        """Pose of the tool at joint angles q (n,), and its Jacobian (6, n), by the product of exponentials.
+
+        The Jacobian holds linear over angular velocity, both in the world frame.
+        """
+        cross, cross_squared = self._generators
+        turns = np.eye(3) + np.sin(q)[:, None, None] * cross + (1 - np.cos(q))[:, None, None] * cross_squared
+        R, p = np.eye(3), np.zeros(3)
+        axes, points = np.empty((len(q), 3)), np.empty((len(q), 3))
+        for i, (turn, axis, point) in enumerate(zip(turns, self.axes, self.points, strict=True)):
+            axes[i], points[i] = R @ axis, R @ point + p
+            R = R @ turn
+            p = points[i] - R @ point
+        pose = Pose(R @ self.tip.position + p, R @ self.tip.rotation)
+        return pose, np.vstack([np.cross(axes, pose.position - points).T, axes.T])
+
+    @cached_property
+    def _generators(self) -> tuple[Array, Array]:
+        """Cross-product matrices (n, 3, 3) of the axes, and their squares."""
+        cross = np.cross(np.eye(3)[None], self.axes[:, None])
+        return np.asarray(cross), np.asarray(cross @ cross)
+
+
+def _residual(target: Pose, pose: Pose) -> Array:
+    return np.concatenate([target.position - pose.position, to_vector(target.rotation @ pose.rotation.T)])

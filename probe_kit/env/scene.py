@@ -11,15 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from probe_kit.env.robot.arm import Arm
-from probe_kit.env.robot.arm_models import ARMS
-from probe_kit.env.robot.kinematics import Pose
-from probe_kit.env.rotations import Array, to_vector, yaw_quaternion
-from probe_kit.env.simulation.background import load_photo, wooden_table
-from probe_kit.env.simulation.bullet import BulletClient
-from probe_kit.env.simulation.camera import Backdrop, Camera, Frame, Picture
-from probe_kit.env.simulation.film import INVISIBLE, FilmCamera
-from probe_kit.env.simulation.tiles import TextureCache, write_quad
+from probe_kit.env.arm import ARMS, Arm
+from probe_kit.env.rotations import Array, Pose, to_vector, yaw_quaternion
+from probe_kit.env.simulation import (
+    INVISIBLE,
+    Backdrop,
+    BulletClient,
+    Camera,
+    FilmCamera,
+    Frame,
+    Picture,
+    TextureCache,
+    load_photo,
+    wooden_table,
+    write_quad,
+)
 from probe_kit.env.spec import XY, XYZ, CameraSpec, LightSpec, SceneSpec
 from probe_kit.errors import SceneError
 from probe_kit.suite.items import Side, other_side

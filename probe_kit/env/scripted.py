@@ -1,14 +1,17 @@
-"""Scripted policies: an expert with privileged state, and one that does nothing, as bounds of the success rate."""
+"""Scripted policies that need no model, and pictures as models elsewhere want them."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from probe_kit.env.act2answer import Act2AnswerEnv
 from probe_kit.env.rotations import Array, to_rpy
+from probe_kit.env.simulation import Picture
 from probe_kit.errors import EpisodeOverError
 from probe_kit.suite.items import other_side
 
@@ -152,3 +155,50 @@ class Idle:
     def act(self) -> NDArray[np.float32]:
         """The next action (7,) float32."""
         return np.array([0, 0, 0, 0, 0, 0, not self._env.scene_spec.start_grasped], np.float32)
+
+
+def to_lerobot(observation: Mapping[str, Any]) -> dict[str, Any]:
+    """The observation as lerobot's policies name it, in numpy.
+
+    `observation.images.image`: (..., 3, H, W) float32 in [0, 1]. `observation.state`: (..., 8) float32. Leading
+    batch dimensions, as a vector environment adds them, stay.
+    """
+    image = np.asarray(observation["pixels"]["image"])
+    return {
+        "observation.images.image": np.moveaxis(image, -1, -3).astype(np.float32) / 255,
+        "observation.state": np.asarray(observation["agent_pos"], np.float32),
+    }
+
+
+def to_openpi(observation: Mapping[str, Any], prompt: str, size: int = 224) -> dict[str, Any]:
+    """One observation as an openpi policy server expects it.
+
+    `observation/image`: (size, size, 3) uint8, the whole picture shrunk and padded with black to a square.
+    `observation/state`: (8,) float32. `prompt`: the instruction.
+    """
+    return {
+        "observation/image": _padded(Image.fromarray(observation["pixels"]["image"]), size),
+        "observation/state": np.asarray(observation["agent_pos"], np.float32),
+        "prompt": prompt,
+    }
+
+
+def _padded(image: Image.Image, size: int) -> Any:
+    scale = size / max(image.size)
+    small = image.resize((round(image.width * scale), round(image.height * scale)), Image.Resampling.BILINEAR)
+    square = Image.new("RGB", (size, size))
+    square.paste(small, ((size - small.width) // 2, (size - small.height) // 2))
+    return np.asarray(square)
+
+
+def save_gif(path: Path, pictures: Sequence[Picture], fps: float = 5.0) -> None:
+    """Write pictures (H, W, 3) uint8 as an endless GIF; collect them with `env.render()` after each action.
+
+    Raises ValueError if there are none.
+    """
+    if not pictures:
+        raise ValueError(f"{path}: no pictures to write; call `env.render()` at least once.")
+    first, *later = (Image.fromarray(picture) for picture in pictures)
+    # A GIF counts in hundredths of a second, and many players slow down anything below two of them.
+    duration = max(20, round(100 / fps) * 10)
+    first.save(path, save_all=True, append_images=later, duration=duration, loop=0)

@@ -13,7 +13,7 @@ from probe_kit._system.bounded_json import read_json_object
 from probe_kit.errors import UsageError
 from probe_kit.extract.settings import Settings
 from probe_kit.extract.sources.kinds import kind_of, kinds_typed
-from probe_kit.hooks.contract.options import read_pairs
+from probe_kit.hooks.contract.declared import read_pairs
 from probe_kit.runs.layout import RUN_FILE
 from probe_kit.runs.origin import is_here, option_files
 from probe_kit.runs.reader import origin_of

@@ -9,7 +9,7 @@ import numpy as np
 from probe_kit.errors import ProbeKitError
 from probe_kit.extract.plan import Plan
 from probe_kit.extract.settings import Settings
-from probe_kit.hooks.contract.views import view_names
+from probe_kit.hooks.contract.sites import view_names
 from probe_kit.hooks.family import DTYPES
 from probe_kit.runs.layout import StoredStream
 
@@ -114,7 +114,7 @@ def planned_sizes(settings: Settings, instructions: Sequence[str] = ()) -> Plann
 
 def _tokens(model: "Model", instructions: Sequence[str]) -> dict[str, int]:
     """The longest sequence of every stream; empty where its tokenizer or processor is not here."""
-    from probe_kit.hooks.checkpoints.hub import without_network
+    from probe_kit.hooks.checkpoints.checkpoint import without_network
     from probe_kit.hooks.contract.observation import Observation
 
     picture, state = np.zeros((*_PICTURE, 3), np.uint8), np.zeros(8, np.float32)

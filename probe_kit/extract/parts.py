@@ -21,8 +21,7 @@ from probe_kit.extract.vqa.phrases import Picture, Query
 from probe_kit.extract.vqa.templates import P1, Template, find_template
 from probe_kit.hooks import family as hook_family
 from probe_kit.hooks.capturing.edits import Edit, Vectors
-from probe_kit.hooks.contract.options import read_pairs
-from probe_kit.hooks.contract.protocol import ProtocolName, Rotation
+from probe_kit.hooks.contract.declared import ProtocolName, Rotation, read_pairs
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.runs.layout import AskTokens, Codec, FrameChoice, LaterViews, Tokens, VideoChoice
 

@@ -9,7 +9,7 @@ from probe_kit.errors import UsageError
 from probe_kit.extract.parts import ActTask, ModelSettings
 from probe_kit.extract.sources.source import SourceSettings
 from probe_kit.hooks.contract.card import EMBEDDED
-from probe_kit.hooks.contract.protocol import ACT2ANSWER, PLAIN, ProtocolRow, as_text
+from probe_kit.hooks.contract.declared import ACT2ANSWER, PLAIN, ProtocolRow, as_text
 from probe_kit.runs.origin import is_here
 
 if TYPE_CHECKING:

@@ -35,7 +35,7 @@ from probe_kit.extract.sources.source import SourceSettings
 from probe_kit.extract.vqa.templates import INSTRUCTION, find_template
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.checkpoints.checkpoint import is_on_hub
-from probe_kit.hooks.contract.protocol import PLAIN
+from probe_kit.hooks.contract.declared import PLAIN
 from probe_kit.runs.layout import MOST_FRAMES
 
 if TYPE_CHECKING:

@@ -5,26 +5,25 @@ from typing import TYPE_CHECKING
 from probe_kit._system.lazy import lazy_names
 from probe_kit.hooks.capturing.edits import Edit
 from probe_kit.hooks.contract.card import ModelCard
-from probe_kit.hooks.contract.interventions import Interventions
+from probe_kit.hooks.contract.declared import Interventions, Option
 from probe_kit.hooks.contract.observation import Observation
-from probe_kit.hooks.contract.options import Option
 from probe_kit.hooks.contract.sites import Site, Stream
 from probe_kit.hooks.family import Family
 from probe_kit.hooks.registry import known_families, load_model, load_policy
 
 if TYPE_CHECKING:
-    from probe_kit.hooks.capturing.activation_cache import ActivationCache
-    from probe_kit.hooks.capturing.attention import AttentionMass, capture_attention
-    from probe_kit.hooks.capturing.attention_patterns import attended_roles, capture_patterns
-    from probe_kit.hooks.capturing.capture_context import capture, edit
-    from probe_kit.hooks.capturing.edit_engine import apply_edits
-    from probe_kit.hooks.capturing.gradients import gradients_at
-    from probe_kit.hooks.capturing.head_outputs import project_heads
-    from probe_kit.hooks.capturing.logit_lens import LogitLens, logit_lens
+    from probe_kit.hooks.capturing.attention import (
+        AttentionMass,
+        attended_roles,
+        capture_attention,
+        capture_patterns,
+    )
+    from probe_kit.hooks.capturing.capture_context import ActivationCache, capture, edit, gradients_at
+    from probe_kit.hooks.capturing.edits import apply_edits
+    from probe_kit.hooks.capturing.readouts import LogitLens, logit_lens, project_heads
     from probe_kit.hooks.checkpoints.weights import load_weights, read_weights
-    from probe_kit.hooks.contract.model import AnswerModel, Model, Policy, Prompt, Reading, Rows, Tap
+    from probe_kit.hooks.contract.model import AnswerModel, Model, Policy, Prompt, Reading, Rows, Tap, Unembedding
     from probe_kit.hooks.contract.roles import Roles, pool
-    from probe_kit.hooks.contract.unembedding import Unembedding
 
 __all__ = [
     "ActivationCache",
@@ -72,12 +71,12 @@ __getattr__, __dir__ = lazy_names(
         "load_weights": "checkpoints.weights",
         "capture_attention": "capturing.attention",
         "AttentionMass": "capturing.attention",
-        "capture_patterns": "capturing.attention_patterns",
-        "attended_roles": "capturing.attention_patterns",
-        "project_heads": "capturing.head_outputs",
-        "logit_lens": "capturing.logit_lens",
-        "LogitLens": "capturing.logit_lens",
-        "Unembedding": "contract.unembedding",
+        "capture_patterns": "capturing.attention",
+        "attended_roles": "capturing.attention",
+        "project_heads": "capturing.readouts",
+        "logit_lens": "capturing.readouts",
+        "LogitLens": "capturing.readouts",
+        "Unembedding": "contract.model",
         "Model": "contract.model",
         "Policy": "contract.model",
         "Prompt": "contract.model",
@@ -85,9 +84,9 @@ __getattr__, __dir__ = lazy_names(
         "Reading": "contract.model",
         "Rows": "contract.model",
         "Tap": "contract.model",
-        "ActivationCache": "capturing.activation_cache",
-        "apply_edits": "capturing.edit_engine",
-        "gradients_at": "capturing.gradients",
+        "ActivationCache": "capturing.capture_context",
+        "apply_edits": "capturing.edits",
+        "gradients_at": "capturing.capture_context",
         "capture": "capturing.capture_context",
         "edit": "capturing.capture_context",
         "Roles": "contract.roles",

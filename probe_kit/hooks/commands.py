@@ -10,7 +10,7 @@ from probe_kit._terminal.options import AsJson
 from probe_kit.errors import UsageError
 
 if TYPE_CHECKING:
-    from probe_kit.hooks.verification.verify import Verification
+    from probe_kit.hooks.verify import Verification
 
 
 def verify(
@@ -28,7 +28,7 @@ def verify(
     """
     if (folder is None) == (keys is None):
         raise UsageError("give either a golden reference folder or --keys FILE")
-    from probe_kit.hooks.verification.verify import verify_keys, verify_reference
+    from probe_kit.hooks.verify import verify_keys, verify_reference
 
     verification = verify_keys(family, keys) if keys else verify_reference(family, cast("Path", folder))
     if as_json:

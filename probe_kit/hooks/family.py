@@ -20,7 +20,6 @@ from probe_kit.errors import (
     UnsupportedInterventionError,
     UsageError,
 )
-from probe_kit.hooks.checkpoints.adapter_files import with_adapters_named
 from probe_kit.hooks.checkpoints.checkpoint import (
     CONFIG_FILE,
     PATTERNS,
@@ -28,18 +27,23 @@ from probe_kit.hooks.checkpoints.checkpoint import (
     is_on_hub,
     missing_weights,
     pinned,
+    recorded_commits,
     without_revision,
 )
-from probe_kit.hooks.checkpoints.file_checks import check_files
-from probe_kit.hooks.checkpoints.folders import checkpoint_folder
-from probe_kit.hooks.checkpoints.hub import recorded_commits
+from probe_kit.hooks.checkpoints.folders import check_files, checkpoint_folder, with_adapters_named
 from probe_kit.hooks.checkpoints.third_party import naming_checkpoint, while_loading
 from probe_kit.hooks.contract.card import ModelCard, SourceWeights
-from probe_kit.hooks.contract.declared import DeclaredStream
-from probe_kit.hooks.contract.default_scene import RELEASED, DefaultScene
-from probe_kit.hooks.contract.interventions import ALL_EDITS, InterventionKind, Interventions
-from probe_kit.hooks.contract.options import Option, check_options
-from probe_kit.hooks.contract.protocol import ProtocolRow
+from probe_kit.hooks.contract.declared import (
+    ALL_EDITS,
+    RELEASED,
+    DeclaredStream,
+    DefaultScene,
+    InterventionKind,
+    Interventions,
+    Option,
+    ProtocolRow,
+    check_options,
+)
 from probe_kit.hooks.outline import Outline, bytes_to_fetch, is_complete, is_configured, outline_of
 from probe_kit.models.bounds import MOST_STEPS
 
@@ -63,7 +67,7 @@ class Family:
     folder, recorded arrays) gives the `Outputs` that a golden reference is compared with; full_size() gives the
     network of the released size on the meta device; it takes the name of one where there are `sizes`.
     stored_names: `module:constant`, how names of tensors in released files become those of the network, see
-    `probe_kit.models.naming`.
+    `probe_kit.models.checkpoint_files`.
     options: what else the loader takes as keyword arguments. acts, reads: whether it is a Policy, an AnswerModel.
     hub: what the default checkpoint is loaded from, hub ids with a file each whose presence tells; default its
     config.json. packages: modules of an extra that it needs, with the name of that extra.
@@ -178,7 +182,7 @@ class Family:
         loader_options = self.check(checkpoint, device, dtype, random_weights, options, weights_seed)
         location = self.location(checkpoint, loader_options.pop(SIZE, None))
         check_machine(device, dtype)
-        from probe_kit.hooks.capturing.changed_outputs import switch_off_fused_encoder
+        from probe_kit.hooks.capturing.capture_context import switch_off_fused_encoder
 
         switch_off_fused_encoder()
         with while_loading(self.name, self.loader):
@@ -402,7 +406,7 @@ class Family:
         location = self.location(checkpoint, options.get(SIZE))
         if location is not None:
             return Path(location).expanduser()
-        from probe_kit.models.embedded.folder import embedded_checkpoint
+        from probe_kit.models.embedded import embedded_checkpoint
 
         return embedded_checkpoint(self.name)
 

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 from probe_kit._system.bounded_json import load_json
 from probe_kit.errors import ProbeKitError
-from probe_kit.hooks.checkpoints.adapter_files import ADAPTER_WEIGHTS
 from probe_kit.hooks.checkpoints.checkpoint import (
     ADAPTER_FILE,
     NotCachedError,
@@ -15,9 +14,9 @@ from probe_kit.hooks.checkpoints.checkpoint import (
     is_on_hub,
     missing_bytes,
     missing_weights,
+    without_network,
 )
-from probe_kit.hooks.checkpoints.folders import file_state, has_configuration
-from probe_kit.hooks.checkpoints.hub import without_network
+from probe_kit.hooks.checkpoints.folders import ADAPTER_WEIGHTS, file_state, has_configuration
 from probe_kit.hooks.checkpoints.third_party import in_words
 
 if TYPE_CHECKING:
@@ -74,7 +73,7 @@ def outline_of(
 
 
 def _built(load: Any, location: str, dtype: str | None, options: Mapping[str, Any], complete: bool) -> Outline:
-    from probe_kit.models.sizes_only import sizes_only
+    from probe_kit.models.building import sizes_only
 
     try:
         with without_network(), sizes_only():

@@ -22,7 +22,6 @@ if TYPE_CHECKING:
 ENTRY_POINTS = "probe_kit.policies"
 FOLDERS = (
     "pi0",
-    "pi05",
     "pi0_fast",
     "molmoact2",
     "groot",
@@ -36,8 +35,7 @@ FOLDERS = (
     "xiaomi",
     "internvla",
     "paligemma",
-    "qwen2_5_vl",
-    "qwen3_vl",
+    "qwen_vl",
     "internvl",
     "ovis2_5",
 )

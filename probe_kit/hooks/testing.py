@@ -14,7 +14,22 @@ A check that is not about this adapter raises `unittest.SkipTest`. `probe-kit ch
 without pytest.
 """
 
-from probe_kit.hooks.conformance.contract import ANSWER_CHECKS, POLICY_CHECKS
-from probe_kit.hooks.conformance.subject import AnswerSubject, PolicySubject, example_observations
+from collections.abc import Mapping, Sequence
 
-__all__ = ["ANSWER_CHECKS", "POLICY_CHECKS", "AnswerSubject", "PolicySubject", "example_observations"]
+from probe_kit.hooks.conformance import answering, captures, loading, policies
+from probe_kit.hooks.conformance.check import Check, checks_of
+from probe_kit.hooks.conformance.subject import AnswerSubject, PolicySubject, Subject, example_observations
+
+__all__ = [
+    "ANSWER_CHECKS",
+    "POLICY_CHECKS",
+    "AnswerSubject",
+    "PolicySubject",
+    "example_observations",
+]
+
+
+_MODEL_CHECKS = checks_of(captures, captures, captures, captures, captures, loading)
+POLICY_CHECKS: Sequence[Check] = (*_MODEL_CHECKS, *checks_of(policies, policies, policies))
+ANSWER_CHECKS: Sequence[Check] = (*_MODEL_CHECKS, *checks_of(answering))
+CONTRACTS: Mapping[type[Subject], Sequence[Check]] = {PolicySubject: POLICY_CHECKS, AnswerSubject: ANSWER_CHECKS}

@@ -18,7 +18,7 @@ from probe_kit._terminal.options import LISTED, Names, choices, further_option, 
 from probe_kit._terminal.panelled_help import PanelledHelp
 from probe_kit.errors import UsageError
 from probe_kit.extract.moved import MovedOptions, moved_of
-from probe_kit.hooks.contract.interventions import Readout
+from probe_kit.hooks.contract.declared import Readout
 from probe_kit.intervene.kinds import every_kind, kind_names, kind_of
 from probe_kit.suite.categories import category_of
 
@@ -195,7 +195,7 @@ def intervene(
     probe-kit intervene runs/mine
     probe-kit intervene runs/mine --kind interchange --sites "backbone.*"
     """
-    from probe_kit.hooks.contract.options import read_pairs as read_options
+    from probe_kit.hooks.contract.declared import read_pairs as read_options
     from probe_kit.intervene import ReplaySource
     from probe_kit.intervene.pairs import read_pairs
     from probe_kit.runs import open_run

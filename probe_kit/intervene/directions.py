@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import NoDirectionError, UsageError
 from probe_kit.hashing import derive_seed
-from probe_kit.hooks.contract.sites import Site
-from probe_kit.hooks.contract.views import resolve_view
+from probe_kit.hooks.contract.sites import Site, resolve_view
 from probe_kit.intervene.erasers import (
     NO_DIRECTION,
     Eraser,

@@ -6,10 +6,9 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from probe_kit.errors import UnknownSiteError, UsageError
-from probe_kit.hooks.capturing.token_edits import OfOneHead, TokenEdit
-from probe_kit.hooks.contract.interventions import Interventions
-from probe_kit.hooks.contract.sites import HEADS, KV, KV_STREAM, Site
-from probe_kit.hooks.contract.views import plays
+from probe_kit.hooks.capturing.edits import OfOneHead, TokenEdit
+from probe_kit.hooks.contract.declared import Interventions
+from probe_kit.hooks.contract.sites import HEADS, KV, KV_STREAM, Site, plays
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Model, Policy, Stream

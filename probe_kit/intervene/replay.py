@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.hooks.capturing.edit_engine import LOG_FIELDS, EditLog
+from probe_kit.hooks.capturing.edits import LOG_FIELDS, EditLog
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.intervene.outcomes import BY_CONDITION, CLEAN, CONTROL_INPUT, DONOR, IMAGE_SWAP
 from probe_kit.intervene.pairs import Chunk, Given, Pair

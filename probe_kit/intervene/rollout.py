@@ -17,9 +17,9 @@ from probe_kit.errors import CaptureChangedActionError, NoTrajectoryError
 from probe_kit.extract.rollout.executed_actions import executed_actions
 from probe_kit.extract.sources.player import Answer, Ending
 from probe_kit.hashing import derive_seed
-from probe_kit.hooks.capturing.edit_engine import EditLog
+from probe_kit.hooks.capturing.edits import EditLog
+from probe_kit.hooks.contract.declared import PLAIN
 from probe_kit.hooks.contract.observation import Observation
-from probe_kit.hooks.contract.protocol import PLAIN
 from probe_kit.intervene.pairs import Chunk, Pair
 from probe_kit.intervene.replay import AttentionRecord, Condition, ConditionContext, ReplayBatch
 from probe_kit.intervene.sessions.scene import SceneSession

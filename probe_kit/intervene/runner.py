@@ -7,7 +7,7 @@ import numpy as np
 
 from probe_kit._terminal.notebook import notebook_progress
 from probe_kit.errors import CaptureChangedActionError
-from probe_kit.hooks.capturing.edit_engine import LOG_FIELDS
+from probe_kit.hooks.capturing.edits import LOG_FIELDS
 from probe_kit.hooks.registry import get_family
 from probe_kit.intervene.kinds.base import ConditionName, Intervention, Measurement
 from probe_kit.intervene.kinds.image_swap import ImageSwap, tiles_apart

@@ -5,7 +5,7 @@ from typing import Any, ClassVar, Protocol
 
 from probe_kit.errors import UnknownCategoryError, UsageError
 from probe_kit.hashing import sha256_json
-from probe_kit.hooks.contract.interventions import Readout
+from probe_kit.hooks.contract.declared import Readout
 from probe_kit.runs.reader import SIDE
 from probe_kit.runs.run import Run
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import EmptyRoleError, UsageError
 from probe_kit.extract.sources.inputs import PICTURE, picture_of, with_pictures
-from probe_kit.hooks.capturing.token_edits import TokenSelection
+from probe_kit.hooks.capturing.edits import TokenSelection
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.intervene.pairs import Given, Pair
 from probe_kit.intervene.places import ALL, TILE_ROLES, positions_of

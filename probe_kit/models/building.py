@@ -1,15 +1,75 @@
-"""Construction of networks from transformers' and timm's parts without drawing random weights."""
+"""Construction of empty networks: by size, without numbers, with initial weights; parts that networks share."""
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from contextvars import ContextVar
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
-from probe_kit.models.sizes_only import building_device
+_SIZES_ONLY = ContextVar("sizes_only", default=False)
+
+
+@contextmanager
+def sizes_only() -> Iterator[None]:
+    """A context in which networks are built on the meta device, and neither filled nor read."""
+    token = _SIZES_ONLY.set(True)
+    try:
+        with torch.device("meta"):
+            yield
+    finally:
+        _SIZES_ONLY.reset(token)
+
+
+def builds_sizes_only() -> bool:
+    """Whether networks are built for their sizes alone."""
+    return _SIZES_ONLY.get()
+
+
+def building_device(device: str = "cpu") -> str:
+    """Return the device on which a network without numbers of its own is built: `device`, or meta for sizes."""
+    return "meta" if builds_sizes_only() else device
+
+
+@torch.no_grad()
+def initialise(network: nn.Module, seed: int) -> None:
+    """Fill every parameter with random numbers of a scale that keeps activations of order one.
+
+    Matrices N(0, 1/fan_in), residual outputs half of that, embeddings 1/sqrt(width), position embeddings
+    0.5, biases zero, norms untouched. Drawn by numpy in name order, so that a seed means the same bits
+    on every machine.
+    """
+    if builds_sizes_only():
+        return
+    rng = np.random.Generator(np.random.PCG64(seed))
+    residual_outputs = ("o_proj.weight", "out_proj.weight", "down_proj.weight", "fc2.weight")
+    for name, parameter in sorted(network.named_parameters()):
+        if parameter.ndim < 2:
+            if name.endswith("bias"):
+                parameter.zero_()  # torch draws them from its global generator
+            continue
+        scale = 1 / float(np.sqrt(parameter[0].numel()))
+        if "position_embedding" in name or "pos_embed" in name:
+            scale = 0.5
+        elif name.endswith(residual_outputs):
+            scale /= 2
+        values = rng.standard_normal(tuple(parameter.shape), dtype=np.float32) * np.float32(scale)
+        parameter.copy_(torch.from_numpy(values))
+
+
+def frequencies(count: int, longest: float) -> Tensor:
+    """(count,) float32 angular frequencies on the CPU, geometrically from 1 down to nearly 1 / `longest`.
+
+    The exponents are float32, as in the original implementations, and their exponential is rounded correctly: that
+    of torch differs in the last bit between versions and processors, and a time of 600 makes 600 times that of it.
+    """
+    exponents = -math.log(longest) * torch.arange(count, dtype=torch.float32) / count
+    return torch.exp(exponents.double()).float()
 
 
 def without_precision(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,17 +1,39 @@
-"""Token-by-token decoding behind a prompt of embeddings, and the positions and masks that it needs.
+"""Prompts as batches, their keys and values, and token-by-token decoding."""
 
-B batch, S positions of the prompt, D width of the language model, V its vocabulary.
-"""
-
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 from transformers import DynamicCache
 
-from probe_kit.models.prompt_kv import PromptKV
+
+class Passage(nn.Module):
+    """Hands on what it is given, the same tensor: a place for hooks, without weights and without arithmetic."""
+
+    def forward(self, passing: Tensor) -> Tensor:
+        """`passing`."""
+        return passing
+
+
+class PromptKV(nn.Module):
+    """One passage for the keys and one for the values of every block.
+
+    An inference sends what it keeps of the prompt through once: when the prompt is read, and before the part that
+    acts reads it.
+    """
+
+    def __init__(self, blocks: int) -> None:
+        super().__init__()
+        self.keys = nn.ModuleList(Passage() for _ in range(blocks))
+        self.values = nn.ModuleList(Passage() for _ in range(blocks))
+
+    def forward(self, layers: Sequence[Any]) -> None:
+        """Send through `keys` and `values` (B, H, T, E) of every layer of transformers' cache, block by block."""
+        for layer, keys, values in zip(layers, self.keys, self.values, strict=True):
+            layer.keys, layer.values = cast(Tensor, keys(layer.keys)), cast(Tensor, values(layer.values))
+
 
 Choose = Callable[[Tensor], Tensor]
 """(B,) ids of the next tokens from their logits (B, V)."""
@@ -103,3 +125,54 @@ class TokenNetwork(nn.Module):
             following = ids[-1] if fed is None else fed[:, len(ids) - 1]
             embeddings = self.language_model.get_input_embeddings()(following[:, None])
             mask = torch.cat([mask, torch.ones_like(mask[:, :1])], dim=1)
+
+
+def packed(rows: Sequence[Tensor], padding: int = 0) -> tuple[Tensor, Tensor]:
+    """Rows (T, …) as one batch (B, S, …), and its mask (B, S) bool, False at padding.
+
+    Padding stands before the last token of a row: the last tokens line up, and no other token moves, whatever else
+    is in the batch. Positions count tokens only, so the network computes the same numbers as without padding.
+    """
+    longest = max(map(len, rows))
+    batch = rows[0].new_full((len(rows), longest, *rows[0].shape[1:]), padding)
+    mask = torch.zeros((len(rows), longest), dtype=torch.bool, device=batch.device)
+    for index, row in enumerate(rows):
+        batch[index, : len(row) - 1], batch[index, -1] = row[:-1], row[-1]
+        mask[index, : len(row) - 1], mask[index, -1] = True, True
+    return batch, mask
+
+
+@dataclass(frozen=True)
+class Packed:
+    """Prompts as one batch: ids (B, T) int64 and mask (B, T) bool, see `packed`."""
+
+    ids: Tensor
+    mask: Tensor
+
+    @classmethod
+    def of(cls, rows: Sequence[Sequence[int]], padding: int) -> "Packed":
+        """Pack one prompt per row."""
+        return cls(*packed([torch.tensor(row) for row in rows], padding))
+
+
+@dataclass(frozen=True)
+class LeftPacked:
+    """Prompts as one batch: ids (B, T) int64 and mask (B, T) int64, 0 at padding, which stands before each row."""
+
+    ids: Tensor
+    mask: Tensor
+
+    @classmethod
+    def of(cls, rows: Sequence[Sequence[int]], padding: int, device: str = "cpu") -> "LeftPacked":
+        """Pack one prompt per row."""
+        longest = max(map(len, rows))
+        ids = torch.full((len(rows), longest), padding)
+        mask = torch.zeros((len(rows), longest), dtype=torch.long)
+        for index, row in enumerate(rows):
+            ids[index, longest - len(row) :] = torch.tensor(row)
+            mask[index, longest - len(row) :] = 1
+        return cls(ids.to(device), mask.to(device))
+
+    def positions(self, first: int = 0) -> Tensor:
+        """(B, T) positions that count tokens, not padding, from `first`."""
+        return positions(self.mask) + first

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from probe_kit.env.scoring.outcome import SENSITIVITY_RADII, success_at
+from probe_kit.env.scoring import SENSITIVITY_RADII, success_at
 from probe_kit.errors import UsageError
 from probe_kit.runs.layout import CAPTURE_ONLY
 from probe_kit.runs.reader import RunReader, check_several_wordings, full_name

@@ -288,7 +288,7 @@ def retention(
     picture. Each in both layouts. Both runs need the same first frames.
     """
     values = locals()
-    from probe_kit.env.scoring.outcome import SENSITIVITY_RADII
+    from probe_kit.env.scoring import SENSITIVITY_RADII
     from probe_kit.retention import retention_table as make_table
     from probe_kit.retention.behaviour import scored
     from probe_kit.retention.rows.outcome_rules import check_epsilons

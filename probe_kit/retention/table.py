@@ -8,8 +8,7 @@ from probe_kit._system.escaping import csv_of_frame
 from probe_kit._tables.formats import render
 from probe_kit._tables.table import Table
 from probe_kit._terminal.plain_text import without_places
-from probe_kit.env.scoring.outcome import SENSITIVITY_RADII
-from probe_kit.env.scoring.rules import DEFAULT_RULE, check_rule
+from probe_kit.env.scoring import DEFAULT_RULE, SENSITIVITY_RADII, check_rule
 from probe_kit.errors import NoProbesError, NoTrajectoryError, UsageError
 from probe_kit.retention.behaviour import (
     ask_of,
@@ -321,7 +320,7 @@ def retention_table(
     against: the run or group that every other is compared with instead, by its name. views: those that were probed
     by default. iterations: which expert iterations take part. keys: which stored probe results of each run to use,
     in order, the newest by default, and none for "". epsilons: zone radii in metres at which SR is scored again,
-    for the rule `disc`. rule: by which episodes are judged, a name of `probe_kit.env.scoring.rules.RULES`;
+    for the rule `disc`. rule: by which episodes are judged, a name of `probe_kit.env.scoring.RULES`;
     last_steps: control steps at their end that count. absent_below: accuracy below which a stream without signal
     is called absent. A run that keeps no trajectories has no success rate by another rule than `disc`. A run
     without activations or probes shows success rates only. score: by which VLM runs are read, `text`, `logits` or

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from probe_kit._system.bounded_arrays import UNREADABLE, open_arrays
 from probe_kit._system.bounded_json import parse_json, read_json_object
 from probe_kit.errors import UsageError
-from probe_kit.hooks.contract.sites import Site
-from probe_kit.hooks.contract.views import role_of_view
+from probe_kit.hooks.contract.sites import Site, role_of_view
 
 ENTRY = "directions"
 SUFFIXES = (".safetensors", ".npz")

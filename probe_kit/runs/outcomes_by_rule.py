@@ -6,9 +6,7 @@ from typing import Any
 
 import pandas as pd
 
-from probe_kit.env.scoring.behaviour import behaviour_of
-from probe_kit.env.scoring.rules import RULES, judge, rule_of
-from probe_kit.env.scoring.trajectory import Trajectory
+from probe_kit.env.scoring import RULES, Trajectory, behaviour_of, judge, rule_of
 from probe_kit.env.spec import SceneSpec
 from probe_kit.suite.items import Side, other_side
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from zarr.errors import ChunkNotFoundError
 
 from probe_kit.errors import RunDamagedError
-from probe_kit.hooks.contract.views import PADDING, plays
+from probe_kit.hooks.contract.sites import PADDING, plays
 from probe_kit.runs.arrays import decode_bfloat16
 
 Spans = Sequence[tuple[str, int, int]]

@@ -13,15 +13,14 @@ import pandas as pd
 from numpy.typing import NDArray
 from zarr.abc.store import Store
 
-from probe_kit.env.scoring.rules import DEFAULT_RULE, check_rule
+from probe_kit.env.scoring import DEFAULT_RULE, check_rule
 from probe_kit.errors import (
     NoTrajectoryError,
     RunIncompleteError,
     UnknownSiteError,
     UsageError,
 )
-from probe_kit.hooks.contract.sites import Site, Stream
-from probe_kit.hooks.contract.views import resolve_view
+from probe_kit.hooks.contract.sites import Site, Stream, resolve_view
 from probe_kit.runs.arrays import decode_bfloat16, open_array
 from probe_kit.runs.certificates import read_certificate
 from probe_kit.runs.checking import CheckedStore
@@ -65,7 +64,7 @@ from probe_kit.runs.trajectories import Trajectories, names_trajectory
 if TYPE_CHECKING:
     import xarray as xr
 
-    from probe_kit.env.scoring.trajectory import Trajectory
+    from probe_kit.env.scoring import Trajectory
 
 
 _OUTCOME = ("outcome", "side_placed")
@@ -499,7 +498,7 @@ class Run:
     def judged(self, rule: str, last_steps: int = 1) -> pd.DataFrame:
         """A row per episode with the fields of `Judgement`: what an outcome rule says of it.
 
-        rule: a name of `probe_kit.env.scoring.rules.RULES`. last_steps: control steps at the end that count; the
+        rule: a name of `probe_kit.env.scoring.RULES`. last_steps: control steps at the end that count; the
         released evaluation averages over 11. Raises UsageError for an unknown rule, NoTrajectoryError.
         """
         if last_steps == 1:
@@ -517,7 +516,7 @@ class Run:
 
     @cached_property
     def behaviour(self) -> pd.DataFrame:
-        """A row per episode: its id, then what hand and cube did, see `probe_kit.env.scoring.behaviour`.
+        """A row per episode: its id, then what hand and cube did, see `probe_kit.env.scoring`.
 
         Raises NoTrajectoryError if the run keeps no trajectories.
         """

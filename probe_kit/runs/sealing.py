@@ -8,7 +8,7 @@ import numpy as np
 import zarr
 from numpy.typing import NDArray
 
-from probe_kit.hooks.contract.views import PADDING
+from probe_kit.hooks.contract.sites import PADDING
 from probe_kit.runs.arrays import codecs
 from probe_kit.runs.checking import BlankStore
 from probe_kit.runs.columns import columns_folder, seal_key, write_seal

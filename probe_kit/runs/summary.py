@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from probe_kit._terminal.notebook import facts_html
-from probe_kit.hooks.contract.summary import streams_text
+from probe_kit.hooks.contract.card import streams_text
 from probe_kit.runs.layout import CAPTURE_ONLY
 from probe_kit.runs.reader import RunReader
 

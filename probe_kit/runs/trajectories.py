@@ -2,7 +2,7 @@
 
     data.zarr/trajectory   float32 (episode, frame, channel); frames behind the end of an episode are not numbers
 
-Frames and channels are those of `probe_kit.env.scoring.trajectory`.
+Frames and channels are those of `probe_kit.env.scoring`.
 """
 
 from collections.abc import Iterator, Sequence
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from zarr.abc.store import Store
 from zarr.core.array_spec import ArrayConfigLike
 
-from probe_kit.env.scoring.trajectory import CHANNELS, Trajectory
+from probe_kit.env.scoring import CHANNELS, Trajectory
 from probe_kit.errors import RunDamagedError
 from probe_kit.runs.arrays import ROOM, codecs
 from probe_kit.runs.commits import Commit

@@ -5,9 +5,8 @@ from graphlib import CycleError, TopologicalSorter
 
 from probe_kit.errors import ProbeKitError
 from probe_kit.extract.parts import SCRIPTED
-from probe_kit.hooks.contract.declared import DeclaredStream
-from probe_kit.hooks.contract.options import check_options
-from probe_kit.hooks.contract.views import resolve_view, view_names
+from probe_kit.hooks.contract.declared import DeclaredStream, check_options
+from probe_kit.hooks.contract.sites import resolve_view, view_names
 from probe_kit.hooks.registry import find_family, get_family
 from probe_kit.runs.store import SCHEMES
 from probe_kit.statistics.label_permutations import permutations_for, smallest_p

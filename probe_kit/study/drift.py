@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
 from probe_kit.extract.vqa.scores import side_expected
-from probe_kit.hooks.contract.sites import Site
-from probe_kit.hooks.contract.views import PADDING
+from probe_kit.hooks.contract.sites import PADDING, Site
 from probe_kit.retention.behaviour import ask_of
 from probe_kit.retention.compare.compare import Difference, common_items, wording_of
 from probe_kit.retention.rows.row import RetentionRow

@@ -9,7 +9,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from probe_kit.extract.parts import ModelSettings
 from probe_kit.extract.sources.scene import SceneOptions
 from probe_kit.extract.vqa.phrases import Picture, Query
-from probe_kit.hooks.contract.protocol import ProtocolName
+from probe_kit.hooks.contract.declared import ProtocolName
 from probe_kit.runs.layout import AskTokens, LaterViews
 from probe_kit.scene_names import SceneName
 from probe_kit.train.choices import CORRECT, Side

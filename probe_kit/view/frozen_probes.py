@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.hooks.contract.sites import Site
-from probe_kit.hooks.contract.views import resolve_view
+from probe_kit.hooks.contract.sites import Site, resolve_view
 from probe_kit.runs import Run
 from probe_kit.runs.arrays import decode_bfloat16
 from probe_kit.runs.layout import MEAN_VIEW

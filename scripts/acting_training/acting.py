@@ -20,7 +20,7 @@ from vlm_tiny_training.training import Stage
 
 from acting_training.frames import Frames
 from probe_kit.hooks.families.pi0.adapter import Pi0
-from probe_kit.models.embedded.pi0_tiny import ACTION_DIMS, CHUNK, IDLE_DIMS
+from probe_kit.models.embedded.tiny import ACTION_DIMS, CHUNK, IDLE_DIMS
 from probe_kit.models.embedded.words import WORDS
 from probe_kit.suite.wording import instruction_for
 

@@ -8,7 +8,7 @@ from vlm_tiny_training.batches import Pair, Pixels
 from vlm_tiny_training.painting import Place, Surface
 
 from acting_training.demonstrations import Demonstrations
-from probe_kit.env.question import Question
+from probe_kit.env.act2answer import Question
 
 
 class Frames:

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy import sparse
 
-from probe_kit.env.simulation.tiles import TEXTURE_PIXELS, as_texture
-from probe_kit.models.embedded.pi0_tiny import IMAGE_SIDE
+from probe_kit.env.simulation import TEXTURE_PIXELS, as_texture
+from probe_kit.models.embedded.tiny import IMAGE_SIDE
 
 
 @dataclass(frozen=True)

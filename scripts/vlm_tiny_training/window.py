@@ -5,8 +5,7 @@ import torch
 from numpy.typing import NDArray
 from torchvision.transforms.v2 import functional
 
-from probe_kit.models.embedded.pi0_tiny import IMAGE_SIDE
-from probe_kit.models.embedded.vlm_tiny import LOOKED_AT
+from probe_kit.models.embedded.tiny import IMAGE_SIDE, LOOKED_AT
 
 
 def seen(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:

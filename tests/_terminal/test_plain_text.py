@@ -12,7 +12,7 @@ import pytest
 from probe_kit._terminal.notebook import facts_html, rows_html
 from probe_kit._terminal.plain_text import terminal_safe, without_places
 from probe_kit.hooks import load_model
-from probe_kit.models.embedded.folder import embedded_checkpoint
+from probe_kit.models.embedded import embedded_checkpoint
 from probe_kit.retention import retention_table
 from probe_kit.retention.report import report_html
 from tests.retention.asked_runs import SaidRun, acted, asked

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from probe_kit.env import Act2AnswerEnv, Outcome, SceneSpec, ScriptedExpert
-from probe_kit.env.robot.arm_models import ARMS
+from probe_kit.env.arm import ARMS
 from probe_kit.suite.items import Item
 
 

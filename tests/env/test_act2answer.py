@@ -9,7 +9,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from probe_kit.env import ENV_ID, Act2AnswerEnv, SceneSpec
-from probe_kit.env.robot.arm_models import ARMS
+from probe_kit.env.arm import ARMS
 from probe_kit.errors import ActionError, EpisodeOverError, SceneError, SuiteError
 
 STAY = np.array([0, 0, 0, 0, 0, 0, 1], np.float32)

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from probe_kit.env import Act2AnswerEnv, Idle, SceneSpec, ScriptedExpert
-from probe_kit.env.robot.arm_models import ARMS
+from probe_kit.env.arm import ARMS
 from probe_kit.env.rotations import to_rpy
 from probe_kit.env.scene import Scene
-from probe_kit.env.simulation.camera import Camera
+from probe_kit.env.simulation import Camera
 from probe_kit.errors import SceneError
 from tests.env import episode_digest
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from probe_kit.env.adapters import save_gif, to_lerobot, to_openpi
+from probe_kit.env.scripted import save_gif, to_lerobot, to_openpi
 
 
 @pytest.fixture

@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from probe_kit.env.question import Question
+from probe_kit.env.act2answer import Question
 from probe_kit.errors import SceneError, SuiteError
 
 

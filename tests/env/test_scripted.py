@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from probe_kit.env import ScriptedExpert
-from probe_kit.env.robot.arm_models import ARMS
+from probe_kit.env.arm import ARMS
 from probe_kit.errors import EpisodeOverError
 
 RANDOM_START = {"start_jitter": 0.02, "start_jitter_yaw": np.pi, "early_stop": True}

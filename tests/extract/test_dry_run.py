@@ -16,7 +16,7 @@ from probe_kit.extract.extraction import prepare_asks
 from probe_kit.extract.needs import weights_needed
 from probe_kit.extract.plan import Plan
 from probe_kit.hooks import load_model
-from probe_kit.hooks.contract.views import PADDING
+from probe_kit.hooks.contract.sites import PADDING
 from probe_kit.hooks.registry import own_families
 from probe_kit.runs.disk import in_units
 from probe_kit.suite import Suite, build_suite, default_suite, load_suite
@@ -39,7 +39,7 @@ def nowhere(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
     monkeypatch.setattr("probe_kit.extract.sources.scene_source.SceneSource.rehearse", lambda *_: None)
     monkeypatch.setattr(socket, "create_connection", refuse)
-    monkeypatch.setattr("probe_kit.hooks.checkpoints.hub.urlopen", refuse)
+    monkeypatch.setattr("probe_kit.hooks.checkpoints.checkpoint.urlopen", refuse)
     monkeypatch.setattr("huggingface_hub.snapshot_download", refuse)
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "empty"))
 

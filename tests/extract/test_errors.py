@@ -64,7 +64,7 @@ def test_a_stage_raises_the_same_error_wherever_it_stands(
 def test_an_arm_without_its_extra_is_said_before_anything_is_played(
     suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("probe_kit.env.robot.widowx.find_spec", lambda _name: None)
+    monkeypatch.setattr("probe_kit.env.arm.find_spec", lambda _name: None)
     settings = ExtractSettings("expert", suite=suite.folder, scene=SceneSpec(arm="widowx"), env_workers=0)
     with pytest.raises(SceneError, match=r"Install `rtb-data") as caught:
         extract_run(settings, tmp_path / "run")

@@ -11,7 +11,7 @@ from probe_kit.errors import UsageError
 from probe_kit.extract import AskSettings, ExtractSettings, extract_run, prepare, protocols
 from probe_kit.extract.protocols import check_protocol, protocol_scene
 from probe_kit.extract.settings import run_label
-from probe_kit.hooks.contract.options import check_options
+from probe_kit.hooks.contract.declared import check_options
 from probe_kit.hooks.registry import own_families
 from probe_kit.retention.report.parts import provenance
 from probe_kit.suite import Suite

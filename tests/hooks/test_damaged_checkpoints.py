@@ -16,7 +16,7 @@ from probe_kit.errors import CheckpointError, MissingExtraError, ProbeKitError, 
 from probe_kit.hooks.checkpoints.third_party import while_acting
 from probe_kit.hooks.registry import find_family
 from probe_kit.hooks.testing import example_observations
-from probe_kit.models.embedded.folder import embedded_checkpoint
+from probe_kit.models.embedded import embedded_checkpoint
 from tests.support.every_checkpoint import WRITERS, families
 
 GOLDEN = Path(__file__).parents[1] / "golden"

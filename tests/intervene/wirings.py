@@ -19,14 +19,14 @@ from torch import Tensor, nn
 
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks import ModelCard, Observation, Policy, Roles, Site, Stream, Tap
-from probe_kit.hooks.contract.interventions import Interventions
+from probe_kit.hooks.contract.declared import Interventions
 from probe_kit.hooks.contract.sites import kv_stream
-from probe_kit.hooks.families.shared.prompt_kv import kv_tap
+from probe_kit.hooks.families.shared.taps import kv_tap
 from probe_kit.intervene import ConditionOutcomes
 from probe_kit.intervene.pairs import Pair
 from probe_kit.intervene.replay import CleanRun, Condition, ReplayBatch, SourceRun, replay
 from probe_kit.intervene.sessions.scene import SceneSession
-from probe_kit.models.prompt_kv import PromptKV
+from probe_kit.models.decoding import PromptKV
 
 WIDTH, BLOCKS, CHUNK, METRES = 24, 3, 4, 0.15
 LEFT, RIGHT, IMAGE, WORDS, STATE = slice(0, 4), slice(4, 8), slice(0, 8), slice(8, 12), 12

@@ -9,11 +9,11 @@ import pytest
 
 from probe_kit.errors import CheckpointError
 from probe_kit.models.config_file import ConfigFile, Count
-from probe_kit.models.embedded.pi0_tiny import SIZE
+from probe_kit.models.embedded.tiny import SIZE
 from probe_kit.models.internvla import InternVLAConfig
-from probe_kit.models.lerobot.pi0 import Pi0Size
 from probe_kit.models.magma import MagmaConfig
 from probe_kit.models.ovis2_5 import VisionConfig
+from probe_kit.models.pi0 import Pi0Size
 from probe_kit.models.prismatic import PrismaticConfig
 from probe_kit.models.spatialvla import SpatialVLAConfig
 from probe_kit.models.xiaomi import XiaomiConfig

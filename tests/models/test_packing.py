@@ -1,4 +1,4 @@
-from probe_kit.models.packing import Packed
+from probe_kit.models.decoding import Packed
 
 
 def test_padding_stands_before_the_last_token_so_that_no_other_token_moves() -> None:

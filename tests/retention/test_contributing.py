@@ -97,8 +97,8 @@ def test_a_rule_is_a_class_and_its_name_from_the_option_to_the_verdict(use: Call
 import numpy as np
 from typer.testing import CliRunner
 from probe_kit.cli import app
-from probe_kit.env.scoring.rules import RULES, rule_of
-from probe_kit.env.scoring.trajectory import CHANNELS, Trajectory
+from probe_kit.env.scoring import RULES, rule_of
+from probe_kit.env.scoring import CHANNELS, Trajectory
 from probe_kit.env.spec import SceneSpec
 
 frames = np.zeros((2, len(CHANNELS)), np.float32)

@@ -13,8 +13,7 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.env import SceneSpec
-from probe_kit.env.scoring.rules import RULES
-from probe_kit.env.scoring.trajectory import Trajectory
+from probe_kit.env.scoring import RULES, Trajectory
 from probe_kit.errors import NoTrajectoryError, UsageError
 from probe_kit.extract import ExtractSettings, extract_run
 from probe_kit.retention import FinalPositionsDisplay, OutcomeRulesDisplay, retention_table, success_rate

@@ -18,10 +18,10 @@ from vlm_tiny_training.painting import Surface, sheet
 from vlm_tiny_training.pictures import PictureBank
 from vlm_tiny_training.training import Stage, Trainer
 
-from probe_kit.env.question import Question
+from probe_kit.env.act2answer import Question
 from probe_kit.env.scripted import MAX_SHIFT, OPEN
-from probe_kit.models.embedded.folder import embedded_checkpoint
-from probe_kit.models.embedded.pi0_tiny import ACTION_DIMS, CHUNK, IDLE_DIMS, IMAGE_SIDE
+from probe_kit.models.embedded import embedded_checkpoint
+from probe_kit.models.embedded.tiny import ACTION_DIMS, CHUNK, IDLE_DIMS, IMAGE_SIDE
 
 SURFACE = "sheet"
 

@@ -14,9 +14,9 @@ from vlm_tiny_training.training import Stage, Trainer
 from vlm_tiny_training.window import seen
 
 from probe_kit.env import Act2AnswerEnv, SceneSpec
-from probe_kit.env.question import Question
+from probe_kit.env.act2answer import Question
 from probe_kit.env.scene import SIDES
-from probe_kit.models.embedded.vlm_tiny import new_vlm_tiny, write_vlm_tiny
+from probe_kit.models.embedded.tiny import new_vlm_tiny, write_vlm_tiny
 
 pytestmark = pytest.mark.slow
 

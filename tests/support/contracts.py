@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from probe_kit.hooks import Observation, Prompt
-from probe_kit.hooks.conformance.contract import CONTRACTS
 from probe_kit.hooks.conformance.subject import INSTRUCTIONS, AnswerSubject, PolicySubject, Subject
-from probe_kit.hooks.families.internvla.convert import convert
+from probe_kit.hooks.families.internvla.checkpoint import convert
 from probe_kit.hooks.family import SIZE
-from probe_kit.models.embedded.folder import embedded_checkpoint
+from probe_kit.hooks.testing import CONTRACTS
+from probe_kit.models.embedded import embedded_checkpoint
 from tests.support import (
     groot_checkpoints,
     internvla_checkpoints,

@@ -18,8 +18,8 @@ def write_eo1(folder: Path, seed: int = 0, cameras: Sequence[str] = ("image",), 
     from lerobot.policies.eo1.processor_eo1 import make_eo1_pre_post_processors
     from transformers import Qwen2_5_VLConfig
 
-    from probe_kit.models.initialisation import initialise
-    from probe_kit.models.lerobot.eo1 import build_eo1
+    from probe_kit.hooks.families.eo1.adapter import build_eo1
+    from probe_kit.models.building import initialise
 
     write_processor_files(folder / "vlm", write_qwen2_5_vl)
     config = EO1Config(

@@ -45,8 +45,8 @@ def write_nvidias(
     network: fields of its configuration.
     relative: the actions of the arm are relative to its state, as in most of NVIDIA's embodiments.
     """
-    from probe_kit.models.initialisation import initialise
-    from probe_kit.models.lerobot.groot import GrootConfig, build_groot, network_config
+    from probe_kit.hooks.families.groot.network import GrootConfig, build_groot, network_config
+    from probe_kit.models.building import initialise
 
     write_processor_files(folder / "vlm", write_qwen3_vl)
     _write_processor(folder, cameras, relative)
@@ -62,7 +62,7 @@ def write_nvidias(
 def write_groot(folder: Path, seed: int = 22, cameras: Sequence[str] = ("image",), **fields: Any) -> Path:
     """What lerobot saves of a policy that grew from `base`; `fields` go into its configuration."""
     from probe_kit.hooks.families.groot.adapter import Groot
-    from probe_kit.models.lerobot.groot import GrootConfig
+    from probe_kit.hooks.families.groot.network import GrootConfig
 
     write_nvidias(folder / "base", seed, cameras)
     inputs, outputs = _features(cameras)

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 import yaml
 
-from probe_kit.models.initialisation import initialise
+from probe_kit.models.building import initialise
 from probe_kit.models.internvla import InternVLAConfig, InternVLANetwork, build_internvla
 from tests.support.qwen_checkpoints import ID, VOCABULARY, picture_settings, token_ids, write_tokenizer
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from probe_kit.env.scoring.trajectory import CHANNELS, Trajectory
+from probe_kit.env.scoring import CHANNELS, Trajectory
 from probe_kit.env.spec import SceneSpec
 from probe_kit.hashing import derive_seed
 from probe_kit.runs import Run, open_run, seal

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.env.scoring.trajectory import CHANNELS
+from probe_kit.env.scoring import CHANNELS
 from probe_kit.env.spec import SceneSpec
 from probe_kit.extract.plan import Plan
 from probe_kit.hashing import derive_seed

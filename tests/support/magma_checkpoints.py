@@ -15,9 +15,18 @@ from tokenizers import AddedToken, Tokenizer, decoders, pre_tokenizers, processo
 from tokenizers.models import BPE
 from torch import Tensor
 
-from probe_kit.models.initialisation import initialise
-from probe_kit.models.magma import UNUSED_WEIGHTS, MagmaConfig, MagmaNetwork, build_magma
-from probe_kit.models.magma.prompt import BEGINNING, END_OF_TURN, IMAGE, IMAGE_END, IMAGE_START
+from probe_kit.models.building import initialise
+from probe_kit.models.magma import (
+    BEGINNING,
+    END_OF_TURN,
+    IMAGE,
+    IMAGE_END,
+    IMAGE_START,
+    UNUSED_WEIGHTS,
+    MagmaConfig,
+    MagmaNetwork,
+    build_magma,
+)
 
 BINS, STEPS = 256, 7
 VOCABULARY = 2 * BINS

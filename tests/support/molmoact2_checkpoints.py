@@ -31,8 +31,8 @@ def write_molmoact2(folder: Path, seed: int = 0, cameras: Sequence[str] = ("imag
     from lerobot.configs.types import FeatureType, PolicyFeature
     from lerobot.policies.molmoact2.configuration_molmoact2 import MolmoAct2Config
 
-    from probe_kit.models.initialisation import initialise
-    from probe_kit.models.lerobot.molmoact2 import build_molmoact2, network_config
+    from probe_kit.hooks.families.molmoact2.adapter import build_molmoact2, network_config
+    from probe_kit.models.building import initialise
 
     ids = _write_vlm(folder / "vlm")
     config = MolmoAct2Config(

@@ -34,9 +34,8 @@ def write_pi05(
     from lerobot.configs.types import FeatureType, PolicyFeature
     from lerobot.policies.pi05.configuration_pi05 import PI05Config
 
-    from probe_kit.models.initialisation import initialise
-    from probe_kit.models.lerobot.pi0 import GemmaSize, Pi0Size, SiglipSize
-    from probe_kit.models.lerobot.pi05 import build_pi05
+    from probe_kit.models.building import initialise
+    from probe_kit.models.pi0 import GemmaSize, Pi0Size, SiglipSize, build_pi05
 
     words = write_tokenizer(folder, further_words)
     size = Pi0Size(

@@ -94,10 +94,10 @@ def write_intact(folder: Path, seed: int = 0) -> Path:
     from lerobot.configs.types import FeatureType, NormalizationMode, PolicyFeature
     from lerobot.policies.pi0.configuration_pi0 import PI0Config
 
-    from probe_kit.models.embedded.folder import embedded_checkpoint
-    from probe_kit.models.embedded.pi0_tiny import SIZE
-    from probe_kit.models.initialisation import initialise
-    from probe_kit.models.lerobot.pi0 import build_pi0
+    from probe_kit.models.building import initialise
+    from probe_kit.models.embedded import embedded_checkpoint
+    from probe_kit.models.embedded.tiny import SIZE
+    from probe_kit.models.pi0 import build_pi0
 
     config = PI0Config(
         input_features={
@@ -140,7 +140,7 @@ def network_chunk(
     policy: Any, picture: NDArray[np.uint8], state: NDArray[np.float64], text: str, seed: int
 ) -> Any:
     """(chunk, 7) of the bare network: 5 lines of lerobot's own calls, around our adapter."""
-    from probe_kit.hooks.families.shared.lerobot.features import IMAGES, STATE
+    from probe_kit.hooks.families.shared.kinds import IMAGES, STATE
     from probe_kit.hooks.families.shared.lerobot.policy import MASK, TOKENS
 
     tokens, mask = policy.tokenise([text])

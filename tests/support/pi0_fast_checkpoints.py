@@ -37,9 +37,9 @@ def write_pi0_fast(
     from lerobot.configs.types import FeatureType, PolicyFeature
     from lerobot.policies.pi0_fast.configuration_pi0_fast import PI0FastConfig
 
-    from probe_kit.models.initialisation import initialise
-    from probe_kit.models.lerobot.pi0 import GemmaSize, SiglipSize
-    from probe_kit.models.lerobot.pi0_fast import Pi0FastSize, build_pi0_fast
+    from probe_kit.hooks.families.pi0_fast.adapter import Pi0FastSize, build_pi0_fast
+    from probe_kit.models.building import initialise
+    from probe_kit.models.pi0 import GemmaSize, SiglipSize
 
     fast = write_fast_tokenizer(folder / "fast")
     size = Pi0FastSize(

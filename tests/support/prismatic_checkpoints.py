@@ -11,7 +11,7 @@ from tokenizers.models import WordLevel
 from tokenizers.normalizers import Lowercase
 from tokenizers.pre_tokenizers import Sequence, Split
 
-from probe_kit.models.initialisation import initialise
+from probe_kit.models.building import initialise
 from probe_kit.models.prismatic import PrismaticConfig, build_prismatic
 
 FUSED, SINGLE = "dinosiglip-vit-so-224px", "siglip-vit-so400m"

@@ -11,8 +11,8 @@ from tokenizers.models import WordLevel
 from tokenizers.normalizers import Lowercase
 from tokenizers.pre_tokenizers import Sequence, Split
 
-from probe_kit.models.initialisation import initialise
-from probe_kit.models.lerobot.smolvla import build_smolvla
+from probe_kit.hooks.families.smolvla.adapter import build_smolvla
+from probe_kit.models.building import initialise
 from tests.support.lerobot_units import write_units
 
 SPECIAL = [

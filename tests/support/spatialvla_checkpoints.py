@@ -14,7 +14,7 @@ from tokenizers.decoders import Sequence as Decoders
 from tokenizers.models import BPE
 from tokenizers.normalizers import Replace
 
-from probe_kit.models.initialisation import initialise
+from probe_kit.models.building import initialise
 from probe_kit.models.spatialvla import SpatialVLAConfig, SpatialVLANetwork, build_spatialvla
 
 SIDE = 42

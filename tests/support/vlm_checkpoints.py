@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from probe_kit.models.initialisation import initialise
+from probe_kit.models.building import initialise
 from probe_kit.models.internvl import build_internvl
 from probe_kit.models.ovis2_5 import OvisConfig, build_ovis2_5
 from probe_kit.models.paligemma import build_paligemma

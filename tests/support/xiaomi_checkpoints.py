@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from probe_kit.models.initialisation import initialise
+from probe_kit.models.building import initialise
 from probe_kit.models.xiaomi import XiaomiConfig, build_xiaomi
 from tests.support.qwen_checkpoints import (
     ID,

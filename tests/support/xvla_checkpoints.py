@@ -43,8 +43,8 @@ def write_xvla(
     from lerobot.policies.xvla.configuration_xvla import XVLAConfig
     from lerobot.policies.xvla.processor_xvla import XVLAAddDomainIdProcessorStep, make_xvla_pre_post_processors
 
-    from probe_kit.models.initialisation import initialise
-    from probe_kit.models.lerobot.xvla import build_xvla
+    from probe_kit.hooks.families.xvla.adapter import build_xvla
+    from probe_kit.models.building import initialise
 
     write_bart_tokenizer(folder)
     config = XVLAConfig(

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from probe_kit.env import SceneSpec
-from probe_kit.env.scoring.trajectory import CHANNELS
+from probe_kit.env.scoring import CHANNELS
 from probe_kit.runs import Run, label_run, open_run, seal
 from probe_kit.runs.store import locate
 from probe_kit.runs.thumbnails import as_thumbnail, thumbnail_key

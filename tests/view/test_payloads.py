@@ -10,9 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from probe_kit.env.scoring.events import EVENTS, Events
-from probe_kit.env.scoring.rules import RULES
-from probe_kit.env.scoring.trajectory import Trajectory
+from probe_kit.env.scoring import EVENTS, RULES, Events, Trajectory
 from probe_kit.errors import RunDamagedError, UsageError
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.intervene.kinds.image_swap import stored_image_swaps

@@ -15,7 +15,7 @@ from probe_kit.extract.settings import ExtractSettings
 from probe_kit.extract.sources.source import Source
 from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE
 from probe_kit.hooks.checkpoints.third_party import with_origin
-from probe_kit.hooks.families.shared.lerobot.features import STATE, cameras_of
+from probe_kit.hooks.families.shared.kinds import STATE, cameras_of
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy

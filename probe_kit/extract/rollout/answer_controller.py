@@ -23,7 +23,7 @@ from probe_kit.extract.vqa.phrases import Phrase, phrases
 from probe_kit.extract.vqa.pictures import side_by_side
 from probe_kit.extract.vqa.scores import Choice, letter_margins, outcome_of, side_expected, side_said
 from probe_kit.extract.vqa.templates import Order, sides
-from probe_kit.hooks.checkpoints.containment import copied
+from probe_kit.hooks.checkpoints.third_party import copied
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.runs.layout import StoredStream
 from probe_kit.suite.wording import side_words

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from probe_kit._system.machine import cores_here
-from probe_kit.env.robot.controller import ACTION_SIZE
+from probe_kit.env.arm import ACTION_SIZE
 from probe_kit.errors import UsageError
 from probe_kit.extract.plan import Row
 from probe_kit.extract.rollout.controllers import PolicyController

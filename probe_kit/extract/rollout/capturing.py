@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import CaptureChangedActionError
-from probe_kit.hooks.contract.views import view_names
+from probe_kit.hooks.contract.sites import view_names
 from probe_kit.runs.layout import StoredStream
 
 if TYPE_CHECKING:
@@ -100,7 +100,7 @@ class Capturer:
             "observations": len(captured),
         }
         if _sha256(captured) != _sha256(plain):
-            from probe_kit.hooks.capturing.changed_outputs import reason_of_change
+            from probe_kit.hooks.capturing.capture_context import reason_of_change
 
             raise CaptureChangedActionError(
                 f"capturing changed the {name} by up to {np.abs(plain - captured).max():.3g}; they must be equal "

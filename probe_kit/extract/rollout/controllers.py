@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.env.robot.controller import ACTION_SIZE
+from probe_kit.env.arm import ACTION_SIZE
 from probe_kit.errors import PolicyFailedError, ProbeKitError
 from probe_kit.extract.plan import Row
 from probe_kit.extract.rollout.capturing import SMALL, Capturer, stored_streams
@@ -20,10 +20,9 @@ from probe_kit.extract.settings import ExtractSettings
 from probe_kit.extract.sources.source import Source
 from probe_kit.extract.sources.units import check_predictions
 from probe_kit.hashing import derive_seed
-from probe_kit.hooks.checkpoints.containment import begin_randomness, copied
-from probe_kit.hooks.checkpoints.third_party import while_acting
+from probe_kit.hooks.checkpoints.third_party import begin_randomness, copied, while_acting
+from probe_kit.hooks.contract.declared import PLAIN, Rotation
 from probe_kit.hooks.contract.observation import Observation
-from probe_kit.hooks.contract.protocol import PLAIN, Rotation
 from probe_kit.runs.certificates import INPUT_CHECK
 from probe_kit.runs.layout import StoredStream
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.env.rotations import from_rpy, to_vector
-from probe_kit.hooks.contract.protocol import PLAIN, Rotation
+from probe_kit.hooks.contract.declared import PLAIN, Rotation
 
 _TURN = slice(3, 6)
 """Roll, pitch and yaw among the seven numbers of an action."""

@@ -16,7 +16,7 @@ from probe_kit.errors import RecordingError, UsageError
 from probe_kit.extract.sources.hashed_files import HashedFiles
 from probe_kit.extract.sources.lerobot_meta import IMAGE, KEYS, NUMERIC, EpisodeMeta, LeRobotMeta
 from probe_kit.extract.sources.recording import LeRobotSource
-from probe_kit.hooks.checkpoints.hub import OFFLINE_WAY_OUT, hub_reason, unreachable, way_out
+from probe_kit.hooks.checkpoints.checkpoint import OFFLINE_WAY_OUT, hub_reason, unreachable, way_out
 
 MOST_FRAMES = 64
 """Chosen frames that one row holds."""

@@ -25,9 +25,8 @@ from probe_kit.extract.sources.recording import Pixels
 from probe_kit.extract.sources.source import Played, Source, SourceSettings
 from probe_kit.extract.sources.units import predicted_once
 from probe_kit.hashing import derive_seed
-from probe_kit.hooks.contract.observation import Observation
-from probe_kit.hooks.contract.state_layout import ARM_NUMBERS
-from probe_kit.hooks.contract.views import CAMERA
+from probe_kit.hooks.contract.observation import ARM_NUMBERS, Observation
+from probe_kit.hooks.contract.sites import CAMERA
 from probe_kit.runs.layout import CAPTURE_ONLY, CLASSES, DATASET, OTHER_ACTIONS, RECORDED_EPISODES, TRUTHS
 from probe_kit.suite.pictures import decode_bytes
 

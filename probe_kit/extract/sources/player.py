@@ -28,7 +28,7 @@ SIDE = 32
 class Ending:
     """The end of an episode: its record as flat columns, a frame per action if it was filmed, its small frames.
 
-    trajectory: (T + 1, C) float32; see `probe_kit.env.scoring.trajectory`. seconds: that the player worked on the
+    trajectory: (T + 1, C) float32; see `probe_kit.env.scoring`. seconds: that the player worked on the
     episode, by the wall clock. inputs: (n, …) by kind what was shown in n inferences, of sources without a scene.
     """
 

@@ -11,7 +11,7 @@ from pydantic import BeforeValidator, Field
 
 from probe_kit.errors import UsageError
 from probe_kit.extract.sources.source import SourceSettings
-from probe_kit.hooks.families.shared.lerobot.features import IMAGES
+from probe_kit.hooks.families.shared.kinds import IMAGES
 
 TURNS = (90, 180, 270)
 """Degrees that pictures can be rotated by, counterclockwise."""

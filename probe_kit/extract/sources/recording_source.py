@@ -28,9 +28,8 @@ from probe_kit.extract.sources.units import (
     unusual_shares,
 )
 from probe_kit.hashing import derive_seed
-from probe_kit.hooks.contract.observation import Observation
-from probe_kit.hooks.contract.state_layout import ARM_NUMBERS
-from probe_kit.hooks.families.shared.lerobot.features import ACTION, IMAGES, STATE
+from probe_kit.hooks.contract.observation import ARM_NUMBERS, Observation
+from probe_kit.hooks.families.shared.kinds import ACTION, IMAGES, STATE
 from probe_kit.runs.layout import CAPTURE_ONLY, DATASET, OTHER_ACTIONS, RECORDED_EPISODES, TRUTHS
 
 if TYPE_CHECKING:

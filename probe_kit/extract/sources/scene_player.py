@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.env import Act2AnswerEnv, Idle, SceneSpec, ScriptedExpert
-from probe_kit.env.recorder import Recorder
+from probe_kit.env.act2answer import Recorder
 from probe_kit.extract.plan import Row
 from probe_kit.extract.sources.player import Answer, Ending, Player
 from probe_kit.extract.sources.source import Played

@@ -19,7 +19,7 @@ from probe_kit.extract.sources.source import Played, Source
 from probe_kit.extract.sources.units import FIRST_EPISODES, check_units, unusual_shares
 from probe_kit.hashing import derive_seed, sha256_json
 from probe_kit.hooks.contract.observation import Observation
-from probe_kit.hooks.contract.views import CAMERA
+from probe_kit.hooks.contract.sites import CAMERA
 from probe_kit.suite import Episode, Suite, default_suite, load_suite
 from probe_kit.suite.build import ITEMS, default_folder
 from probe_kit.suite.validation.sufficiency import Smallest

@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import PolicyFailedError, UnitsError
-from probe_kit.hooks.checkpoints.containment import copied
-from probe_kit.hooks.checkpoints.third_party import while_acting
+from probe_kit.hooks.checkpoints.third_party import copied, while_acting
 from probe_kit.hooks.contract.observation import Observation
 
 if TYPE_CHECKING:

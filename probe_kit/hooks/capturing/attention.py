@@ -1,21 +1,34 @@
-"""Attention of the acting stream to every token of the backbone; descriptive, no evidence of use.
+"""Attention: the mass that the acting stream gives to every token, and the patterns of every head.
 
-with attention(policy) as mass:
+with capture_attention(policy) as mass:
     policy.act([seen], [seed])
 mass.of_role(policy.roles([seen])["backbone"], "image")  # {(block, iteration): (B,)}
+
+with capture_patterns(policy, policy.streams["expert"].sites("heads")) as patterns:
+    policy.act([seen], [0])
+patterns["expert.02.heads@9"]  # (B, H, S, T): S positions of the stream attend to T
+
+Queries, keys, masks and scales are those that reach torch, behind rotation and norms. Every pattern is checked:
+with the values of the same call it must give what the heads read. An attended token need not be used.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn import functional
+from torch.overrides import TorchFunctionMode
 
-from probe_kit.errors import CaptureError, RolesMismatchError
-from probe_kit.hooks.contract.model import Policy
+from probe_kit.errors import CaptureError, RolesMismatchError, UnknownSiteError, UsageError
+from probe_kit.hooks.capturing.capture_context import ActivationCache, capture
+from probe_kit.hooks.contract.model import Model, Policy
 from probe_kit.hooks.contract.roles import Roles
+from probe_kit.hooks.contract.sites import HEADS, Site, Stream, first_of
 
 Read = tuple[int, int]
 """A block of the backbone whose keys and values are read, and the iteration in which it is."""
@@ -81,3 +94,197 @@ def capture_attention(policy: Policy) -> Iterator[AttentionMass]:
         yield mass
     if not mass.by_head:
         raise CaptureError(f"{policy.card.family} paid no attention in this context; act once inside of it")
+
+
+MOST_BYTES = 2_000_000_000
+"""Of all patterns of one capture together, as float32 on the host."""
+TOLERANCE: Mapping[torch.dtype, float] = {torch.float32: 1e-4, torch.float16: 5e-3, torch.bfloat16: 3e-2}
+"""By how much what a pattern gives may differ from what the heads read, as a share of its largest number."""
+_FUSED: Callable[..., Any] = functional.scaled_dot_product_attention
+_SOFTMAX = (functional.softmax, torch.softmax, Tensor.softmax)
+_MATMUL = (torch.matmul, Tensor.matmul, Tensor.__matmul__)
+
+
+@contextmanager
+def capture_patterns(
+    model: Model, sites: Iterable[Site], most_bytes: int = MOST_BYTES
+) -> Iterator[ActivationCache]:
+    """Capture the attention patterns of blocks while the model runs once; its output stays bit-identical.
+
+    sites: of the quantity `heads`; the pattern of a site is (B, H, S, T) float32 on the host, and its rows sum
+    to 1, or to 0 where a position attends to nothing. Raises UnknownSiteError for another quantity, UsageError
+    beyond `most_bytes`, CaptureError for a pattern that does not give what the heads read, and what `capture`
+    raises.
+    """
+    head_sites = tuple(dict.fromkeys(sites))
+    if other := [site for site in head_sites if site.quantity != HEADS]:
+        raise UnknownSiteError(
+            f"{other[0]} has no attention pattern; expected sites of the quantity heads, such as "
+            f"{other[0].stream}.{other[0].layer:02d}.{HEADS}"
+        )
+    calls, used = _AttentionCalls(), 0
+
+    def keep(site: Site, read: Tensor) -> Tensor:
+        nonlocal used
+        pattern = _pattern_of(model, site, calls, read)
+        used += pattern.numel() * 4
+        if used > most_bytes:
+            raise UsageError(
+                f"attention patterns of {len(head_sites)} sites take more than {most_bytes / 1e9:.2f} GB, with "
+                f"{pattern.numel() * 4 / 1e6:.1f} MB at {site}. Capture fewer sites, or raise most_bytes"
+            )
+        return pattern.cpu()
+
+    with calls, capture(model, head_sites, reduce=keep) as patterns:
+        yield patterns
+
+
+def attended_roles(model: Model, roles: Mapping[str, Sequence[Roles]], site: Site, tokens: int) -> list[Roles]:
+    """The roles of the T = `tokens` positions that a site attends to, per row.
+
+    roles: of every stream, as `Model.token_roles` or `AnswerModel.asked_roles` says them. A stream that acts reads
+    the backbone's positions, then its own; where a decoder puts out tokens, those that came before. Raises
+    RolesMismatchError for a number of tokens that fits neither.
+    """
+    stream, backbone = model.stream_of(site), first_of("backbone", model.streams.values())
+    acting = first_of("action", model.streams.values())
+    stream_roles = roles.get(stream.name)
+    if stream_roles is None or backbone is None:
+        raise RolesMismatchError(f"the tokens of {stream.name} have no roles; those of {', '.join(roles)} have")
+    before, behind = roles[backbone], stream_roles
+    if stream.name == backbone:
+        behind = roles.get(acting or "", stream_roles)
+    elif len(stream_roles[0]) == tokens and model.prompt_kv is None:
+        return list(stream_roles)
+    joined = [_joined(first, last, tokens) for first, last in zip(before, behind, strict=True)]
+    if any(row is None for row in joined):
+        raise RolesMismatchError(
+            f"{site} attends to {tokens} positions; {backbone} has {len(before[0])} and {stream.name} "
+            f"{len(stream_roles[0])}. Take the roles of the observations that were inferred"
+        )
+    return [row for row in joined if row is not None]
+
+
+def _joined(before: Roles, behind: Roles, tokens: int) -> Roles | None:
+    """`before`, and `behind` once or, of a single position, as often as there is room; None if they do not fit."""
+    labels = _labels(before)
+    missing, repeated = tokens - len(labels), _labels(behind)
+    if missing < 0 or (missing not in (0, len(repeated)) and len(repeated) != 1):
+        return None
+    return Roles.from_labels(labels + (repeated if len(repeated) == missing else repeated * missing))
+
+
+def _labels(roles: Roles) -> list[str]:
+    return [span.role for span in roles.spans for _ in range(span.start, span.stop)]
+
+
+# -- patterns of calls ------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Attention:
+    """One attention of a model. weights: makes (B, H, S, T) float32. values: (B, G, T, E), H a multiple of G."""
+
+    weights: Callable[[], Tensor]
+    values: Tensor
+
+
+class _AttentionCalls(TorchFunctionMode):
+    """Sees torch's calls while a model runs, and changes none. last: the attention that was computed last."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.last: _Attention | None = None
+        self.is_paused = False
+        self._shares: Tensor | None = None
+
+    def __torch_function__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        del types
+        keywords = kwargs or {}
+        result = func(*args, **keywords)
+        if self.is_paused:
+            return result
+        if func is _FUSED:
+            self.last = _fused(*args, **keywords)
+        elif func in _SOFTMAX and result.dim() == 4:
+            self._shares = result
+        elif func in _MATMUL and self._shares is not None and _is_reading(self._shares, *args[:2]):
+            shares, self._shares = self._shares, None
+            self.last = _Attention(shares.float, args[1])
+        return result
+
+
+def _is_reading(shares: Tensor, weights: Tensor, values: Tensor) -> bool:
+    """Whether a product is of these shares, or a copy of them in another dtype, with values."""
+    return weights.shape == shares.shape and values.dim() == 4 and values.shape[2] == shares.shape[3]
+
+
+def _fused(
+    query: Tensor,
+    key: Tensor,
+    value: Tensor,
+    attn_mask: Tensor | None = None,
+    dropout_p: float = 0.0,
+    is_causal: bool = False,
+    scale: float | None = None,
+    **_: Any,
+) -> _Attention | None:
+    """torch's fused attention of queries (B, H, S, E), keys and values (B, G, T, E); None of other shapes."""
+    if query.dim() != 4 or dropout_p:
+        return None
+
+    def weights() -> Tensor:
+        keys = _of_every_head(key, query.shape[1]).float()
+        factor = query.shape[-1] ** -0.5 if scale is None else scale
+        logits = query.float() @ keys.transpose(2, 3) * factor
+        mask = attn_mask
+        if is_causal:
+            mask = torch.ones(logits.shape[2:], dtype=torch.bool, device=logits.device).tril()
+        if mask is not None:
+            logits = logits.masked_fill(~mask, -torch.inf) if mask.dtype == torch.bool else logits + mask
+        return functional.softmax(logits, dim=-1).nan_to_num(0.0)  # a position that attends to nothing
+
+    return _Attention(weights, value)
+
+
+def _of_every_head(heads: Tensor, count: int) -> Tensor:
+    """(B, H, T, E) of (B, G, T, E), each of the G repeated for the heads that share it."""
+    return heads.repeat_interleave(count // heads.shape[1], dim=1)
+
+
+def _pattern_of(model: Model, site: Site, calls: _AttentionCalls, read: Tensor) -> Tensor:
+    """(B, H, S, T) of the positions of a site. read: (B, S, H · E) what its heads read."""
+    tap, stream = model.tap(site), model.stream_of(site)
+    if calls.last is None:
+        raise CaptureError(
+            f"{site}: no attention that torch computes came before the output projection. Load the model with "
+            "the attention sdpa or eager; kernels of other libraries do not show what they weigh"
+        )
+    calls.is_paused = True
+    weights = calls.last.weights()
+    values = _of_every_head(calls.last.values, weights.shape[1]).float()
+    computed = tap.rows.of((weights @ values.to(weights.device)).transpose(1, 2).flatten(2))[:, tap.tokens]
+    calls.is_paused = False
+    _check_reading(site, stream, weights.shape[1], computed, read)
+    return tap.rows.of(weights)[:, :, tap.tokens]
+
+
+def _check_reading(site: Site, stream: Stream, heads: int, computed: Tensor, read: Tensor) -> None:
+    """Raise CaptureError unless what a pattern gives is what the heads read."""
+    if heads == stream.heads and computed.shape == read.shape:
+        limit = TOLERANCE.get(read.dtype, TOLERANCE[torch.float32]) * float(read.abs().max())
+        apart = float((computed - read.float().nan_to_num(0.0)).abs().max())
+        if apart <= limit:
+            return
+        actual, expected = f"is off by {apart:.3g}", f"at most {limit:.3g}"
+    else:
+        actual, expected = (
+            f"has {heads} heads and {tuple(computed.shape)}",
+            f"{stream.heads} and {tuple(read.shape)}",
+        )
+    raise CaptureError(
+        f"the attention in front of {site} does not give what its heads read: it {actual}; expected {expected}. "
+        "The block computes something between its attention and its output projection; correct the tap of `heads`"
+    )

@@ -1,29 +1,198 @@
-"""Contexts that capture or replace the activations of chosen sites while a model runs.
+"""Capture of activations and gradients while a model runs once, and proof that it changes no output.
 
-Both leave the model exactly as found, also when the body raises.
+value, slopes = gradients_at(policy, [observation], [seed], policy.sites(), lambda actions: actions[0, :, 1].sum())
+slopes["backbone.02.residual"]  # (B, T, D)
+
+A gradient at a site is of everything behind it. At `kv` that is what the acting part reads: the backbone's own
+reading of the same keys and values lies beside it.
+
+`torch.nn.TransformerEncoder` computes with fused kernels while no hook is registered in it. With hooks it runs its
+submodules, and the rounding differs. `Family.load` switches these kernels off, so that both ways are the same.
 """
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from itertools import groupby
 from typing import Any
 from weakref import WeakSet
 
+import numpy as np
 import torch
-from torch import Tensor
+from numpy.typing import NDArray
+from torch import Tensor, nn
 from torch.utils.hooks import RemovableHandle
 
+from probe_kit._terminal.notebook import rows_html
 from probe_kit.errors import (
     CaptureError,
     NonFiniteActivationError,
     SiteFiredTooOftenError,
     SiteNeverFiredError,
+    UnknownSiteError,
 )
-from probe_kit.hooks.capturing.activation_cache import ActivationCache
-from probe_kit.hooks.contract.model import Model, Tap
-from probe_kit.hooks.contract.sites import Site
+from probe_kit.hooks.contract.model import Model, Policy, Tap
+from probe_kit.hooks.contract.observation import Observation
+from probe_kit.hooks.contract.sites import KV_STREAM, Site
 
-__all__ = ["ActivationCache", "EditFunction", "Reduce", "capture", "edit"]
+__all__ = [
+    "ActivationCache",
+    "EditFunction",
+    "Reduce",
+    "capture",
+    "edit",
+]
+
+
+Infer = Callable[[], NDArray[np.float32]]
+
+
+def switch_off_fused_encoder() -> None:
+    """Let every `nn.TransformerEncoder` of this process run its submodules, with and without hooks."""
+    torch.backends.mha.set_fastpath_enabled(False)
+
+
+@contextmanager
+def without_fused_encoder() -> Iterator[None]:
+    """The same inside the body; afterwards it is as it was."""
+    before = torch.backends.mha.get_fastpath_enabled()
+    torch.backends.mha.set_fastpath_enabled(False)
+    try:
+        yield
+    finally:
+        torch.backends.mha.set_fastpath_enabled(before)
+
+
+def reason_of_change(infer: Infer, plain: NDArray[np.float32], infer_captured: Infer) -> str:
+    """Why an inference under capture differs from `plain`, and what to change, as sentences.
+
+    infer: the inference without hooks, whose output `plain` is, of any shape. infer_captured: the same with hooks.
+    Both are repeated at most once.
+    """
+    if not same_bits(infer(), plain):
+        return (
+            "Without hooks the same inference does not repeat either. The adapter keeps state between calls, or "
+            "its model is not deterministic: take all randomness from the seeds, and reset caches at every call"
+        )
+    with without_fused_encoder():
+        repaired = same_bits(infer(), infer_captured())
+    if repaired:
+        return (
+            "The cause is torch's fused encoder: nn.TransformerEncoder computes with other kernels while it has "
+            "no hooks. Call torch.backends.mha.set_fastpath_enabled(False) in the loader, or load the model with "
+            "probe_kit.hooks.load_model, which does so"
+        )
+    return (
+        "Without hooks the same inference repeats bit for bit. A module computes in another way while it has "
+        "hooks, as fused and compiled modules do: switch that off in the loader"
+    )
+
+
+def same_bits(array: NDArray[np.float32], other: NDArray[np.float32]) -> bool:
+    """Equal shape, type and bytes; NaN equals itself."""
+    return array.shape == other.shape and array.dtype == other.dtype and array.tobytes() == other.tobytes()
+
+
+class ActivationCache(Mapping[Site, Tensor]):
+    """The captured activations of one inference, a mapping from sites in the order in which they fired.
+
+    `tape[site]` is what `capture` kept of it, (B, T, D) on the model's device unless it was reduced; the name of a
+    site does as well as the site. fires: how often each tapped module was called.
+    """
+
+    def __init__(self) -> None:
+        self._kept: dict[Site, Tensor] = {}
+        self.fires: dict[str, int] = {}
+
+    def __getitem__(self, site: Site | str) -> Tensor:
+        """Raises UnknownSiteError for a site that was not captured or a name that is none."""
+        activation = self._kept.get(Site.parse(site) if isinstance(site, str) else site)
+        if activation is None:
+            raise UnknownSiteError(f"{site} was not captured; the tape holds {self._contents() or 'nothing yet'}")
+        return activation
+
+    def __iter__(self) -> Iterator[Site]:
+        return iter(self._kept)
+
+    def __len__(self) -> int:
+        return len(self._kept)
+
+    def __contains__(self, site: object) -> bool:
+        try:
+            return (Site.parse(site) if isinstance(site, str) else site) in self._kept
+        except UnknownSiteError:
+            return False
+
+    # Like tensors, tapes are compared by identity.
+    __eq__ = object.__eq__
+    __hash__ = object.__hash__
+
+    def get(self, site: Site | str, default: Any = None) -> Any:  # Mapping's own waits for a KeyError
+        """The activation, or `default` where the site was not captured."""
+        return self[site] if site in self else default  # noqa: SIM401  (this is `get`)
+
+    def stack(self, stream: str, quantity: str = "residual") -> Tensor:
+        """All of one stream and quantity as one tensor.
+
+        Returns (layers, B, T, D), or (layers, iterations, B, T, D) where sites have iterations; layers and
+        iterations ascend, as many as were captured. Raises UnknownSiteError if none was, if a layer lacks an
+        iteration that another has, or if shapes differ.
+        """
+        sites = sorted(
+            (site for site in self._kept if (site.stream, site.quantity) == (stream, quantity)),
+            key=lambda site: (site.layer, -1 if site.iteration is None else site.iteration),
+        )
+        if not sites:
+            raise UnknownSiteError(
+                f"no site {stream}.….{quantity} was captured; the tape holds {self._contents() or 'nothing yet'}"
+            )
+        layers = [list(of_layer) for _, of_layer in groupby(sites, key=lambda site: site.layer)]
+        iterations = {site.iteration for site in sites}
+        incomplete = [of_layer[0].layer for of_layer in layers if len(of_layer) != len(iterations)]
+        if incomplete:
+            raise UnknownSiteError(
+                f"layers {incomplete} of {stream} lack iterations that others have; capture all of "
+                f"{len(iterations)} iterations in every layer, or take single sites"
+            )
+        if len({self._kept[site].shape for site in sites}) > 1:
+            raise UnknownSiteError(f"the sites of {stream} have different shapes; take them one by one")
+        rows = [torch.stack([self._kept[site] for site in of_layer]) for of_layer in layers]
+        stacked = torch.stack(rows)
+        return stacked[:, 0] if iterations == {None} else stacked
+
+    def _streams(self) -> list[tuple[str, str, int, int, tuple[int, ...], str]]:
+        """Per stream and quantity: layers, iterations (0: none), shape of a site, dtype and device."""
+        by_stream: dict[tuple[str, str], list[Site]] = {}
+        for site in self._kept:
+            by_stream.setdefault((site.stream, site.quantity), []).append(site)
+        return [
+            (
+                stream, quantity, len({site.layer for site in sites}),
+                len({site.iteration for site in sites} - {None}), tuple(self._kept[sites[0]].shape),
+                f"{str(self._kept[sites[0]].dtype).removeprefix('torch.')} on {self._kept[sites[0]].device}",
+            )
+            for (stream, quantity), sites in by_stream.items()
+        ]  # fmt: skip
+
+    def _contents(self) -> str:
+        return "; ".join(
+            f"{stream}.{quantity}: {layers} layers" + (f" x {iterations} iterations" if iterations else "")
+            for stream, quantity, layers, iterations, _, _ in self._streams()
+        )
+
+    def __repr__(self) -> str:
+        return f"<ActivationCache of {len(self)} sites{': ' if self._kept else ''}{self._contents()}>"
+
+    def _repr_html_(self) -> str:
+        rows = [
+            (stream, quantity, layers, iterations or "–", " × ".join(map(str, shape)), kind)
+            for stream, quantity, layers, iterations, shape, kind in self._streams()
+        ]
+        columns = ("stream", "quantity", "layers", "iterations", "each (B × T × D)", "")
+        note = "tape[site] or tape['backbone.03.residual'] for one of them, tape.stack(stream) for all layers"
+        return rows_html(f"ActivationCache of {len(self)} sites", columns, rows, note)
+
 
 Reduce = Callable[[Site, Tensor], Tensor]
 EditFunction = Callable[[Tensor], Tensor]
@@ -169,3 +338,82 @@ def _check_non_finite(tape: ActivationCache) -> None:
             raise NonFiniteActivationError(
                 f"{site} holds NaN or infinity; look for overflow (try --dtype float32) or damaged weights"
             )
+
+
+Metric = Callable[[Tensor], Tensor]
+"""From (B, chunk, 7) actions, metres and radians, to a number."""
+
+
+def gradients_at(
+    policy: Policy,
+    observations: Sequence[Observation],
+    seeds: Sequence[int],
+    sites: Iterable[Site],
+    metric: Metric,
+) -> tuple[float, ActivationCache]:
+    """The metric of one inference, and its gradient at every site: (B, T, D) float32, zero where nothing reads it.
+
+    Costs about three inferences, however many sites. Raises UnsupportedInterventionError, and what `capture`
+    raises.
+    """
+    policy.interventions.check("gradients", policy.card.family)
+    with flowing_tensors(policy, sites) as flowing:
+        value = metric(policy.differentiable(observations, seeds))
+    return float(value.detach()), flowing.gradients_of(value)
+
+
+@dataclass
+class FlowingTensors:
+    """The tensors themselves that passed at sites, with the taps that select the sites' parts of them."""
+
+    passed: dict[Site, tuple[Tap, Tensor]] = field(default_factory=dict)
+
+    def gradients_of(self, value: Tensor) -> ActivationCache:
+        """The gradient of a number at every site. Frees the graph."""
+        gradients = ActivationCache()
+        tensors = [tensor for _, tensor in self.passed.values()]
+        slopes: Sequence[Tensor | None] = [None] * len(tensors)
+        if value.requires_grad:
+            slopes = torch.autograd.grad(value, tensors, allow_unused=True)
+        for (site, (tap, tensor)), slope in zip(self.passed.items(), slopes, strict=True):
+            gradients._kept[site] = tap.select(torch.zeros_like(tensor) if slope is None else slope).float()
+        return gradients
+
+
+@contextmanager
+def flowing_tensors(model: Model, sites: Iterable[Site]) -> Iterator[FlowingTensors]:
+    """Keep what passes at `sites` while the model runs once with a graph.
+
+    An input is kept as the very tensor that flows, so that the norm and the path around the block both count. Of
+    an output, and of `kv`, a copy passes on: what read the tensor before does not count, and what is added to it
+    in place does not reach it. The first tensor of all becomes a leaf: nothing above it is kept.
+    """
+    flowing = FlowingTensors()
+
+    def keep(site: Site, tap: Tap, passing: Tensor) -> Tensor | None:
+        is_copied = tap.end == "output" or site.stream == KV_STREAM
+        tensor = passing.view_as(passing) if is_copied and passing.requires_grad else passing
+        if not tensor.requires_grad:
+            tensor.requires_grad_()
+        flowing.passed[site] = (tap, tensor)
+        return tensor.clone() if is_copied else None
+
+    with ExitStack() as stack:
+        hooks = _attach(model, sites, keep, stack)
+        yield flowing
+    for hook in hooks:
+        hook.check_count()
+
+
+@contextmanager
+def frozen(network: nn.Module) -> Iterator[None]:
+    """Run the body with a graph of activations alone: no weight asks for its gradient."""
+    trained = [weight for weight in network.parameters() if weight.requires_grad]
+    for weight in trained:
+        weight.requires_grad_(False)
+    try:
+        with torch.enable_grad():
+            yield
+    finally:
+        for weight in trained:
+            weight.requires_grad_(True)

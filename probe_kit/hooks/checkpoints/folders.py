@@ -1,30 +1,187 @@
-"""The folder of a checkpoint as loaders read it: a LoRA adapter alone is joined with its base's small files.
-
-A loader is given one folder with all files of a checkpoint but the base's weights, which `adapter_files` finds.
-Imports no torch.
-"""
+"""Folders of checkpoints: LoRA adapters and their bases, checks of files, states. Imports no torch."""
 
 import atexit
 import shutil
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from probe_kit.errors import CheckpointError
-from probe_kit.hooks.checkpoints.adapter_files import (
-    ADAPTER_WEIGHTS,
-    adapter_settings,
-    base_folder_of,
-    remember_joined,
-)
+from probe_kit._system.bounded_json import read_json, read_json_object
+from probe_kit.errors import CheckpointError, WeightsError
 from probe_kit.hooks.checkpoints.checkpoint import (
     ADAPTER_FILE,
     CONFIG_FILE,
     PATTERNS,
     SMALL_FILES,
+    check_unambiguous,
+    is_in_cache,
     is_weights,
+    missing_weights,
     plain_folder,
 )
+
+ADAPTER_WEIGHTS = ("adapter_model.safetensors", "adapter_model.bin")
+SCALING = ("r", "lora_alpha", "rank_pattern", "alpha_pattern", "use_rslora", "use_dora", "lora_bias")
+"""Fields that decide how much the factors add to a weight."""
+_COPIES = ("bias", "modules_to_save")
+_NAMING = ("peft_type", "base_model_name_or_path")
+_WITHOUT_EFFECT = (
+    "task_type", "auto_mapping", "peft_version", "inference_mode", "target_modules", "exclude_modules",
+    "lora_dropout", "layers_to_transform", "layers_pattern", "megatron_core", "qalora_group_size",
+    "runtime_config", "eva_config", "loftq_config", "velora_config",
+)  # fmt: skip
+"""Training, speed, and rules for choosing modules: the tensors themselves say which modules they change."""
+_INERT: Mapping[str, tuple[Any, ...]] = {
+    "init_lora_weights": (True, False, None, "gaussian", "eva", "orthogonal"),
+    "revision": (None, "", "main"),
+}
+"""Fields with the values under which a merge is exact. Other initialisations change the base's weights."""
+_NOTHING: tuple[Any, ...] = (None, False, "", [], {})
+"""What switches every other field off."""
+
+
+@dataclass(frozen=True)
+class AdapterFiles:
+    """A LoRA adapter. settings: of its `adapter_config.json`. weights: the file of its tensors."""
+
+    folder: Path
+    settings: Mapping[str, Any]
+    weights: Path
+
+    @property
+    def base(self) -> str:
+        """Folder or hub id of the checkpoint that it was trained on, as the file names it."""
+        return str(self.settings["base_model_name_or_path"])
+
+    def base_folder(self, patterns: Sequence[str] = PATTERNS) -> Path:
+        """The folder of the base's checkpoint; a relative path may start at the adapter.
+
+        patterns: the files that are needed of a base on the hub. Raises CheckpointError if it is not there, or is
+        an adapter itself.
+        """
+        return base_folder_of(self.folder, self.settings, patterns)
+
+
+_JOINED: dict[str, Path] = {}
+"""Folders in which the files of an adapter and its base are joined, with the adapter's own."""
+
+
+def remember_joined(joined: Path, folder: Path) -> None:
+    """Note that a folder holds links to the files of the adapter in `folder`, and of its base."""
+    _JOINED[str(joined)] = folder
+
+
+def with_adapters_named(text: str) -> str:
+    """Return a text in which every joined folder has the name of its adapter's own."""
+    for joined, folder in _JOINED.items():
+        text = text.replace(joined, str(folder))
+    return text
+
+
+def base_folder_of(folder: Path, settings: Mapping[str, Any], patterns: Sequence[str] = PATTERNS) -> Path:
+    """The folder of the base of the adapter in `folder`, with these settings; see `AdapterFiles.base_folder`."""
+    base = str(settings["base_model_name_or_path"])
+    sibling = folder / base
+    try:
+        base_folder = sibling.resolve() if sibling.is_dir() else plain_folder(base, patterns)
+    except CheckpointError as error:
+        raise CheckpointError(
+            f"the LoRA adapter in {folder} was trained on {base!r}: {error}. "
+            f"Correct base_model_name_or_path in its {ADAPTER_FILE}"
+        ) from error
+    if base_folder.resolve() == folder.resolve():
+        return folder
+    if (base_folder / ADAPTER_FILE).is_file():
+        raise CheckpointError(
+            f"the base {base_folder} of the LoRA adapter in {folder} is an adapter itself. Merge the base with "
+            "peft first, and name the merged folder as base_model_name_or_path"
+        )
+    return base_folder
+
+
+def adapter_settings(file: Path) -> dict[str, Any]:
+    """The content of an `adapter_config.json` of an adapter that can be merged. Raises CheckpointError."""
+    settings = dict(read_json_object(file, CheckpointError, "Download the adapter again"))
+    _check_settings(file, settings)
+    return settings
+
+
+def adapter_in(folder: Path) -> AdapterFiles | None:
+    """The LoRA adapter in a checkpoint's folder; None where there is none.
+
+    Raises CheckpointError for an adapter that cannot be merged exactly, for one of which a file is missing, and
+    for weights beside it of which no file says whether they are the base's or merged.
+    """
+    folder = _JOINED.get(str(folder), folder)
+    file = folder / ADAPTER_FILE
+    weights = next((folder / name for name in ADAPTER_WEIGHTS if (folder / name).is_file()), None)
+    if not file.is_file():
+        _check_no_traces(folder, weights)
+        return None
+    settings = adapter_settings(file)
+    if weights is None:
+        raise CheckpointError(
+            f"{folder} has {ADAPTER_FILE}, but neither {' nor '.join(ADAPTER_WEIGHTS)}. Download the adapter again"
+        )
+    adapter = AdapterFiles(folder, settings, weights)
+    if not missing_weights(folder):
+        _check_own_base(adapter)
+    return adapter
+
+
+def _check_no_traces(folder: Path, weights: Path | None) -> None:
+    """Raise CheckpointError for a folder that was an adapter's, without the file that says how it is merged."""
+    if weights is not None:
+        raise CheckpointError(
+            f"{folder} has {weights.name}, but no {ADAPTER_FILE}, which says how it changes the weights. Put the "
+            f"adapter's {ADAPTER_FILE} there, or remove {weights.name} if the weights are merged"
+        )
+    config = folder / CONFIG_FILE
+    if not config.is_file():
+        return
+    values = read_json_object(config, CheckpointError, "Download the checkpoint again")
+    if values.get("use_peft"):
+        raise CheckpointError(
+            f"{config} says use_peft: true, and {folder} has no {ADAPTER_FILE}: its weights alone may be those "
+            f"of the base. Put {ADAPTER_FILE} and {ADAPTER_WEIGHTS[0]} there, or set use_peft to false if the "
+            "weights are merged"
+        )
+
+
+def _check_settings(file: Path, settings: Mapping[str, Any]) -> None:
+    """Raise CheckpointError for an adapter that adds something else to weights than its scaled factors."""
+    if (kind := settings.get("peft_type")) != "LORA":
+        raise CheckpointError(
+            f"{file.parent} holds a {kind} adapter; only LORA can be merged. Merge it with peft, and pass the "
+            "merged folder"
+        )
+    if not settings.get("base_model_name_or_path"):
+        raise CheckpointError(f"{file} does not say its base_model_name_or_path; add it")
+    plain = {*SCALING, *_COPIES, *_NAMING, *_WITHOUT_EFFECT}
+    unexplained = {name: value for name, value in settings.items() if name not in plain}
+    wrong = [
+        f"{name}: {value!r}" for name, value in unexplained.items() if value not in _INERT.get(name, _NOTHING)
+    ]
+    if wrong:
+        raise CheckpointError(
+            f"{file} says {', '.join(wrong)}, which a merge of low-rank factors does not repeat exactly. Merge "
+            "the adapter with the tool that made it, and pass the merged folder"
+        )
+
+
+def _check_own_base(adapter: AdapterFiles) -> None:
+    """Raise CheckpointError unless the weights beside the adapter are the base that it names."""
+    base_folder = adapter.folder / adapter.base
+    if base_folder.is_dir() and base_folder.resolve() == adapter.folder.resolve():
+        return
+    raise CheckpointError(
+        f"{adapter.folder} holds weights and a LoRA adapter of {adapter.base!r}: no file says whether these "
+        f"weights are the base's or merged. If they are merged, remove {ADAPTER_FILE} and {adapter.weights.name}. "
+        "If they are the base's, set base_model_name_or_path to '.'. If they are neither, remove them"
+    )
+
 
 CONFIGURATIONS = (CONFIG_FILE, "config.yaml")
 """Either holds the configuration of a network."""
@@ -120,3 +277,51 @@ def _is_replaced(name: str, adapter_names: Sequence[str]) -> bool:
     """Whether the adapter has this file of the base, or one that is read together with such files."""
     parts = (begin for heads, begin in _READ_TOGETHER if any(head in adapter_names for head in heads))
     return name in adapter_names or any(name.startswith(begin) for begin in parts)
+
+
+def check_files(
+    folder: Path, types: Sequence[str], weights: bool = True, instead: Sequence[tuple[str, str]] = ()
+) -> None:
+    """Look at what can be wrong with a checkpoint before anything heavy is imported.
+
+    types: what `type` or `model_type` of its config may be. weights: whether its weights will be read. instead:
+    for other types that people may take for one of them, what to do.
+    Raises CheckpointError for a missing or unreadable config or one of another model, and for a LoRA adapter that
+    cannot be merged; WeightsError for missing weights, and for two sets of them.
+    """
+    file = folder / CONFIG_FILE
+    adapter = adapter_in(folder) if weights else None
+    if not file.is_file():
+        raise CheckpointError(f"{file} is missing; {folder} is not a checkpoint of {' or '.join(types)}")
+    config = read_json(file, CheckpointError, "Download the checkpoint again")
+    model_type = _type_of(config)
+    if not isinstance(model_type, str) or model_type not in types:
+        way_out = dict(instead).get(str(model_type), "Pass the right --model")
+        raise CheckpointError(f"{file} holds a {model_type!r} model; expected {' or '.join(types)}. {way_out}")
+    if not weights:
+        return
+    weights_folder = folder if adapter is None else adapter.base_folder()
+    check_unambiguous(weights_folder)
+    if lacking := missing_weights(weights_folder):
+        raise WeightsError(f"no weights in {weights_folder}: {lacking}. {_way_to_weights(weights_folder)}")
+
+
+def _type_of(config: Any) -> Any:
+    """The model type that a config.json describes; that of a training run of Prismatic has a part `model`."""
+    if not isinstance(config, dict):
+        return None
+    part = config.get("model")
+    if isinstance(part, dict) and "vision_backbone_id" in part:
+        return "prismatic"
+    return config.get("type") or config.get("model_type")
+
+
+def _way_to_weights(folder: Path) -> str:
+    """Advice where weights are missing; an adapter in a folder below is no weights of this one."""
+    if is_in_cache(folder):
+        return (
+            "Either the repository lacks them, or its copy in the cache is incomplete: compare with the files on "
+            "its page, and fetch it again with the network on"
+        )
+    below = sorted(path.parent.name for path in folder.glob(f"*/{ADAPTER_FILE}"))
+    return f"Pass {folder / below[0]}, which holds an adapter" if below else "Download the checkpoint again"

@@ -1,17 +1,185 @@
-"""Calls of third-party code: every exception, even SystemExit, becomes an error of probe_kit.
+"""Calls of other people's code: its errors get names, and what it changed in the process is put back.
 
-What is wrong with a checkpoint says whose it is and where it lies, wherever in the loading or acting it was found.
+A policy of a third party runs in the process that plays other episodes, and writes them. What it changes there by
+accident is put back after every call: random numbers, torch's default dtype, the working directory, environment
+variables, how Ctrl-C is answered. What it prints is shown as text on stderr. What it does on purpose is not
+contained; see SECURITY.md.
 """
 
 import logging
+import os
+import random
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
+import signal
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
+from dataclasses import replace
+from io import TextIOBase
 from pathlib import Path
+from types import FrameType
+from typing import Any, TextIO
 
+import numpy as np
+from rich.file_proxy import FileProxy
+
+from probe_kit._terminal.plain_text import terminal_safe
 from probe_kit.errors import CheckpointError, InstructionError, PolicyFailedError, ProbeKitError, WeightsError
-from probe_kit.hooks.checkpoints.adapter_files import with_adapters_named
-from probe_kit.hooks.checkpoints.containment import contained
+from probe_kit.hooks.checkpoints.folders import with_adapters_named
+from probe_kit.hooks.contract.observation import Observation
+
+_ENDING = (signal.SIGINT, signal.SIGTERM)
+
+
+class Interruptions:
+    """Interruptions of this process while a policy worked, as policies can raise KeyboardInterrupt themselves."""
+
+    def __init__(self) -> None:
+        self.asked = False
+
+
+@contextmanager
+def contained(limit: float | None = None) -> Iterator[Interruptions]:
+    """Run a policy's code in the body; afterwards this process is as it was.
+
+    limit: seconds after which the process is ended by SIGALRM, which no code can hold up; None for no limit.
+    A process that the body forked ends here: it would play on beside its parent, into the same run.
+    """
+    process = os.getpid()
+    try:
+        with ExitStack() as stack:
+            stack.enter_context(_kept_randomness())
+            stack.enter_context(_kept_surroundings())
+            stack.enter_context(_quoted_output())
+            interruptions = stack.enter_context(_noted_interruptions())
+            if limit is not None:
+                signal.setitimer(signal.ITIMER_REAL, limit)
+            yield interruptions
+    finally:
+        if os.getpid() != process:
+            os._exit(1)
+        if limit is not None:
+            signal.setitimer(signal.ITIMER_REAL, 0)
+
+
+def begin_randomness(seed: int) -> None:
+    """Let the global random numbers of Python, NumPy and torch begin at `seed` (63 bits).
+
+    So a policy that draws from them depends on its episodes alone, and not on what was played before.
+    """
+    import torch
+
+    random.seed(seed)
+    np.random.seed(seed % 2**32)  # noqa: NPY002
+    torch.manual_seed(seed)
+
+
+def copied(observations: Sequence[Observation]) -> list[Observation]:
+    """Observations whose arrays may be written to: those of the stage stay as they are."""
+    return [
+        replace(
+            observation,
+            image=np.array(observation.image),
+            state=np.array(observation.state),
+            intrinsics=None if observation.intrinsics is None else np.array(observation.intrinsics),
+            cameras={name: np.array(picture) for name, picture in observation.cameras.items()},
+        )
+        for observation in observations
+    ]
+
+
+@contextmanager
+def _kept_randomness() -> Iterator[None]:
+    import torch
+
+    on_gpu: bool = torch.cuda.is_initialized()  # type: ignore[no-untyped-call]
+    python, numpy, host = random.getstate(), np.random.get_state(), torch.get_rng_state()  # noqa: NPY002
+    devices = torch.cuda.get_rng_state_all() if on_gpu else []
+    try:
+        yield
+    finally:
+        random.setstate(python)
+        np.random.set_state(numpy)  # noqa: NPY002
+        torch.set_rng_state(host)
+        if on_gpu:
+            torch.cuda.set_rng_state_all(devices)
+
+
+@contextmanager
+def _kept_surroundings() -> Iterator[None]:
+    """Torch's default dtype, the working directory and the environment variables."""
+    import torch
+
+    dtype, folder, variables = torch.get_default_dtype(), os.open(".", os.O_RDONLY), dict(os.environ)
+    try:
+        yield
+    finally:
+        torch.set_default_dtype(dtype)
+        os.fchdir(folder)
+        os.close(folder)
+        for name in os.environ.keys() - variables.keys():
+            del os.environ[name]
+        os.environ.update({name: value for name, value in variables.items() if os.environ.get(name) != value})
+
+
+class _Quoted(TextIOBase):
+    """Writes to another stream, what a terminal would obey as visible signs."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        self._stream.write(terminal_safe(text))
+        return len(text)
+
+    def flush(self) -> None:
+        self._stream.flush()
+
+    def isatty(self) -> bool:
+        return False
+
+    @property
+    def encoding(self) -> str:  # type: ignore[override]
+        return self._stream.encoding
+
+
+@contextmanager
+def _quoted_output() -> Iterator[None]:
+    """Redirect Python's output to stderr as text; stdout is for results.
+
+    While a progress bar is drawn, both are rich's already, and what it prints ends in our consoles.
+    """
+    if isinstance(sys.stdout, FileProxy) or isinstance(sys.stderr, FileProxy) or sys.stderr is None:
+        yield
+        return
+    quoted = _Quoted(sys.stderr)
+    with redirect_stdout(quoted), redirect_stderr(quoted):
+        yield
+
+
+@contextmanager
+def _noted_interruptions() -> Iterator[Interruptions]:
+    """Record Ctrl-C and SIGTERM before their handlers run; only the main thread can."""
+    interruptions = Interruptions()
+    before: dict[int, Callable[[int, FrameType | None], Any]] = {}
+
+    def note(number: int, frame: FrameType | None) -> None:
+        interruptions.asked = True
+        before[number](number, frame)
+
+    try:
+        for number in _ENDING:
+            if callable(handler := signal.getsignal(number)):
+                before[number] = handler
+                signal.signal(number, note)
+    except ValueError:  # another thread, where KeyboardInterrupt comes from code alone
+        before.clear()
+    try:
+        yield interruptions
+    finally:
+        for ending, handler in before.items():
+            signal.signal(ending, handler)
+
 
 _LONGEST = 300
 

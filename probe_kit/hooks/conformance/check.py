@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import ProbeKitError
-from probe_kit.hooks.checkpoints.containment import contained
-from probe_kit.hooks.checkpoints.third_party import in_words
+from probe_kit.hooks.checkpoints.third_party import contained, in_words
 
 __all__ = [
     "Check",

@@ -11,7 +11,7 @@ from probe_kit.errors import CheckpointError, ProbeKitError, UsageError, Weights
 from probe_kit.hooks.checkpoints.folders import CONFIGURATIONS
 from probe_kit.hooks.conformance.check import CheckFailedError, SkipTest, check, refused, require
 from probe_kit.hooks.conformance.subject import Subject
-from probe_kit.hooks.verification.verify import CHECKPOINT_FOLDER, REFERENCE_FILE, verify_reference
+from probe_kit.hooks.verify import CHECKPOINT_FOLDER, REFERENCE_FILE, verify_reference
 
 _DAMAGES = {
     "missing": "a tensor is missing",

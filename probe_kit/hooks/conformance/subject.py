@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.conformance.check import SkipTest, require
 from probe_kit.hooks.contract.card import ModelCard
+from probe_kit.hooks.contract.declared import Option, check_options
 from probe_kit.hooks.contract.model import AnswerModel, Model, Policy, Prompt, Reading
 from probe_kit.hooks.contract.observation import Observation
-from probe_kit.hooks.contract.options import Option, check_options
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import Stream
 from probe_kit.hooks.family import SIZE, Family

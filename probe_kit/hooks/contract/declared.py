@@ -1,10 +1,181 @@
-"""The streams of a released size, declared without its network. Imports no torch."""
+"""Declarations of a family: scene, options, protocols, streams, interventions. Imports no torch."""
 
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from types import MappingProxyType
+from typing import Any, Literal, get_args
 
+from probe_kit.errors import UnsupportedInterventionError, UsageError
+from probe_kit.hooks.contract.card import layers_text
 from probe_kit.hooks.contract.sites import Stream
-from probe_kit.hooks.contract.summary import layers_text
+
+
+@dataclass(frozen=True)
+class DefaultScene:
+    """preset: of `SceneSpec.preset`. changes: its fields that differ, also when other fields are asked for."""
+
+    preset: str
+    changes: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
+
+    def __str__(self) -> str:
+        """The preset and its changes, as `probe-kit models` shows them."""
+        return ", ".join([self.preset, *(f"{name} {value}" for name, value in self.changes.items())])
+
+
+RELEASED = DefaultScene("act2answer")
+"""Of every family that declares no other: policies and VLMs of one study get the same first frames."""
+EMBEDDED = DefaultScene("act2answer", MappingProxyType({"early_stop": True, "max_steps": 40}))
+"""Of the embedded models, whose demonstrations took at most 40 actions."""
+
+
+# For text options of kind bool; Python's own `bool("false")` is True.
+_WORDS = {"true": True, "yes": True, "on": True, "1": True, "false": False, "no": False, "off": False, "0": False}
+_EXPECTED = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
+
+LARGEST = 1 << 31
+"""Of a number that is an option; larger ones, and NaN, are mistakes."""
+
+Kind = type[bool] | type[int] | type[float] | type[str]
+
+
+@dataclass(frozen=True)
+class Option:
+    """One option of a family.
+
+    kind: bool, int, float or str. help: one line for `probe-kit models NAME`. default: as people read it.
+    choices: the admissible values; empty for any of the kind. is_path: whether it may name a file or folder, which
+    a run finds again wherever its command was typed.
+    """
+
+    name: str
+    kind: Kind
+    help: str
+    default: str = ""
+    choices: tuple[Any, ...] = ()
+    is_path: bool = False
+
+    def value(self, raw: Any) -> Any:
+        """Return `raw`, text or already of the kind, as the loader gets it. Raises UsageError."""
+        value = self._read(raw)
+        if self.choices and value not in self.choices:
+            allowed = ", ".join(map(str, self.choices))
+            raise UsageError(f"model option {self.name} is {raw!r}; expected one of {allowed}")
+        return value
+
+    def _read(self, raw: Any) -> Any:
+        if self.kind is float and type(raw) is int:
+            return float(raw)
+        if type(raw) is self.kind:
+            return raw
+        try:
+            if not isinstance(raw, str):
+                raise ValueError
+            value = _WORDS[raw.lower()] if self.kind is bool else self.kind(raw)
+            if isinstance(value, int | float) and not abs(value) <= LARGEST:  # `not <=` also catches NaN
+                raise ValueError
+            return value
+        except (ValueError, KeyError, OverflowError):
+            raise UsageError(f"model option {self.name} is {raw!r}; expected {_EXPECTED[self.kind]}") from None
+
+
+def read_pairs(pairs: Sequence[str]) -> dict[str, str]:
+    """`key=value` texts as a dict. Raises UsageError for another form and for a key given twice."""
+    options: dict[str, str] = {}
+    for pair in pairs:
+        key, equals, value = pair.partition("=")
+        if not equals or not key.strip():
+            raise UsageError(f"model option {pair!r} is not KEY=VALUE, such as -M unnorm_key=bridge_orig")
+        name = key.strip().replace("-", "_")
+        if name in options:
+            raise UsageError(f"model option {name} is given twice: {options[name]!r} and {value!r}")
+        options[name] = value
+    return options
+
+
+def check_options(family: str, declared: Sequence[Option], options: Mapping[str, Any]) -> dict[str, Any]:
+    """The given options as the loader gets them. Raises UsageError for one that the family does not declare."""
+    by_name = {option.name: option for option in declared}
+    for name in sorted(options):
+        if name not in by_name:
+            near = get_close_matches(name, by_name, n=1)
+            hint = f" Did you mean {near[0]}?" if near else ""
+            available = f"it has {', '.join(sorted(by_name))}" if by_name else "it has none"
+            raise UsageError(f"{family} has no model option {name}; {available}.{hint}")
+    return {name: by_name[name].value(value) for name, value in options.items()}
+
+
+Rotation = Literal["roll-pitch-yaw", "axis-angle"]
+"""What reaches the controller as the rotation of an action; see `ProtocolRow.rotation`."""
+ROTATIONS: tuple[Rotation, ...] = get_args(Rotation)
+PLAIN: Rotation = "roll-pitch-yaw"
+
+
+@dataclass(frozen=True)
+class ProtocolRow:
+    """The settings with which a protocol uses a family.
+
+    execute: actions executed per inference. options: of the family, whatever the checkpoint. of_checkpoint: the
+    ones that only the protocol's own checkpoint needs. rotation: `roll-pitch-yaw` passes the angles of an action
+    on; `axis-angle` passes axis times angle of the same turn on, which the controller then reads as angles.
+    unmatched: what of the protocol cannot be done here. variant: which of several checkpoints it is, as in labels.
+    alternatives: rows of the others; without a checkpoint, the row that holds them is used.
+    """
+
+    checkpoint: str
+    execute: int
+    dtype: str
+    options: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
+    of_checkpoint: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
+    rotation: Rotation = PLAIN
+    unmatched: tuple[str, ...] = ()
+    variant: str = ""
+    alternatives: "tuple[ProtocolRow, ...]" = ()
+
+    @property
+    def rows(self) -> "tuple[ProtocolRow, ...]":
+        """The row itself and its alternatives."""
+        return (self, *self.alternatives)
+
+    def of(self, checkpoint: str | None) -> "ProtocolRow":
+        """The row of `checkpoint`, at any revision.
+
+        This one for None, and for a checkpoint that the protocol does not use.
+        """
+        return next((row for row in self.rows if row.checkpoint == _bare(checkpoint)), self)
+
+    def options_for(self, checkpoint: str | None) -> dict[str, Any]:
+        """The options with `checkpoint`, None for the protocol's own."""
+        checkpoint_options = self.of_checkpoint if _bare(checkpoint) in (None, self.checkpoint) else {}
+        return {**checkpoint_options, **self.options}
+
+    def settings(self) -> dict[str, str]:
+        """Every setting by name, as text; those of the family with -M in front."""
+        return {
+            "checkpoint": self.checkpoint,
+            "execute": str(self.execute),
+            "rotation": self.rotation,
+            "dtype": self.dtype,
+            **{f"-M {name}": as_text(value) for name, value in self.options_for(None).items()},
+        }
+
+
+def _bare(checkpoint: str | None) -> str | None:
+    """A hub id without the revision at which it is read."""
+    return None if checkpoint is None else checkpoint.partition("@")[0]
+
+
+def as_text(value: Any) -> str:
+    """An option's value as it is given on the command line."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+ProtocolName = Literal["act2answer"]
+ACT2ANSWER: ProtocolName = "act2answer"
+OWN_SEEDS = "draws come from the episode's seed; the release seeds once per process"
+
 
 TEXT = ("language", "special")
 
@@ -49,3 +220,111 @@ def expert(
 def answering(layers: int, width: int, tokens: int, sums: bool = True) -> tuple[DeclaredStream, ...]:
     """The two streams of a VLM that answers."""
     return backbone(layers, width, tokens, sums=sums), chosen_tokens("answer", layers, width, 1, sums)
+
+
+InterventionKind = Literal["swap", "edit", "kv", "attention", "tiles", "gradients"]
+Readout = Literal["first-chunk", "per-step"]
+"""first-chunk: lateral displacement by the first inference's actions, none of them executed.
+per-step: its sum over every inference of the unedited episode; only the clean actions are executed."""
+ASKED_AS: Mapping[InterventionKind, tuple[str, tuple[str, ...]]] = MappingProxyType(
+    {
+        "swap": ("--kind", ("image-swap", "instruction-swap")),
+        "edit": ("--kind", ("interchange", "joint", "steer", "closed-loop", "erase")),
+        "attention": ("--kind", ("attention",)),
+        "gradients": ("--kind", ("attribution",)),
+        "kv": ("--sites", ("kv.*",)),
+        "tiles": ("--roles", ("image.left", "image.right")),
+    }
+)
+"""What a family supports, as `probe-kit intervene` asks for it: an option and its values."""
+_UNDECLARED = {
+    "kv": "its adapter declares no `kv` stream. Patch residual sites instead, or declare `Model.prompt_kv`",
+    "attention": "its adapter gives no attention. Patch `kv` or single roles instead: what a patch "
+    "moves is read, whatever attention weighs",
+    "gradients": "its adapter has no differentiable inference. Patch exactly: `--kind interchange`, or "
+    "`--kind joint`, which halves large sets",
+    "tiles": "its adapter does not say which picture token comes of which patch. Patch all of `image`, or "
+    "declare `Model.patch_order`",
+}
+
+
+@dataclass(frozen=True)
+class Interventions:
+    """The interventions that a family supports, to test whether a stream is used.
+
+    Following, the comparison of actions on swapped images or words, every policy supports: it is two
+    inferences.
+
+    edits: per stored stream the quantities that can be rewritten; None for all that its streams have.
+    unread: streams whose end nothing that acts reads: an edit of the last residual or the final norm there leaves
+    the actions bit for bit, which makes it a control.
+    prompt_kv: whether it keeps keys and values of the prompt that the acting stream reads, see `Model.prompt_kv`.
+    first_affected_token: the first output that an edit of backbone or `kv` reaches through `kv`: 0, or 1 where the
+    prompt's own pass already chooses the first token.
+    attention: whether it records the acting stream's attention to every token of the prompt.
+    tiles: whether it says which of the picture's tokens come of which patches, see `Model.patch_order`.
+    gradients: whether `Policy.differentiable` gives its actions with a graph.
+    readout: `first-chunk` where the first chunk shows where the hand will go; `per-step` where an inference gives
+    one action in discrete bins. Conditions are then evaluated at every call of an unedited episode, not executed.
+    instead: for what is not supported, why and what to do.
+    Raises UsageError for advice on a kind of intervention that does not exist.
+    """
+
+    edits: Mapping[str, tuple[str, ...]] | None = None
+    unread: tuple[str, ...] = ()
+    prompt_kv: bool = False
+    first_affected_token: int = 0
+    attention: bool = False
+    tiles: bool = False
+    gradients: bool = False
+    readout: Readout = "first-chunk"
+    instead: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
+
+    def __post_init__(self) -> None:
+        if unknown := set(self.instead) - set(get_args(InterventionKind)):
+            raise UsageError(f"there is no intervention {', '.join(sorted(unknown))} to advise on")
+
+    def supports(self, kind: InterventionKind) -> bool:
+        """Whether `kind` can be asked for."""
+        declared = {
+            "kv": self.prompt_kv,
+            "attention": self.attention,
+            "tiles": self.tiles,
+            "gradients": self.gradients,
+        }
+        return declared.get(kind, True)
+
+    def asked_as(self) -> dict[str, list[str]]:
+        """The options and values of `probe-kit intervene` that are supported."""
+        values_of: dict[str, list[str]] = {}
+        for kind, (option, values) in ASKED_AS.items():
+            if self.supports(kind):
+                values_of.setdefault(option, []).extend(values)
+        return values_of
+
+    def check(self, kind: InterventionKind, family: str) -> None:
+        """Raises UnsupportedInterventionError if `family`, whose declaration this is, does not support `kind`."""
+        if not self.supports(kind):
+            why = {**_UNDECLARED, **self.instead}[kind]
+            option, values = ASKED_AS[kind]
+            request = f"{option} {', '.join(values)}"
+            raise UnsupportedInterventionError(
+                f"{family} does not support the intervention {kind!r} (`probe-kit intervene {request}`): {why}"
+            )
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values, for listings and certificates."""
+        return {
+            "kinds": [kind for kind in get_args(InterventionKind) if self.supports(kind)],
+            "edits": None
+            if self.edits is None
+            else {name: list(quantities) for name, quantities in self.edits.items()},
+            "unread": list(self.unread),
+            "first_affected_token": self.first_affected_token,
+            "readout": self.readout,
+            "instead": dict(self.instead),
+        }
+
+
+ALL_EDITS = Interventions()
+"""Default of a family: image swaps, and edits at every site."""

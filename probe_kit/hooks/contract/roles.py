@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from probe_kit.errors import EmptyRoleError, RolesMismatchError, UnknownSiteError
-from probe_kit.hooks.contract.views import PADDING, plays
+from probe_kit.hooks.contract.sites import PADDING, plays
 
 
 class Span(NamedTuple):

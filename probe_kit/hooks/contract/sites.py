@@ -1,4 +1,4 @@
-"""Sites: the names under which activations are captured, stored, probed and plotted. Imports no torch."""
+"""Sites: the names under which activations are captured, stored, probed and plotted; roles and views. No torch."""
 
 import re
 from collections.abc import Iterable, Sequence
@@ -169,3 +169,43 @@ def label_of(stream: str) -> str:
 def first_of(part: Part, streams: Iterable[Stream]) -> str | None:
     """Name of the first probed stream of `part`, the one peaks and retention are about; None if there is none."""
     return next((stream.name for stream in streams if stream.part == part and stream.probed), None)
+
+
+PADDING = "padding"
+CAMERA = "primary"
+"""The camera of families whose models know one."""
+IMAGE_ROLE = f"image.{CAMERA}"
+
+
+def plays(role: str, group: str) -> bool:
+    """Whether a token of `role` belongs to `group`: `image.wrist` belongs to `image.wrist` and to `image`."""
+    return role == group or role.startswith(f"{group}.")
+
+
+def view_names(roles: Sequence[str]) -> tuple[str, ...]:
+    """The pooled views of a stream whose tokens play `roles`: mean, last, and one mean per role.
+
+    With several cameras also `mean:image` over all of them; with one, `resolve_view` finds it under that name.
+    """
+    images = [role for role in roles if plays(role, "image")]
+    content_roles = [role for role in roles if role not in (PADDING, "special")]
+    return (
+        "mean",
+        "last",
+        *(f"mean:{role}" for role in content_roles),
+        *(["mean:image"] if len(images) > 1 else []),
+    )
+
+
+def resolve_view(view: str, stored: Sequence[str]) -> str:
+    """The stored view that `view` names: itself, or `mean:image.<camera>` for `mean:image` of the only camera."""
+    if view in stored or not view.startswith("mean:"):
+        return view
+    parts = [name for name in stored if name.startswith(f"{view}.")]
+    return parts[0] if len(parts) == 1 else view
+
+
+def role_of_view(view: str) -> str | None:
+    """Return the role whose tokens a view averages, `all` for `mean`; None for another view."""
+    kind, _, role = view.partition(":")
+    return (role or "all") if kind == "mean" else None

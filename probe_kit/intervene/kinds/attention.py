@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from probe_kit._system.bounded_arrays import open_arrays
 from probe_kit.errors import CaptureChangedActionError, CaptureError, EmptyRoleError, UsageError
-from probe_kit.hooks.contract.interventions import InterventionKind
+from probe_kit.hooks.contract.declared import InterventionKind
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.sites import first_of
 from probe_kit.intervene.kinds.base import Intervention, Measurement, TableContext, effect_table

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
 from probe_kit.hashing import derive_seed
-from probe_kit.hooks.contract.interventions import InterventionKind
+from probe_kit.hooks.contract.declared import InterventionKind
 from probe_kit.hooks.contract.sites import KV_STREAM
 from probe_kit.intervene.kinds.base import (
     Intervention,

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
 from probe_kit.hashing import derive_seed
-from probe_kit.hooks.capturing.edit_engine import LOG_FIELDS
-from probe_kit.hooks.contract.interventions import InterventionKind, Readout
+from probe_kit.hooks.capturing.edits import LOG_FIELDS
+from probe_kit.hooks.contract.declared import InterventionKind, Readout
 from probe_kit.hooks.contract.sites import KV_STREAM
 from probe_kit.intervene.outcomes import ConditionOutcomes, Effect
 from probe_kit.intervene.places import SEPARATOR

@@ -14,11 +14,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import numpy as np
 
-from probe_kit.env.scoring.rules import DEFAULT_RULE
+from probe_kit.env.scoring import DEFAULT_RULE
 from probe_kit.errors import UsageError
-from probe_kit.hooks.capturing.edit_engine import EditLog, apply_patch
-from probe_kit.hooks.capturing.token_edits import Identity
-from probe_kit.hooks.contract.interventions import InterventionKind
+from probe_kit.hooks.capturing.edits import EditLog, Identity, apply_patch
+from probe_kit.hooks.contract.declared import InterventionKind
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.intervene.kinds.base import (
     NONE,

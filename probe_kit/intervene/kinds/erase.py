@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
-from probe_kit.hooks.capturing.edit_engine import apply_patch
-from probe_kit.hooks.capturing.token_edits import Identity, TokenIndex
+from probe_kit.hooks.capturing.edits import Identity, TokenIndex, apply_patch
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.intervene.erasers import Eraser, Method, PaddedTokens
 from probe_kit.intervene.kinds.base import (

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit._system.counting import counted
-from probe_kit.hooks.contract.interventions import InterventionKind, Readout
+from probe_kit.hooks.contract.declared import InterventionKind, Readout
 from probe_kit.intervene.inputs import INPUT_LEGEND, InputEffect, describe_input, find_input, input_effects
 from probe_kit.intervene.kinds.base import (
     TILES_APART,

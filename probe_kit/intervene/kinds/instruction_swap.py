@@ -12,7 +12,7 @@ import numpy as np
 
 from probe_kit.errors import UsageError
 from probe_kit.hashing import derive_seed
-from probe_kit.hooks.contract.interventions import InterventionKind
+from probe_kit.hooks.contract.declared import InterventionKind
 from probe_kit.intervene.inputs import InputEffect
 from probe_kit.intervene.kinds.base import Intervention, Measurement, TableContext, effect_table
 from probe_kit.intervene.kinds.image_swap import (

@@ -14,8 +14,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, get_args
 
 from probe_kit.errors import UsageError
-from probe_kit.hooks.capturing.edit_engine import apply_patch
-from probe_kit.hooks.capturing.token_edits import AddVector
+from probe_kit.hooks.capturing.edits import AddVector, apply_patch
 from probe_kit.intervene.kinds.base import AlongDirection, ConditionName, Measurement
 from probe_kit.intervene.kinds.image_swap import SMALLEST_REACH
 from probe_kit.intervene.kinds.interchange import Interchange

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING
 from probe_kit._system.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from probe_kit.hooks.capturing.head_outputs import project_heads
-    from probe_kit.hooks.capturing.logit_lens import logit_lens
+    from probe_kit.hooks.capturing.readouts import logit_lens, project_heads
     from probe_kit.intervene.pairs import Pair
     from probe_kit.intervene.patching.attribution import Screen, attribute_cells
     from probe_kit.intervene.patching.inference import HookPoint, run_with_cache, run_with_hooks
@@ -67,10 +66,10 @@ __getattr__, __dir__ = lazy_names(
         "find_cells": "patch",
         "find_minimal_cells": "sets",
         "find_pairs": "probe_kit.intervene.sessions.opening",
-        "logit_lens": "probe_kit.hooks.capturing.logit_lens",
+        "logit_lens": "probe_kit.hooks.capturing.readouts",
         "open_session": "probe_kit.intervene.sessions.opening",
         "patch_cells": "patch",
-        "project_heads": "probe_kit.hooks.capturing.head_outputs",
+        "project_heads": "probe_kit.hooks.capturing.readouts",
         "run_with_cache": "inference",
         "run_with_hooks": "inference",
         "sweep_cells": "sweep",

@@ -9,11 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
-from probe_kit.hooks.capturing.edit_engine import EditLog, apply_patches
-from probe_kit.hooks.capturing.token_edits import ReplaceInSubspace, ReplaceWith, TokenEdit, TokenSelection
-from probe_kit.hooks.contract.interventions import ALL_EDITS
-from probe_kit.hooks.contract.sites import Site
-from probe_kit.hooks.contract.views import plays
+from probe_kit.hooks.capturing.edits import (
+    EditLog,
+    ReplaceInSubspace,
+    ReplaceWith,
+    TokenEdit,
+    TokenSelection,
+    apply_patches,
+)
+from probe_kit.hooks.contract.declared import ALL_EDITS
+from probe_kit.hooks.contract.sites import Site, plays
 from probe_kit.intervene.pairs import Pair
 from probe_kit.intervene.patching.inference import Output, infer, run_with_cache
 from probe_kit.intervene.places import ALL, SEPARATOR, TILE_ROLES, SiteGroup, positions_of, resolve_sites

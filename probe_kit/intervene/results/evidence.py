@@ -5,8 +5,7 @@ from functools import cached_property
 from itertools import starmap
 from typing import TYPE_CHECKING, Literal
 
-from probe_kit.hooks.contract.sites import KV_STREAM
-from probe_kit.hooks.contract.views import role_of_view
+from probe_kit.hooks.contract.sites import KV_STREAM, role_of_view
 from probe_kit.hooks.registry import get_family
 from probe_kit.intervene.directions import DIRECTIONS, MEAN_DIFFERENCE
 from probe_kit.intervene.kinds.image_swap import ImageSwapEffect, stored_image_swaps

@@ -14,8 +14,7 @@ from probe_kit.errors import UsageError
 from probe_kit.extract.sources.donors import Frame, draw_donors
 from probe_kit.extract.sources.inputs import PICTURE, hardly_changed, with_input
 from probe_kit.hashing import derive_seed
-from probe_kit.hooks.checkpoints.containment import copied
-from probe_kit.hooks.checkpoints.third_party import while_acting
+from probe_kit.hooks.checkpoints.third_party import copied, while_acting
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.intervene.pairs import Chunk, Given, Pair
 from probe_kit.intervene.sessions.frames import Frames

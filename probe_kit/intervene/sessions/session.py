@@ -13,10 +13,8 @@ import numpy as np
 from probe_kit.errors import CaptureChangedActionError, SettingsMismatchError
 from probe_kit.extract.rollout.capturing import SMALL
 from probe_kit.extract.rollout.worker import torch_threads
-from probe_kit.hooks.checkpoints.checkpoint import cached_folder
-from probe_kit.hooks.checkpoints.containment import copied
-from probe_kit.hooks.checkpoints.hub import pinned_commits
-from probe_kit.hooks.checkpoints.third_party import while_acting
+from probe_kit.hooks.checkpoints.checkpoint import cached_folder, pinned_commits
+from probe_kit.hooks.checkpoints.third_party import copied, while_acting
 from probe_kit.hooks.contract.card import EMBEDDED
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.family import SIZE

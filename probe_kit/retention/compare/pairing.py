@@ -6,7 +6,7 @@ from functools import cached_property
 from itertools import combinations, product
 from typing import TYPE_CHECKING, Any
 
-from probe_kit.env.scoring.rules import DEFAULT_RULE
+from probe_kit.env.scoring import DEFAULT_RULE
 from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour import ask_of, full_names
 from probe_kit.retention.compare.compare import (

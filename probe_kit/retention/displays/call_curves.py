@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.env.scoring.events import EVENTS, Events
+from probe_kit.env.scoring import EVENTS, Events
 from probe_kit.errors import TooFewGroupsError, UsageError
 from probe_kit.hooks.contract.sites import label_of
 from probe_kit.retention.columns.text import title_of

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.env.scoring.rules import DEFAULT_RULE, Box, Disc, OutcomeRule, ReleasedOnTile, rule_of
+from probe_kit.env.scoring import DEFAULT_RULE, Box, Disc, OutcomeRule, ReleasedOnTile, rule_of
 from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour import capture_only
 from probe_kit.retention.columns.text import title_of

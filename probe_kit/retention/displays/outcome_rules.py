@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from probe_kit.env.scoring.rules import DEFAULT_RULE, RULES
+from probe_kit.env.scoring import DEFAULT_RULE, RULES
 from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour import full_names, shares_of
 from probe_kit.retention.displays.base.display import Display

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from probe_kit.env.scoring.rules import DEFAULT_RULE
+from probe_kit.env.scoring import DEFAULT_RULE
 from probe_kit.errors import UnknownSiteError
 from probe_kit.intervene.kinds.image_swap import ImageSwapEffect, stored_image_swaps
 from probe_kit.intervene.results.evidence import StoredEvidence, stored_other_readouts, stored_places, stored_ties
@@ -65,7 +65,7 @@ class RowSettings:
     """The settings of a table.
 
     epsilons: zone radii in metres for `sr_by_epsilon`, which belong to the rule `disc`. rule, last_steps: see
-    `probe_kit.env.scoring.rules.judge`. absent_below: accuracy below which a stream's best site counts as absent.
+    `probe_kit.env.scoring.judge`. absent_below: accuracy below which a stream's best site counts as absent.
     with_behaviour: see `RunUnderRule.of`.
     """
 

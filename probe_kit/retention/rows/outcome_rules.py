@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Protocol, Self, cast
 
 import numpy as np
 
-from probe_kit.env.scoring.rules import DEFAULT_RULE, RULES, rule_of
+from probe_kit.env.scoring import DEFAULT_RULE, RULES, rule_of
 from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour import ask_of, capture_only, group_names, shares_of
 from probe_kit.retention.estimators import Limits, limits

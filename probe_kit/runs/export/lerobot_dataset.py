@@ -8,7 +8,7 @@ import numpy as np
 
 from probe_kit._system.machine import same_scheduling
 from probe_kit._system.optional_dependencies import require
-from probe_kit.env.scoring.trajectory import MOTION, STATE
+from probe_kit.env.scoring import MOTION, STATE
 from probe_kit.errors import UsageError
 from probe_kit.runs.run import Run
 from probe_kit.runs.small_frames import SmallFrames

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UnknownSiteError, UsageError
-from probe_kit.hooks.contract.sites import Site
-from probe_kit.hooks.contract.views import PADDING, plays, resolve_view
+from probe_kit.hooks.contract.sites import PADDING, Site, plays, resolve_view
 from probe_kit.runs.arrays import decode_bfloat16
 from probe_kit.runs.layout import ArrayKind, StoredStream
 from probe_kit.runs.rows import Rows, Spans

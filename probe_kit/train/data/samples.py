@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import NonFiniteActivationError, UnknownSiteError
-from probe_kit.hooks.contract.sites import Site
-from probe_kit.hooks.contract.views import resolve_view
+from probe_kit.hooks.contract.sites import Site, resolve_view
 from probe_kit.runs.reader import RunReader, Tokens
 from probe_kit.runs.rows import TokenBlock
 from probe_kit.train.solver.backend import Array, to_device, to_numpy

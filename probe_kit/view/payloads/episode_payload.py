@@ -6,9 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.env.scoring.events import EVENTS, Events
-from probe_kit.env.scoring.rules import RULES, judge, rule_of
-from probe_kit.env.scoring.trajectory import Trajectory
+from probe_kit.env.scoring import EVENTS, RULES, Events, Trajectory, judge, rule_of
 from probe_kit.errors import RunDamagedError
 from probe_kit.retention.behaviour import SCORES
 from probe_kit.runs.layout import FRAME_COLUMNS

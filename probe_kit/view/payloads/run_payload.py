@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from probe_kit.env.scoring.rules import RULES
+from probe_kit.env.scoring import RULES
 from probe_kit.retention import RetentionRow
 from probe_kit.retention.columns.columns import (
     ACCURACY,

@@ -4,7 +4,7 @@ import numpy as np
 import pybullet_data
 import pytest
 
-from probe_kit.env.robot.arm_models import ARMS
+from probe_kit.env.arm import ARMS
 from probe_kit.env.rotations import from_rpy
 from probe_kit.env.scene import Scene
 from probe_kit.env.spec import SceneSpec

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from probe_kit.env import LimitSpec
-from probe_kit.env.robot.controller import DeltaController, check_action
+from probe_kit.env.arm import DeltaController, check_action
 from probe_kit.env.rotations import from_euler_xyz, from_rpy
 from probe_kit.errors import ActionError
 

@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from probe_kit.env.robot.kinematics import Pose, SerialChain
-from probe_kit.env.rotations import from_rpy
+from probe_kit.env.rotations import Pose, SerialChain, from_rpy
 
 
 @pytest.fixture

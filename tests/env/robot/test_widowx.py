@@ -3,9 +3,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from probe_kit.env.robot import widowx
-from probe_kit.env.robot.widowx import write_urdf
-from probe_kit.env.simulation.bullet import BulletClient
+from probe_kit.env import arm
+from probe_kit.env.arm import write_urdf
+from probe_kit.env.simulation import BulletClient
 from probe_kit.errors import SceneError
 
 
@@ -40,13 +40,13 @@ def test_every_link_that_should_be_seen_has_a_mesh(robot):
 
 
 def test_missing_meshes_are_announced_with_what_to_install(monkeypatch, tmp_path):
-    monkeypatch.setattr(widowx, "find_spec", lambda _: None)
+    monkeypatch.setattr(arm, "find_spec", lambda _: None)
     with pytest.raises(SceneError, match=r"Install `rtb-data"):
         write_urdf(tmp_path)
 
 
 def test_another_version_of_the_meshes_is_refused(monkeypatch, tmp_path):
-    monkeypatch.setattr(widowx, "MESH_FOLDER", Path("elsewhere"))
+    monkeypatch.setattr(arm, "MESH_FOLDER", Path("elsewhere"))
     pytest.importorskip("rtbdata")
     with pytest.raises(SceneError, match="not version 2"):
         write_urdf(tmp_path)

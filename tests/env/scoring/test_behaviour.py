@@ -3,8 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from probe_kit.env.scoring.behaviour import behaviour_of
-from probe_kit.env.scoring.trajectory import CHANNELS, Trajectory
+from probe_kit.env.scoring import CHANNELS, Trajectory, behaviour_of
 
 HOME = (0.2921, -0.0061, 0.1349)  # of the released scene: over the right picture's box
 GAP = (0.2921, 0.028, 0.15)

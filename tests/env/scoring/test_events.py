@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from probe_kit.env.scoring.events import EVENTS, LATERAL, MOTION, Events
-from probe_kit.env.scoring.trajectory import Trajectory
+from probe_kit.env.scoring import EVENTS, LATERAL, MOVED, Events, Trajectory
 
 FRAMES = 12
 LEFT, RIGHT = (0.4, 0.155), (0.4, -0.155)
@@ -28,7 +27,7 @@ def trajectory(tool: np.ndarray, held: list[int]) -> Trajectory:
 def reaching() -> np.ndarray:
     """Settles, sets off at frame 2 sideways to the cube, lifts it, moves aside from frame 8 on."""
     places = np.zeros((FRAMES, 3))
-    places[1, 2] = MOTION / 2
+    places[1, 2] = MOVED / 2
     places[2:, 1] = 0.06
     places[5:, 2] = 0.1
     places[8:, 1] += 1.5 * LATERAL
@@ -58,7 +57,7 @@ def test_a_cube_that_is_still_held_was_not_released() -> None:
 
 def test_the_scripted_expert_sets_off_grasps_chooses_a_side_and_lets_go(shared_env) -> None:
     from probe_kit.env import ScriptedExpert
-    from probe_kit.env.recorder import Recorder
+    from probe_kit.env.act2answer import Recorder
 
     shared_env.reset(seed=0)
     expert = ScriptedExpert(shared_env)

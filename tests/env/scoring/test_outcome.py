@@ -3,7 +3,7 @@ from dataclasses import replace
 
 import pytest
 
-from probe_kit.env.scoring.outcome import Outcome, success_by_radius, zone
+from probe_kit.env.scoring import Outcome, success_by_radius, zone
 from probe_kit.errors import SceneError
 
 ON_TILE = Outcome(

@@ -3,8 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from probe_kit.env.scoring.rules import RELEASED_STEPS, RULES, Box, judge, rule_of
-from probe_kit.env.scoring.trajectory import CHANNELS, Trajectory
+from probe_kit.env.scoring import CHANNELS, RELEASED_STEPS, RULES, Box, Trajectory, judge, rule_of
 from probe_kit.env.spec import SceneSpec
 from probe_kit.errors import UsageError
 

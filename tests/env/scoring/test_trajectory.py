@@ -1,8 +1,8 @@
 import numpy as np
 
 from probe_kit.env import ScriptedExpert
-from probe_kit.env.recorder import Recorder
-from probe_kit.env.scoring.trajectory import CHANNELS, Trajectory
+from probe_kit.env.act2answer import Recorder
+from probe_kit.env.scoring import CHANNELS, Trajectory
 
 
 def recorded(env, actions) -> Trajectory:

@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from probe_kit.env.simulation.background import load_photo, wooden_table
-from probe_kit.env.simulation.camera import Camera
+from probe_kit.env.simulation import Camera, load_photo, wooden_table
 from probe_kit.env.spec import CameraSpec
 from probe_kit.errors import SceneError
 

@@ -8,7 +8,7 @@ import pybullet
 import pytest
 
 from probe_kit._system.installing import install_command
-from probe_kit.env.simulation.bullet import BulletClient
+from probe_kit.env.simulation import BulletClient
 
 
 def test_this_pybullet_was_compiled_with_numpy():
@@ -69,15 +69,14 @@ def test_what_others_say_while_it_is_imported_is_passed_on(tmp_path):
         "import os, sys\nos.write(2, b'pybullet build time: today\\nby C\\n')\nsys.stderr.write('by Python\\n')\n",
         encoding="utf-8",
     )
-    code = "from probe_kit.env.simulation.bullet import import_pybullet as load; load(); load()"
+    code = "from probe_kit.env.simulation import import_pybullet as load; load(); load()"
     done = run([sys.executable, "-c", code], capture_output=True, check=True, env={"PYTHONPATH": str(tmp_path)})
     assert done.stderr == b"by C\nby Python\n"
 
 
 def test_it_can_be_imported_by_a_process_without_stderr():
     code = (
-        "import os; os.close(2); from probe_kit.env.simulation.bullet import BulletClient; BulletClient(); "
-        "print('there')"
+        "import os; os.close(2); from probe_kit.env.simulation import BulletClient; BulletClient(); print('there')"
     )
     assert run([sys.executable, "-c", code], stdout=-1, check=True).stdout == b"there\n"
 

@@ -3,7 +3,7 @@ import pybullet
 import pytest
 
 from probe_kit.env.scene import FLOOR_COLOR, TABLE_COLOR
-from probe_kit.env.simulation.camera import Camera
+from probe_kit.env.simulation import Camera
 from probe_kit.env.spec import CameraSpec
 
 

@@ -2,8 +2,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from probe_kit.env.simulation.bullet import BulletClient
-from probe_kit.env.simulation.tiles import TEXTURE_PIXELS, TextureCache, as_texture, write_quad
+from probe_kit.env.simulation import TEXTURE_PIXELS, BulletClient, TextureCache, as_texture, write_quad
 
 
 @pytest.fixture

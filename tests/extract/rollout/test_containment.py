@@ -23,8 +23,7 @@ from probe_kit.env import SceneSpec
 from probe_kit.errors import CaptureChangedActionError, EpisodesFailedError, PolicyFailedError, UsageError
 from probe_kit.extract import ExtractSettings, extract_run
 from probe_kit.hooks import Observation
-from probe_kit.hooks.checkpoints.containment import contained
-from probe_kit.hooks.checkpoints.third_party import while_acting
+from probe_kit.hooks.checkpoints.third_party import contained, while_acting
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.runs import Run, open_run
 from probe_kit.suite import Suite, build_suite
@@ -349,7 +348,7 @@ def test_a_limit_changes_no_name_of_a_run(settings: ExtractSettings) -> None:
 @pytest.mark.slow
 def test_the_limit_ends_a_process_that_holds_the_interpreter() -> None:
     code = (
-        "from probe_kit.hooks.checkpoints.containment import contained\nwith contained(0.2):\n  sum(range(10**12))"
+        "from probe_kit.hooks.checkpoints.third_party import contained\nwith contained(0.2):\n  sum(range(10**12))"
     )
     done = subprocess.run([sys.executable, "-c", code], check=False, timeout=120)
     assert done.returncode == -signal.SIGALRM

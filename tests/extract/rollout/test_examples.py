@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from probe_kit.env import SceneSpec
-from probe_kit.env.simulation.camera import Camera
+from probe_kit.env.simulation import Camera
 from probe_kit.errors import UsageError
 from probe_kit.extract import ExtractSettings
 from probe_kit.extract.rollout.task import check_fit

@@ -30,7 +30,7 @@ from probe_kit.hooks import (
 )
 from probe_kit.hooks.conformance.subject import examples_for
 from probe_kit.hooks.families.pi0.adapter import Pi0
-from probe_kit.hooks.verification.outputs import outputs_of
+from probe_kit.hooks.outputs import outputs_of
 from tests.support.every_checkpoint import WRITERS
 
 pytestmark = pytest.mark.filterwarnings("ignore:the model put out tokens that name no action")

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from probe_kit.hooks import Observation, capture
-from probe_kit.hooks.capturing.changed_outputs import reason_of_change
+from probe_kit.hooks.capturing.capture_context import reason_of_change
 from probe_kit.hooks.family import Family
 from probe_kit.hooks.testing import example_observations
 from tests.support.encoder_vla.policy import EncoderPolicy, load, write_checkpoint

@@ -6,8 +6,7 @@ import pytest
 
 from probe_kit.errors import UnknownSiteError, UsageError
 from probe_kit.hooks import Observation, Site, capture
-from probe_kit.hooks.capturing.edit_engine import apply_edits
-from probe_kit.hooks.capturing.edits import Edit, vector_hash
+from probe_kit.hooks.capturing.edits import Edit, apply_edits, vector_hash
 from probe_kit.hooks.families.pi0.adapter import Pi0
 
 SITE = Site("backbone", 2)

@@ -14,7 +14,7 @@ import probe_kit
 from probe_kit.errors import CheckpointError, MissingExtraError
 from probe_kit.hooks.registry import find_family
 from probe_kit.hooks.testing import example_observations
-from probe_kit.models.pretrained import load_pretrained
+from probe_kit.models.checkpoint_files import load_pretrained
 from tests.support.every_checkpoint import WRITERS, families
 from tests.support.parsed import package_nodes
 
@@ -138,7 +138,7 @@ def test_every_call_that_can_run_code_of_a_checkpoint_refuses_it() -> None:
     ]
     assert loading
     lacking = [where for where, call, name in loading if name not in WITHOUT_AUTO_MAP and not _refuses_code(call)]
-    assert not lacking, "use probe_kit.models.pretrained.load_pretrained"
+    assert not lacking, "use probe_kit.models.checkpoint_files.load_pretrained"
 
 
 def test_no_call_allows_code_of_a_checkpoint() -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from probe_kit.errors import CheckpointError
-from probe_kit.hooks.checkpoints import hub
+from probe_kit.hooks.checkpoints import checkpoint
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 
 
@@ -23,7 +23,7 @@ def silent() -> Iterator[str]:
 def _online(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", False)
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path))
-    monkeypatch.setattr(hub, "PATIENCE", 0.3)
+    monkeypatch.setattr(checkpoint, "PATIENCE", 0.3)
 
 
 @pytest.mark.parametrize("address", ["http://127.0.0.1:9", "http://nowhere.invalid", "no address"])
@@ -42,13 +42,13 @@ def test_a_hub_out_of_reach_is_said_within_seconds(monkeypatch: pytest.MonkeyPat
 
 def test_a_hub_that_says_nothing_is_given_up(monkeypatch: pytest.MonkeyPatch, silent: str) -> None:
     monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", silent)
-    assert hub.unreachable() == f"{silent} did not answer within 0.3 s"  # whichever clock runs out first
+    assert checkpoint.unreachable() == f"{silent} did not answer within 0.3 s"  # whichever clock runs out first
 
 
 def test_offline_mode_sends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
-    monkeypatch.setattr(hub, "urlopen", lambda *_, **__: pytest.fail("it was asked"))
-    assert "offline mode" in hub.unreachable()
+    monkeypatch.setattr(checkpoint, "urlopen", lambda *_, **__: pytest.fail("it was asked"))
+    assert "offline mode" in checkpoint.unreachable()
 
 
 @pytest.mark.parametrize("name", ["checkpoint", "./runs/checkpoint", "runs/mine/checkpoints/last"])
@@ -64,6 +64,6 @@ def test_a_relative_folder_that_is_not_here_is_named_with_the_folder_it_was_look
 
 @pytest.mark.parametrize("name", ["some/[bold]", "some/..", "some/" + "a" * 200, "~nobody/x", "some/\x1b[31m"])
 def test_names_that_no_hub_has_are_refused_as_checkpoints(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    monkeypatch.setattr(hub, "urlopen", lambda *_, **__: (_ for _ in ()).throw(OSError("no network")))
+    monkeypatch.setattr(checkpoint, "urlopen", lambda *_, **__: (_ for _ in ()).throw(OSError("no network")))
     with pytest.raises(CheckpointError):
         checkpoint_folder(name)

@@ -12,9 +12,14 @@ from safetensors.torch import load_file, save_file
 from probe_kit.errors import CheckpointError, WeightsError
 from probe_kit.extract.settings import ExtractSettings, run_label
 from probe_kit.hooks import load_model
-from probe_kit.hooks.checkpoints.checkpoint import cached_folder, hub_files, pinned, without_revision
+from probe_kit.hooks.checkpoints.checkpoint import (
+    cached_folder,
+    hub_files,
+    pinned,
+    pinned_commits,
+    without_revision,
+)
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
-from probe_kit.hooks.checkpoints.hub import pinned_commits
 from tests.support.every_checkpoint import WRITERS
 from tests.support.hub_stand_in import Hub, hub
 from tests.support.pi0_checkpoints import write_intact

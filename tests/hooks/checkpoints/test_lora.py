@@ -15,9 +15,9 @@ from torch import nn
 
 from probe_kit.errors import CheckpointError, WeightsError
 from probe_kit.hooks import Observation, load_model, load_policy
-from probe_kit.hooks.checkpoints.adapter_files import adapter_in
+from probe_kit.hooks.checkpoints.folders import adapter_in
 from probe_kit.hooks.registry import find_family
-from probe_kit.models.embedded.folder import embedded_checkpoint
+from probe_kit.models.embedded import embedded_checkpoint
 from probe_kit.models.magma import shipped_statistics
 from tests.support.every_checkpoint import WRITERS, families
 

@@ -11,7 +11,7 @@ from probe_kit.errors import WeightsError
 from probe_kit.hooks import Observation
 from probe_kit.hooks.checkpoints.weights import INDEX_FILE, SINGLE_FILE, read_weights
 from probe_kit.hooks.families.pi0.adapter import Pi0
-from probe_kit.models.embedded.folder import embedded_checkpoint
+from probe_kit.models.embedded import embedded_checkpoint
 
 NAME = "model.state_proj.weight"
 RANDOM = {"probe_kit.weights": "random, seed 0"}

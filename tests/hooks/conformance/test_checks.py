@@ -22,13 +22,13 @@ from probe_kit.errors import UsageError
 from probe_kit.hooks import Family, Model, Observation, Roles, Site, Stream, Tap, registry
 from probe_kit.hooks.checkpoints.weights import read_weights
 from probe_kit.hooks.conformance.check import CheckFailedError, SkipTest, check, refused, require_bits
-from probe_kit.hooks.conformance.contract import ANSWER_CHECKS, POLICY_CHECKS
 from probe_kit.hooks.conformance.subject import (
     AnswerSubject,
     PolicySubject,
     Subject,
 )
 from probe_kit.hooks.families.pi0.adapter import Pi0
+from probe_kit.hooks.testing import ANSWER_CHECKS, POLICY_CHECKS
 from tests.support.contracts import GOLDEN
 from tests.support.encoder_vla.policy import CHUNK, STEPS, WIDTH, EncoderPolicy, EncoderVLA, load, write_checkpoint
 from tests.support.parsed import parsed

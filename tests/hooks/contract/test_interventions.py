@@ -7,9 +7,8 @@ import pytest
 
 from probe_kit.errors import UnsupportedInterventionError, UsageError
 from probe_kit.hooks import Observation, Site, capture, edit
-from probe_kit.hooks.capturing.edit_engine import apply_edits
-from probe_kit.hooks.capturing.edits import Edit, vector_hash
-from probe_kit.hooks.contract.interventions import Interventions
+from probe_kit.hooks.capturing.edits import Edit, apply_edits, vector_hash
+from probe_kit.hooks.contract.declared import Interventions
 from probe_kit.hooks.families.pi0.adapter import Pi0, load_pi0_tiny
 from probe_kit.hooks.registry import own_families
 

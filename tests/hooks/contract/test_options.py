@@ -2,7 +2,7 @@ import pytest
 
 from probe_kit.errors import UsageError
 from probe_kit.hooks import Family, Option
-from probe_kit.hooks.contract.options import check_options, read_pairs
+from probe_kit.hooks.contract.declared import check_options, read_pairs
 
 DECLARED = (
     Option("size", int, "Of something.", "8", choices=(8, 16)),

@@ -4,7 +4,7 @@ import torch
 
 from probe_kit.errors import EmptyRoleError, RolesMismatchError, UnknownSiteError
 from probe_kit.hooks.contract.roles import Roles, Span, pool
-from probe_kit.hooks.contract.views import view_names
+from probe_kit.hooks.contract.sites import view_names
 
 ROLES = Roles.from_labels(["image.base", "image.base", "language", "language", "padding"])
 

@@ -14,11 +14,11 @@ from torch import Tensor
 
 from probe_kit.errors import ProbeKitError
 from probe_kit.hooks import Policy, load_model
-from probe_kit.hooks.conformance.acting import (
+from probe_kit.hooks.conformance.check import CheckFailedError
+from probe_kit.hooks.conformance.policies import (
     actions_have_the_contracts_shape_and_come_from_the_seed_alone,
     another_seed_gives_another_chunk_where_noise_is_drawn,
 )
-from probe_kit.hooks.conformance.check import CheckFailedError
 from probe_kit.hooks.conformance.subject import PolicySubject
 from probe_kit.hooks.registry import own_families
 from tests.support.every_checkpoint import WRITERS

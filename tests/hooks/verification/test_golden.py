@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from probe_kit.hooks.registry import own_families
-from probe_kit.hooks.verification.verify import Verification, verify_keys, verify_reference
+from probe_kit.hooks.verify import Verification, verify_keys, verify_reference
 
 GOLDEN = Path(__file__).parents[2] / "golden"
 BYTES = {"float32": 4, "bfloat16": 2, "int64": 8}

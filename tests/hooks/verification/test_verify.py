@@ -9,8 +9,8 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from probe_kit.errors import UsageError, WeightsError
-from probe_kit.hooks.verification.outputs import Outputs
-from probe_kit.hooks.verification.verify import compare, verify_keys, verify_reference
+from probe_kit.hooks.outputs import Outputs
+from probe_kit.hooks.verify import compare, verify_keys, verify_reference
 from probe_kit.models.magma import UNUSED_WEIGHTS
 
 

@@ -6,8 +6,7 @@ import torch
 
 from probe_kit.errors import UnknownSiteError, UnsupportedInterventionError
 from probe_kit.hooks import Observation, Site, capture, load_model
-from probe_kit.hooks.capturing.edit_engine import apply_patch, apply_patches
-from probe_kit.hooks.capturing.token_edits import ReplaceWith, TokenSelection
+from probe_kit.hooks.capturing.edits import ReplaceWith, TokenSelection, apply_patch, apply_patches
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.intervene.places import PlaceName, list_places, resolve_sites
 from probe_kit.intervene.tokens import token_mask

@@ -3,7 +3,7 @@
 import pytest
 
 from probe_kit.errors import NoDirectionError
-from probe_kit.hooks.contract.interventions import Interventions
+from probe_kit.hooks.contract.declared import Interventions
 from probe_kit.hooks.contract.sites import Stream
 from probe_kit.intervene import Interchange, JointPlaces, Steering
 from probe_kit.intervene.places import unread_note, unread_places

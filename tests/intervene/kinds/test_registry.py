@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.hooks import Site
-from probe_kit.hooks.contract.interventions import ASKED_AS, InterventionKind
+from probe_kit.hooks.contract.declared import ASKED_AS, InterventionKind
 from probe_kit.intervene import commands, kinds, load_effects
 from probe_kit.intervene.kinds import every_kind, kind_names, kind_of
 from probe_kit.intervene.places import TILE_ROLES

@@ -6,7 +6,7 @@ import pytest
 
 from probe_kit import patching as pt
 from probe_kit.errors import UnsupportedInterventionError, UsageError
-from probe_kit.hooks.contract.interventions import Interventions
+from probe_kit.hooks.contract.declared import Interventions
 from probe_kit.intervene import AttributionPatching
 from probe_kit.intervene.kinds.base import Measurement
 from tests.intervene.wirings import WiredPolicy, WiredSession, outcomes_of

@@ -7,8 +7,7 @@ import pytest
 
 from probe_kit.errors import EmptyRoleError, UnknownSiteError, UsageError
 from probe_kit.hooks import Site
-from probe_kit.hooks.capturing.edit_engine import EditLog, _ActiveEdits
-from probe_kit.hooks.capturing.token_edits import ReplaceInSubspace, ReplaceWith
+from probe_kit.hooks.capturing.edits import EditLog, ReplaceInSubspace, ReplaceWith, _ActiveEdits
 from probe_kit.intervene import (
     ClosedLoop,
     ConceptErasure,

@@ -13,8 +13,8 @@ from probe_kit.extract import AskSettings, ExtractSettings, extract_run
 from probe_kit.extract.protocols import scene_of
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.hooks.registry import own_families
-from probe_kit.models.embedded.folder import embedded_checkpoint
-from probe_kit.models.embedded.pi0_tiny import ACTION_DIMS
+from probe_kit.models.embedded import embedded_checkpoint
+from probe_kit.models.embedded.tiny import ACTION_DIMS
 from probe_kit.suite import build_suite
 
 NAMES = ("pi0-tiny", "pi0-tiny-early", "pi0-tiny-state")

@@ -16,7 +16,7 @@ from probe_kit.extract.vqa.templates import ORDERS, TEMPLATES
 from probe_kit.hooks.contract.model import Prompt
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.families.paligemma.adapter import PaliGemma, load_vlm_tiny
-from probe_kit.models.embedded.folder import embedded_checkpoint
+from probe_kit.models.embedded import embedded_checkpoint
 from probe_kit.models.embedded.words import WORDS
 from probe_kit.suite import build_suite
 from probe_kit.suite.generators import GENERATORS, vocabulary

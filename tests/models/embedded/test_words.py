@@ -12,7 +12,7 @@ from probe_kit.errors import InstructionError
 from probe_kit.extract import AskSettings, ExtractSettings
 from probe_kit.extract.preparation import open_checked
 from probe_kit.hooks.registry import find_family
-from probe_kit.models.embedded.folder import embedded_checkpoint
+from probe_kit.models.embedded import embedded_checkpoint
 from probe_kit.models.embedded.words import SPECIAL, WORDS, known_words, words_in
 from probe_kit.suite import Terms, suite_from_csv
 

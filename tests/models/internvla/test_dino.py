@@ -3,9 +3,8 @@ import torch
 from torch import Tensor
 from transformers import Dinov2Config, Dinov2Model
 
-from probe_kit.models.initialisation import initialise
-from probe_kit.models.internvla.config import DinoConfig
-from probe_kit.models.internvla.dino import DinoV2
+from probe_kit.models.building import initialise
+from probe_kit.models.internvla import DinoConfig, DinoV2
 from tests.support.internvla_checkpoints import dims_values
 
 CONFIG = DinoConfig.read(dims_values()["dino"], "test")

@@ -7,9 +7,9 @@ import torch
 from lerobot.policies.pi0 import modeling_pi0
 
 from probe_kit.errors import CheckpointError
-from probe_kit.models.embedded.pi0_tiny import SIZE, _config
-from probe_kit.models.initialisation import initialise
-from probe_kit.models.lerobot.pi0 import Pi0Size, build_pi0
+from probe_kit.models.building import initialise
+from probe_kit.models.embedded.tiny import SIZE, _config
+from probe_kit.models.pi0 import Pi0Size, build_pi0
 
 
 def test_lerobots_module_is_left_as_found() -> None:

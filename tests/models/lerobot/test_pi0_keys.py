@@ -2,9 +2,8 @@ import torch
 from torch import Tensor
 
 from probe_kit.hooks.families.pi0.adapter import Pi0
-from probe_kit.models.embedded.pi0_tiny import SIZE, _config
-from probe_kit.models.lerobot.pi0 import build_pi0
-from probe_kit.models.lerobot.pi0_keys import current_pi0_keys
+from probe_kit.models.embedded.tiny import SIZE, _config
+from probe_kit.models.pi0 import build_pi0, current_pi0_keys
 
 VLM = "model.paligemma_with_expert.paligemma"
 

@@ -4,14 +4,21 @@ from pathlib import Path
 import pytest
 import torch
 
-from probe_kit.models.ovis2_5 import PICTURE, PICTURE_BEGINS, PICTURE_ENDS, OvisConfig, OvisNetwork, build_ovis2_5
-from probe_kit.models.ovis2_5.vision import word_order
+from probe_kit.models.ovis2_5 import (
+    PICTURE,
+    PICTURE_BEGINS,
+    PICTURE_ENDS,
+    OvisConfig,
+    OvisNetwork,
+    build_ovis2_5,
+    word_order,
+)
 from tests.support.vlm_checkpoints import write_ovis2_5
 
 
 @pytest.fixture(scope="module")
 def network(tmp_path_factory: pytest.TempPathFactory) -> OvisNetwork:
-    from probe_kit.models.initialisation import initialise
+    from probe_kit.models.building import initialise
 
     folder: Path = write_ovis2_5(tmp_path_factory.mktemp("ovis"))
     values = json.loads((folder / "config.json").read_text(encoding="utf-8"))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from probe_kit.errors import CheckpointError
-from probe_kit.models.paligemma.pictures import CROP, SquarePictures
+from probe_kit.models.paligemma import CROP, SquarePictures
 
 SETTINGS = {
     "do_resize": True, "do_rescale": True, "rescale_factor": 1 / 255, "do_normalize": True,

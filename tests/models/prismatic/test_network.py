@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from probe_kit.models.initialisation import initialise
+from probe_kit.models.building import initialise
 from probe_kit.models.prismatic import (
     PrismaticConfig,
     PrismaticNetwork,

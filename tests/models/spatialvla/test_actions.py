@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import norm
 
 from probe_kit.errors import CheckpointError
-from probe_kit.models.spatialvla import ActionBins, equal_mass_edges
+from probe_kit.models.spatialvla_actions import ActionBins, equal_mass_edges
 from tests.support.spatialvla_checkpoints import BINS, FIRST_ACTION, processor_values
 
 AXES = ("theta", "phi", "r", "roll", "pitch", "yaw")

@@ -7,13 +7,14 @@ from torch import Tensor
 
 from probe_kit.hooks.checkpoints.weights import load_weights, read_weights
 from probe_kit.models.spatialvla import (
+    DEPTH_SIDE,
+    MARGIN,
     SpatialVLAConfig,
     SpatialVLANetwork,
     build_spatialvla,
     depth_input,
     estimate_depth,
 )
-from probe_kit.models.spatialvla.depth import DEPTH_SIDE, MARGIN
 from tests.support.spatialvla_checkpoints import SIDE, network
 
 

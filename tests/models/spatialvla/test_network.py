@@ -9,13 +9,8 @@ from torch import Tensor
 
 from probe_kit.errors import UsageError
 from probe_kit.hooks.checkpoints.weights import load_weights, read_weights
-from probe_kit.models.packing import Packed
-from probe_kit.models.spatialvla import (
-    SpatialVLAConfig,
-    SpatialVLANetwork,
-    build_spatialvla,
-    full_size_spatialvla,
-)
+from probe_kit.models.decoding import Packed
+from probe_kit.models.spatialvla import SpatialVLAConfig, SpatialVLANetwork, build_spatialvla, full_size_spatialvla
 from tests.support.spatialvla_checkpoints import FIRST_ACTION, IMAGE, SIDE, config_values, network
 
 CAMERA = torch.tensor([[60.0, 0, 20], [0, 62, 22], [0, 0, 1]])

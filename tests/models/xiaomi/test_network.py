@@ -6,7 +6,7 @@ import torch
 from safetensors.torch import load_file
 from torch import Tensor
 
-from probe_kit.models.initialisation import initialise
+from probe_kit.models.building import initialise
 from probe_kit.models.qwen import QwenInputs, pack_inputs
 from probe_kit.models.xiaomi import XiaomiConfig, XiaomiNetwork, build_xiaomi, full_size_xiaomi
 from tests.support.qwen_checkpoints import ID

@@ -13,7 +13,7 @@ from safetensors.torch import load_file
 
 from probe_kit.hooks import ModelCard, load_model
 from probe_kit.hooks.registry import find_family, own_families
-from probe_kit.models.embedded.folder import embedded_checkpoint
+from probe_kit.models.embedded import embedded_checkpoint
 from probe_kit.retention import retention_table
 from probe_kit.retention.compare.models import grew_from
 from probe_kit.retention.report import report_html

@@ -11,8 +11,7 @@ import pandas as pd
 import pytest
 from matplotlib import pyplot as plt
 
-from probe_kit.env.scoring.events import EVENTS
-from probe_kit.env.scoring.trajectory import CHANNELS, Trajectory
+from probe_kit.env.scoring import CHANNELS, EVENTS, Trajectory
 from probe_kit.errors import UsageError
 from probe_kit.retention.displays import CallCurveDisplay, aligned_curves, call_curves
 from probe_kit.retention.displays.call_curves import CallCurves, event_calls

@@ -16,7 +16,7 @@ from probe_kit.hooks import ModelCard, Observation, Policy, Roles, Site, Stream,
 from probe_kit.hooks.checkpoints.checkpoint import content_hashes, side_files
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.checkpoints.weights import Weights, load_weights, read_weights
-from probe_kit.models.initialisation import initialise
+from probe_kit.models.building import initialise
 
 WIDTH, BLOCKS, STEPS, CHUNK, PATCHES, LETTERS = 16, 2, 2, 4, 16, 48
 

@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from probe_kit.cli import app
-from probe_kit.env.scoring.trajectory import CHANNELS
+from probe_kit.env.scoring import CHANNELS
 from probe_kit.errors import ProbeKitError, UsageError
 from probe_kit.runs import open_run
 from probe_kit.train import Target, train_probes

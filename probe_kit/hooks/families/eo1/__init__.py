@@ -1,7 +1,6 @@
 """EO-1 through lerobot."""
 
-from probe_kit.hooks.contract.declared import backbone, expert
-from probe_kit.hooks.contract.interventions import Interventions
+from probe_kit.hooks.contract.declared import Interventions, backbone, expert
 from probe_kit.hooks.contract.sites import QUANTITIES
 from probe_kit.hooks.families.shared.kinds import MERGED, lerobot_family
 

@@ -1,8 +1,6 @@
 """GR00T N1.7 through lerobot."""
 
-from probe_kit.hooks.contract.declared import TEXT, DeclaredStream, backbone, expert
-from probe_kit.hooks.contract.interventions import Interventions
-from probe_kit.hooks.contract.options import Option
+from probe_kit.hooks.contract.declared import TEXT, DeclaredStream, Interventions, Option, backbone, expert
 from probe_kit.hooks.contract.sites import QUANTITIES, Stream
 from probe_kit.hooks.families.shared.kinds import MERGED, lerobot_family
 
@@ -28,6 +26,7 @@ FAMILIES = (
         "GR00T N1.7 (Qwen3-VL cut behind layer 16, bridge, diffusion transformer) through lerobot",
         "nvidia/GR00T-N1.7-3B",
         "groot.adapter:Groot",
+        full_size="probe_kit.hooks.families.groot.network:full_size_groot",
         embodiment="as the checkpoint's statistics",
         hub=(("nvidia/Cosmos-Reason2-2B", "tokenizer.json"),),
         notes=(

@@ -20,15 +20,21 @@ from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.model import Tap
 from probe_kit.hooks.contract.sites import HEADS, Site, Stream
 from probe_kit.hooks.families.groot import BRIDGE, INTERVENTIONS
-from probe_kit.hooks.families.groot.checkpoint import GrootChoice, Places, is_nvidias, nvidias_config
-from probe_kit.hooks.families.groot.packing import Packing, Steps, read_steps
-from probe_kit.hooks.families.groot.pictures import NvidiasPictures, lerobots_rule
+from probe_kit.hooks.families.groot.network import (
+    GrootChoice,
+    Places,
+    build_groot,
+    flow_actions,
+    is_nvidias,
+    network_config,
+    nvidias_config,
+)
+from probe_kit.hooks.families.groot.packing import NvidiasPictures, Packing, Steps, lerobots_rule, read_steps
 from probe_kit.hooks.families.groot.units import BoundedUnits, StateUnits, action_units, state_units
-from probe_kit.hooks.families.shared.lerobot.packed import PackedPolicy
-from probe_kit.hooks.families.shared.lerobot.stacks import Stack
-from probe_kit.hooks.families.shared.qwen.tower import tower_tap
-from probe_kit.hooks.verification.outputs import Produce, RecordedRun, numpy_of
-from probe_kit.models.lerobot.groot import build_groot, flow_actions, network_config
+from probe_kit.hooks.families.shared.lerobot.flow import PackedPolicy
+from probe_kit.hooks.families.shared.qwen import tower_tap
+from probe_kit.hooks.families.shared.taps import Stack
+from probe_kit.hooks.outputs import Produce, RecordedRun, numpy_of
 
 _MODEL = "_groot_model."
 _EMBEDDING = f"{_MODEL}backbone.model.model.language_model.embed_tokens.weight"

@@ -1,12 +1,14 @@
-"""The inputs of GR00T: lerobot's own processor steps, from the files of a checkpoint, without remote code."""
+"""Prompts of GR00T: settings of its processor files, pictures as two codes resize them, chats."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from importlib.metadata import version
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 import torch
 from lerobot.lerobot_types import TransitionKey
@@ -23,16 +25,253 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor
+from torchvision.transforms.v2 import functional
 from transformers import AutoTokenizer, Qwen2VLImageProcessor, Qwen3VLProcessor, Qwen3VLVideoProcessor
 
 from probe_kit._system.bounded_json import read_json_object
 from probe_kit.errors import CheckpointError, InstructionError
 from probe_kit.hooks.checkpoints.checkpoint import shard_name
-from probe_kit.hooks.families.groot.pictures import nvidias_pictures
-from probe_kit.hooks.families.groot.processor_fields import StateFields, processor_settings, read_state_fields
-from probe_kit.hooks.families.shared.lerobot.features import IMAGES, STATE
-from probe_kit.hooks.families.shared.lerobot.packed import PackedRow, chat_labels
-from probe_kit.models.pretrained import load_pretrained
+from probe_kit.hooks.families.shared.kinds import IMAGES, STATE
+from probe_kit.hooks.families.shared.lerobot.flow import PackedRow, chat_labels
+from probe_kit.hooks.families.shared.lerobot.pipelines import check_values
+from probe_kit.models.checkpoint_files import load_pretrained
+
+PROCESSOR_FILE = "processor_config.json"
+_FLAG = (True, False)
+_OFF = (False, None)
+_ANY = None
+_TOP: Mapping[str, tuple[Any, ...] | None] = {
+    "processor_class": ("Gr00tN1d7Processor",),
+    "processor_kwargs": _ANY,
+}
+_SETTINGS: Mapping[str, tuple[Any, ...] | None] = {
+    **dict.fromkeys(
+        ("modality_configs", "max_action_horizon", "max_state_dim", "max_action_dim", "image_crop_size",
+         "image_target_size", "shortest_image_edge", "crop_fraction"), _ANY,
+    ),
+    **dict.fromkeys(
+        ("use_percentiles", "clip_outliers", "formalize_language", "use_relative_action", "use_albumentations",
+         "letter_box_transform", "apply_sincos_state_encoding", "exclude_state"), _FLAG,
+    ),
+    # Of training, or of a model that the network's configuration names too.
+    **dict.fromkeys(
+        ("random_rotation_angle", "color_jitter_params", "extra_augmentation_config", "state_dropout_prob",
+         "model_name", "transformers_loading_kwargs"), _ANY,
+    ),
+    "model_type": ("qwen",),
+    # NVIDIA's processor stores it and reads it nowhere: nothing says what a checkpoint that has it was trained on.
+    "use_mean_std": _OFF,
+    "use_tactile": _OFF,
+    **dict.fromkeys(("tactile_state_keys", "tactile_input_shape", "tactile_embed_dim"), _ANY),
+}  # fmt: skip
+_MODALITIES = dict.fromkeys(("video", "state", "action", "language"), _ANY)
+_MODALITY: Mapping[str, tuple[Any, ...] | None] = {
+    **dict.fromkeys(
+        ("delta_indices", "modality_keys", "sin_cos_embedding_keys", "mean_std_embedding_keys", "action_configs"),
+        _ANY,
+    ),
+    "exclude_state": (*_FLAG, None),
+}
+_ACTION = dict.fromkeys(("rep", "type", "format", "state_key"), _ANY)
+
+
+@dataclass(frozen=True)
+class StateFields:
+    """The state of one embodiment. excluded: the network reads zeros. angles: groups read as sine and cosine.
+
+    deviations, action_deviations: groups of the state and of the action that are mapped by mean and deviation.
+    """
+
+    excluded: bool
+    angles: tuple[str, ...]
+    deviations: tuple[str, ...]
+    action_deviations: tuple[str, ...]
+
+
+def processor_settings(folder: Path) -> dict[str, Any]:
+    """The settings in `processor_config.json`. Raises CheckpointError for one that may change numbers unseen."""
+    path = folder / PROCESSOR_FILE
+    content = read_json_object(path, CheckpointError, "Download the checkpoint again")
+    check_values(content, _TOP, str(path))
+    settings = content.get("processor_kwargs")
+    if not isinstance(settings, dict):
+        raise CheckpointError(f"{path} has no processor_kwargs with fields. Download the checkpoint again")
+    check_values(settings, _SETTINGS, str(path))
+    for name in ("image_crop_size", "image_target_size"):
+        _check_pair(path, name, settings.get(name))
+    _check_number(path, "shortest_image_edge", settings.get("shortest_image_edge"), int, 1 << 16)
+    _check_number(path, "crop_fraction", settings.get("crop_fraction"), (int, float), 1)
+    return settings
+
+
+def read_state_fields(folder: Path, settings: Mapping[str, Any], tag: str) -> StateFields:
+    """The settings of the processor file for the state of embodiment `tag`.
+
+    Raises CheckpointError for several frames of the state, and for a field that may change numbers unseen.
+    """
+    path = folder / PROCESSOR_FILE
+    modalities = settings.get("modality_configs", {}).get(tag, {})
+    check_values(modalities, _MODALITIES, f"{path}: {tag}")
+    for name, modality in modalities.items():
+        if not isinstance(modality, dict):
+            raise CheckpointError(
+                f"{path}: {name} of {tag} is {modality!r}; expected fields such as modality_keys"
+            )
+        check_values(modality, _MODALITY, f"{path}: {name} of {tag}")
+        for action in modality.get("action_configs") or ():
+            check_values(action, _ACTION, f"{path}: an action of {tag}")
+    state, action = modalities.get("state", {}), modalities.get("action", {})
+    if (frames := state.get("delta_indices", [0])) != [0]:
+        raise CheckpointError(
+            f"{path}: {tag} reads states of the steps {frames} (delta_indices); every inference here is given "
+            "that of step 0. Take a checkpoint that reads one"
+        )
+    angles = _groups(path, state, "sin_cos_embedding_keys") if settings.get("apply_sincos_state_encoding") else ()
+    return StateFields(
+        excluded=bool(settings.get("exclude_state") or state.get("exclude_state")),
+        angles=angles,
+        # NVIDIA's processor looks for angles first.
+        deviations=tuple(key for key in _groups(path, state, "mean_std_embedding_keys") if key not in angles),
+        action_deviations=_groups(path, action, "mean_std_embedding_keys"),
+    )
+
+
+def check_widths(folder: Path, settings: Mapping[str, Any], network: Mapping[str, Any]) -> None:
+    """Raise CheckpointError where processor and network say different widths of state or action."""
+    for name in ("max_state_dim", "max_action_dim"):
+        width, other = settings.get(name), network.get(name)
+        if width is not None and other is not None and width != other:
+            raise CheckpointError(
+                f"{folder / PROCESSOR_FILE} says {name}: {width}, config.json {other}. The network reads the "
+                "latter: take the original files"
+            )
+
+
+def _groups(path: Path, modality: Mapping[str, Any], field: str) -> tuple[str, ...]:
+    """The groups that a field lists. Raises CheckpointError for one that the modality does not have."""
+    listed = modality.get(field) or []
+    keys = modality.get("modality_keys", [])
+    if not isinstance(listed, list) or (strange := [key for key in listed if key not in keys]):
+        raise CheckpointError(
+            f"{path} says {field}: {listed!r}; expected groups of {keys!r}. Take the original file"
+            + (f" (unknown: {', '.join(map(str, strange))})" if isinstance(listed, list) else "")
+        )
+    return tuple(listed)
+
+
+def _check_pair(path: Path, name: str, value: Any) -> None:
+    sides = value if isinstance(value, list) else []
+    if value is not None and not (len(sides) == 2 and all(type(side) is int and side > 0 for side in sides)):
+        raise CheckpointError(f"{path} says {name}: {value!r}; expected height and width in pixels")
+
+
+def _check_number(path: Path, name: str, value: Any, kind: Any, most: int) -> None:
+    if value is not None and (isinstance(value, bool) or not isinstance(value, kind) or not 0 < value <= most):
+        raise CheckpointError(f"{path} says {name}: {value!r}; expected a number above 0 and at most {most}")
+
+
+NVIDIAS_VERSION = "gr00t_n1d7 of Isaac-GR00T, commit 1852a8c of 2026"
+"""The newest code of NVIDIA that was read."""
+_EDGE, _FRACTION = 256, 0.95
+"""What NVIDIA's processor takes for fields that a file lacks."""
+
+
+@dataclass
+class NvidiasPictures(GrootN17VLMEncodeStep):  # type: ignore[misc]
+    """lerobot's step with NVIDIA's resizing in place of its own.
+
+    NVIDIA squashes to the target size, bilinearly, and cuts pixels out; lerobot is bicubic and cuts a fraction.
+    With `use_albumentations` both bring the shortest edge to a length by area; without a length, NVIDIA squashes.
+    """
+
+    def __post_init__(self) -> None:
+        """Raise CheckpointError for sizes that are missing: NVIDIA's code has no others."""
+        missing = [name for name in ("image_target_size", "image_crop_size") if getattr(self, name) is None]
+        needed = not self.use_albumentations or (self.shortest_image_edge is None or self.crop_fraction is None)
+        if missing and needed:
+            raise CheckpointError(
+                f"the processor file has no {' and no '.join(missing)}, without which NVIDIA's code resizes no "
+                "picture. Take the original file, or -M resize=lerobot for lerobot's default"
+            )
+
+    def _build_sample_images(self, video: Any, batch_size: int, target_device: Any) -> list[list[Tensor]]:
+        """(3, H, W) uint8 per frame and camera. video: (B, T, V, H, W, 3) uint8."""
+        del target_device
+        pictures = np.asarray(video)
+        return [
+            [self.resized(np.ascontiguousarray(picture)) for frames in pictures[row] for picture in frames]
+            for row in range(batch_size)
+        ]
+
+    def resized(self, picture: NDArray[np.uint8]) -> Tensor:
+        """(3, H, W) uint8 of (H, W, 3)."""
+        square = _letterboxed(picture) if self.letter_box_transform else picture
+        if self.use_albumentations:
+            return torch.from_numpy(np.ascontiguousarray(self._by_area(square))).permute(2, 0, 1)
+        tensor = torch.from_numpy(square).permute(2, 0, 1)
+        target, crop = list(self.image_target_size or ()), list(self.image_crop_size or ())
+        cut = functional.center_crop(functional.resize(tensor, target), crop)
+        resized: Tensor = functional.resize(cut, target)
+        return resized
+
+    def _by_area(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Resized, cut, and resized again."""
+        target, crop = self.image_target_size or [1, 1], self.image_crop_size or [1, 1]
+        fraction = crop[0] / target[0] if self.crop_fraction is None else self.crop_fraction
+        first = self._one_size(picture)
+        height, width = (max(1, int(side * fraction)) for side in first.shape[:2])
+        top, column = (first.shape[0] - height) // 2, (first.shape[1] - width) // 2
+        return self._one_size(first[top : top + height, column : column + width])
+
+    def _one_size(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The shortest edge at its length, or squashed where there is none."""
+        if self.shortest_image_edge is None:
+            height, width = self.image_target_size or [1, 1]
+        else:
+            scale = self.shortest_image_edge / min(picture.shape[:2])
+            height, width = (max(1, round(side * scale)) for side in picture.shape[:2])
+        if (height, width) == picture.shape[:2]:
+            return picture
+        resized: NDArray[np.uint8] = np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA))
+        return resized
+
+    @property
+    def rule(self) -> str:
+        """The rule in words, for the card."""
+        size = " x ".join(map(str, self.image_target_size or ()))
+        if not self.use_albumentations:
+            return f"squashed to {size} bilinearly, as {NVIDIAS_VERSION}; lerobot is bicubic (-M resize=lerobot)"
+        if self.shortest_image_edge is None:
+            return f"squashed to {size} by area, as {NVIDIAS_VERSION}; lerobot does not squash (-M resize=lerobot)"
+        return f"shortest edge {self.shortest_image_edge} by area, as {NVIDIAS_VERSION}, and lerobot"
+
+
+def nvidias_pictures(step: GrootN17VLMEncodeStep, settings: Mapping[str, Any] | None) -> NvidiasPictures:
+    """The step with NVIDIA's resizing.
+
+    settings: of its processor file, whose missing fields have NVIDIA's values; None in lerobot's layout.
+    """
+    values = {field.name: getattr(step, field.name) for field in fields(GrootN17VLMEncodeStep) if field.init}
+    if settings is not None:
+        values |= {name: settings.get(name) for name in ("image_target_size", "image_crop_size")}
+        values["shortest_image_edge"] = settings.get("shortest_image_edge", _EDGE)
+        values["crop_fraction"] = settings.get("crop_fraction", _FRACTION)
+    return NvidiasPictures(**values)
+
+
+def lerobots_rule(step: GrootN17VLMEncodeStep) -> str:
+    """The resizing of lerobot's own step in words, for the card."""
+    kind = "by area" if step.use_albumentations else "squashed, bicubic"
+    return f"{kind}, as lerobot {version('lerobot')}; NVIDIA's code differs (-M resize=nvidia)"
+
+
+def _letterboxed(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """(side, side, 3) of (H, W, 3), black bars on both ends."""
+    height, width = picture.shape[:2]
+    side = max(height, width)
+    rows, columns = side - height, side - width
+    return np.pad(picture, ((rows // 2, rows - rows // 2), (columns // 2, columns - columns // 2), (0, 0)))
+
 
 _READ = (
     "input_ids", "attention_mask", "pixel_values", "image_grid_thw", "mm_token_type_ids", "embodiment_id"

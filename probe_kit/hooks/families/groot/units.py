@@ -14,7 +14,7 @@ from lerobot.policies.groot.utils import config_value
 from numpy.typing import NDArray
 
 from probe_kit.errors import CheckpointError
-from probe_kit.hooks.families.groot.processor_fields import StateFields
+from probe_kit.hooks.families.groot.packing import StateFields
 from probe_kit.hooks.families.shared.lerobot.normaliser import USUAL_DEVIATIONS, outside
 from probe_kit.models.bounds import check_bounds, check_deviations
 

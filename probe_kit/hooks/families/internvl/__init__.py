@@ -1,7 +1,6 @@
 """InternVL, on transformers' own network."""
 
-from probe_kit.hooks.contract.declared import answering
-from probe_kit.hooks.contract.options import Option
+from probe_kit.hooks.contract.declared import Option, answering
 from probe_kit.hooks.families.shared.kinds import TOKENIZER_FOLDER, answering_family
 
 FAMILIES = (

@@ -8,11 +8,10 @@ from transformers import InternVLConfig
 
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.model import Tap
-from probe_kit.hooks.families.shared.network_loading import Loaded
-from probe_kit.hooks.families.shared.qwen.vlm import ASSISTANT, USER
-from probe_kit.hooks.families.shared.vlm.adapter import Pictures, VisionLanguageModel
-from probe_kit.hooks.families.shared.vlm.loading import Recipe
-from probe_kit.hooks.families.shared.vlm.text import Frame
+from probe_kit.hooks.families.shared.loading import Loaded, Recipe
+from probe_kit.hooks.families.shared.qwen import ASSISTANT, USER
+from probe_kit.hooks.families.shared.text import Frame
+from probe_kit.hooks.families.shared.vlm import Pictures, VisionLanguageModel
 from probe_kit.models.internvl import FILE_NAMES, TiledPictures, build_internvl
 
 TILES = ("auto", "1")

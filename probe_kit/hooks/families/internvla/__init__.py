@@ -1,11 +1,23 @@
 """InternVLA-M1, native."""
 
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
 from probe_kit.hooks.contract.card import SourceWeights
-from probe_kit.hooks.contract.declared import DeclaredStream, backbone, expert
-from probe_kit.hooks.contract.interventions import Interventions
-from probe_kit.hooks.contract.options import Option
-from probe_kit.hooks.contract.protocol import ACT2ANSWER, OWN_SEEDS, ProtocolRow
+from probe_kit.hooks.contract.declared import (
+    ACT2ANSWER,
+    OWN_SEEDS,
+    DeclaredStream,
+    Interventions,
+    Option,
+    ProtocolRow,
+    backbone,
+    expert,
+)
 from probe_kit.hooks.contract.sites import QUANTITIES, Stream
+from probe_kit.hooks.families.shared.action_statistics import ActionStatistics
 from probe_kit.hooks.families.shared.kinds import MERGED
 from probe_kit.hooks.family import Family
 
@@ -33,7 +45,7 @@ FAMILIES = (
         "probe_kit.hooks.families.internvla.adapter:load_internvla",
         embodiment="as the data set of -M unnorm_key; bridge_dataset: WidowX end-effector delta at 5 Hz",
         notes="MIT, Qwen research licence; a .pt file; tokenizer and configuration of Qwen/Qwen2.5-VL-3B-Instruct",
-        outputs="probe_kit.hooks.families.internvla.outputs:internvla_outputs",
+        outputs="probe_kit.hooks.families.internvla.adapter:internvla_outputs",
         source="qwen2.5-vl",
         source_weights=SourceWeights("Qwen/Qwen2.5-VL-3B-Instruct", parameters=3_754_622_976),
         units="probe_kit.hooks.families.internvla.adapter:internvla_units",
@@ -80,3 +92,23 @@ FAMILIES = (
         interventions=INTERVENTIONS,
     ),
 )
+
+
+_GRIPPER, _OPEN = 6, 0.5
+
+
+class ActionUnits(ActionStatistics):
+    """The statistics of a run. Its head puts out numbers beyond [-1, 1], and a gripper between open and closed."""
+
+    lacking: ClassVar[str] = (
+        "the checkpoint has no dataset_statistics.json: its actions have no physical unit. Take the file that the "
+        "run was released with"
+    )
+
+    def restore(self, values: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+        """(…, D) in the data set's units: clipped to [-1, 1], the gripper open or closed, then stretched."""
+        clipped = np.clip(values.astype(np.float64), -1, 1)
+        if clipped.shape[-1] > _GRIPPER:
+            clipped[..., _GRIPPER] = clipped[..., _GRIPPER] >= _OPEN
+        # In the order of the original's operations, for the last bit.
+        return np.where(self.mask, 0.5 * (clipped + 1) * (self.high - self.low) + self.low, clipped)

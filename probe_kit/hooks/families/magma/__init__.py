@@ -1,8 +1,6 @@
 """Magma, native."""
 
-from probe_kit.hooks.contract.declared import backbone, chosen_tokens
-from probe_kit.hooks.contract.options import Option
-from probe_kit.hooks.contract.protocol import ACT2ANSWER, OWN_SEEDS, ProtocolRow
+from probe_kit.hooks.contract.declared import ACT2ANSWER, OWN_SEEDS, Option, ProtocolRow, backbone, chosen_tokens
 from probe_kit.hooks.families.shared.kinds import MAPS
 from probe_kit.hooks.family import Family
 
@@ -15,7 +13,7 @@ FAMILIES = (
         embodiment="as the data set of -M unnorm_key; bridge_orig: WidowX end-effector delta at 5 Hz",
         packages=(("timm", "magma"),),
         notes="MIT, Llama 3 licence; extra magma; about 18 GB in bfloat16",
-        outputs="probe_kit.hooks.families.magma.outputs:magma_outputs",
+        outputs="probe_kit.hooks.families.magma.adapter:magma_outputs",
         words="probe_kit.hooks.families.magma.adapter:check_magma_words",
         units="probe_kit.hooks.families.magma.adapter:magma_units",
         of_default={"unnorm_key": "bridge_orig"},

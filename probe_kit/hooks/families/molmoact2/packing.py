@@ -1,11 +1,9 @@
-"""The inputs of MolmoAct2: lerobot's packing of each observation alone, then padding behind it.
-
-lerobot pads in front and counts positions from the padding on. The expert reads rotated keys, so that an action
-there depends on the longest prompt of its batch. Here each row is what it is alone.
-"""
+"""Units, settings of processor steps, and prompts of MolmoAct2."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,10 +13,184 @@ from lerobot.policies.molmoact2.processor_molmoact2 import MolmoAct2PackInputsPr
 from numpy.typing import NDArray
 from torch import Tensor
 
-from probe_kit.errors import InstructionError
-from probe_kit.hooks.families.shared.lerobot.features import STATE
-from probe_kit.hooks.families.shared.lerobot.packed import PackedRow
-from probe_kit.hooks.families.shared.lerobot.state_prompt import label_groups
+from probe_kit.errors import CheckpointError, InstructionError, ObservationError
+from probe_kit.hooks.families.shared.kinds import STATE
+from probe_kit.hooks.families.shared.lerobot.flow import PackedRow, label_groups
+from probe_kit.hooks.families.shared.lerobot.normaliser import Normaliser
+from probe_kit.hooks.families.shared.lerobot.pipelines import MASKED, check_same, every_step
+
+
+@dataclass(frozen=True)
+class JointFrame:
+    """The first joints in the data set's convention: sign times joint, plus offset.
+
+    signs: 1 or -1 per joint. offsets: in the data set's units.
+    """
+
+    signs: NDArray[np.float32]
+    offsets: NDArray[np.float32]
+
+    def entered(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(..., D) of the data set from (..., D) of the robot."""
+        mapped, joints = np.array(values, np.float32), len(self.signs)
+        mapped[..., :joints] = self.signs * mapped[..., :joints] + self.offsets
+        return mapped
+
+    def left(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(..., D) of the robot from (..., D) of the data set."""
+        mapped, joints = np.array(values, np.float32), len(self.signs)
+        mapped[..., :joints] = self.signs * (mapped[..., :joints] - self.offsets)
+        return mapped
+
+
+SAME_FRAME = JointFrame(np.zeros(0, np.float32), np.zeros(0, np.float32))
+"""The robot has the data set's convention."""
+
+
+@dataclass(frozen=True)
+class SteppedUnits:
+    """Statistics between a joint frame and a clamp.
+
+    unscaled: (D,) True for numbers that stay as they are, such as a gripper. clamp: whether numbers are moved to
+    -1 to 1. unclamped: (D,) True for numbers of the state that the clamp leaves out.
+    """
+
+    units: Normaliser
+    unscaled: NDArray[np.bool_]
+    clamp: bool
+    unclamped: NDArray[np.bool_]
+    frame: JointFrame = SAME_FRAME
+
+    @property
+    def mode(self) -> str:
+        """The kind of map."""
+        return self.units.mode
+
+    @property
+    def source(self) -> str:
+        """The file the statistics come from."""
+        return self.units.source
+
+    def normalise(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Physical units to the numbers the network reads; (..., D).
+
+        Raises ObservationError for a number that stays as it is and lies outside -1 to 1, as lerobot does.
+        """
+        entered = self.frame.entered(values)
+        outside = (np.abs(entered) > 1) & self.unscaled
+        if outside.any():
+            number = int(np.argwhere(outside)[0][-1])
+            raise ObservationError(
+                f"number {number} of the state is {entered[outside][0]:g}; this checkpoint reads it as it is, "
+                "between -1 and 1 (normalize_gripper is off). Give it in these units"
+            )
+        mapped = np.where(self.unscaled, entered, self.units.normalise(entered))
+        if self.clamp:
+            mapped = np.where(self.unclamped, mapped, mapped.clip(-1, 1))
+        return mapped.astype(np.float32)
+
+    def restore(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Network output to physical units; (..., D)."""
+        inside = values.clip(-1, 1) if self.clamp else values
+        return self.frame.left(np.where(self.unscaled, inside, self.units.restore(inside)))
+
+    def slope(self, numbers: int) -> NDArray[np.float32]:
+        """(D,) of `restore`, where it does not clip."""
+        slopes = np.where(self.unscaled, 1, self.units.slope(numbers)).astype(np.float32)
+        slopes[: len(self.frame.signs)] *= self.frame.signs
+        return slopes
+
+    def slopes(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(..., D) of `restore` at these outputs of the network; 0 where it clips."""
+        inside = (np.abs(values) <= 1) | (not self.clamp)
+        return np.asarray(inside * self.slope(values.shape[-1]), np.float32)
+
+    def unusual(self, values: NDArray[np.float32]) -> NDArray[np.bool_]:
+        """(..., D): as without the clamp; numbers that stay as they are have no statistics."""
+        return np.asarray(self.units.unusual(self.frame.entered(values)) & ~self.unscaled)
+
+
+_PACK, _CLAMP_STATE, _CLAMP_ACTION = (
+    "molmoact2_pack_inputs",
+    "molmoact2_clamp_normalized",
+    "molmoact2_clamp_action",
+)
+_FRAMES = ("molmoact2_state_frame_transform", "molmoact2_action_frame_transform")
+STEPS = (*MASKED, _PACK, _CLAMP_STATE, _CLAMP_ACTION, *_FRAMES)
+_PACKED = (
+    "image_keys", "setup_type", "control_mode", "normalize_language", "add_setup_tokens", "add_control_tokens",
+    "num_state_tokens", "max_sequence_length",
+)  # fmt: skip
+"""Fields of the configuration that the packing step has too."""
+_SAME = {
+    "checkpoint_path": "checkpoint_path",
+    "chunk_size": "chunk_size",
+    "max_action_dim": "expected_max_action_dim",
+}
+"""Fields of the packing step that are read from the configuration, under its name."""
+
+
+@dataclass(frozen=True)
+class MolmoAct2Steps:
+    """The processor steps of one checkpoint. packing: fields that count over those of the configuration.
+
+    state_frame, action_frame: of the joints. clamps_state, clamps_action: whether numbers are moved to -1 to 1.
+    unclamped: (D,) True for numbers of the state that the clamp leaves out; None for those without statistics.
+    """
+
+    packing: Mapping[str, Any]
+    state_frame: JointFrame
+    action_frame: JointFrame
+    clamps_state: bool
+    clamps_action: bool
+    unclamped: NDArray[np.bool_] | None
+
+
+def read_steps(folder: Path, config: Any) -> MolmoAct2Steps:
+    """The saved steps; without a packing step, those that lerobot makes of the configuration.
+
+    Raises CheckpointError for frames that are none, and for a packing step of another configuration.
+    """
+    saved = {step.name: step.config for step in every_step(folder)}
+    if _PACK not in saved:
+        frame = _frame(vars(config), folder)
+        return MolmoAct2Steps({}, frame, frame, clamps_state=True, clamps_action=True, unclamped=None)
+    check_same(folder, _PACK, saved[_PACK], {name: getattr(config, theirs) for name, theirs in _SAME.items()})
+    state_frame, action_frame = (_frame(saved.get(name, {}), folder) for name in _FRAMES)
+    scaled = (saved.get(_CLAMP_STATE, {}).get("normalization_masks") or {}).get(STATE, [])
+    return MolmoAct2Steps(
+        {name: saved[_PACK][name] for name in _PACKED if name in saved[_PACK]},
+        state_frame,
+        action_frame,
+        clamps_state=_CLAMP_STATE in saved,
+        clamps_action=_CLAMP_ACTION in saved,
+        unclamped=~np.array(scaled, bool),
+    )
+
+
+def _frame(fields: Mapping[str, Any], folder: Path) -> JointFrame:
+    signs, offsets = fields.get("joint_signs"), fields.get("joint_offsets")
+    if signs is None or offsets is None:
+        return SAME_FRAME
+    if len(signs) != len(offsets) or not set(signs) <= {1, -1}:
+        raise CheckpointError(
+            f"{folder} has joint_signs {signs} and joint_offsets {offsets}; expected 1 or -1, and one offset each"
+        )
+    return JointFrame(np.array(signs, np.float32), np.array(offsets, np.float32))
+
+
+def in_packed_order(config: Any, folder: Path) -> dict[str, Any]:
+    """The input features with the pictures that the packing reads, in its order. Raises CheckpointError."""
+    if not config.image_keys:
+        return dict(config.input_features)
+    if missing := [key for key in config.image_keys if key not in config.input_features]:
+        raise CheckpointError(f"{folder} packs {', '.join(missing)}, which its configuration does not have")
+    pictures = {key: config.input_features[key] for key in config.image_keys}
+    other_features = {
+        key: feature for key, feature in config.input_features.items() if key not in config.image_features
+    }
+    return {**pictures, **other_features}
+
 
 _PROMPT = re.compile(
     r"The task is to (?P<language>.*)\. The setup is .*<state_start>(?P<state>(?:<state_\d+>)*)<state_end>",

@@ -1,8 +1,6 @@
 """OpenVLA, native."""
 
-from probe_kit.hooks.contract.declared import backbone, chosen_tokens
-from probe_kit.hooks.contract.options import Option
-from probe_kit.hooks.contract.protocol import ACT2ANSWER, OWN_SEEDS, ProtocolRow
+from probe_kit.hooks.contract.declared import ACT2ANSWER, OWN_SEEDS, Option, ProtocolRow, backbone, chosen_tokens
 from probe_kit.hooks.families.prismatic import BITS, TOKENIZER
 from probe_kit.hooks.families.shared.kinds import TOKENS
 from probe_kit.hooks.family import Family
@@ -34,7 +32,7 @@ FAMILIES = (
         embodiment="as the data set of -M unnorm_key; bridge_orig: WidowX end-effector delta at 5 Hz",
         packages=(("timm", "openvla"),),
         notes="MIT, Llama 2 licence; extra openvla; about 16 GB in bfloat16",
-        outputs="probe_kit.hooks.families.openvla.outputs:openvla_outputs",
+        outputs="probe_kit.hooks.families.openvla.adapter:openvla_outputs",
         config_types=("openvla", "prismatic"),
         source="prismatic",
         words="probe_kit.hooks.families.openvla.adapter:check_openvla_words",

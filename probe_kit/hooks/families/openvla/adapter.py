@@ -4,8 +4,10 @@ Sequence: beginning, 256 patches, "In: What action should the robot take to …?
 greedy tokens follow, one per dimension; iteration k of the stream `action` is the position that chooses the k-th.
 """
 
-from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
@@ -18,22 +20,46 @@ from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES
 from probe_kit.hooks.contract.card import ARM
 from probe_kit.hooks.contract.model import Policy
 from probe_kit.hooks.contract.observation import Observation, checked_picture
-from probe_kit.hooks.families.openvla.actions import ActionTokens
-from probe_kit.hooks.families.prismatic.adapter import PrismaticModel
+from probe_kit.hooks.families.prismatic.adapter import BYTES, PrismaticModel, find_tokenizer
 from probe_kit.hooks.families.prismatic.checkpoint import (
     LoadedPrismatic,
     checkpoint_folders,
     load_checkpoint,
     prismatic_statistics,
 )
-from probe_kit.hooks.families.prismatic.tokenizer import BYTES, find_tokenizer
+from probe_kit.hooks.families.prismatic.outputs import INPUTS, Reference
 from probe_kit.hooks.families.shared.action_statistics import DIMENSIONS, ActionStatistics, open_or_closed
 from probe_kit.hooks.families.shared.kinds import TOKENS
-from probe_kit.hooks.families.shared.prompt_kv import kept_prompt
-from probe_kit.hooks.families.shared.sampling import ALL, chooser, top_of
-from probe_kit.hooks.families.shared.token_decoder import warn_of_unknown
-from probe_kit.models.prismatic import CROP_AREA, PrismaticConfig, centre_crop
-from probe_kit.models.prismatic.tensor_pictures import prepare_tensor
+from probe_kit.hooks.families.shared.taps import kept_prompt
+from probe_kit.hooks.families.shared.token_decoder import ALL, chooser, top_of, warn_of_unknown
+from probe_kit.hooks.outputs import Arrays, Outputs, Produce
+from probe_kit.models.prismatic import CROP_AREA, PrismaticConfig, centre_crop, prepare_tensor
+
+
+@dataclass(frozen=True)
+class ActionTokens:
+    """The last `bins` text ids, from the highest down, name bins of [-1, 1].
+
+    vocabulary: number of text ids, without the padding of the embedding.
+    """
+
+    vocabulary: int
+    bins: int
+
+    @property
+    def centres(self) -> NDArray[np.float64]:
+        """(bins - 1,): `bins` edges have one interval fewer between them."""
+        edges = np.linspace(-1, 1, self.bins)
+        return np.asarray((edges[:-1] + edges[1:]) / 2)
+
+    def values(self, ids: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Normalised values of ids of any shape; an id outside the range counts as the nearest bin."""
+        return np.asarray(self.centres[np.clip(self.vocabulary - 1 - ids, 0, self.bins - 2)])
+
+    def is_action(self, ids: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return, per id, True where it names a bin."""
+        return np.asarray((ids >= self.vocabulary - self.bins) & (ids < self.vocabulary))
+
 
 DEFAULT_CHECKPOINT = "openvla/openvla-7b"
 _SLOT = "{instruction}"
@@ -245,3 +271,29 @@ def _template(prompt: str | None, config: PrismaticConfig) -> str:
     if _SLOT not in template:
         raise UsageError(f"prompt {name!r} is neither one of {', '.join(PROMPTS)} nor a template with {_SLOT}")
     return template
+
+
+_ACTION = "action_"
+_WITHOUT_EMPTY = "prompt_ids_without_empty"
+
+
+def openvla_outputs(load: Callable[..., OpenVLA], folder: Path, recorded: Arrays) -> Outputs:
+    """Compare a reference of a policy; each recorded `action_<data set>` with that data set's statistics.
+
+    The adapter adds the empty token to ids that are recorded without it.
+    """
+    checkpoint = folder / "checkpoint"
+    by_data_set = PrismaticConfig.from_folder(checkpoint).statistics
+    keys = [key for key in by_data_set if _ACTION + key in recorded]
+    policy = load(str(checkpoint), unnorm_key=next(iter(keys or by_data_set), None))
+    added = _WITHOUT_EMPTY in recorded
+    ids: list[int] = recorded[_WITHOUT_EMPTY if added else "input_ids"].ravel().tolist()
+    reference = Reference(policy, recorded, policy.with_empty_token(ids) if added else ids)
+    values = policy.action_tokens.values(reference.decoded.ids[0].numpy())
+    statistics, _ = prismatic_statistics(policy.config, policy.loaded.folders)
+    produced: dict[str, Produce] = {
+        _ACTION + key: partial(ActionStatistics.choose(statistics, key).restore, values) for key in keys
+    }
+    every = np.arange(int(policy.config.text.vocab_size))
+    inputs = INPUTS if added else (*INPUTS, "input_ids")
+    return reference.outputs(inputs, detok_table=lambda: policy.action_tokens.values(every), **produced)

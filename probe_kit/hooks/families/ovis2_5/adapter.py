@@ -10,12 +10,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from probe_kit.hooks.contract.model import Prompt, Tap
-from probe_kit.hooks.families.shared.qwen.tower import by_picture
-from probe_kit.hooks.families.shared.qwen.vlm import ASSISTANT, USER
-from probe_kit.hooks.families.shared.vlm.adapter import Pictures, VisionLanguageModel
-from probe_kit.hooks.families.shared.vlm.loading import Recipe
-from probe_kit.hooks.families.shared.vlm.text import Frame
-from probe_kit.hooks.verification.outputs import Produce, numpy_of
+from probe_kit.hooks.families.shared.loading import Recipe
+from probe_kit.hooks.families.shared.qwen import ASSISTANT, USER, by_picture
+from probe_kit.hooks.families.shared.text import Frame
+from probe_kit.hooks.families.shared.vlm import Pictures, VisionLanguageModel
+from probe_kit.hooks.outputs import Produce, numpy_of
 from probe_kit.models.ovis2_5 import (
     PICTURE,
     PICTURE_BEGINS,

@@ -1,7 +1,6 @@
 """PaliGemma, on transformers' own network, and the embedded VLM of 0.61 million parameters."""
 
-from probe_kit.hooks.contract.declared import answering
-from probe_kit.hooks.contract.default_scene import EMBEDDED
+from probe_kit.hooks.contract.declared import EMBEDDED, answering
 from probe_kit.hooks.families.shared.kinds import TOKENIZER_FOLDER, answering_family
 
 FAMILIES = (

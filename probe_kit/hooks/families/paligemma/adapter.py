@@ -10,11 +10,11 @@ from transformers import PaliGemmaConfig
 
 from probe_kit.hooks.contract.card import EMBEDDED
 from probe_kit.hooks.contract.model import Tap
-from probe_kit.hooks.families.shared.vlm.adapter import Pictures, VisionLanguageModel
-from probe_kit.hooks.families.shared.vlm.loading import Recipe
-from probe_kit.hooks.families.shared.vlm.text import Frame
-from probe_kit.models.embedded.folder import embedded_checkpoint
-from probe_kit.models.packing import LeftPacked
+from probe_kit.hooks.families.shared.loading import Recipe
+from probe_kit.hooks.families.shared.text import Frame
+from probe_kit.hooks.families.shared.vlm import Pictures, VisionLanguageModel
+from probe_kit.models.decoding import LeftPacked
+from probe_kit.models.embedded import embedded_checkpoint
 from probe_kit.models.paligemma import FILE_NAMES, SquarePictures, build_paligemma
 
 _FIRST_POSITION = 1

@@ -1,12 +1,16 @@
-"""pi0 through lerobot, and the embedded policies, which are pi0 at 0.84 million parameters."""
+"""pi0 and pi0.5 through lerobot, and the embedded policies, which are pi0 at 0.84 million parameters."""
 
 from probe_kit.hooks.contract.card import SourceWeights
-from probe_kit.hooks.contract.declared import backbone, expert
-from probe_kit.hooks.contract.default_scene import EMBEDDED
-from probe_kit.hooks.contract.options import Option
-from probe_kit.hooks.contract.protocol import ACT2ANSWER, OWN_SEEDS, ProtocolRow
-from probe_kit.hooks.families.shared.kinds import FLOW, lerobot_family
-from probe_kit.hooks.families.shared.lerobot.evaluation import EVALUATION_OPTIONS
+from probe_kit.hooks.contract.declared import (
+    ACT2ANSWER,
+    EMBEDDED,
+    OWN_SEEDS,
+    Option,
+    ProtocolRow,
+    backbone,
+    expert,
+)
+from probe_kit.hooks.families.shared.kinds import EVALUATION_OPTIONS, FLOW, lerobot_family
 from probe_kit.hooks.family import Family
 
 _VLM_TINY = SourceWeights(
@@ -54,6 +58,7 @@ FAMILIES = (
         "pi0 (PaliGemma 3B + 300M flow-matching expert) through lerobot",
         "juexzz/INTACT-pi0-finetune-bridge",
         "pi0.adapter:Pi0",
+        full_size="probe_kit.models.pi0:full_size_pi0",
         embodiment="WidowX end-effector delta at 5 Hz; other fine-tunes as --checkpoint",
         hub=(("google/paligemma-3b-pt-224", "tokenizer.json"),),
         notes=(
@@ -90,6 +95,33 @@ FAMILIES = (
                 ),
             )
         },
+        interventions=FLOW,
+    ),
+    lerobot_family(
+        "pi05",
+        "pi0.5 (PaliGemma 3B + 300M flow-matching expert with adaptive norms) through lerobot",
+        "lerobot/pi05_base",
+        "pi0.adapter:Pi05",
+        config_types=("pi05",),
+        full_size="probe_kit.models.pi0:full_size_pi05",
+        embodiment="as fine-tuned; the base model acts in 32 unnamed dimensions",
+        hub=(("google/paligemma-3b-pt-224", "tokenizer.json"),),
+        notes=(
+            "Gemma licence; tokenizer google/paligemma-3b-pt-224 is gated. The base can be captured without "
+            "acting (--no-act); to act it needs a fine-tune for end-effector deltas. The prompt holds the state "
+            "as digits"
+        ),
+        source="paligemma",
+        source_weights=SourceWeights("google/paligemma-3b-pt-224", parameters=2_923_466_480),
+        declared={
+            "": (
+                backbone(19, 2048, 968, "state", camera="base_0_rgb"),
+                expert(19, 1024, 10, 50, ("action",)),
+            )
+        },
+        parameters={"": 4_143_404_816},
+        not_acting=("lerobot/pi05_base",),
+        options=EVALUATION_OPTIONS,
         interventions=FLOW,
     ),
 )

@@ -3,8 +3,7 @@
 from dataclasses import replace
 
 from probe_kit.hooks.contract.card import SourceWeights
-from probe_kit.hooks.contract.declared import backbone, chosen_tokens
-from probe_kit.hooks.contract.options import Option
+from probe_kit.hooks.contract.declared import Option, backbone, chosen_tokens
 from probe_kit.hooks.families.shared.kinds import TOKENS, lerobot_family
 
 CAPTURED = 10

@@ -5,40 +5,300 @@ block, whose last token begins the actions. Action tokens follow, each reading a
 Iteration k of the stream `action` is the position that chooses the k-th token. The first ones are captured; the
 others are decoded and belong to no site.
 
-Source: arXiv 2501.09747, through lerobot's `PI0FastPolicy`.
+lerobot's constructor loads two tokenizers, one of them with remote code. The network is built without both.
+`decode_tokens` calls lerobot's modules as its `sample_actions_fast_kv_cache` does, and gives the same tokens. It
+also draws each row by its own seed, and decodes at least as many tokens as are captured.
+
+A chunk is transformed per dimension along time (discrete cosine transform), scaled and rounded. It is flattened,
+the lowest frequency of every dimension first. Each coefficient is a character; byte pairs of that text are tokens.
+
+Source: arXiv 2501.09747; decoding as in `UniversalActionProcessor`, which lerobot ships for MolmoAct2.
 """
 
 import warnings
-from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from types import SimpleNamespace
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import torch
+from lerobot.policies.common.vla_utils import prepare_attention_masks_4d
+from lerobot.policies.pi0_fast import modeling_pi0_fast
+from lerobot.policies.pi0_fast.configuration_pi0_fast import PI0FastConfig
+from lerobot.policies.pi0_fast.modeling_pi0_fast import PI0FastPolicy
 from numpy.typing import NDArray
+from scipy.fft import idct  # type: ignore[import-untyped]
+from tokenizers import Tokenizer
 from torch import Tensor, nn
 
-from probe_kit.errors import UsageError
+from probe_kit._system.bounded_json import load_json
+from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.hooks.checkpoints.folders import inside_or_hub
+from probe_kit.hooks.contract.model import Unembedding
 from probe_kit.hooks.contract.sites import Stream
-from probe_kit.hooks.contract.unembedding import Unembedding
 from probe_kit.hooks.families.pi0_fast import CAPTURED, FAST
-from probe_kit.hooks.families.pi0_fast.actions import FILES, ActionText, DecodedChunk, FastTokenizer
-from probe_kit.hooks.families.shared.attention_weights import Note, of_decoder
-from probe_kit.hooks.families.shared.lerobot.evaluation import Evaluation
-from probe_kit.hooks.families.shared.lerobot.paligemma import PaliGemmaPolicy, sizes_file
+from probe_kit.hooks.families.shared.kinds import Evaluation
+from probe_kit.hooks.families.shared.lerobot.flow import PaliGemmaPolicy, StatePrompt, sizes_file
 from probe_kit.hooks.families.shared.lerobot.pipelines import CROP
 from probe_kit.hooks.families.shared.lerobot.policy import MASK, TOKENS
-from probe_kit.hooks.families.shared.lerobot.stacks import Stack, TokenStack, flow_stacks
-from probe_kit.hooks.families.shared.lerobot.state_prompt import StatePrompt
-from probe_kit.hooks.families.shared.prompt_kv import ALL_BUT_LAST, LAST, kept_prompt
-from probe_kit.hooks.families.shared.sampling import chooser
-from probe_kit.hooks.verification.outputs import Arrays, Produce, RecordedRun, numpy_of
-from probe_kit.models.lerobot.pi0_fast import Pi0FastSize, TokenPrompt, build_pi0_fast, decode_tokens
-from probe_kit.models.lerobot.pi0_keys import EMBEDDING, LM_HEAD, current_pi0_fast_keys
+from probe_kit.hooks.families.shared.taps import (
+    ALL_BUT_LAST,
+    LAST,
+    Note,
+    Stack,
+    TokenStack,
+    flow_stacks,
+    kept_prompt,
+    of_decoder,
+)
+from probe_kit.hooks.families.shared.token_decoder import chooser
+from probe_kit.hooks.outputs import Arrays, Produce, RecordedRun, numpy_of
+from probe_kit.models.building import building_device, replaced
+from probe_kit.models.config_file import Count
+from probe_kit.models.decoding import PromptKV
+from probe_kit.models.pi0 import (
+    EMBEDDING,
+    LM_HEAD,
+    GemmaSize,
+    SiglipSize,
+    SizeFile,
+    current_pi0_fast_keys,
+    sized_paligemma,
+)
+
+FILES = ("tokenizer.json", "processor_config.json")
+_BROKEN = "\ufffd"
+"""What bytes become that make no character."""
+
+
+@dataclass(frozen=True)
+class DecodedChunk:
+    """values: (H, D) float64, normalised. problems: why the tokens are no whole chunk; empty where they are."""
+
+    values: NDArray[np.float64]
+    problems: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class FastTokenizer:
+    """FAST's tokenizer. pieces: byte pairs. scale: coefficients per unit. least: the coefficient of chr(0)."""
+
+    pieces: Any
+    scale: float
+    least: int
+
+    @classmethod
+    def from_folder(cls, folder: Path) -> "FastTokenizer":
+        """Read `tokenizer.json` and `processor_config.json`. Raises CheckpointError."""
+        lacking = [name for name in FILES if not (folder / name).is_file()]
+        if lacking:
+            raise CheckpointError(
+                f"{folder} is no FAST tokenizer: it has no {' and no '.join(lacking)}. Download it again"
+            )
+        try:
+            values = load_json(folder / FILES[1])
+            scale, least = float(values["scale"]), int(values["min_token"])
+            pieces = Tokenizer.from_file(str(folder / FILES[0]))
+        except (KeyError, TypeError, ValueError, Exception) as error:  # tokenizers raises Exception itself
+            raise CheckpointError(f"the FAST tokenizer in {folder} cannot be read ({error!r})") from error
+        if not scale > 0:
+            raise CheckpointError(f"{folder / FILES[1]} has scale {scale}; expected a positive number")
+        return cls(pieces, scale, least)
+
+    @property
+    def size(self) -> int:
+        """Number of its tokens."""
+        return int(self.pieces.get_vocab_size())
+
+    def decode(self, ids: Sequence[int], horizon: int, dimensions: int) -> DecodedChunk:
+        """The chunk (horizon, dimensions) of its ids.
+
+        Ids that it does not have and bytes that make no character are left out, missing coefficients are zero, and
+        surplus ones are cut, as in lerobot's relaxed decoding. Each is a problem: lerobot says so only in its log.
+        """
+        problems = []
+        fast_ids = [number for number in ids if 0 <= number < self.size]
+        if len(fast_ids) < len(ids):
+            problems.append(f"{len(ids) - len(fast_ids)} of {len(ids)} tokens name no FAST token")
+        text = self.pieces.decode(fast_ids, skip_special_tokens=False)
+        if broken := text.count(_BROKEN):
+            problems.append(f"the tokens break {broken} characters apart")
+        coefficients = (
+            np.array([ord(character) for character in text if character != _BROKEN], np.int64) + self.least
+        )
+        count = horizon * dimensions
+        if len(coefficients) != count:
+            problems.append(f"{len(coefficients)} coefficients; a chunk has {horizon} x {dimensions}")
+        filled = np.zeros(count)
+        filled[: len(coefficients)] = coefficients[:count]
+        values = idct(filled.reshape(horizon, dimensions) / self.scale, axis=0, norm="ortho")
+        return DecodedChunk(np.asarray(values), tuple(problems))
+
+
+@dataclass(frozen=True)
+class ActionText:
+    """The place of FAST's tokens in the network's output: behind `begin`, before `end`.
+
+    fast: the tokenizer. last: the id of its token 0; the others lie below. begin: ids of "Action: ". end: the id
+    that ends a chunk. checked: whether a row must begin with `begin`.
+    """
+
+    fast: FastTokenizer
+    last: int
+    begin: tuple[int, ...]
+    end: int
+    checked: bool = True
+
+    @classmethod
+    def of(cls, text: Any, fast: FastTokenizer, skipped: int, checked: bool) -> "ActionText":
+        """Read PaliGemma's tokenizer. skipped: ids at its end that stay free. Raises CheckpointError."""
+        last = int(text.vocab_size) - 1 - skipped
+        if last - fast.size < 0:
+            raise CheckpointError(
+                f"the text tokenizer has {text.vocab_size} ids; {skipped} free ones and {fast.size} FAST tokens "
+                "do not fit. Its files belong to another checkpoint"
+            )
+        begin = tuple(text.encode("Action: ", add_special_tokens=False))
+        return cls(fast, last, begin, int(text.convert_tokens_to_ids("|")), checked)
+
+    def ids(self, fast: Sequence[int]) -> list[int]:
+        """The network's ids for FAST's tokens: "Action: ", the tokens, and the end."""
+        return [*self.begin, *(self.last - number for number in fast), self.end]
+
+    def decode(self, ids: Sequence[int], horizon: int, dimensions: int) -> DecodedChunk:
+        """The chunk in one row of ids. Also a problem: another beginning, and no end."""
+        tokens, problems = list(ids), []
+        if self.end in tokens:
+            tokens = tokens[: tokens.index(self.end)]
+        else:
+            problems.append(f"no end of the actions in {len(tokens)} tokens")
+        if self.checked and tuple(tokens[: len(self.begin)]) != self.begin:
+            problems.append('the tokens do not begin with "Action: "')
+        chunk = self.fast.decode(
+            [self.last - number for number in self._without_begin(tokens)], horizon, dimensions
+        )
+        return DecodedChunk(chunk.values, (*problems, *chunk.problems))
+
+    def _without_begin(self, ids: Sequence[int]) -> list[int]:
+        """Every "Action: " is left out, as lerobot does it."""
+        remaining, at, length = [], 0, len(self.begin)
+        while at < len(ids):
+            if tuple(ids[at : at + length]) == self.begin:
+                at += length
+            else:
+                remaining.append(ids[at])
+                at += 1
+        return remaining
+
+
+_NO_TOKENIZER = SimpleNamespace(from_pretrained=lambda *_, **__: None)
+
+
+class Pi0FastSize(SizeFile):
+    """Every dimension of a pi0-FAST that its `config.json` cannot express."""
+
+    network = "pi0-FAST"
+
+    vlm: GemmaSize
+    vision: SiglipSize
+    vocab_size: Count
+
+
+def build_pi0_fast(config: PI0FastConfig, size: Pi0FastSize | None = None, device: str = "cpu") -> PI0FastPolicy:
+    """A `PI0FastPolicy` in eval mode with uninitialised weights and without tokenizers; see `build_pi0`."""
+    device = building_device(device)
+    config.device = device
+    no_tokenizers = {"AutoProcessor": _NO_TOKENIZER, "AutoTokenizer": _NO_TOKENIZER}
+    with sized(size, config), replaced(modeling_pi0_fast, no_tokenizers), torch.device(device):
+        policy = PI0FastPolicy(config)
+    policy.eval()
+    joint: Any = policy.model.paligemma_with_expert
+    joint.prompt_kv = PromptKV(len(joint.paligemma.model.language_model.layers))
+    return cast(PI0FastPolicy, policy)
+
+
+def full_size_pi0_fast() -> PI0FastPolicy:
+    """The released size, on the meta device."""
+    return build_pi0_fast(PI0FastConfig(device="cpu"), device="meta")
+
+
+@contextmanager
+def sized(size: Pi0FastSize | None, config: PI0FastConfig) -> Iterator[None]:
+    """Inside, lerobot's module builds a network of this size; None for the released one."""
+    if size is None:
+        yield
+        return
+    build = sized_paligemma(modeling_pi0_fast, size.vlm, size.vision, size.vocab_size, config.image_resolution[0])
+    replacements: dict[str, Callable[..., Any]] = {
+        "get_gemma_config": lambda _: size.vlm,
+        "PaliGemmaForConditionalGenerationWithPiGemma": build,
+    }
+    with replaced(modeling_pi0_fast, replacements):
+        yield
+
+
+@dataclass(frozen=True)
+class TokenPrompt:
+    """The inputs before the first action token. bos: id that begins the actions; end: id that ends them.
+
+    images: (B, 3, H, W) in [-1, 1] of every camera. image_masks: (B,) of every camera. tokens, mask: (B, T).
+    """
+
+    images: list[Tensor]
+    image_masks: list[Tensor]
+    tokens: Tensor
+    mask: Tensor
+    bos: int
+    end: int
+
+
+def decode_tokens(
+    model: Any, prompt: TokenPrompt, least: int, most: int, choose: Callable[[Tensor], Tensor]
+) -> Tensor:
+    """(B, n) ids of `least` to `most` tokens: until every row has put out `end`.
+
+    model: lerobot's `PI0FastPytorch`. choose: (B,) ids of logits (B, V). A row that has ended is decoded
+    with the others, so that no row depends on another one; what it puts out behind its `end` means nothing.
+    """
+    joint = model.paligemma_with_expert
+    rows, device = len(prompt.tokens), prompt.tokens.device
+    always = torch.ones((rows, 1), dtype=torch.bool, device=device)
+    begin = torch.full((rows, 1), prompt.bos, dtype=torch.long, device=device)
+    tokens, mask = torch.cat([prompt.tokens, begin], dim=1), torch.cat([prompt.mask, always], dim=1)
+    entering, valid, attends, _, _ = model.embed_prefix_fast(prompt.images, prompt.image_masks, tokens, mask)
+    entering = entering.to(_dtype(joint, entering))
+    places, past = torch.cumsum(valid, dim=1) - 1, None
+    ids: list[Tensor] = []
+    ended = torch.zeros(rows, dtype=torch.bool, device=device)
+    while True:
+        (states, _), past = joint.forward(
+            attention_mask=prepare_attention_masks_4d(attends, dtype=entering.dtype),
+            position_ids=places,
+            past_key_values=past,
+            inputs_embeds=[entering, None],
+            use_cache=True,
+            adarms_cond=[None, None],
+        )
+        if not ids:  # what follows reads what is kept of the prompt
+            joint.prompt_kv(past.layers)
+        ids.append(choose(joint.paligemma.lm_head(states[:, -1:])[:, -1]))
+        ended |= ids[-1] == prompt.end
+        if len(ids) >= most or (len(ids) >= least and bool(ended.all())):
+            return torch.stack(ids, dim=1)
+        entering = joint.embed_language_tokens(ids[-1][:, None])
+        entering = entering.to(_dtype(joint, entering))
+        valid = torch.cat([valid, always], dim=1)
+        places, attends = valid.sum(dim=1, keepdim=True) - 1, valid[:, None]
+
+
+def _dtype(joint: Any, entering: Tensor) -> torch.dtype:
+    """lerobot computes in bfloat16 where the attention's weights are."""
+    stored: torch.dtype = joint.paligemma.model.language_model.layers[0].self_attn.q_proj.weight.dtype
+    return torch.bfloat16 if stored == torch.bfloat16 else entering.dtype
 
 
 @dataclass(frozen=True)

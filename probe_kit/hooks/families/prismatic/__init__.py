@@ -1,8 +1,7 @@
 """Prismatic vision-language models, native."""
 
 from probe_kit.hooks.checkpoints.checkpoint import PATTERNS, RUN_WEIGHTS
-from probe_kit.hooks.contract.declared import answering
-from probe_kit.hooks.contract.options import Option
+from probe_kit.hooks.contract.declared import Option, answering
 from probe_kit.hooks.families.shared.kinds import answering_family
 
 TOKENIZER = Option(

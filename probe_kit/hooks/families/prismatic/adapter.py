@@ -6,11 +6,11 @@ one the positions whose logits choose the output: the prompt's last token, then 
 
 from abc import abstractmethod
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import takewhile
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 import torch
@@ -23,17 +23,176 @@ from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.contract.model import Prompt, Reading, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
-from probe_kit.hooks.contract.sites import Site, Stream
-from probe_kit.hooks.contract.views import IMAGE_ROLE
+from probe_kit.hooks.contract.sites import IMAGE_ROLE, Site, Stream
 from probe_kit.hooks.families.prismatic.checkpoint import LoadedPrismatic, load_checkpoint
-from probe_kit.hooks.families.prismatic.frames import TextFrame, frame_of
-from probe_kit.hooks.families.prismatic.tokenizer import ByteTokenizer, TextTokenizer, find_tokenizer, id_behind
+from probe_kit.hooks.families.shared.text import (
+    SETTINGS_FILE,
+    TOKENIZER_FILE,
+    TokenizerFile,
+    first_behind,
+    positions_of,
+    token_ids_of,
+)
 from probe_kit.hooks.families.shared.token_decoder import TokenDecoder
-from probe_kit.hooks.families.shared.tokenizer_file import SETTINGS_FILE, TOKENIZER_FILE, token_ids_of
-from probe_kit.hooks.families.shared.vlm.decoding import Prefill, SpeakingModel
-from probe_kit.models.decoding import Choose, Decoded, greedy
-from probe_kit.models.packing import Packed
+from probe_kit.hooks.families.shared.vlm import Prefill, SpeakingModel
+from probe_kit.models.decoding import Choose, Decoded, Packed, greedy
 from probe_kit.models.prismatic import PictureSettings, PrismaticNetwork, prepare_picture
+
+VICUNA_SYSTEM = (
+    "A chat between a curious user and an artificial intelligence assistant. "
+    "The assistant gives helpful, detailed, and polite answers to the user's questions."
+)
+_LLAMA_SYSTEM = (
+    "You are a helpful language and vision assistant. You are able to understand the visual content that the user "
+    "provides, and assist the user with a variety of tasks using natural language."
+)
+
+
+@dataclass(frozen=True)
+class TextFrame:
+    """Before and behind a question."""
+
+    before: str
+    behind: str
+
+    def around(self, question: str) -> str:
+        """The whole text; the original strips white space from both ends of a question."""
+        return f"{self.before}{question.strip()}{self.behind}"
+
+    def question_span(self, question: str) -> tuple[int, int]:
+        """The beginning and end of the question in the text."""
+        return len(self.before), len(self.before) + len(question.strip())
+
+
+_PURE = TextFrame("In: ", "\nOut:")
+_INSTRUCT = TextFrame("[INST] ", " [/INST]")
+# The bracket that is missing behind <<SYS> is missing in the original, too.
+_CHAT = TextFrame(f"[INST] <<SYS>\n{_LLAMA_SYSTEM}\n<</SYS>>\n\n", " [/INST]")
+_VICUNA = TextFrame(f"{VICUNA_SYSTEM} USER: ", " ASSISTANT:")
+_PHI = TextFrame("Input: ", "\nOutput:")
+
+
+def frame_of(language_id: str) -> TextFrame:
+    """The frame of a `llm_backbone_id`; all ids of the configuration's table have one."""
+    if language_id.startswith("vicuna"):
+        return _VICUNA
+    if language_id.startswith("phi"):
+        return _PHI
+    if language_id.endswith("-chat"):
+        return _CHAT
+    return _INSTRUCT if language_id.endswith("-instruct") else _PURE
+
+
+BYTES = "bytes"
+"""Asks for `ByteTokenizer`."""
+
+
+class TextTokenizer(Protocol):
+    """The methods that an adapter needs. special: ids that stand for no text."""
+
+    @property
+    def special(self) -> frozenset[int]:
+        """Ids that stand for no text."""
+
+    def encode(self, text: str) -> list[int]:
+        """Ids, the beginning-of-sequence token first. Raises InstructionError for a word it does not know."""
+
+    def inside(self, text: str, start: int, stop: int) -> list[bool]:
+        """Per id of `encode(text)` whether it holds any of the characters from `start` to `stop`."""
+
+    def decode(self, ids: Sequence[int]) -> str:
+        """The text of ids that the model put out, without special tokens."""
+
+
+def id_behind(tokenizer: TextTokenizer, prompt: str, answer: str) -> int:
+    """The first id of `answer` behind `prompt`. Raises UsageError if it changes the prompt's own ids."""
+    return first_behind(tokenizer.encode(prompt), tokenizer.encode(prompt + answer), answer)
+
+
+@dataclass(frozen=True)
+class FileTokenizer(TokenizerFile):
+    """A tokenizer that begins every text. beginning: the id of the model's configuration."""
+
+    beginning: int | None
+
+    @cached_property
+    def _beginning(self) -> int | None:
+        """The beginning-of-sequence id, from the tokenizer's own files before the model's configuration."""
+        content = self.token_of("bos_token")
+        number: int | None = self.tokenizer.token_to_id(content) if content else None
+        return self.beginning if number is None else number
+
+    @cached_property
+    def special(self) -> frozenset[int]:
+        """Ids that the file declares special."""
+        return super().special | {self._beginning or 0}
+
+    def encode(self, text: str) -> list[int]:
+        """Ids, the beginning-of-sequence token first, also where the file does not add it."""
+        ids: list[int] = self.encoding(text, special=True).ids
+        begins = self._beginning is None or ids[:1] == [self._beginning]
+        return ids if begins else [self._beginning, *ids]  # type: ignore[list-item]
+
+    def inside(self, text: str, start: int, stop: int) -> list[bool]:
+        """Per id whether it holds any of these characters, by the offsets that the tokenizer gives."""
+        flags = positions_of(self.encoding(text, special=True), start, stop)
+        return [False] * (len(self.encode(text)) - len(flags)) + list(flags)
+
+    def decode(self, ids: Sequence[int]) -> str:
+        """The text of ids, without special tokens."""
+        return self.words(ids)
+
+
+@dataclass(frozen=True)
+class ByteTokenizer:
+    """UTF-8 bytes as ids 3 … 258, for development checkpoints that come without a tokenizer.
+
+    No model was trained with it, so a trained checkpoint would read noise.
+    """
+
+    beginning: int
+
+    @property
+    def special(self) -> frozenset[int]:
+        """The beginning-of-sequence token."""
+        return frozenset({self.beginning})
+
+    def encode(self, text: str) -> list[int]:
+        """Ids, the beginning-of-sequence token first."""
+        return [self.beginning, *(3 + byte for byte in text.encode())]
+
+    def inside(self, text: str, start: int, stop: int) -> list[bool]:
+        """Per id whether it is a byte of these characters."""
+        before, length = (len(part.encode()) for part in (text[:start], text[start:stop]))
+        return [False] + [before <= position < before + length for position in range(len(text.encode()))]
+
+    def decode(self, ids: Sequence[int]) -> str:
+        """The bytes among the ids as text."""
+        return bytes(number - 3 for number in ids if 3 <= number < 259).decode(errors="replace").strip()
+
+
+def find_tokenizer(
+    folders: Sequence[Path], tokenizer: str | None, beginning: int | None, vocabulary: int
+) -> TextTokenizer:
+    """The checkpoint's tokenizer, or the one in the folder `tokenizer`, or bytes if that is asked for.
+
+    vocabulary: the number of text ids the model has. Raises CheckpointError naming the missing files.
+    """
+    if tokenizer == BYTES:
+        if vocabulary < 259:
+            raise CheckpointError(f"bytes need 259 text ids; this checkpoint has {vocabulary}")
+        return ByteTokenizer(1 if beginning is None else beginning)
+    places = list(folders) if tokenizer is None else [Path(tokenizer).expanduser()]
+    for folder in places:
+        if (folder / TOKENIZER_FILE).is_file():
+            return FileTokenizer(folder, beginning)
+    raise CheckpointError(
+        f"{TOKENIZER_FILE} and {SETTINGS_FILE} are missing in {' and '.join(map(str, places))}. The tokenizer "
+        "comes with the checkpoint: copy these files from the model's page, or from the model it was fine-tuned "
+        f"from, or name their folder with -M tokenizer=DIR. For a development checkpoint that has none: "
+        f"-M tokenizer={BYTES}"
+    )
+
 
 DEFAULT_CHECKPOINT = "TRI-ML/prismatic-vlms/prism-dinosiglip-224px+7b"
 

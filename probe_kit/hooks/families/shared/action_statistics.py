@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from probe_kit.errors import CheckpointError
 from probe_kit.hashing import sha256_json
 from probe_kit.models.bounds import check_bounds
-from probe_kit.models.statistics_choice import chosen_name
+from probe_kit.models.checkpoint_files import chosen_name
 
 DIMENSIONS = 7
 """Of an action: an end-effector's delta, and the gripper last."""

@@ -1,10 +1,11 @@
-"""Declarations that all families of one kind share, and the interventions that they support. Imports no torch."""
+"""Declarations that all families of one kind share, for plans too. Imports no torch and no lerobot."""
 
-from dataclasses import replace
-from typing import Any
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
-from probe_kit.hooks.contract.interventions import Interventions
-from probe_kit.hooks.contract.options import Option
+from probe_kit.hooks.contract.declared import Interventions, Option
+from probe_kit.hooks.contract.observation import OPENNESS
 from probe_kit.hooks.contract.sites import QUANTITIES
 from probe_kit.hooks.family import Family
 
@@ -52,7 +53,7 @@ def lerobot_family(name: str, description: str, checkpoint: str | None, adapter:
         "outputs": f"{_FAMILIES}.shared.lerobot.outputs:lerobot_outputs",
         "config_types": (kind,),
         "words": f"{path}.check_words",
-        "full_size": f"probe_kit.models.lerobot.{kind}:full_size_{kind}",
+        "full_size": f"{path.partition(':')[0]}:full_size_{kind}",
     }
     return Family(name, description, checkpoint, f"{path}.load", **{**shared, **fields})
 
@@ -61,8 +62,58 @@ def answering_family(name: str, description: str, checkpoint: str | None, loader
     """A VLM that answers and does not act. loader: `folder.adapter:function`. fields: others of `Family`."""
     shared = {
         "embodiment": "none: answers, does not act",
-        "outputs": f"{_FAMILIES}.shared.vlm.outputs:vlm_outputs",
+        "outputs": f"{_FAMILIES}.shared.vlm:vlm_outputs",
         "acts": False,
         "reads": True,
     }
     return Family(name, description, checkpoint, f"{_FAMILIES}.{loader}", **{**shared, **fields})
+
+
+IMAGES, STATE, ACTION = "observation.images.", "observation.state", "action"
+_EMPTY_CAMERA = "empty_camera"
+"""Beginning of the names that lerobot gives to cameras that never get a picture."""
+
+
+def cameras_of(features: Iterable[str]) -> tuple[str, ...]:
+    """Return the cameras among names of features that a picture can be given for, in their order."""
+    names = (name.removeprefix(IMAGES) for name in features if name.startswith(IMAGES))
+    return tuple(name for name in names if not name.startswith(_EMPTY_CAMERA))
+
+
+Picture = Literal["padded", "padded-top-left", "squashed"]
+PICTURES: tuple[Picture, ...] = ("padded", "padded-top-left", "squashed")
+EVALUATION_OPTIONS = (
+    Option(
+        "statistics",
+        str,
+        "File with p01 and p99 of action and proprio, or bridge (shipped), where the checkpoint has none; "
+        "none: its numbers are metres and radians.",
+        "the checkpoint's",
+        is_path=True,
+    ),
+    Option(
+        "picture",
+        str,
+        "How pictures come to the network's resolution.",
+        "as the checkpoint's layout implies",
+        PICTURES,
+    ),
+    Option("openness", str, "release: as Act2Answer's evaluation has it.", "measured", OPENNESS),
+)
+"""The fields of `Evaluation` that users of any such policy set."""
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The treatment of observations and actions around the network; its fields are the options of loaders.
+
+    statistics: a file, the name of a shipped one, `none` for numbers that are units already, or None for what the
+    checkpoint says. picture: how a picture comes to the network's resolution; None for what the layout of the
+    checkpoint implies. openness: the state's last number, see `state_layout`. unread: settings of an old
+    config.json that are left out, comma-separated.
+    """
+
+    statistics: str | None = None
+    picture: Picture | None = None
+    openness: str = "measured"
+    unread: str = ""

@@ -1,8 +1,6 @@
 """SpatialVLA, native."""
 
-from probe_kit.hooks.contract.declared import backbone, chosen_tokens
-from probe_kit.hooks.contract.options import Option
-from probe_kit.hooks.contract.protocol import ACT2ANSWER, ProtocolRow
+from probe_kit.hooks.contract.declared import ACT2ANSWER, Option, ProtocolRow, backbone, chosen_tokens
 from probe_kit.hooks.families.prismatic import TOKENIZER
 from probe_kit.hooks.families.shared.kinds import TOKENS
 from probe_kit.hooks.family import Family

@@ -7,7 +7,8 @@ action token: the new line, then every token fed back but the last. Three tokens
 
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager
-from functools import cached_property
+from dataclasses import dataclass
+from functools import cached_property, partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar
@@ -17,42 +18,162 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from probe_kit.errors import CheckpointError, ObservationError, UsageError
+from probe_kit._system.bounded_json import load_json
+from probe_kit.errors import CheckpointError, InstructionError, ObservationError, UsageError
 from probe_kit.hashing import sha256_json
-from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES
+from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES, chosen_dtype
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
+from probe_kit.hooks.checkpoints.weights import read_weights
 from probe_kit.hooks.contract.card import ARM
 from probe_kit.hooks.contract.model import Policy, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
-from probe_kit.hooks.contract.sites import HEADS, Site, Stream
-from probe_kit.hooks.contract.views import IMAGE_ROLE
-from probe_kit.hooks.families.prismatic.tokenizer import BYTES
+from probe_kit.hooks.contract.sites import HEADS, IMAGE_ROLE, Site, Stream
+from probe_kit.hooks.families.prismatic.adapter import BYTES, TextTokenizer, find_tokenizer
 from probe_kit.hooks.families.shared.action_statistics import ActionStatistics, open_or_closed
-from probe_kit.hooks.families.shared.attention_weights import Note, of_decoder
 from probe_kit.hooks.families.shared.kinds import TOKENS
-from probe_kit.hooks.families.shared.prompt_kv import kept_prompt
+from probe_kit.hooks.families.shared.loading import DTYPES, Loaded, load_network
+from probe_kit.hooks.families.shared.taps import Note, kept_prompt, of_decoder
 from probe_kit.hooks.families.shared.token_decoder import TokenDecoder, warn_of_unknown
-from probe_kit.hooks.families.spatialvla.checkpoint import (
-    PROCESSOR_FILE,
-    LoadedSpatialVLA,
-    load_checkpoint,
-    read_processor,
-)
-from probe_kit.hooks.families.spatialvla.speech import Speech
-from probe_kit.models.decoding import Decoded
-from probe_kit.models.packing import Packed
+from probe_kit.models.checkpoint_files import stored_statistics
+from probe_kit.models.decoding import Decoded, Packed
 from probe_kit.models.spatialvla import (
-    STEP_TOKENS,
-    ActionBins,
     Intrinsics,
     PictureSettings,
     SpatialVLAConfig,
     SpatialVLANetwork,
+    build_spatialvla,
     known_cameras,
     prepare_picture,
 )
-from probe_kit.models.statistics_choice import stored_statistics
+from probe_kit.models.spatialvla_actions import STEP_TOKENS, ActionBins
+
+PROCESSOR_FILE = "processor_config.json"
+
+
+@dataclass(frozen=True, kw_only=True)
+class LoadedSpatialVLA(Loaded[SpatialVLANetwork]):
+    """A loaded network. processor: the content of `processor_config.json`: bins, statistics, cameras."""
+
+    processor: Mapping[str, Any]
+
+    @property
+    def config(self) -> SpatialVLAConfig:
+        """The network's."""
+        return self.network.config
+
+    @property
+    def processor_file(self) -> str:
+        """The file named by errors about bins, statistics and cameras."""
+        return str(self.folder / PROCESSOR_FILE)
+
+    @property
+    def chunk(self) -> int:
+        """Steps that one inference plans. Raises CheckpointError for none."""
+        steps = int(self.processor.get("action_chunk_size", 1))
+        if steps < 1:
+            raise CheckpointError(f"{self.processor_file}: action_chunk_size is {steps}; expected at least 1")
+        return steps
+
+
+def load_checkpoint(
+    checkpoint: str, device: str, dtype: str | None, random_weights: bool, weights_seed: int = 0
+) -> LoadedSpatialVLA:
+    """Load a folder or hub id.
+
+    dtype: float32 or bfloat16; default what the checkpoint says. Raises CheckpointError, WeightsError, UsageError
+    for another dtype.
+    """
+    folder = checkpoint_folder(checkpoint)
+    config = SpatialVLAConfig.from_folder(folder)
+    processor = read_processor(folder)
+    loaded = load_network(
+        partial(build_spatialvla, config),
+        lambda: read_weights(folder),
+        checkpoint,
+        folder,
+        device,
+        chosen_dtype(dtype, config.dtype, DTYPES),
+        random_weights,
+        weights_seed,
+        finish=lambda network: network.embed_actions(),
+    )
+    return LoadedSpatialVLA(**vars(loaded), processor=processor)
+
+
+def read_processor(folder: Path) -> dict[str, Any]:
+    """The content of `processor_config.json`. Raises CheckpointError if it is missing."""
+    file = folder / PROCESSOR_FILE
+    if not file.is_file():
+        raise CheckpointError(
+            f"{file} is missing: it holds the action bins, statistics and cameras. Copy it from the model's page"
+        )
+    return dict(load_json(file))
+
+
+SLOT = "{instruction}"
+PROMPTS = {"bare": SLOT, "question": f"What action should the robot take to {SLOT}?"}
+"""What training and the released evaluation say, and what the model's page shows."""
+_END = "\n"
+
+
+@dataclass(frozen=True)
+class Speech:
+    """The way from an instruction to ids.
+
+    template: with a place for the instruction. lowercase: as in training; the released evaluation does not.
+    tokenizer_choice: None for the checkpoint's, a folder, or `bytes`.
+    """
+
+    config: SpatialVLAConfig
+    folder: Path
+    template: str
+    lowercase: bool
+    tokenizer_choice: str | None
+
+    @classmethod
+    def of(
+        cls, config: SpatialVLAConfig, folder: Path, prompt: str | None, lowercase: bool, tokenizer: str | None
+    ) -> "Speech":
+        """Choose a prompt by name or template. Raises UsageError for one without a place for the instruction."""
+        name = prompt or "bare"
+        template = PROMPTS.get(name, name)
+        if SLOT not in template:
+            raise UsageError(f"prompt {name!r} is neither one of {', '.join(PROMPTS)} nor a template with {SLOT}")
+        return cls(config, folder, template, lowercase, tokenizer)
+
+    @cached_property
+    def tokenizer(self) -> TextTokenizer:
+        """Raises CheckpointError naming files that are missing, or ids that are not this model's."""
+        config = self.config
+        tokenizer = find_tokenizer([self.folder], self.tokenizer_choice, config.beginning, config.image_token)
+        if self.tokenizer_choice != BYTES:
+            for token, expected in (("<image>", config.image_token), ("<ACTION00000>", config.first_action)):
+                if (ids := tokenizer.encode(token)[1:]) != [expected]:
+                    raise CheckpointError(
+                        f"the tokenizer reads {token} as {ids}; the model expects {expected}. It belongs to "
+                        "another checkpoint: take the tokenizer files from the model's own page"
+                    )
+        return tokenizer
+
+    def prompt(self, instruction: str) -> list[int]:
+        """Ids of the whole prompt: the picture's places, beginning of sequence, text, new line.
+
+        Raises InstructionError for text that the tokenizer reads as a picture or an action, or that takes the new
+        line into itself: the model chooses its action there.
+        """
+        text = self.template.replace(SLOT, instruction.lower() if self.lowercase else instruction)
+        ids = self.tokenizer.encode(text + _END)
+        if max(ids) >= self.config.image_token:
+            raise InstructionError(
+                f"{text!r} holds a token that stands for a picture or an action; say it in words"
+            )
+        if ids[-1:] != self.tokenizer.encode(_END)[-1:]:
+            raise InstructionError(
+                f"the end of {text!r} merges with the new line behind it; leave out white space there"
+            )
+        return [self.config.image_token] * self.config.patches + ids
+
 
 DEFAULT_CHECKPOINT = "IPEC-COMMUNITY/spatialvla-4b-224-pt"
 """The data set of the WidowX arm that Act2Answer imitates."""

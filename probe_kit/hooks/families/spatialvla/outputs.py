@@ -16,10 +16,15 @@ from torch import Tensor
 
 from probe_kit.hooks.capturing.capture_context import ActivationCache
 from probe_kit.hooks.contract.observation import Observation
-from probe_kit.hooks.families.spatialvla.adapter import SCENE, SpatialVLA, choose_statistics
-from probe_kit.hooks.families.spatialvla.checkpoint import LoadedSpatialVLA, load_checkpoint
-from probe_kit.hooks.families.spatialvla.speech import Speech
-from probe_kit.hooks.verification.outputs import (
+from probe_kit.hooks.families.spatialvla.adapter import (
+    SCENE,
+    LoadedSpatialVLA,
+    SpatialVLA,
+    Speech,
+    choose_statistics,
+    load_checkpoint,
+)
+from probe_kit.hooks.outputs import (
     Arrays,
     Outputs,
     Produce,
@@ -28,14 +33,8 @@ from probe_kit.hooks.verification.outputs import (
     stacked,
     watch,
 )
-from probe_kit.models.spatialvla import (
-    STEP_TOKENS,
-    Sight,
-    depth_input,
-    known_cameras,
-    point_places,
-    prepare_picture,
-)
+from probe_kit.models.spatialvla import Sight, depth_input, known_cameras, point_places, prepare_picture
+from probe_kit.models.spatialvla_actions import STEP_TOKENS
 
 TOLERANCE = 5e-5
 _INPUTS = (

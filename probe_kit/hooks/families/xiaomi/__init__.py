@@ -1,12 +1,9 @@
 """Xiaomi-Robotics-R0, native."""
 
 from probe_kit.hooks.contract.card import SourceWeights
-from probe_kit.hooks.contract.declared import backbone, expert
-from probe_kit.hooks.contract.interventions import Interventions
-from probe_kit.hooks.contract.options import Option
-from probe_kit.hooks.contract.protocol import ACT2ANSWER, ProtocolRow
+from probe_kit.hooks.contract.declared import ACT2ANSWER, Interventions, Option, ProtocolRow, backbone, expert
+from probe_kit.hooks.contract.observation import OPENNESS
 from probe_kit.hooks.contract.sites import QUANTITIES
-from probe_kit.hooks.contract.state_layout import OPENNESS
 from probe_kit.hooks.families.shared.kinds import MERGED, TOKENIZER_FOLDER
 from probe_kit.hooks.family import Family
 
@@ -28,7 +25,7 @@ FAMILIES = (
         "probe_kit.hooks.families.xiaomi.adapter:load_xiaomi",
         embodiment="as the robot of -M robot; bridge: WidowX end-effector delta at 5 Hz",
         notes="Apache-2.0; 9.4 GB in bfloat16; the expert's layers renormalise their stream inside",
-        outputs="probe_kit.hooks.families.xiaomi.outputs:xiaomi_outputs",
+        outputs="probe_kit.hooks.families.xiaomi.adapter:xiaomi_outputs",
         source="qwen3-vl",
         source_weights=SourceWeights("Qwen/Qwen3-VL-4B-Instruct", parameters=4_437_815_808),
         units="probe_kit.hooks.families.xiaomi.adapter:xiaomi_units",

@@ -1,8 +1,6 @@
 """X-VLA through lerobot."""
 
-from probe_kit.hooks.contract.declared import TEXT, DeclaredStream, expert
-from probe_kit.hooks.contract.interventions import Interventions
-from probe_kit.hooks.contract.options import Option
+from probe_kit.hooks.contract.declared import TEXT, DeclaredStream, Interventions, Option, expert
 from probe_kit.hooks.contract.sites import Stream
 from probe_kit.hooks.families.shared.kinds import MERGED, lerobot_family
 

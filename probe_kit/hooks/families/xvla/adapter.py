@@ -4,6 +4,9 @@ Backbone: Florence-2's encoder over the first camera's picture and the text. Exp
 actions, the end of the backbone, the further cameras and the robot's soft prompts, at every denoising step; all
 attend to all. Florence-2 norms behind each addition, so nothing in the backbone's stream only adds.
 
+lerobot's `predict_action_chunk` ignores the noise it is given and draws its own for a whole batch at once.
+`denoised_actions` calls the same modules with noise that is given.
+
 Source: arXiv 2510.10274, through lerobot's `XVLAPolicy`.
 """
 
@@ -11,10 +14,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import torch
+from lerobot.configs.types import FeatureType, PolicyFeature
+from lerobot.policies.xvla.configuration_xvla import XVLAConfig
+from lerobot.policies.xvla.modeling_xvla import (
+    XVLAPolicy,
+    _is_vendored_florence_state_dict,
+    _remap_vendored_florence_state_dict,
+)
 from lerobot.utils.constants import IMAGENET_STATS
 from numpy.typing import NDArray
 from PIL import Image
@@ -26,17 +36,143 @@ from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.contract.model import Tap
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.roles import Roles
-from probe_kit.hooks.contract.sites import HEADS, Site, Stream
-from probe_kit.hooks.contract.views import PADDING
-from probe_kit.hooks.families.shared.lerobot.evaluation import Evaluation
-from probe_kit.hooks.families.shared.lerobot.features import IMAGES, STATE
+from probe_kit.hooks.contract.sites import HEADS, PADDING, Site, Stream
+from probe_kit.hooks.families.shared.kinds import IMAGES, STATE, Evaluation
 from probe_kit.hooks.families.shared.lerobot.flow import DenoisingPolicy
-from probe_kit.hooks.families.shared.lerobot.stacks import Stack
+from probe_kit.hooks.families.shared.lerobot.pipelines import (
+    NORMALISERS,
+    POSTPROCESSOR,
+    TOKENIZER,
+    check_pipelines,
+    check_steps,
+    every_step,
+    text_length,
+    tokenizer_folder,
+)
+from probe_kit.hooks.families.shared.taps import Stack
 from probe_kit.hooks.families.xvla import BLOCK, INTERVENTIONS
-from probe_kit.hooks.families.xvla.steps import STEPS, XvlaSteps, read_steps
-from probe_kit.hooks.verification.outputs import Produce, RecordedRun, numpy_of
-from probe_kit.models.lerobot.xvla import EMBEDDINGS, build_xvla, current_xvla_keys, denoised_actions
-from probe_kit.models.pretrained import load_pretrained
+from probe_kit.hooks.outputs import Produce, RecordedRun, numpy_of
+from probe_kit.models.building import build_empty, building_device
+from probe_kit.models.checkpoint_files import load_pretrained
+
+_LANGUAGE = "model.vlm.language_model."
+EMBEDDINGS = (f"{_LANGUAGE}shared.weight", f"{_LANGUAGE}encoder.embed_tokens.weight")
+"""One tensor under two names, of which a file may hold either."""
+FLORENCE_LARGE: dict[str, Any] = {
+    "vision_config": {
+        "embed_dim": [256, 512, 1024, 2048],
+        "num_heads": [8, 16, 32, 64],
+        "num_groups": [8, 16, 32, 64],
+        "projection_dim": 1024,
+    },
+    "text_config": {
+        "vocab_size": 51289,
+        "d_model": 1024,
+        "encoder_layers": 12,
+        "encoder_attention_heads": 16,
+        "encoder_ffn_dim": 4096,
+        "max_position_embeddings": 4096,
+    },
+}
+"""Florence-2 large, the backbone that the paper names; the rest as transformers has it by default."""
+
+
+def build_xvla(config: XVLAConfig, device: str = "cpu") -> XVLAPolicy:
+    """A `XVLAPolicy` in eval mode with uninitialised weights, in the precision that `config` names."""
+    device = building_device(device)
+    config.device = device
+    dtype = torch.bfloat16 if config.dtype == "bfloat16" else torch.float32
+    return cast(XVLAPolicy, build_empty(lambda: XVLAPolicy(config), dtype, device))
+
+
+def full_size_xvla() -> XVLAPolicy:
+    """Florence-2 large under lerobot's default transformer, on the meta device."""
+    config = XVLAConfig(
+        device="cpu",
+        florence_config=FLORENCE_LARGE,
+        input_features={
+            "observation.images.image": PolicyFeature(FeatureType.VISUAL, (3, 224, 224)),
+            "observation.state": PolicyFeature(FeatureType.STATE, (20,)),
+        },
+        output_features={"action": PolicyFeature(FeatureType.ACTION, (20,))},
+    )
+    return build_xvla(config, device="meta")
+
+
+def current_xvla_keys(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """A file's tensors under the names lerobot's network has.
+
+    Files of 2025 have Florence-2 in its authors' layout.
+    """
+    stored = dict(tensors)
+    return _remap_vendored_florence_state_dict(stored) if _is_vendored_florence_state_dict(stored) else stored
+
+
+def denoised_actions(policy: Any, inputs: Mapping[str, Tensor], noise: Tensor) -> Tensor:
+    """(B, chunk, D) actions from noise (B, chunk, widest action): lerobot's denoising, one inference.
+
+    inputs: in lerobot's keys. The network predicts actions, not a velocity: every step mixes them with the noise.
+    """
+    model, steps = policy.model, max(1, int(policy.config.num_denoising_steps))
+    model_inputs = policy._build_model_inputs(dict(inputs))
+    dtype = model._get_target_dtype()
+    proprio, noise = model_inputs["proprio"].to(dtype), noise.to(dtype)
+    prompt = model.forward_vlm(
+        model_inputs["input_ids"], model_inputs["image_input"].to(dtype), model_inputs["image_mask"]
+    )
+    actions = torch.zeros_like(noise)
+    for remaining in range(steps, 0, -1):
+        time = torch.full((len(noise),), remaining / steps, device=noise.device, dtype=dtype)
+        share = time.view(-1, 1, 1)
+        state, noisy = model.action_space.preprocess(proprio, noise * share + actions * (1 - share))
+        actions = model.transformer(
+            domain_id=model_inputs["domain_id"], action_with_noise=noisy, proprio=state, t=time, **prompt
+        )
+    return cast(Tensor, model.action_space.postprocess(actions))
+
+
+_MEAN, _DOMAIN = "xvla_imagenet_normalize", "xvla_add_domain_id"
+STEPS = ("xvla_image_to_float", _MEAN, _DOMAIN)
+
+
+@dataclass(frozen=True)
+class XvlaSteps:
+    """The settings of one checkpoint. domain: the robot's number. tokenizer: its name, None where no file has one.
+
+    imagenet: whether pictures are normalised with ImageNet's mean and deviation. length: positions of the text.
+    """
+
+    domain: int
+    imagenet: bool
+    tokenizer: str | None
+    length: int | None
+
+
+def read_steps(folder: Path, domain: int | None, pictures: Sequence[str] = ()) -> XvlaSteps:
+    """Read the processor files; `domain` counts over theirs. pictures: keys of all. Raises CheckpointError.
+
+    lerobot takes robot 0 where nothing names one: here it is an error, and so is a step that changes numbers in
+    another way.
+    """
+    check_pipelines(folder)
+    check_steps(folder, POSTPROCESSOR, (*NORMALISERS, *STEPS))
+    configs: dict[str, Mapping[str, Any]] = {step.name: step.config for step in every_step(folder)}
+    for name in STEPS:
+        keys = configs.get(name, {}).get("image_keys")
+        if keys is not None and (left_out := sorted(set(pictures) - set(keys))):
+            raise CheckpointError(
+                f"{folder}: the step {name!r} leaves out {', '.join(left_out)} (image_keys); every picture is "
+                "treated alike here. Take a checkpoint whose image_keys are null or name all"
+            )
+    if domain is None and _DOMAIN not in configs:
+        raise CheckpointError(f"{folder} names no robot; say whose soft prompts are read with -M domain=N")
+    text, length = configs.get(TOKENIZER, {}), text_length(folder)
+    if text.get("padding", "max_length") != "max_length":
+        raise CheckpointError(f"{folder} pads its text in another way than behind its end up to a fixed length")
+    tokenizer = str(saved) if (saved := tokenizer_folder(folder)) is not None else text.get("tokenizer_name")
+    robot = configs.get(_DOMAIN, {}).get("domain_id", 0) if domain is None else domain
+    return XvlaSteps(int(robot), _MEAN in configs, tokenizer, length)
+
 
 SOFT_PROMPT = "soft_prompt"
 """The role of the robot's learned tokens."""

@@ -18,8 +18,8 @@ from safetensors.torch import load_file, save_file
 from probe_kit.errors import CheckpointError, InstructionError, UsageError, WeightsError
 from probe_kit.hooks import Observation, Site, capture, edit
 from probe_kit.hooks.conformance.subject import examples_for
+from probe_kit.hooks.families.groot import network
 from probe_kit.hooks.families.groot.adapter import Groot
-from probe_kit.models.lerobot import groot as network
 from tests.support.groot_checkpoints import CHUNK, HORIZON, TAG, write_groot, write_nvidias
 from tests.support.pi05_checkpoints import HIGH, LEAST, MOST
 

@@ -14,8 +14,7 @@ import yaml
 from probe_kit.errors import CheckpointError, UsageError, WeightsError
 from probe_kit.hooks import Observation
 from probe_kit.hooks.families.internvla.adapter import load_internvla
-from probe_kit.hooks.families.internvla.checkpoint import RELEASED_STEP, find_parts
-from probe_kit.hooks.families.internvla.convert import convert
+from probe_kit.hooks.families.internvla.checkpoint import RELEASED_STEP, convert, find_parts
 from tests.support.internvla_checkpoints import write_checkpoint, write_vlm
 
 NAME = "steps_7_pytorch_model.pt"
@@ -159,7 +158,7 @@ def test_a_converted_folder_is_whole_and_has_the_same_hash_and_actions(
 
 @pytest.mark.slow
 def test_the_converter_is_a_command(run: Path, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "probe_kit.hooks.families.internvla.convert"]
+    command = [sys.executable, "-m", "probe_kit.hooks.families.internvla.checkpoint"]
     done = subprocess.run(
         [*command, str(run), str(tmp_path / "out")], capture_output=True, encoding="utf-8", check=False
     )

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from probe_kit.errors import CheckpointError, UsageError
-from probe_kit.hooks.families.internvla.units import ActionUnits
+from probe_kit.hooks.families.internvla import ActionUnits
 from tests.support.internvla_checkpoints import statistics
 
 LOW, HIGH = [-1.0] * 6 + [0.0], [3.0] * 6 + [1.0]

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from probe_kit.hooks.verification.verify import verify_reference
+from probe_kit.hooks.verify import verify_reference
 from tests.support.magma_reference import write_reference
 
 INPUTS = 11

@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from probe_kit.errors import CheckpointError, InstructionError, UsageError
-from probe_kit.hooks.families.magma.text import ChatText
+from probe_kit.hooks.families.magma.checkpoint import ChatText
 from probe_kit.models.magma import MagmaConfig
 from tests.support.magma_checkpoints import IDS, config_values, write_tokenizer
 

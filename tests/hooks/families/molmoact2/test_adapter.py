@@ -16,8 +16,8 @@ from safetensors.torch import load_file, save_file
 from probe_kit.errors import CaptureError, CheckpointError, ObservationError, WeightsError
 from probe_kit.hooks import Observation, capture
 from probe_kit.hooks.conformance.subject import examples_for
+from probe_kit.hooks.families.molmoact2 import adapter as network
 from probe_kit.hooks.families.molmoact2.adapter import MolmoAct2
-from probe_kit.models.lerobot import molmoact2 as network
 from tests.support.lerobot_pipelines import changed, raw, save_pipelines
 from tests.support.molmoact2_checkpoints import write_molmoact2
 from tests.support.pi05_checkpoints import HIGH, LOW

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from probe_kit.errors import CheckpointError, UsageError
-from probe_kit.hooks.families.openvla.actions import ActionTokens
+from probe_kit.hooks.families.openvla.adapter import ActionTokens
 from probe_kit.hooks.families.shared.action_statistics import ActionStatistics
 
 TOKENS = ActionTokens(vocabulary=32000, bins=256)

@@ -10,7 +10,7 @@ import torch
 from probe_kit.errors import CheckpointError, InstructionError, UsageError
 from probe_kit.hooks import Observation, Site, capture, load_policy
 from probe_kit.hooks.families.openvla.adapter import PROMPTS, OpenVLA, load_openvla
-from probe_kit.models.statistics_choice import STATISTICS_FILE
+from probe_kit.models.checkpoint_files import STATISTICS_FILE
 from tests.support.prismatic_checkpoints import SINGLE, config_values, write_checkpoint, write_tokenizer
 
 pytestmark = pytest.mark.filterwarnings("ignore:the model put out tokens")

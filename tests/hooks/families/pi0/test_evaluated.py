@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 import pytest
 
-from probe_kit.env.robot.arm_models import WIDOWX
+from probe_kit.env.arm import WIDOWX
 from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.hooks import Observation
-from probe_kit.hooks.contract.state_layout import CLOSED, OPENED, laid_out
-from probe_kit.hooks.families.pi0 import adapter, evaluated
+from probe_kit.hooks.contract.observation import CLOSED, OPENED, laid_out
+from probe_kit.hooks.families.pi0 import adapter
 from probe_kit.hooks.families.pi0.adapter import Pi0
-from probe_kit.hooks.families.shared.statistics_bounds import StatisticsFile
+from probe_kit.hooks.families.shared.lerobot.normaliser import StatisticsFile
 from probe_kit.hooks.registry import find_family
 from tests.support.pi0_checkpoints import bounds_of, network_chunk, write_intact, write_statistics
 
@@ -101,7 +101,7 @@ def test_the_protocols_checkpoint_by_its_name_gets_the_shipped_statistics(
 ) -> None:
     """The hub is stood in for by a folder: what is proved is what follows from the name."""
     name = find_family("pi0").default_checkpoint
-    assert name in evaluated.EVALUATED_WITH
+    assert name in adapter.EVALUATED_WITH
     monkeypatch.setattr("probe_kit.hooks.families.shared.lerobot.policy.checkpoint_folder", lambda _: folder)
     policy = adapter.Pi0.load(str(name))
     assert policy.embodiment_mismatch() is None

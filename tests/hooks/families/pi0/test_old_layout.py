@@ -10,9 +10,8 @@ from safetensors.torch import load_file, save_file
 
 from probe_kit.errors import CheckpointError, WeightsError
 from probe_kit.hooks import Observation
-from probe_kit.hooks.families.pi0.adapter import Pi0
-from probe_kit.hooks.families.pi0.old_layout import current_config
-from probe_kit.hooks.verification.verify import verify_reference
+from probe_kit.hooks.families.pi0.adapter import Pi0, current_config
+from probe_kit.hooks.verify import verify_reference
 from tests.support.pi0_checkpoints import old_golden
 
 

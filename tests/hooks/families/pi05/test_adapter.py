@@ -17,8 +17,8 @@ from safetensors.torch import load_file, save_file
 from probe_kit.errors import CheckpointError, WeightsError
 from probe_kit.hooks import Observation, capture
 from probe_kit.hooks.conformance.subject import examples_for
-from probe_kit.hooks.families.pi05.adapter import Pi05
-from probe_kit.models.lerobot import pi05 as network
+from probe_kit.hooks.families.pi0.adapter import Pi05
+from probe_kit.models import pi0 as network
 from tests.support.pi05_checkpoints import write_pi05
 
 

@@ -14,7 +14,7 @@ from tokenizers.models import BPE
 from tokenizers.pre_tokenizers import ByteLevel
 
 from probe_kit.errors import CheckpointError
-from probe_kit.hooks.families.pi0_fast.actions import ActionText, FastTokenizer
+from probe_kit.hooks.families.pi0_fast.adapter import ActionText, FastTokenizer
 from tests.support.pi0_fast_checkpoints import ACTIONS, CHUNK, fast_processor, smooth_chunks
 
 

@@ -16,8 +16,8 @@ from safetensors.torch import load_file, save_file
 from probe_kit.errors import UsageError
 from probe_kit.hooks import Observation, capture
 from probe_kit.hooks.conformance.subject import examples_for
+from probe_kit.hooks.families.pi0_fast import adapter as network
 from probe_kit.hooks.families.pi0_fast.adapter import Pi0Fast
-from probe_kit.models.lerobot import pi0_fast as network
 from tests.support.pi0_fast_checkpoints import HEAD, INSTRUCTIONS, TRAINED, write_pi0_fast
 
 EMBEDDING = "model.paligemma_with_expert.paligemma.model.language_model.embed_tokens.weight"

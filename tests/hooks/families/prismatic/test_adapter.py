@@ -7,8 +7,7 @@ import torch
 
 from probe_kit.errors import InstructionError, ObservationError, UnknownSiteError, UsageError
 from probe_kit.hooks import Observation, Prompt, Site, capture, load_policy
-from probe_kit.hooks.families.prismatic.adapter import Prismatic, load_prismatic
-from probe_kit.hooks.families.prismatic.frames import frame_of
+from probe_kit.hooks.families.prismatic.adapter import Prismatic, frame_of, load_prismatic
 from tests.support.prismatic_checkpoints import write_checkpoint
 
 

@@ -14,8 +14,7 @@ from torch import nn
 from probe_kit._system.installing import install_command
 from probe_kit.errors import CheckpointError, MissingExtraError, UsageError, WeightsError
 from probe_kit.hooks.families.openvla.adapter import load_openvla
-from probe_kit.hooks.families.prismatic.checkpoint import load_checkpoint
-from probe_kit.hooks.families.prismatic.quantised import quantise
+from probe_kit.hooks.families.prismatic.checkpoint import load_checkpoint, quantise
 from probe_kit.models.prismatic import PrismaticNetwork
 from tests.support.prismatic_checkpoints import write_checkpoint
 

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from probe_kit.errors import CheckpointError, InstructionError
-from probe_kit.hooks.families.prismatic.tokenizer import ByteTokenizer, FileTokenizer, find_tokenizer
+from probe_kit.hooks.families.prismatic.adapter import ByteTokenizer, FileTokenizer, find_tokenizer
 from tests.support.prismatic_checkpoints import write_tokenizer
 
 

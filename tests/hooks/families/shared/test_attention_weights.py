@@ -7,14 +7,14 @@ from torch.nn import functional
 from transformers import DynamicCache, LlamaConfig, LlamaModel
 
 from probe_kit.errors import UnsupportedInterventionError
-from probe_kit.hooks.families.shared.attention_weights import (
+from probe_kit.hooks.families.shared.taps import (
     on_the_prompt,
     recomputed,
     recording_weights,
     returned,
     shares,
 )
-from probe_kit.models.xiaomi.transformer import Attention
+from probe_kit.models.xiaomi import Attention
 
 
 def test_shares_are_those_of_torchs_own_attention_under_either_kind_of_mask() -> None:

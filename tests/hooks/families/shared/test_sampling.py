@@ -6,7 +6,7 @@ import torch
 from transformers.generation.logits_process import TemperatureLogitsWarper, TopKLogitsWarper
 
 from probe_kit.errors import CheckpointError, UsageError
-from probe_kit.hooks.families.shared.sampling import ALL, CHECKPOINT, TOP, chooser, top_of
+from probe_kit.hooks.families.shared.token_decoder import ALL, CHECKPOINT, TOP, chooser, top_of
 
 
 def logits(rows: int) -> torch.Tensor:

@@ -6,7 +6,7 @@ import torch
 
 from probe_kit.errors import CheckpointError
 from probe_kit.hooks.checkpoints.weights import read_weights
-from probe_kit.hooks.families.spatialvla.checkpoint import LoadedSpatialVLA, load_checkpoint
+from probe_kit.hooks.families.spatialvla.adapter import LoadedSpatialVLA, load_checkpoint
 from tests.support.spatialvla_checkpoints import FIRST_ACTION, write_checkpoint
 
 

@@ -8,9 +8,10 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from probe_kit.hooks.families.spatialvla.checkpoint import load_checkpoint
-from probe_kit.hooks.verification.verify import verify_reference
-from probe_kit.models.spatialvla import ActionBins, PictureSettings, depth_input, prepare_picture
+from probe_kit.hooks.families.spatialvla.adapter import load_checkpoint
+from probe_kit.hooks.verify import verify_reference
+from probe_kit.models.spatialvla import PictureSettings, depth_input, prepare_picture
+from probe_kit.models.spatialvla_actions import ActionBins
 from tests.support.spatialvla_checkpoints import FIRST_ACTION, IMAGE, config_values, write_checkpoint
 
 OTHER_BINS = {

@@ -4,7 +4,7 @@ from typing import Any
 import pytest
 
 from probe_kit.errors import CheckpointError, InstructionError, UsageError
-from probe_kit.hooks.families.spatialvla.speech import Speech
+from probe_kit.hooks.families.spatialvla.adapter import Speech
 from probe_kit.models.spatialvla import SpatialVLAConfig
 from tests.support.spatialvla_checkpoints import IMAGE, WORDS, config_values, write_tokenizer
 

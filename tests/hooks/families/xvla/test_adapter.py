@@ -19,8 +19,8 @@ from safetensors.torch import load_file, save_file
 from probe_kit.errors import CheckpointError, ObservationError, UsageError, WeightsError
 from probe_kit.hooks import Observation, Site, capture, edit
 from probe_kit.hooks.conformance.subject import examples_for
+from probe_kit.hooks.families.xvla import adapter as network
 from probe_kit.hooks.families.xvla.adapter import Xvla
-from probe_kit.models.lerobot import xvla as network
 from tests.support.xvla_checkpoints import CHUNK, DOMAIN, DOMAINS, TEXT, to_authors_layout, write_xvla
 
 

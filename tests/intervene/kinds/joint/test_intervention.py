@@ -7,7 +7,7 @@ import pytest
 
 from probe_kit._terminal.console import out
 from probe_kit.errors import UnsupportedInterventionError, UsageError
-from probe_kit.hooks.contract.interventions import Interventions
+from probe_kit.hooks.contract.declared import Interventions
 from probe_kit.intervene import Interchange, InterventionResult, ReplaySource, run_intervention
 from probe_kit.intervene.kinds.joint import JointPlaces, stored_joint_places
 from probe_kit.intervene.kinds.site_maps import localised_by_category, stored_site_effects

@@ -1,25 +1,34 @@
-"""Base adapter of lerobot's flow-matching policies: noise, the prompt's keys and values, gradients, taps."""
+"""Bases of lerobot's policies by kind: flows, packed prompts, PaliGemma's prompts, prompts that hold the state."""
 
+import re
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import partial
+from dataclasses import dataclass
+from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from transformers import AutoTokenizer
 
-from probe_kit.hooks.capturing.gradients import frozen
-from probe_kit.hooks.contract.observation import Observation
-from probe_kit.hooks.contract.sites import Site, kv_stream
-from probe_kit.hooks.families.shared.kinds import FLOW
+from probe_kit.errors import CheckpointError
+from probe_kit.hooks.capturing.capture_context import frozen
+from probe_kit.hooks.checkpoints.folders import checkpoint_folder
+from probe_kit.hooks.contract.observation import ARM_NUMBERS, Observation
+from probe_kit.hooks.contract.roles import Roles
+from probe_kit.hooks.contract.sites import PADDING, Site, kv_stream
+from probe_kit.hooks.families.shared.kinds import FLOW, IMAGES
+from probe_kit.hooks.families.shared.lerobot.pipelines import tokenizer_folder, tokenizer_name
 from probe_kit.hooks.families.shared.lerobot.policy import LerobotPolicy, checked_steps
-from probe_kit.hooks.families.shared.prompt_kv import attach_prompt_kv
-from probe_kit.hooks.families.shared.sampling import seeded_noise
-from probe_kit.hooks.verification.outputs import Arrays, Produce, RecordedRun, euler_path, numpy_of
+from probe_kit.hooks.families.shared.taps import attach_prompt_kv
+from probe_kit.hooks.families.shared.token_decoder import seeded_noise
+from probe_kit.hooks.outputs import Arrays, Produce, RecordedRun, euler_path, numpy_of
+from probe_kit.models.checkpoint_files import load_pretrained
+from probe_kit.models.pi0 import EMBEDDING, LM_HEAD
 
 
 class DenoisingPolicy(LerobotPolicy):
@@ -155,3 +164,265 @@ def _with_graph(model: Any) -> Iterator[None]:
         yield
     finally:
         del model.sample_actions
+
+
+Tokens = list[tuple[int, str]]
+"""The id and the role of every position of one prompt."""
+
+
+class PackedRow(NamedTuple):
+    """One packed observation. inputs: what lerobot packs, with a batch axis of 1. labels: a role per position."""
+
+    inputs: dict[str, Tensor]
+    labels: list[str]
+
+    @property
+    def tokens(self) -> Tokens:
+        """The ids of the prompt with their roles."""
+        return list(zip(self.inputs["input_ids"][0].tolist(), self.labels, strict=True))
+
+
+@dataclass(frozen=True)
+class PackedBatch:
+    """Packed observations. inputs: what the network reads. rows: of each, its prompt without the actions."""
+
+    inputs: dict[str, Tensor]
+    rows: list[Tokens]
+
+
+def chat_labels(
+    ids: Sequence[int], pictures: Iterable[str], picture: int, words: tuple[int, int], state: int | None = None
+) -> list[str]:
+    """The role of every position of a chat: `language` between two marks, else `special`.
+
+    pictures: the roles of the pictures, each a run of patches, in their order. picture, state: the ids of a patch
+    and of the state. words: the ids of the marks; the first counts where it stands last.
+    """
+    begin = len(ids) - ids[::-1].index(words[0])
+    end, roles, role = ids.index(words[1], begin), iter(pictures), ""
+    labels = []
+    for index, token in enumerate(ids):
+        if token == picture and (not index or ids[index - 1] != picture):
+            role = next(roles)
+        other = "language" if begin <= index < end else "state" if token == state else "special"
+        labels.append(role if token == picture else other)
+    return labels
+
+
+class PackedPolicy(DenoisingPolicy):
+    """A denoising policy that packs as lerobot's processors do; the packing says the role of every position."""
+
+    masked_cameras = 0
+    word_roles: ClassVar[tuple[str, ...]] = ("language", "special")
+    """The tokens that stand for an instruction where two are compared."""
+
+    @cached_property
+    @abstractmethod
+    def packing(self) -> Any:
+        """lerobot's packing; it has the `tokenizer`, and `row` and `batch` for `pack`."""
+
+    def pack(self, observations: Sequence[Observation], state: NDArray[np.float32]) -> PackedBatch:
+        """The observations as the network reads them. state: (B, numbers) as it reads them.
+
+        Raises InstructionError for a text that it cannot take in.
+        """
+        rows: list[PackedRow] = [
+            self.packing.row(self.pictures_of(observation), observation.instruction, numbers)
+            for observation, numbers in zip(observations, state, strict=True)
+        ]
+        return PackedBatch(self.packing.batch(rows), [row.tokens for row in rows])
+
+    @cached_property
+    def tokenizer(self) -> Any:
+        """The tokenizer of the packing."""
+        return self.packing.tokenizer
+
+    def pictures_of(self, observation: Observation) -> dict[str, NDArray[np.uint8]]:
+        """The pictures (H, W, 3) of the shown cameras. Raises ObservationError."""
+        return {camera: self.picture_of(camera, observation) for camera in self.shown_cameras}
+
+    def batch(
+        self, observations: Sequence[Observation], state: NDArray[np.float32] | None = None
+    ) -> dict[str, Tensor]:
+        """Return a batch in lerobot's keys. state: (B, numbers) as the network reads them."""
+        packed = self.pack(observations, self.state(observations) if state is None else state)
+        return {name: tensor.to(self.config.device) for name, tensor in packed.inputs.items()}
+
+    def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
+        """Roles from the packing itself; streams besides the acting one have the backbone's tokens."""
+        state = self.read_state(observations)
+        rows = self.pack(observations, self._no_state(len(observations)) if state is None else state).rows
+        prompts = Roles.padded([[label for _, label in row] for row in rows])
+        suffix = [Roles.from_labels(self.suffix_labels())] * len(rows)
+        return {name: suffix if name == self.acting_stream else prompts for name in self.streams}
+
+    def token_ids(self, instructions: Sequence[str]) -> list[tuple[int, ...]]:
+        """The ids of each prompt, without pictures and without the state, which change at every inference."""
+        height, width = self.config.image_features[f"{IMAGES}{self.cameras[0]}"].shape[-2:]
+        blank, state = np.zeros((height, width, 3), np.uint8), np.zeros(ARM_NUMBERS, np.float32)
+        cameras = dict.fromkeys(self.shown_cameras[1:], blank)
+        observations = [Observation(blank, state, text, cameras=cameras) for text in instructions]
+        rows = [self.pack([observation], self._no_state(1)).rows[0] for observation in observations]
+        return [tuple(number for number, role in row if role in self.word_roles) for row in rows]
+
+    @classmethod
+    def check_words(cls, checkpoint: str, instructions: Sequence[str], **options: Any) -> None:
+        """Raise InstructionError as `pack` would, from configuration and tokenizer alone."""
+        cls._text_reader(checkpoint, options).token_ids(instructions)
+
+    def _no_state(self, rows: int) -> NDArray[np.float32]:
+        return np.zeros((rows, self._state_numbers), np.float32)
+
+
+_TOKENIZER = "google/paligemma-3b-pt-224"
+_TOKENIZER_FILES = ("tokenizer*", "special_tokens_map.json", "added_tokens.json", "config.json")
+LEAST_BYTES = 1_000_000_000
+"""Of weights in the released sizes, which have 3 billion parameters or more."""
+
+
+def _check_small_weights(folder: Path) -> None:
+    """A small network that lost its `dims.json` would be built at full size, for minutes, before it is refused."""
+    size = sum(file.stat().st_size for file in folder.glob("*.safetensors"))
+    if 0 < size < LEAST_BYTES:
+        raise CheckpointError(
+            f"{folder} has {size / 1e6:,.1f} MB of weights and no dims.json; the released size has "
+            "several GB. Put the dims.json beside its config.json, or download the checkpoint again"
+        )
+
+
+def sizes_file(folder: Path) -> Path | None:
+    """The `dims.json` of a small checkpoint; None for one of the released size.
+
+    Raises CheckpointError for a small one that lost it.
+    """
+    sizes = [parent / "dims.json" for parent in (folder, folder.parent) if (parent / "dims.json").is_file()]
+    if not sizes:
+        _check_small_weights(folder)
+    return sizes[0] if sizes else None
+
+
+class PaliGemmaPolicy(LerobotPolicy):
+    """A lerobot policy whose prompt is read by PaliGemma."""
+
+    # pi0_base holds the embedding as `lm_head` alone.
+    tied: ClassVar[Mapping[str, str]] = {EMBEDDING: LM_HEAD}
+
+    @cached_property
+    def tokenizer(self) -> Any:
+        """PaliGemma's, from the checkpoint folder or the hub."""
+        if (folder := self._tokenizer_folder()) is not None:
+            return load_pretrained(AutoTokenizer, folder)
+        repository = tokenizer_name(self.folder) or _TOKENIZER
+        try:
+            return load_pretrained(AutoTokenizer, checkpoint_folder(repository, _TOKENIZER_FILES))
+        except (CheckpointError, OSError, ValueError) as error:
+            gated = "gated " if repository == _TOKENIZER else ""
+            raise CheckpointError(
+                f"{self.folder} has no tokenizer.json and the {gated}{repository} cannot be fetched. Run "
+                "`hf auth login`, or put its tokenizer.json and tokenizer_config.json into the checkpoint folder"
+            ) from error
+
+    def _tokenizer_folder(self) -> Path | None:
+        if (saved := tokenizer_folder(self.folder)) is not None:
+            return saved
+        places = (self.folder, self.folder.parent / "tokenizer")
+        return next((folder for folder in places if (folder / "tokenizer.json").is_file()), None)
+
+    def side_files(self) -> dict[str, Path]:
+        """Also the sizes, where they lie beside the folder."""
+        files, sizes = super().side_files(), self.folder.parent / "dims.json"
+        return {**({"dims.json": sizes} if sizes.is_file() else {}), **files}
+
+    def parts(self) -> dict[str, Path]:
+        """The tokenizer, where it lies beside the folder."""
+        folder = self._tokenizer_folder()
+        return {} if folder is None or folder == self.folder else {"tokenizer": folder}
+
+    @property
+    def masked_cameras(self) -> int:
+        """All that are not shown."""
+        return len(self.config.image_features) - len(self.shown_cameras)
+
+    def prefix_labels(self, language: Sequence[str]) -> list[str]:
+        """Cameras without a picture are masked and lie behind the shown ones."""
+        images = [f"image.{camera}" for camera in self.shown_cameras for _ in range(self.tokens_per_camera)]
+        return [*images, *[PADDING] * self.tokens_per_camera * self.masked_cameras, *language]
+
+    def patch_order(self) -> NDArray[np.int64]:
+        """A token per patch, row by row."""
+        return np.arange(self.tokens_per_camera)
+
+    @property
+    def tokens_per_camera(self) -> int:
+        """Patches of one picture."""
+        vision = self.network.model.paligemma_with_expert.paligemma.model.vision_tower.vision_model
+        return int(vision.embeddings.num_patches)
+
+
+BINS = np.linspace(-1, 1, 256 + 1)[:-1]
+"""Lower edges of the 256 bins of a normalised state, as lerobot's processor step of pi0.5 makes them."""
+_PROMPT = re.compile(
+    r"Task: ?(?P<language>.*), ?State: ?(?P<state>[-\d ]*);\s*(?:Action:\s*)?\Z", re.DOTALL | re.IGNORECASE
+)
+"""The prompt of pi0.5; its named parts are roles."""
+_LEFT_OUT = (PADDING, "state")
+
+
+def digits(state: NDArray[np.float32]) -> list[str]:
+    """(B, numbers) normalised to the numbers of their bins: 0 to 255, and -1 below the range."""
+    return [" ".join(map(str, row)) for row in np.digitize(state, BINS) - 1]
+
+
+def label_groups(pieces: Sequence[str], pattern: re.Pattern[str]) -> list[str]:
+    """A label per piece of a text: the named group of `pattern` that it has characters in, else `special`."""
+    ends = np.cumsum([len(piece) for piece in pieces])
+    labels = ["special"] * len(pieces)
+    if (match := pattern.search("".join(pieces))) is None:
+        return labels
+    for role in pattern.groupindex:
+        first, last = match.span(role)
+        for position, (piece, end) in enumerate(zip(pieces, ends, strict=True)):
+            if piece and end - len(piece) < last and end > first:
+                labels[position] = role
+    return labels
+
+
+class StatePrompt(LerobotPolicy):
+    """A lerobot policy that reads its state in its prompt."""
+
+    other_roles: ClassVar[tuple[str, ...]] = ("language", "state", "special")
+    prompt_end: ClassVar[str] = ""
+    """What follows the state."""
+
+    def prompts(self, instructions: Sequence[str], state: NDArray[np.float32]) -> list[str]:
+        """Return prompts as lerobot's processor steps of these policies word them."""
+        tasks = [text.strip().replace("_", " ").replace("\n", " ") for text in instructions]
+        return [
+            f"Task: {task}, State: {state_digits};\n{self.prompt_end}"
+            for task, state_digits in zip(tasks, digits(state), strict=True)
+        ]
+
+    def text_labels(self, ids: Sequence[int], valid: Sequence[bool]) -> list[str]:
+        """The instruction is `language`, the digits are `state`, and the words around them are `special`."""
+        special = frozenset(self.tokenizer.all_special_ids)
+        pieces = [
+            "" if number in special or not is_text else piece.replace("\u2581", " ")
+            for number, is_text, piece in zip(
+                ids, valid, self.tokenizer.convert_ids_to_tokens(list(ids)), strict=True
+            )
+        ]
+        labels = label_groups(pieces, _PROMPT)
+        return [label if is_text else PADDING for label, is_text in zip(labels, valid, strict=True)]
+
+    def token_ids(self, instructions: Sequence[str]) -> list[tuple[int, ...]]:
+        """The ids of each prompt without padding and without the digits, which change at every inference."""
+        tokens, mask = self.tokenise(instructions)
+        rows = zip(tokens.tolist(), mask.tolist(), strict=True)
+        return [
+            tuple(
+                number
+                for number, label in zip(ids, self.text_labels(ids, valid), strict=True)
+                if label not in _LEFT_OUT
+            )
+            for ids, valid in rows
+        ]

@@ -13,9 +13,9 @@ import torch
 from torch import Tensor
 
 from probe_kit.hooks.contract.observation import Observation
-from probe_kit.hooks.families.shared.lerobot.features import IMAGES, STATE
+from probe_kit.hooks.families.shared.kinds import IMAGES, STATE
 from probe_kit.hooks.families.shared.lerobot.policy import MASK, TOKENS, LerobotPolicy
-from probe_kit.hooks.verification.outputs import (
+from probe_kit.hooks.outputs import (
     Arrays,
     Outputs,
     Produce,

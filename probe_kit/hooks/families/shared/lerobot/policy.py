@@ -26,14 +26,10 @@ from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.checkpoints.weights import Weights, load_weights, read_weights
 from probe_kit.hooks.contract.card import ARM
 from probe_kit.hooks.contract.model import Policy, Tap
-from probe_kit.hooks.contract.observation import Observation, checked_picture
+from probe_kit.hooks.contract.observation import ARM_NUMBERS, Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
-from probe_kit.hooks.contract.sites import Site
-from probe_kit.hooks.contract.state_layout import ARM_NUMBERS
-from probe_kit.hooks.contract.views import PADDING
-from probe_kit.hooks.families.shared.lerobot.config_fields import Inert, check_one_frame, known_values
-from probe_kit.hooks.families.shared.lerobot.evaluation import Evaluation
-from probe_kit.hooks.families.shared.lerobot.features import IMAGES, STATE, cameras_of
+from probe_kit.hooks.contract.sites import PADDING, Site
+from probe_kit.hooks.families.shared.kinds import IMAGES, STATE, Evaluation, cameras_of
 from probe_kit.hooks.families.shared.lerobot.normaliser import (
     Normaliser,
     Units,
@@ -48,17 +44,19 @@ from probe_kit.hooks.families.shared.lerobot.pipelines import (
     PREPROCESSOR,
     RELATIVE,
     TOKENIZER,
+    Inert,
     adds_state,
+    check_one_frame,
     check_steps,
+    known_values,
     text_length,
 )
-from probe_kit.hooks.families.shared.lerobot.stacks import Stack
 from probe_kit.hooks.families.shared.lerobot.window import PictureWindow, read_window
-from probe_kit.hooks.families.shared.network_loading import Loaded
-from probe_kit.hooks.families.shared.prompt_kv import ALL_TOKENS, kv_tap
-from probe_kit.hooks.verification.outputs import Arrays, Produce, RecordedRun
-from probe_kit.models.initialisation import initialise
-from probe_kit.models.prompt_kv import PromptKV
+from probe_kit.hooks.families.shared.loading import Loaded
+from probe_kit.hooks.families.shared.taps import ALL_TOKENS, Stack, kv_tap
+from probe_kit.hooks.outputs import Arrays, Produce, RecordedRun
+from probe_kit.models.building import initialise
+from probe_kit.models.decoding import PromptKV
 
 MOST_TOKENS = 1 << 16
 """Of a prompt: far beyond any policy, and no memory without end."""

@@ -10,7 +10,7 @@ import pytest
 
 from probe_kit.errors import CheckpointError, ProbeKitError
 from probe_kit.hooks import Observation, load_policy
-from probe_kit.hooks.families.shared.lerobot.config_fields import known_values
+from probe_kit.hooks.families.shared.lerobot.pipelines import known_values
 from tests.support import (
     eo1_checkpoints,
     groot_checkpoints,

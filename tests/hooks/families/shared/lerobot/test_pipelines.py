@@ -18,10 +18,9 @@ from safetensors.torch import load_file, save_file
 from probe_kit.errors import CheckpointError, InstructionError
 from probe_kit.hooks import Observation
 from probe_kit.hooks.conformance.subject import examples_for
-from probe_kit.hooks.families.pi0_fast.adapter import Pi0Fast
-from probe_kit.hooks.families.pi05.adapter import Pi05
-from probe_kit.models.lerobot.pi0 import Pi0Size, resized
-from probe_kit.models.lerobot.pi0_fast import Pi0FastSize, sized
+from probe_kit.hooks.families.pi0.adapter import Pi05
+from probe_kit.hooks.families.pi0_fast.adapter import Pi0Fast, Pi0FastSize, sized
+from probe_kit.models.pi0 import Pi0Size, resized
 from tests.support.lerobot_pipelines import changed, raw, save_pipelines, without_hub
 from tests.support.pi0_fast_checkpoints import fast_processor, write_pi0_fast
 from tests.support.pi05_checkpoints import HIGH, LOW, write_pi05

@@ -3,9 +3,8 @@
 import numpy as np
 import pytest
 
-from probe_kit.hooks.families.molmoact2.units import JointFrame, SteppedUnits
-from probe_kit.hooks.families.shared.lerobot.normaliser import Normaliser, Units
-from probe_kit.hooks.families.shared.statistics_bounds import Bounds
+from probe_kit.hooks.families.molmoact2.packing import JointFrame, SteppedUnits
+from probe_kit.hooks.families.shared.lerobot.normaliser import Bounds, Normaliser, Units
 
 LOW, HIGH = np.array([-1.0, 0.0], np.float32), np.array([1.0, 0.5], np.float32)
 INSIDE, BELOW, ABOVE = (

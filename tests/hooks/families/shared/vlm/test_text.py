@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from probe_kit.errors import CheckpointError, InstructionError, UsageError
-from probe_kit.hooks.families.shared.vlm.text import Frame, FramedText
+from probe_kit.hooks.families.shared.text import Frame, FramedText
 from tests.support.qwen_checkpoints import ID, write_tokenizer
 
 FRAME = Frame("<|im_start|>user\n<|vision_start|>", "<|vision_end|>", "<|im_start|>user\n", "<|im_end|>\nSay: ")

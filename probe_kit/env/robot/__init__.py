@@ -1,1 +1,0 @@
-"""Robot arms and their controller."""

@@ -1,0 +1,625 @@
+"""Scoring of an episode by pure functions of its trajectory: outcome, events, outcome rules, behaviour.
+
+A frame is the state before the first action or after one; frame t follows action t. All that is said about an
+episode is computed from its frames, so that re-scoring needs no simulator.
+
+The rule of the paper uses the final position of the cube in the plane alone. A success rate is made of a policy
+*and* of a rule, and rules disagree on the same episodes by a factor of ten. So a rule is a named object, every
+episode can be judged by all of them, and every printed rate comes with its rule's name. All use the places of the
+tiles at the moment that is judged, which after a push is not where they began.
+
+The start biases some of the behaviour. In the released scene the hand starts over the right picture's box, so that
+every answer to the right is also the "first choice", and it is nearer to the right picture before it has moved.
+What the start gave is therefore left out (first choice, dwell, closer to, release) or named beside it (side of the
+start).
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from difflib import get_close_matches
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.env.spec import XY, SceneSpec
+from probe_kit.errors import SceneError, UsageError
+from probe_kit.suite.items import Layout, Side, other_side
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+
+Values = NDArray[np.float32]
+
+POSE: tuple[str, ...] = ("x", "y", "z", "qx", "qy", "qz", "qw")
+STATE: dict[str, tuple[str, ...]] = {
+    "tool": ("x", "y", "z", "roll", "pitch", "yaw"),
+    "opening": ("share",),
+    "cube": POSE,
+    "cube_speed": ("m/s",),
+    "tile_left": POSE,
+    "tile_right": POSE,
+    "finger_force": ("one", "other"),
+    "held": ("bool",),
+    "touches": ("left", "right"),
+}
+"""What every frame holds, and the names of its parts."""
+MOTION: tuple[str, ...] = ("dx", "dy", "dz", "droll", "dpitch", "dyaw", "gripper")
+ACTIONS: dict[str, tuple[str, ...]] = {"commanded": MOTION, "executed": MOTION, "ik_error": ("m",)}
+"""What led to a frame; not a number in the first."""
+CHANNELS: tuple[str, ...] = tuple(f"{name}.{part}" for name, parts in (STATE | ACTIONS).items() for part in parts)
+"""Columns of a stored frame, in order."""
+_AXES = {MOTION: "motion", POSE: "pose"}
+LED_TO = sum(len(parts) for parts in ACTIONS.values())
+"""How many of them describe the action."""
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """One episode of T actions in T + 1 frames; float32, metres, radians, seconds, newtons, in the world frame.
+
+    tool: (T + 1, 6) measured x, y, z, roll, pitch, yaw, the angles relative to pointing down. opening: (T + 1,) of
+    the gripper, 1 open. cube, tile_left, tile_right: (T + 1, 7) middle of the body x, y, z and its quaternion
+    x, y, z, w. cube_speed: (T + 1,). finger_force: (T + 1, 2) with which each finger presses on the cube. held:
+    (T + 1,) bool, both fingers touch the cube. touches: (T + 1, 2) bool, the cube touches the left or right tile.
+    commanded: (T, 7) actions as they came. executed: (T, 7) what the commanded pose really advanced by, after
+    limits, a gripper that is kept shut, and poses out of reach (zero then). ik_error: (T,) metres that remained.
+    """
+
+    tool: Values
+    opening: Values
+    cube: Values
+    cube_speed: Values
+    tile_left: Values
+    tile_right: Values
+    finger_force: Values
+    held: NDArray[np.bool_]
+    touches: NDArray[np.bool_]
+    commanded: Values
+    executed: Values
+    ik_error: Values
+
+    @classmethod
+    def of_frames(cls, frames: Values) -> Self:
+        """Return the trajectory of stored frames (T + 1, len(CHANNELS)); see `frames`."""
+        parts: dict[str, NDArray[Any]] = {}
+        start = 0
+        for name, of_name in (STATE | ACTIONS).items():
+            columns = frames[:, start : start + len(of_name)]
+            start += len(of_name)
+            columns = columns[1:] if name in ACTIONS else columns
+            columns = columns[:, 0] if len(of_name) == 1 else columns
+            parts[name] = columns > 0 if name in ("held", "touches") else columns
+        return cls(**parts)
+
+    @property
+    def frames(self) -> Values:
+        """(T + 1, len(CHANNELS)) float32 as stored: state, then the action that led to it, NaN in the first."""
+        frames = np.full((len(self), len(CHANNELS)), np.nan, np.float32)
+        start = 0
+        for name, of_name in (STATE | ACTIONS).items():
+            first = 1 if name in ACTIONS else 0
+            values = getattr(self, name)
+            frames[first:, start : start + len(of_name)] = values.reshape(len(values), len(of_name))
+            start += len(of_name)
+        return frames
+
+    def __len__(self) -> int:
+        """Number of frames, T + 1."""
+        return len(self.tool)
+
+    @property
+    def steps(self) -> int:
+        """Number of actions, T."""
+        return len(self.commanded)
+
+    def tile(self, side: Side) -> Values:
+        """(T + 1, 7) pose of the tile on `side`."""
+        return self.tile_left if side == "left" else self.tile_right
+
+    def to_xarray(self) -> "xr.Dataset":
+        """The same with labelled axes: `frame` from 0, `step` from 1, and the parts by name."""
+        import xarray as xr
+
+        arrays: dict[str, xr.DataArray] = {}
+        for name, parts in (STATE | ACTIONS).items():
+            time = "step" if name in ACTIONS else "frame"
+            if len(parts) == 1:
+                arrays[name] = xr.DataArray(getattr(self, name), dims=(time,))
+            else:
+                axis = _AXES.get(parts, f"{name}_part")
+                arrays[name] = xr.DataArray(getattr(self, name), dims=(time, axis), coords={axis: list(parts)})
+        times = {"frame": np.arange(len(self)), "step": np.arange(1, len(self))}
+        return xr.Dataset(arrays, coords=times)
+
+
+Zone = Literal["correct", "wrong", "oob"]
+Ending = Literal["max_steps", "cube_fell", "non_finite"]
+SENSITIVITY_RADII = (0.055, 0.065, 0.081)
+"""Half a tile side, the rule of VL-Think, half a diagonal plus 3 mm: metres, for the default tile."""
+
+
+REST_SPEED = 0.002
+"""Speed of the cube in m/s below which it lies still."""
+
+
+def distance(a: XY, b: XY) -> float:
+    """Distance in the plane, in the unit of the arguments."""
+    return float(np.hypot(a[0] - b[0], a[1] - b[1]))
+
+
+def zone(distance_correct: float, distance_wrong: float, radius: float) -> Zone:
+    """Return the zone in which the cube ended, from its distances to both tile centres (all in one unit).
+
+    A cube on the edge of a zone is inside. Out of bounds if it is in neither; if a distance is not a
+    number, because the simulator broke, it is in neither. Raises SceneError if it would be in both.
+    """
+    on_correct, on_wrong = distance_correct <= radius, distance_wrong <= radius
+    if on_correct and on_wrong:
+        raise SceneError(
+            f"zones of radius {radius} m overlap: the cube is {distance_correct:.3f} m from the correct and "
+            f"{distance_wrong:.3f} m from the wrong tile. Use a smaller radius."
+        )
+    return "correct" if on_correct else "wrong" if on_wrong else "oob"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The stored result of one finished or running episode. Metres, in the world frame.
+
+    zone: by the rule of the paper, with radius `epsilon`. cube_xy, cube_z: the middle of the cube.
+    distance_correct, distance_wrong: in the plane, to the tile centres. cube_moved: it is further than
+    `SceneSpec.moved` from where it started. on_tile: it touches a tile. is_grasped: both fingers touch it.
+    clipped: how many actions the limits changed. truncation_reason: why the episode was cut, None if it is
+    running or stopped early by itself.
+    """
+
+    zone: Zone
+    layout: Layout
+    side_correct: Side
+    cube_xy: XY
+    cube_z: float
+    distance_correct: float
+    distance_wrong: float
+    epsilon: float
+    cube_moved: bool
+    on_tile: bool
+    is_grasped: bool
+    steps: int
+    clipped: int
+    truncation_reason: Ending | None
+
+    @property
+    def is_success(self) -> bool:
+        """Whether the cube is in the correct zone."""
+        return self.zone == "correct"
+
+    @property
+    def side_placed(self) -> Literal["left", "right", "none"]:
+        """Side of the zone the cube is in."""
+        if self.zone == "oob":
+            return "none"
+        return self.side_correct if self.is_success else other_side(self.side_correct)
+
+    @property
+    def never_moved(self) -> bool:
+        """Out of bounds because the cube stayed where it was: a failed grasp rather than a wrong answer."""
+        return self.zone == "oob" and not self.cube_moved
+
+    def to_json(self) -> dict[str, Any]:
+        """The record as plain JSON values; numbers that are not finite become None."""
+        derived = {
+            "is_success": self.is_success,
+            "side_placed": self.side_placed,
+            "never_moved": self.never_moved,
+        }
+        return {key: _plain(value) for key, value in (asdict(self) | derived).items()}
+
+
+def success_by_radius(
+    outcomes: Iterable[Outcome], radii: Sequence[float] = SENSITIVITY_RADII
+) -> dict[float, float]:
+    """Success rate for each zone radius in metres, from the stored distances: no episode runs again.
+
+    Raises ValueError without outcomes, SceneError if a radius makes the zones overlap.
+    """
+    distances = [(o.distance_correct, o.distance_wrong) for o in outcomes]
+    if not distances:
+        raise ValueError("no outcomes to score; expected at least one.")
+    return {radius: success_at(distances, radius) for radius in radii}
+
+
+def success_at(distances: Iterable[tuple[float, float]], radius: float) -> float:
+    """Success rate at a zone radius, metres, from distances to the correct and the wrong tile, metres.
+
+    Raises SceneError if the radius makes the zones overlap.
+    """
+    return float(np.mean([zone(correct, wrong, radius) == "correct" for correct, wrong in distances]))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return [_plain(part) for part in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+MOVED = 0.005
+"""Metres the tool has to leave its first place by to have set off; less is the arm settling."""
+LATERAL = 0.02
+"""Metres towards either tile, of some 0.31 between them, by which the tool has committed to a side."""
+
+EVENTS = ("first motion", "grasp", "first lateral move", "release")
+
+
+@dataclass(frozen=True)
+class Events:
+    """Frames of one episode at which something was first the case; None for what never happened.
+
+    first_motion: the tool has left its place. grasp: the cube is held. first_lateral_move: after the grasp, the
+    tool has moved `LATERAL` along the line between the tiles from where it grasped: before the grasp it goes
+    where the cube is, whatever the question. release: the cube is not held any more, and not again. Frame t
+    follows action t, so that the action with that number brought it about.
+    """
+
+    first_motion: int | None
+    grasp: int | None
+    first_lateral_move: int | None
+    release: int | None
+
+    @classmethod
+    def of(cls, trajectory: Trajectory) -> "Events":
+        """Return the events of a trajectory, from the positions frame by frame."""
+        tool = trajectory.tool[:, :3].astype(np.float64)
+        grasp = _first(trajectory.held)
+        frames = np.flatnonzero(trajectory.held)
+        release = None if frames.size == 0 or frames[-1] + 1 == len(trajectory) else int(frames[-1]) + 1
+        return cls(
+            first_motion=_first(np.linalg.norm(tool - tool[0], axis=1) > MOVED),
+            grasp=grasp,
+            first_lateral_move=None if grasp is None else _lateral(trajectory, tool, grasp),
+            release=release,
+        )
+
+    def frame(self, event: str) -> int | None:
+        """Return the frame of an event by its name in `EVENTS`."""
+        frame: int | None = getattr(self, event.replace(" ", "_"))
+        return frame
+
+
+def _lateral(trajectory: Trajectory, tool: NDArray[np.float64], grasp: int) -> int | None:
+    across = (trajectory.tile_left[0, :2] - trajectory.tile_right[0, :2]).astype(np.float64)
+    length = float(np.linalg.norm(across))
+    if length == 0:
+        return None
+    moved = np.abs((tool[:, :2] - tool[grasp, :2]) @ (across / length))
+    moved[: grasp + 1] = 0
+    return _first(moved > LATERAL)
+
+
+def _first(happened: NDArray[np.bool_]) -> int | None:
+    frames = np.flatnonzero(happened)
+    return int(frames[0]) if frames.size else None
+
+
+RELEASED_STEPS = 11
+"""Control steps at the end that the released evaluation averages over."""
+
+Flags = NDArray[np.bool_]
+
+
+class OutcomeRule(ABC):
+    """A rule that decides when the cube counts as put on a picture."""
+
+    name: str
+
+    @abstractmethod
+    def inside(self, trajectory: Trajectory, side: Side) -> Flags:
+        """(T + 1,) whether the cube counts as put on the picture on `side`, frame by frame. Not a number: no."""
+
+    @property
+    @abstractmethod
+    def words(self) -> str:
+        """The rule in a few words, with its numbers."""
+
+
+@dataclass(frozen=True)
+class Disc(OutcomeRule):
+    """The middle of the cube, seen from above, is within `radius` metres of the middle of the picture."""
+
+    radius: float
+    name = "disc"
+
+    def inside(self, trajectory: Trajectory, side: Side) -> Flags:
+        """Height, grasp and motion do not count."""
+        away = trajectory.cube[:, :2] - trajectory.tile(side)[:, :2]
+        return np.asarray(np.hypot(*away.T) <= self.radius)
+
+    @property
+    def words(self) -> str:
+        """The rule as captions print it."""
+        return f"within {100 * self.radius:.1f} cm of the picture's middle, seen from above"
+
+
+@dataclass(frozen=True)
+class Box(OutcomeRule):
+    """The middle of the cube is over a square of `half` metres to every side of the picture, `height` above it.
+
+    The rule of the released evaluation. The square lies along x and y of the world, whatever way the tiles are
+    turned, and `height` counts from the middle of the tile. The cube may be held, lie on the bare table or have
+    been left where it started.
+    """
+
+    half: float
+    height: float
+    name = "box"
+
+    def inside(self, trajectory: Trajectory, side: Side) -> Flags:
+        """Held or lying, on the picture or beside it."""
+        away = trajectory.cube[:, :3] - trajectory.tile(side)[:, :3]
+        return np.asarray((np.abs(away[:, :2]) <= self.half).all(axis=1) & (away[:, 2] >= self.height))
+
+    @property
+    def words(self) -> str:
+        """The rule as captions print it."""
+        return f"over a square of {200 * self.half:.0f} cm around the picture, held or lying, on it or beside it"
+
+
+@dataclass(frozen=True)
+class ReleasedOnTile(OutcomeRule):
+    """The cube was let go and lies still on the picture that can be seen: `half` metres to every side."""
+
+    half: float
+    name = "released-on-tile"
+
+    def inside(self, trajectory: Trajectory, side: Side) -> Flags:
+        """Demand the square of the tile as it lies, touch, open fingers, and rest."""
+        tile, position = trajectory.tile(side), 0 if side == "left" else 1
+        away = _turned_back(trajectory.cube[:, :2] - tile[:, :2], tile[:, 3:])
+        over = (np.abs(away) <= self.half).all(axis=1)
+        return np.asarray(
+            over & trajectory.touches[:, position] & ~trajectory.held & (trajectory.cube_speed < REST_SPEED)
+        )
+
+    @property
+    def words(self) -> str:
+        """The rule as captions print it."""
+        return f"let go and at rest on the picture, {200 * self.half:.1f} cm wide"
+
+
+def _turned_back(away: NDArray[np.float32], quaternion: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(F, 2) offsets in the plane, seen from a tile that is turned about the vertical; quaternions x, y, z, w."""
+    x, y, z, w = quaternion.T
+    yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    turned = np.stack([np.cos(yaw), np.sin(yaw), -np.sin(yaw), np.cos(yaw)], axis=1).reshape(-1, 2, 2)
+    return np.asarray(np.einsum("fij,fj->fi", turned, away), np.float32)
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """The verdict of a rule on one episode.
+
+    outcome: at its end. correct, wrong, oob: share of the judged steps, whole numbers where only the last one is
+    judged. both: at its end the cube counts for both pictures, which is called correct. idle: the outcome if
+    nothing had moved since before the first action.
+    """
+
+    outcome: Zone
+    correct: float
+    wrong: float
+    oob: float
+    both: bool
+    idle: Zone
+
+
+def judge(
+    trajectory: Trajectory,
+    rule: OutcomeRule,
+    side_correct: Side,
+    last_steps: int = 1,
+    max_steps: int | None = None,
+) -> Judgement:
+    """Judge one episode by a rule.
+
+    last_steps: how many control steps at the end count, each as much as the others. An episode that ended before
+    `max_steps` is taken to have stayed as it was until then. Raises UsageError for fewer than one.
+    """
+    if last_steps < 1:
+        raise UsageError(f"the last {last_steps} steps of an episode cannot be judged; expected at least 1")
+    correct, wrong = rule.inside(trajectory, side_correct), rule.inside(trajectory, other_side(side_correct))
+    end = max(trajectory.steps, max_steps or 0)
+    judged = np.arange(max(1, end - last_steps + 1), end + 1).clip(max=trajectory.steps)
+    right, other = correct[judged], wrong[judged] & ~correct[judged]
+    return Judgement(
+        outcome=_zone(bool(correct[-1]), bool(wrong[-1])),
+        correct=float(right.mean()),
+        wrong=float(other.mean()),
+        oob=float((~right & ~other).mean()),
+        both=bool(correct[-1] and wrong[-1]),
+        idle=_zone(bool(correct[0]), bool(wrong[0])),
+    )
+
+
+def _zone(correct: bool, wrong: bool) -> Zone:
+    return "correct" if correct else "wrong" if wrong else "oob"
+
+
+# -- by name ---------------------------------------------------------------------------------------------
+
+_DEFAULT = SceneSpec.__dataclass_fields__
+
+
+def _disc(scene: Mapping[str, Any]) -> OutcomeRule:
+    return Disc(scene["epsilon"])
+
+
+def _box(scene: Mapping[str, Any]) -> OutcomeRule:
+    """Scoring side and margins are newer than some scenes that are still read."""
+    side, margin, height = (
+        scene.get(name, _DEFAULT[name].default) for name in ("scoring_side", "box_margin", "box_height")
+    )
+    return Box(side / 2 + margin, height)
+
+
+def _released(scene: Mapping[str, Any]) -> OutcomeRule:
+    return ReleasedOnTile(scene["tile_side"] / 2)
+
+
+_MAKERS: dict[str, Callable[[Mapping[str, Any]], OutcomeRule]] = {
+    Disc.name: _disc,
+    Box.name: _box,
+    ReleasedOnTile.name: _released,
+}
+DEFAULT_RULE = Disc.name
+RULES: Mapping[str, str] = MappingProxyType(
+    {
+        Disc.name: "the middle of the cube ends over a disc around the picture's middle (ours)",
+        Box.name: "it ends over a wide square around the picture, held or lying (the released evaluation's)",
+        ReleasedOnTile.name: "the cube was let go and lies still on the picture",
+    }
+)
+"""Every rule by name, and what it asks for."""
+
+
+def check_rule(name: str) -> str:
+    """`name`, if there is such a rule. Raises UsageError, naming the nearest and all."""
+    if name not in RULES:
+        near = get_close_matches(name, RULES, n=1)
+        hint = f"did you mean {near[0]}? " if near else ""
+        raise UsageError(f"there is no outcome rule {name!r}; {hint}rules: {', '.join(RULES)}")
+    return name
+
+
+def rule_of(name: str, scene: Mapping[str, Any]) -> OutcomeRule:
+    """The rule of this name with the sizes of a scene, `SceneSpec.to_json()`. Raises UsageError."""
+    return _MAKERS[check_rule(name)](scene)
+
+
+Choice = Literal["correct", "wrong", "none"]
+
+HAND_ABOVE = 0.02
+"""How far above the middle of a tile the tool must be to count as over it, metres (the released evaluation's)."""
+
+
+@dataclass(frozen=True)
+class Behaviour:
+    """One episode. Metres, shares from 0 to 1, control steps; None where there is nothing to say.
+
+    grasped, released: both fingers ever touched the cube, and let go of it after that. released_at: frame of the
+    first release. moved: the cube was ever further than `SceneSpec.moved` from its start, seen from above.
+    furthest: how far it was at most.
+    hand_starts_over, hand_starts_nearer: which picture the hand is over, and nearer to, before the first action.
+    first_choice: the picture whose box the hand was brought into first. The box it began in counts from when the
+    hand is nearer to that picture by more than `SceneSpec.moved`, or was away and came back.
+    dwell_correct, dwell_wrong: steps over either box, counted likewise; dwell_start: what is left out so.
+    min_distance_correct, min_distance_wrong: of the hand, seen from above, over the whole episode.
+    closer_to: to which picture the hand came closer than it was at the start, by the larger gain.
+    release_near: the picture whose box the hand was over at the first release, counted likewise; None if it
+    released nothing.
+    correct_side_share: share of steps with the hand on the correct side of the line between the pictures.
+    start_side_correct: whether it began on that side.
+    """
+
+    grasped: bool
+    released: bool
+    released_at: int | None
+    moved: bool
+    furthest: float
+    hand_starts_over: Choice
+    hand_starts_nearer: Choice
+    first_choice: Choice
+    dwell_correct: int
+    dwell_wrong: int
+    dwell_start: int
+    min_distance_correct: float
+    min_distance_wrong: float
+    closer_to: Choice
+    release_near: Choice | None
+    correct_side_share: float
+    start_side_correct: bool
+
+
+def behaviour_of(trajectory: Trajectory, side_correct: Side, box_half: float, moved: float) -> Behaviour:
+    """Describe the behaviour in one episode; box_half, moved: as in the scene, metres."""
+    sides: tuple[Side, Side] = (side_correct, other_side(side_correct))
+    over = [_over(trajectory, side, box_half) for side in sides]
+    distances = [np.hypot(*(trajectory.tool[:, :2] - trajectory.tile(side)[:, :2]).T) for side in sides]
+    correct, wrong = (
+        over_picture & ~_left_where_it_began(over_picture, away, moved)
+        for over_picture, away in zip(over, distances, strict=True)
+    )
+    start, least = [float(away[0]) for away in distances], [_least(away) for away in distances]
+    furthest = _furthest(trajectory)
+    released_at = _first_release(trajectory.held)
+    towards_correct = _offset_to_correct_side(trajectory, side_correct)
+    return Behaviour(
+        grasped=bool(trajectory.held.any()),
+        released=released_at is not None,
+        released_at=released_at,
+        moved=furthest > moved,
+        furthest=furthest,
+        hand_starts_over=_choice(bool(over[0][0]), bool(over[1][0])),
+        hand_starts_nearer=_choice(start[0] < start[1], start[1] < start[0]),
+        first_choice=_first_choice(correct, wrong),
+        dwell_correct=int(correct[1:].sum()),
+        dwell_wrong=int(wrong[1:].sum()),
+        dwell_start=int(((over[0] | over[1]) & ~correct & ~wrong)[1:].sum()),
+        min_distance_correct=least[0],
+        min_distance_wrong=least[1],
+        closer_to=_larger(start[0] - least[0], start[1] - least[1]),
+        release_near=_release_near(correct, wrong, released_at),
+        correct_side_share=float((towards_correct[1:] > 0).mean()),
+        start_side_correct=bool(towards_correct[0] > 0),
+    )
+
+
+def _over(trajectory: Trajectory, side: Side, half: float) -> Flags:
+    """(T + 1,) whether the hand is over the box around a picture."""
+    away = trajectory.tool[:, :3] - trajectory.tile(side)[:, :3]
+    return np.asarray((np.abs(away[:, :2]) <= half).all(axis=1) & (away[:, 2] >= HAND_ABOVE))
+
+
+def _left_where_it_began(over: Flags, away: NDArray[np.float32], moved: float) -> Flags:
+    """(T + 1,) the frames of an uninterrupted stay from the start on in which the hand was not brought closer."""
+    return np.asarray(np.logical_and.accumulate(over) & (away[0] - away < moved))
+
+
+def _first_choice(correct: Flags, wrong: Flags) -> Choice:
+    entered = np.flatnonzero(correct | wrong)
+    return "none" if entered.size == 0 else _choice(bool(correct[entered[0]]), bool(wrong[entered[0]]))
+
+
+def _choice(correct: bool, wrong: bool) -> Choice:
+    return "correct" if correct else "wrong" if wrong else "none"
+
+
+def _larger(correct: float, wrong: float, tie: float = 1e-3) -> Choice:
+    """Gains within a millimetre of each other are none."""
+    return _choice(correct > wrong + tie, wrong > correct + tie)
+
+
+def _first_release(grasped: Flags) -> int | None:
+    let_go = np.flatnonzero(grasped[:-1] & ~grasped[1:])
+    return None if let_go.size == 0 else int(let_go[0]) + 1
+
+
+def _release_near(correct: Flags, wrong: Flags, at: int | None) -> Choice | None:
+    return None if at is None else _choice(bool(correct[at]), bool(wrong[at]))
+
+
+def _least(distance: NDArray[np.float32]) -> float:
+    """The smallest that is a number: the simulator may break in mid-episode, not before."""
+    return float(np.nanmin(distance))
+
+
+def _furthest(trajectory: Trajectory) -> float:
+    return float(np.nanmax(np.hypot(*(trajectory.cube[:, :2] - trajectory.cube[0, :2]).T)))
+
+
+def _offset_to_correct_side(trajectory: Trajectory, side_correct: Side) -> NDArray[np.float32]:
+    """(T + 1,) how far the hand is on the correct side of the line midway between where the pictures began."""
+    correct, wrong = trajectory.tile(side_correct)[0, :2], trajectory.tile(other_side(side_correct))[0, :2]
+    middle, towards = (correct + wrong) / 2, (correct - wrong) / np.linalg.norm(correct - wrong)
+    return np.asarray((trajectory.tool[:, :2] - middle) @ towards)

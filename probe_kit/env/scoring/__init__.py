@@ -1,1 +1,0 @@
-"""Scores of an episode, computed from stored numbers."""

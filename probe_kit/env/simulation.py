@@ -1,0 +1,417 @@
+"""PyBullet's side of the scene: clients, the camera, pictures on tiles, photographed backgrounds, films.
+
+Pixels covered by the table cost most of the rendering time and never change. So the empty table is drawn once
+(the *backdrop*), hidden from the renderer afterwards, and every frame is composed with it by depth. The result is
+the naive rendering bit for bit; under visual matching a photo takes the place of the backdrop's colours.
+
+PyBullet stretches a texture on a box so that only a corner of it shows, and it loads broken files without an
+error. So a tile is a box with a quad of our own mesh on top, and every texture is a PNG we wrote ourselves.
+"""
+
+import hashlib
+import os
+import sys
+import warnings
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from functools import lru_cache, partial
+from importlib import import_module
+from pathlib import Path
+from tempfile import TemporaryFile
+from threading import Lock
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from PIL import Image
+
+from probe_kit._system.bounded_files import read_regular
+from probe_kit._system.installing import install_command
+from probe_kit.env.rotations import Array
+from probe_kit.env.spec import CameraSpec, LightSpec
+from probe_kit.errors import SceneError
+from probe_kit.suite.pictures import decode_bytes
+
+_GREETING = b"pybullet build time:"
+_importing = Lock()  # the descriptor that is exchanged meanwhile is of the whole process
+
+
+def import_pybullet() -> Any:
+    """The module pybullet, without the line on stderr that says when it was compiled.
+
+    Its C code writes that line to the file descriptor on every first import, past `sys.stderr`.
+    """
+    with _importing:
+        if "pybullet" in sys.modules:
+            return sys.modules["pybullet"]
+        with _without_greeting():
+            return import_module("pybullet")
+
+
+@contextmanager
+def _without_greeting() -> Iterator[None]:
+    """Hold back what is written to file descriptor 2, and pass it on without the greeting."""
+    if sys.stderr is not None:
+        sys.stderr.flush()
+    try:
+        stderr = os.dup(2)
+    except OSError:  # the process has no stderr; nothing can be seen
+        yield
+        return
+    with TemporaryFile() as buffer:
+        os.dup2(buffer.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(stderr, 2)
+            os.close(stderr)
+            buffer.seek(0)
+            text = b"".join(line for line in buffer if not line.startswith(_GREETING))
+            if text:
+                os.write(2, text)
+
+
+class BulletClient:
+    """One PyBullet server without a window; every pybullet function is a method bound to it.
+
+    pybullet is imported here, at the first use, and not by `import probe_kit.env`.
+    """
+
+    def __init__(self) -> None:
+        pybullet = import_pybullet()
+        if not pybullet.isNumpyEnabled():
+            warnings.warn(
+                "pybullet was compiled without numpy: a picture comes back as nested tuples and costs three times "
+                "as much. Build it again beside numpy: "
+                f"`{install_command(rebuild='pybullet')}`.",
+                stacklevel=2,
+            )
+        self._pybullet = pybullet
+        self._server = pybullet.connect(pybullet.DIRECT)
+
+    def __getattr__(self, name: str) -> Any:
+        member = getattr(self._pybullet, name)
+        return partial(member, physicsClientId=self._server) if callable(member) else member
+
+    def close(self) -> None:
+        """Disconnect; a second call does nothing."""
+        if self._server >= 0:
+            self._pybullet.disconnect(physicsClientId=self._server)
+            self._server = -1
+
+
+Picture = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A rendering: colours (H, W, 3), depth buffer (H, W) in [0, 1] and body ids (H, W), -1 for none."""
+
+    rgb: Picture
+    depth: NDArray[np.float32]
+    bodies: NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A camera of the given description. Pixel (0, 0) is the upper left corner of the picture."""
+
+    spec: CameraSpec
+
+    @property
+    def axes(self) -> Array:
+        """Rows right, up, forward (3, 3): unit axes of the camera in the world."""
+        forward = np.asarray(self.spec.forward) / np.linalg.norm(self.spec.forward)
+        right = np.cross(forward, (0.0, 0.0, 1.0))
+        right /= np.linalg.norm(right)
+        return np.array([right, np.cross(right, forward), forward])
+
+    def project(self, points: ArrayLike) -> Array:
+        """Pixel places (..., 2) as x, y of world points (..., 3) in front of the camera."""
+        x, y, z = np.moveaxis((np.asarray(points) - self.spec.eye) @ self.axes.T, -1, 0)
+        centre = np.array([self.spec.width, self.spec.height]) / 2
+        return np.asarray(centre + self.spec.focal_length * np.stack([x, -y], -1) / z[..., None])
+
+    def rays(self) -> Array:
+        """Viewing direction (H, W, 3) in the world through the middle of every pixel, not normalised."""
+        v, u = np.mgrid[: self.spec.height, : self.spec.width] + 0.5
+        across = (u - self.spec.width / 2) / self.spec.focal_length
+        down = (v - self.spec.height / 2) / self.spec.focal_length
+        return np.asarray(np.stack([across, -down, np.ones_like(across)], -1) @ self.axes)
+
+    def magnified(self, factor: int) -> "Camera":
+        """The same view with `factor` times the pixels in each direction."""
+        spec = self.spec
+        return Camera(replace(spec, width=factor * spec.width, height=factor * spec.height))
+
+    def at_height(self, height: int) -> "Camera":
+        """The same view with so many rows of pixels."""
+        spec = self.spec
+        return Camera(replace(spec, width=round(spec.width * height / spec.height), height=height))
+
+    def widened(self) -> "Camera":
+        """The same view at the same scale, twice as wide and high: with what lies just outside of it."""
+        spec = self.spec
+        fov = 2 * float(np.degrees(np.arctan(2 * np.tan(np.radians(spec.fov) / 2))))
+        return Camera(replace(spec, width=2 * spec.width, height=2 * spec.height, fov=fov))
+
+    def view_matrix(self) -> list[float]:
+        """World to camera, column-major as OpenGL wants it."""
+        right, up, forward = self.axes
+        matrix = np.eye(4)
+        matrix[:3, :3] = right, up, -forward
+        matrix[:3, 3] = -matrix[:3, :3] @ self.spec.eye
+        return [float(x) for x in matrix.T.ravel()]
+
+    def projection_matrix(self) -> list[float]:
+        """Camera to clip space, column-major as OpenGL wants it."""
+        spec = self.spec
+        f = 1 / np.tan(np.radians(spec.fov) / 2)
+        depth = spec.far - spec.near
+        matrix = np.zeros((4, 4))
+        matrix[0, 0], matrix[1, 1] = f * spec.height / spec.width, f
+        matrix[2, 2:] = -(spec.far + spec.near) / depth, -2 * spec.far * spec.near / depth
+        matrix[3, 2] = -1
+        return [float(x) for x in matrix.T.ravel()]
+
+    def render(self, client: BulletClient, light: LightSpec, level: float) -> Frame:
+        """Draw what is visible in the server behind `client`, with all light scaled by `level`."""
+        width, height = self.spec.width, self.spec.height
+        _, _, rgba, depth, bodies = client.getCameraImage(
+            width,
+            height,
+            self.view_matrix(),
+            self.projection_matrix(),
+            lightDirection=light.direction,
+            lightColor=(1.0, 1.0, 1.0),
+            shadow=0,
+            lightAmbientCoeff=light.ambient * level,
+            lightDiffuseCoeff=light.diffuse * level,
+            lightSpecularCoeff=light.specular * level,
+            renderer=client.ER_TINY_RENDERER,
+        )
+        # np.asarray with reshape is right for both builds of pybullet, with numpy and without.
+        return Frame(
+            np.asarray(rgba, np.uint8).reshape(height, width, 4)[..., :3],
+            np.asarray(depth, np.float32).reshape(height, width),
+            np.asarray(bodies, np.int32).reshape(height, width),
+        )
+
+
+@dataclass(frozen=True)
+class Backdrop:
+    """The scene without robot, cube and tiles: colours (H, W, 3) and depth buffer (H, W)."""
+
+    rgb: Picture
+    depth: NDArray[np.float32]
+
+    def at_size(self, spec: CameraSpec) -> "Backdrop":
+        """The same with the pixels of `spec`: mean colours, and the depth of the nearest pixel."""
+        size = (spec.width, spec.height)
+        rgb = Image.fromarray(self.rgb).resize(size, Image.Resampling.BOX)
+        depth = Image.fromarray(self.depth).resize(size, Image.Resampling.NEAREST)
+        return Backdrop(np.asarray(rgb), np.asarray(depth))
+
+    def under(self, frame: Frame) -> Picture:
+        """The picture (H, W, 3) of `frame` composed with the backdrop: the nearer surface is visible."""
+        # The renderer lets the surface that is drawn later win a tie, and the table is drawn first.
+        in_front = (frame.bodies >= 0) & (frame.depth <= self.depth)
+        picture = self.rgb.copy()
+        picture[in_front] = frame.rgb[in_front]
+        return picture
+
+
+TEXTURE_PIXELS = 256
+"""Side of a texture; a tile covers about 170 pixels of the rendered picture."""
+TEXTURE_BUDGET = 128
+"""Textures per loaded scene, 0.6 MB each. PyBullet frees none of them before the scene is reloaded."""
+
+
+def write_quad(path: Path, side: float) -> None:
+    """Write a square of `side` metres in the plane z = 0 as OBJ; the top of its picture points to +x."""
+    h = side / 2
+    corners = "".join(f"v {x} {y} 0\n" for x, y in ((-h, h), (-h, -h), (h, -h), (h, h)))
+    picture = "".join(f"vt {u} {v}\n" for u, v in ((0, 0), (1, 0), (1, 1), (0, 1)))
+    path.write_text(f"{corners}{picture}vn 0 0 1\nf 1/1/1 2/2/1 3/3/1\nf 1/1/1 3/3/1 4/4/1\n", encoding="utf-8")
+
+
+def as_texture(picture: Image.Image) -> NDArray[np.uint8]:
+    """The pixels (256, 256, 3) of a square picture of any size."""
+    return np.asarray(picture.convert("RGB").resize((TEXTURE_PIXELS, TEXTURE_PIXELS), Image.Resampling.LANCZOS))
+
+
+class TextureCache:
+    """Textures of one loaded scene by the hash of their pixels, so that each picture is loaded once."""
+
+    def __init__(self, client: BulletClient, folder: Path, budget: int = TEXTURE_BUDGET) -> None:
+        self._client = client
+        self._folder = folder
+        self._budget = budget
+        self._ids: dict[str, int] = {}
+
+    def has_room(self, count: int) -> bool:
+        """Whether `count` more textures fit into the budget; if not, reload the scene."""
+        return len(self._ids) + count <= self._budget
+
+    def load(self, picture: Image.Image) -> int:
+        """The texture id of a picture."""
+        pixels = as_texture(picture)
+        key = hashlib.sha256(pixels.tobytes()).hexdigest()
+        if key not in self._ids:
+            path = self._folder / f"{key}.png"
+            Image.fromarray(pixels).save(path)
+            self._ids[key] = self._client.loadTexture(str(path))
+            path.unlink()
+        return self._ids[key]
+
+
+# All colours and numbers of grain are chosen by eye. Pictures, and all that models make of them, depend on each.
+PLANK_WIDTH = 0.14
+"""Metres."""
+TABLE_END = 0.92
+"""x at which the table meets a wall, metres."""
+DARK_WOOD = np.array([118.0, 78.0, 46.0])
+LIGHT_WOOD = np.array([190.0, 146.0, 98.0])
+WALL = np.array([196.0, 198.0, 194.0])
+SUPERSAMPLING = 2
+"""Times as many pixels in each direction are drawn and then scaled down, so that seams are smooth."""
+
+
+def load_photo(path: Path, width: int, height: int) -> Picture:
+    """The photo at `path`, squeezed to (height, width, 3). Raises SceneError if it cannot be read."""
+    remedy = "Give another file, or leave `background` out for our own wooden table."
+    try:
+        encoded = read_regular(path)
+    except OSError as error:
+        raise SceneError(f"background {path}: cannot be read ({error.strerror}). {remedy}") from error
+    picture = decode_bytes(encoded, f"background {path}:", SceneError, remedy)
+    return np.asarray(picture.resize((width, height), Image.Resampling.LANCZOS))
+
+
+@lru_cache(maxsize=8)
+def wooden_table(camera: Camera) -> Picture:
+    """A table of planks with a wall behind it, (H, W, 3), seen by `camera` in the right perspective."""
+    fine = camera.magnified(SUPERSAMPLING)
+    rays = fine.rays()
+    eye = np.array(fine.spec.eye)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        to_table = np.where(rays[..., 2] < 0, -eye[2] / rays[..., 2], np.inf)
+        to_wall = np.where(rays[..., 0] > 0, (TABLE_END - eye[0]) / rays[..., 0], np.inf)
+    nearest = np.minimum(np.minimum(to_table, to_wall), 10.0)  # a ray may meet neither, and is wall
+    points = eye + nearest[..., None] * rays
+    color = np.where((to_table < to_wall)[..., None], _wood(points), _wall(points))
+    picture = Image.fromarray(np.clip(color, 0, 255).astype(np.uint8))
+    return np.asarray(picture.resize((camera.spec.width, camera.spec.height), Image.Resampling.LANCZOS))
+
+
+def _wood(points: Array) -> Array:
+    """Colour of the table at world points (..., 3): planks along y, each with its own grain and tone."""
+    x, y = points[..., 0], points[..., 1]
+    plank = np.floor(x / PLANK_WIDTH)
+    shift = 7.3 * plank
+    rings = np.sin(2 * np.pi * (9 * x + 1.6 * _noise(3 * x + shift, 1.5 * y, 1) + shift))
+    fibre = _noise(260 * x, 9 * y + shift, 2)
+    tone = _noise(5.7 * plank, 0 * y, 3)
+    lightness = 0.45 + 0.16 * rings + 0.30 * (fibre - 0.5) + 0.35 * (tone - 0.5)
+    seam = np.abs(x / PLANK_WIDTH - plank - 0.5) > 0.49
+    shade = (1.06 - 0.35 * np.hypot(x - 0.3, y - 0.1)) * np.where(seam, 0.62, 1.0)
+    return np.asarray((DARK_WOOD + lightness[..., None] * (LIGHT_WOOD - DARK_WOOD)) * shade[..., None])
+
+
+def _wall(points: Array) -> Array:
+    y, z = points[..., 1], points[..., 2]
+    shade = 0.90 + 0.08 * np.tanh(4 * z) + 0.03 * (_noise(3 * y, 3 * z, 4) - 0.5)
+    return np.asarray(WALL * shade[..., None])
+
+
+def _noise(u: Array, v: Array, seed: int) -> Array:
+    """Smooth noise in [0, 1] on the plane: random values on a grid that repeats every 64 cells."""
+    grid: NDArray[np.float64] = np.random.default_rng(seed).random((64, 64))
+    cell_u, cell_v = np.floor(u).astype(int), np.floor(v).astype(int)
+    s, t = _ease(u - cell_u), _ease(v - cell_v)
+    near = (1 - s) * grid[cell_u % 64, cell_v % 64] + s * grid[(cell_u + 1) % 64, cell_v % 64]
+    far = (1 - s) * grid[cell_u % 64, (cell_v + 1) % 64] + s * grid[(cell_u + 1) % 64, (cell_v + 1) % 64]
+    return np.asarray((1 - t) * near + t * far)
+
+
+def _ease(share: Array) -> Array:
+    return np.asarray(share * share * (3 - 2 * share))
+
+
+INVISIBLE = (0.0, 0.0, 0.0, 0.0)
+"""Colour of what the renderer leaves out."""
+REST = 2e-4
+"""How far resting bodies may drift, metres or parts of a unit quaternion: under a tenth of a film's pixel."""
+
+
+@dataclass(frozen=True)
+class _Resting:
+    """The scene without its moving bodies. places: (bodies, 7) positions and quaternions; pictures: textures."""
+
+    backdrop: Backdrop
+    places: Array
+    pictures: tuple[int, ...]
+
+
+class FilmCamera:
+    """Draws one scene with fewer pixels. resting, moving: its bodies; those that move are drawn later.
+
+    The colours of all bodies are those that they have when this is made.
+    """
+
+    def __init__(
+        self, client: BulletClient, backdrop: Backdrop, resting: Iterable[int], moving: Iterable[int]
+    ) -> None:
+        self._client, self._empty = client, backdrop
+        self._resting, self._moving = tuple(resting), tuple(moving)
+        self._colors = {body: _colors(client, body) for body in (*self._resting, *self._moving)}
+        self._drawn: _Resting | None = None
+
+    def picture(self, camera: Camera, light: LightSpec, level: float, pictures: tuple[int, ...]) -> Picture:
+        """The finished picture (h, w, 3). pictures: textures that the resting bodies show."""
+        backdrop = self._backdrop(camera, light, level, pictures)
+        with self._without(self._resting):
+            return backdrop.under(camera.render(self._client, light, level))
+
+    def _backdrop(self, camera: Camera, light: LightSpec, level: float, pictures: tuple[int, ...]) -> Backdrop:
+        states = (self._client.getBasePositionAndOrientation(body) for body in self._resting)
+        places = np.array([np.concatenate(state) for state in states])
+        drawn, shape = self._drawn, (camera.spec.height, camera.spec.width)
+        if (
+            drawn is None
+            or drawn.backdrop.depth.shape != shape
+            or drawn.pictures != pictures
+            or np.abs(drawn.places - places).max() > REST
+        ):
+            with self._without(self._moving):
+                frame = camera.render(self._client, light, level)
+            self._drawn = drawn = _Resting(_over(self._empty.at_size(camera.spec), frame), places, pictures)
+        return drawn.backdrop
+
+    @contextmanager
+    def _without(self, bodies: Iterable[int]) -> Iterator[None]:
+        for body in bodies:
+            for link, number, _ in self._colors[body]:
+                self._client.changeVisualShape(body, link, number, rgbaColor=INVISIBLE)
+        try:
+            yield
+        finally:
+            for body in bodies:
+                for link, number, color in self._colors[body]:
+                    self._client.changeVisualShape(body, link, number, rgbaColor=color)
+
+
+def _colors(client: BulletClient, body: int) -> list[tuple[int, int, tuple[float, ...]]]:
+    """Link, number of the shape in its link, and colour of every visual shape: what `changeVisualShape` takes."""
+    colors: list[tuple[int, int, tuple[float, ...]]] = []
+    for shape in client.getVisualShapeData(body):
+        number = sum(link == shape[1] for link, *_ in colors)
+        colors.append((shape[1], number, shape[7]))
+    return colors
+
+
+def _over(backdrop: Backdrop, frame: Frame) -> Backdrop:
+    """The backdrop with the bodies of a frame in front of it."""
+    nearer = np.where(frame.bodies >= 0, np.minimum(frame.depth, backdrop.depth), backdrop.depth)
+    return Backdrop(backdrop.under(frame), nearer)

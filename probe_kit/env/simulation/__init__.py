@@ -1,1 +1,0 @@
-"""The physics server, its camera and textures."""

@@ -1,0 +1,251 @@
+"""Loading of a network: configuration, renamed weights, random weights, and the card."""
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from huggingface_hub.errors import StrictDataclassError
+from torch import Tensor, nn
+
+from probe_kit._system.bounded_json import load_json
+from probe_kit.errors import CheckpointError, UsageError, WeightsError
+from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, chosen_dtype, content_hashes, side_files
+from probe_kit.hooks.checkpoints.folders import checkpoint_folder
+from probe_kit.hooks.checkpoints.weights import Weights, WeightsAudit, load_weights, read_weights
+from probe_kit.hooks.contract.card import ModelCard
+from probe_kit.models.building import initialise, without_precision
+from probe_kit.models.checkpoint_files import Renames, renamed
+
+DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
+
+
+@dataclass(frozen=True)
+class Loaded[Network: nn.Module]:
+    """A network with its weights, what loading proved, and where it is from.
+
+    dtype: of the weights, as the card has it. checkpoint: as requested. folder: of its other files. weights_seed:
+    of random weights, else None. notes, exact: of the card.
+    """
+
+    network: Network
+    audit: WeightsAudit
+    dtype: str
+    device: str
+    checkpoint: str
+    folder: Path
+    weights_seed: int | None = None
+    notes: tuple[str, ...] = ()
+    exact: bool = True
+
+    def card(
+        self,
+        family: str,
+        settings: Mapping[str, str],
+        *,
+        files: Mapping[str, Path] | None = None,
+        tokenizer: str | Path | None = None,
+        notes: Iterable[str] = (),
+        **fields: Any,
+    ) -> ModelCard:
+        """The card of the model; its settings begin with the content of every file that is read.
+
+        files: besides the weights, by name; default those of the folder. tokenizer: of another folder, or a name.
+        fields: further ones of `ModelCard`.
+        """
+        read = side_files(self.folder) if files is None else dict(files)
+        if tokenizer is not None and (other := Path(tokenizer).expanduser()) != self.folder and other.is_dir():
+            read |= side_files(other, "tokenizer/")
+        return ModelCard(
+            family=family,
+            checkpoint=self.checkpoint,
+            weights_sha256=self.audit.sha256,
+            random_weights=self.audit.random,
+            parameters=self.audit.parameters,
+            dtype=self.dtype,
+            device=self.device,
+            notes=(*self.notes, *notes),
+            audit=self.audit.to_json(),
+            settings={**content_hashes(read), **settings},
+            exact=self.exact,
+            weights_seed=self.weights_seed,
+            **fields,
+        )
+
+
+def _nothing(_: object) -> None:
+    """Do nothing with a network."""
+
+
+def load_network[Network: nn.Module](
+    build: Callable[[torch.dtype, str], Network],
+    read: Callable[[], Weights],
+    checkpoint: str,
+    folder: Path,
+    device: str,
+    dtype: str | None,
+    random_weights: bool,
+    weights_seed: int,
+    *,
+    name_in_module: Callable[[str], str] = str,
+    tensors_of: Callable[[Weights], Mapping[str, Tensor]] | None = None,
+    draw: Callable[[Network, int], object] = initialise,
+    finish: Callable[[Network], object] = _nothing,
+) -> Loaded[Network]:
+    """Load the network that `build(dtype, device)` makes, with exactly the weights of `read()` or random ones.
+
+    A file may leave out parameters that are another one's double, such as tied output weights.
+
+    dtype: float32 or bfloat16; default that of the tensors in the file, float32 for random weights.
+    name_in_module: the network's name of a tensor in the file. tensors_of: the tensors under the network's names,
+    where that is not all. draw: random weights of a seed. finish: called with the whole network, before it goes to
+    the device. Raises UsageError for another dtype, WeightsError for weights that are not exactly the network's.
+    """
+    if random_weights:
+        name = chosen_dtype(dtype, None, DTYPES)
+        network = build(DTYPES[name], "cpu")
+        draw(network, weights_seed)
+        weights = Weights(network.state_dict(), f"random twin of {checkpoint}", random=True)
+        audit = load_weights(network, weights, weights.tensors)
+    else:
+        weights = read()
+        name = chosen_dtype(dtype, _stored_dtype(weights), DTYPES)
+        # On the meta device, without memory: a parameter that no file fills stays empty and is found, and large
+        # models are not held twice.
+        network = build(DTYPES[name], "meta")
+        tensors = tensors_of(weights) if tensors_of else renamed_tensors(weights, name_in_module)
+        audit = assign_weights(network, weights, as_dtype(tensors, DTYPES[name]), name_in_module)
+    network.requires_grad_(False)  # a gradient is asked for at activations only
+    finish(network)
+    seed = weights_seed if random_weights else None
+    notes = (audit.adapter,) if audit.adapter else ()
+    return Loaded(network.to(device), audit, name, device, checkpoint, folder, seed, notes)
+
+
+def renamed_tensors(weights: Weights, name_in_module: Callable[[str], str]) -> dict[str, Tensor]:
+    """The tensors of a file under the network's names. Raises WeightsError for two of one name."""
+    tensors = {name_in_module(name): value for name, value in weights.tensors.items()}
+    if len(tensors) < len(weights.tensors):
+        raise WeightsError(f"{weights.source}: two tensors have the same name here; nothing was run")
+    return tensors
+
+
+def assign_weights(
+    network: nn.Module,
+    weights: Weights,
+    tensors: Mapping[str, Tensor],
+    name_in_module: Callable[[str], str],
+) -> WeightsAudit:
+    """Make `tensors` the parameters of a network on the meta device, and tie doubles again.
+
+    Raises WeightsError for a double with other numbers and for tensors without memory, and what `load_weights`
+    raises.
+    """
+    tied = doubles(network)
+    audit = load_weights(network, weights, tensors, tied, assign=True, name_in_module=name_in_module)
+    for double, original in tied.items():
+        module, _, name = double.rpartition(".")
+        setattr(network.get_submodule(module), name, network.get_parameter(original))
+        if double in tensors and not torch.equal(network.state_dict()[double], tensors[double]):
+            raise WeightsError(
+                f"{weights.source}: {double} differs from the tensor that config.json ties it to "
+                "(tie_word_embeddings); one of the two files is another model's"
+            )
+    _check_filled(network, weights.source)
+    return audit
+
+
+def doubles(network: nn.Module) -> dict[str, str]:
+    """Parameters that are another one's double, with the name of that one."""
+    names = {id(parameter): name for name, parameter in network.named_parameters()}
+    every = network.named_parameters(remove_duplicate=False)
+    return {name: names[id(parameter)] for name, parameter in every if names[id(parameter)] != name}
+
+
+def as_dtype(tensors: Mapping[str, Tensor], dtype: torch.dtype) -> dict[str, Tensor]:
+    """The tensors, those of real numbers in `dtype`."""
+    return {name: value.to(dtype) if value.is_floating_point() else value for name, value in tensors.items()}
+
+
+def _check_filled(network: nn.Module, source: str) -> None:
+    """Raise WeightsError for tensors and buffers without memory."""
+    every = {**network.state_dict(), **dict(network.named_buffers())}
+    if empty := [name for name, tensor in every.items() if tensor.is_meta]:
+        raise WeightsError(f"{source}: {len(empty)} tensors were never filled: {', '.join(empty[:8])}")
+
+
+def _stored_dtype(weights: Weights) -> str:
+    """bfloat16 if every floating tensor of the file is, else float32: nothing is rounded unasked."""
+    kinds = {tensor.dtype for tensor in weights.tensors.values() if tensor.is_floating_point()}
+    return "bfloat16" if kinds == {torch.bfloat16} else "float32"
+
+
+Build = Callable[[Any, torch.dtype, str], Any]
+# What Python, torch and transformers raise for numbers and names in a configuration that cannot be. Many kinds,
+# because nothing checks a configuration before its numbers reach the layers.
+_OF_VALUES = (ValueError, TypeError, LookupError, AttributeError, ArithmeticError, RuntimeError, AssertionError)
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """The way from the files of a checkpoint to a family's network.
+
+    config: of the values of config.json. build: an empty network of a configuration, dtype and device.
+    names: from tensors in files to those of the network.
+    """
+
+    config: Callable[[Mapping[str, Any]], Any]
+    build: Build
+    names: Renames = ()
+
+
+def load_vlm(
+    recipe: Recipe,
+    checkpoint: str | None,
+    device: str,
+    dtype: str | None,
+    random_weights: bool,
+    weights_seed: int,
+) -> Loaded[Any]:
+    """The network of a checkpoint with exactly the weights of its files, or its random twin.
+
+    Raises UsageError without a checkpoint, CheckpointError for a configuration that describes no such network, and
+    WeightsError for weights that are not exactly the network's.
+    """
+    if checkpoint is None:
+        raise UsageError("name a folder or hub id as --checkpoint")
+    folder = checkpoint_folder(checkpoint)
+    file = folder / CONFIG_FILE
+    with _describing(file):
+        config = recipe.config(without_precision(load_json(file)))
+
+    def build(kind: torch.dtype, device: str) -> Any:
+        with _describing(file):
+            return recipe.build(config, kind, device)
+
+    return load_network(
+        build,
+        lambda: read_weights(folder),
+        checkpoint,
+        folder,
+        device,
+        dtype,
+        random_weights,
+        weights_seed,
+        name_in_module=lambda name: renamed(name, recipe.names),
+    )
+
+
+@contextmanager
+def _describing(file: Path) -> Iterator[None]:
+    """Whatever goes wrong inside is because of what a configuration says. Raises CheckpointError."""
+    try:
+        yield
+    except (*_OF_VALUES, StrictDataclassError, OSError) as error:
+        reason = " ".join(str(error).split())[:300]
+        raise CheckpointError(
+            f"{file} describes no network of this family ({type(error).__name__}: {reason}); download it "
+            "again, or pass the right --model"
+        ) from error

@@ -1,0 +1,268 @@
+"""Base adapters of models on Qwen's vision-language models: those that answer, and policies."""
+
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from probe_kit.errors import CheckpointError, InstructionError
+from probe_kit.hooks.contract.model import Policy, Tap
+from probe_kit.hooks.contract.observation import Observation, checked_picture
+from probe_kit.hooks.contract.roles import Roles
+from probe_kit.hooks.contract.sites import IMAGE_ROLE, PADDING, Site, Stream
+from probe_kit.hooks.families.shared.taps import decoder_tap, kept_prompt
+from probe_kit.hooks.families.shared.text import Frame, TokenizerFile
+from probe_kit.hooks.families.shared.vlm import Pictures, VisionLanguageModel
+from probe_kit.hooks.outputs import Arrays
+from probe_kit.models.decoding import LeftPacked
+from probe_kit.models.qwen import QwenInputs, QwenPictures, image_slots, merged_tokens, pack_inputs
+
+
+def tower_tap(tower: Any, layer: int, view: Callable[[Tensor], Tensor]) -> Tap:
+    """The first norm of a block, or the merger's norm, which reads the last one; patches in the tower's order.
+
+    view: from patches (N, D) to the activation of a site.
+    """
+    if layer < len(tower.blocks):
+        return Tap(tower.blocks[layer].norm1, 1, view=view)
+    merger = tower.merger
+    return Tap(merger.ln_q if hasattr(merger, "ln_q") else merger.norm, 1, view=view)
+
+
+def by_picture(patches: Tensor, grid: Tensor | None) -> Tensor:
+    """(pictures, patches of one, D) of (patches, D); (1, patches, D) where pictures differ in size.
+
+    grid: (pictures, 3) patches of each picture along time, height and width.
+    """
+    count = 1 if grid is None or bool((grid != grid[0]).any()) else len(grid)
+    return patches.view(count, -1, patches.shape[-1])
+
+
+SYSTEM = "<|im_start|>system\nYou are a helpful assistant.<|im_end|>\n"
+USER, ASSISTANT = "<|im_start|>user\n", "<|im_end|>\n<|im_start|>assistant\n"
+
+
+def qwen_frame(system: str = "") -> Frame:
+    """Qwen's chat of one turn."""
+    return Frame(f"{system}{USER}<|vision_start|>", "<|vision_end|>", f"{system}{USER}", ASSISTANT)
+
+
+class QwenVLM(VisionLanguageModel):
+    """A VLM on one of transformers' Qwen networks."""
+
+    picture_token: ClassVar[str | None] = "<|image_pad|>"
+    _grid: Tensor | None = None
+    """Of the pictures under way: towers run over the patches of all rows at once."""
+
+    @property
+    def tower(self) -> Any:
+        """The vision tower."""
+        return self.network.model.visual
+
+    @property
+    def vision_size(self) -> tuple[int, int]:
+        """Blocks and width of the vision tower."""
+        return len(self.tower.blocks), int(self.network.config.vision_config.hidden_size)
+
+    def vision_tap(self, layer: int) -> Tap:
+        """The first norm of a block, or what reads the last one; patches in the tower's own order."""
+        return tower_tap(self.tower, layer, self._by_picture)
+
+    def _by_picture(self, patches: Tensor) -> Tensor:
+        return by_picture(patches, self._grid)
+
+    @cached_property
+    def pictures(self) -> QwenPictures:
+        """The processor of pictures into patches. Raises CheckpointError naming the missing file."""
+        vision = self.network.config.vision_config
+        sizes = (int(vision.patch_size), int(vision.temporal_patch_size), int(vision.spatial_merge_size))
+        return QwenPictures.from_folder(self.loaded.folder, *sizes, fast=True)
+
+    def picture_ids(self, height: int, width: int) -> list[int]:
+        """Ids at a picture's positions, as many as its size demands."""
+        count = merged_tokens(self.pictures.grid(height, width), self.pictures.merge)
+        return [int(self.network.config.image_token_id)] * count
+
+    def picture_inputs(self, pictures: Pictures) -> dict[str, Tensor]:
+        """pixel_values (N, channels x time x patch x patch) and image_grid_thw (B, 3)."""
+        pixels, self._grid = self.pictures.patches(pictures)
+        device = self.loaded.device
+        return {"pixel_values": pixels.to(device), "image_grid_thw": self._grid.to(device)}
+
+    def positions(self, packed: LeftPacked, picture_inputs: dict[str, Tensor]) -> Tensor:
+        """(3, B, T) over time, height and width, as the native class counts them; 0 at padding."""
+        counted, _ = self.network.model.get_rope_index(
+            packed.ids,
+            image_grid_thw=picture_inputs.get("image_grid_thw"),
+            attention_mask=packed.mask,
+            **self.other_inputs(packed),
+        )
+        positions: Tensor = counted
+        return positions
+
+    def other_inputs(self, packed: LeftPacked) -> dict[str, Tensor]:
+        """mm_token_type_ids: 1 at positions of pictures. Left out, Qwen2.5-VL silently counts them as text."""
+        return {"mm_token_type_ids": (packed.ids == int(self.network.config.image_token_id)).long()}
+
+
+BACKBONE_ROLES = (IMAGE_ROLE, "language", "special", PADDING)
+
+
+class QwenVLA(Policy):
+    """A policy whose backbone is one of transformers' Qwen vision-language models.
+
+    Subclasses define the model's inputs, and what follows the backbone.
+    """
+
+    fast_pictures: ClassVar[bool]
+    """Which of Qwen's two picture processors the model's authors ran."""
+
+    def __init__(self, vlm: Any, folder: Path, tokenizer: str | None, device: str) -> None:
+        """vlm: `Qwen…VLForConditionalGeneration`. folder: of tokenizer.json and preprocessor_config.json."""
+        self.vlm, self.folder, self.device = vlm, folder, device
+        self._tokenizer_folder = folder if tokenizer is None else Path(tokenizer).expanduser()
+        # Pictures of the inference under way: vision towers run over the patches of all rows at once.
+        self._grid: Tensor | None = None
+
+    @property
+    def language(self) -> Any:
+        """The decoder."""
+        return self.vlm.model.language_model
+
+    @property
+    def tower(self) -> Any:
+        """Qwen's vision tower."""
+        return self.vlm.model.visual
+
+    def backbone_stream(self) -> Stream:
+        """The decoder's stream."""
+        text = self.vlm.config.text_config
+        heads = int(text.num_attention_heads)
+        return Stream("backbone", len(self.language.layers) + 1, int(text.hidden_size), heads=heads)
+
+    def backbone_kv(self) -> Stream:
+        """The decoder's keys and values."""
+        return kept_prompt(self.vlm.config.text_config)
+
+    def vision_stream(self) -> Stream:
+        """The vision tower's stream; the last site is what its merger reads."""
+        vision = self.vlm.config.vision_config
+        return Stream("vision", len(self.tower.blocks) + 1, int(vision.hidden_size), quantities=("residual",))
+
+    # -- what a family decides ---------------------------------------------------------------------------
+
+    @property
+    @abstractmethod
+    def units(self) -> Any:
+        """The statistics that give actions their units. Raises CheckpointError for none."""
+
+    @abstractmethod
+    def text(self, instruction: str) -> str:
+        """The whole prompt with one image slot."""
+
+    @abstractmethod
+    def look(self, observation: Observation) -> Any:
+        """(H, W, 3) uint8 the processor gets."""
+
+    def units_or_reason(self) -> Any:
+        """The units, or why there are none: a checkpoint without them can be captured and cannot act."""
+        try:
+            return self.units
+        except CheckpointError as error:
+            return str(error)
+
+    def patched_picture(self, observation: Observation) -> Any:
+        """(H, W, 3) uint8 that is cut into patches; another one where the authors resize once more before."""
+        return self.look(observation)
+
+    # -- inputs ------------------------------------------------------------------------------------------
+
+    @cached_property
+    def tokenizer(self) -> TokenizerFile:
+        """The checkpoint's. Raises CheckpointError for a missing file, and for one of another model."""
+        tokenizer = TokenizerFile(self._tokenizer_folder)
+        tokenizer.check_present()
+        tokenizer.check_vocabulary(int(self.vlm.config.text_config.vocab_size))
+        return tokenizer
+
+    @cached_property
+    def pictures(self) -> QwenPictures:
+        """The processor of pictures into patches. Raises CheckpointError naming the missing file."""
+        vision = self.vlm.config.vision_config
+        sizes = (int(vision.patch_size), int(vision.temporal_patch_size), int(vision.spatial_merge_size))
+        return QwenPictures.from_folder(self.folder, *sizes, fast=self.fast_pictures)
+
+    def prompt(self, instruction: str) -> list[int]:
+        """Ids of the whole prompt, one for the picture."""
+        ids: list[int] = self.tokenizer.encoding(self.text(instruction)).ids
+        return ids
+
+    def token_ids(self, instructions: Sequence[str]) -> list[tuple[int, ...]]:
+        """The ids of each whole prompt, one for the picture."""
+        return [tuple(self.prompt(instruction)) for instruction in instructions]
+
+    def rows(self, observations: Sequence[Observation]) -> list[list[int]]:
+        """Per observation the ids the backbone gets, the picture's as often as its size demands.
+
+        Raises InstructionError for a prompt that is too long.
+        """
+        limit = int(self.vlm.config.text_config.max_position_embeddings)
+        rows = []
+        for observation in observations:
+            grid = self.pictures.grid(*self.look(observation).shape[:2])
+            count = merged_tokens(grid, self.pictures.merge)
+            row = image_slots(self.prompt(observation.instruction), self._image_token, [count])
+            if len(row) > limit:
+                raise InstructionError(f"a prompt makes {len(row)} positions; this model has {limit}. Shorten it")
+            rows.append(row)
+        return rows
+
+    def inputs(self, observations: Sequence[Observation]) -> QwenInputs:
+        """The observations as the backbone reads them, on the model's device. Raises ObservationError."""
+        for observation in observations:
+            checked_picture(observation.image)
+        pixels, grid = self.pictures.patches([self.patched_picture(observation) for observation in observations])
+        padding = self.vlm.config.text_config.pad_token_id
+        packed = pack_inputs(
+            self.rows(observations), pixels, grid, self._image_token, 0 if padding is None else int(padding)
+        )
+        return packed.to(self.device)
+
+    @property
+    def _image_token(self) -> int:
+        return int(self.vlm.config.image_token_id)
+
+    # -- capture -----------------------------------------------------------------------------------------
+
+    def backbone_roles(self, observations: Sequence[Observation]) -> list[Roles]:
+        """Chat marks, picture, text; padding behind it where another prompt is longer."""
+        rows, special = self.rows(observations), self.tokenizer.special
+
+        def role(number: int) -> str:
+            if number == self._image_token:
+                return IMAGE_ROLE
+            return "special" if number in special else "language"
+
+        return Roles.padded([list(map(role, row)) for row in rows])
+
+    def backbone_tap(self, site: Site) -> Tap:
+        """The first norm of the block the site enters, the final norm, or a block's output."""
+        return decoder_tap(self.language.layers, self.language.norm, site)
+
+    def vision_tap(self, site: Site) -> Tap:
+        """The first norm of the block, or what reads the last one; patches in the tower's own order."""
+        return tower_tap(self.tower, site.layer, self._by_picture)
+
+    def _by_picture(self, patches: Tensor) -> Tensor:
+        return by_picture(patches, self._grid)
+
+
+def recorded_inputs(policy: QwenVLA, recorded: Arrays) -> QwenInputs:
+    """Return the packed prompts of a golden reference."""
+    names = ("in_input_ids", "in_attention_mask", "in_pixel_values", "in_image_grid_thw")
+    ids, mask, pixels, grid = (torch.from_numpy(recorded[name]) for name in names)
+    return QwenInputs(ids, mask, pixels, grid, int(policy.vlm.config.image_token_id))

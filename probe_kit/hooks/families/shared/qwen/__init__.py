@@ -1,1 +1,0 @@
-"""Code that models on Qwen's vision-language models share."""

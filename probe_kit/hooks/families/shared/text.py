@@ -1,0 +1,241 @@
+"""The text side of a model: a checkpoint's `tokenizer.json`, and the frame of a question.
+
+The file is read by the `tokenizers` library itself: transformers 5 rebuilds Llama's tokenizer by rules of its own,
+while the released models were trained with what the file says.
+"""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import takewhile
+from pathlib import Path
+from typing import Any
+
+from tokenizers import Tokenizer
+
+from probe_kit._system.bounded_json import load_json
+from probe_kit.errors import CheckpointError, InstructionError, UsageError
+from probe_kit.hooks.checkpoints.checkpoint import GENERATION_FILE
+
+TOKENIZER_FILE, SETTINGS_FILE = "tokenizer.json", "tokenizer_config.json"
+
+
+@dataclass(frozen=True)
+class TokenizerFile:
+    """The tokenizer of a folder, with the names of special tokens from the file beside it, if any."""
+
+    folder: Path
+
+    @property
+    def file(self) -> Path:
+        """The file of the tokenizer."""
+        return self.folder / TOKENIZER_FILE
+
+    def check_present(self) -> None:
+        """Raise CheckpointError where the file is missing."""
+        if not self.file.is_file():
+            raise CheckpointError(
+                f"{self.file} is missing. The tokenizer comes with the checkpoint or with the model it was made "
+                "of: copy it from that model's page, or name a folder that has it with -M tokenizer=DIR"
+            )
+
+    def check_vocabulary(self, vocabulary: int) -> None:
+        """Raise CheckpointError for ids that a model of so many does not have."""
+        if (highest := max(self.tokenizer.get_vocab(with_added_tokens=True).values())) >= vocabulary:
+            raise CheckpointError(
+                f"{self.file} has ids up to {highest}; this model has {vocabulary}. The tokenizer belongs to "
+                "another checkpoint"
+            )
+
+    @cached_property
+    def tokenizer(self) -> Any:
+        """The library's tokenizer."""
+        return Tokenizer.from_file(str(self.file))
+
+    @cached_property
+    def settings(self) -> dict[str, Any]:
+        """The settings beside it; none without the file. Raises CheckpointError for one that is not JSON."""
+        return values_of(self.folder / SETTINGS_FILE)
+
+    def token_of(self, kind: str) -> str | None:
+        """The text of a special token such as `pad_token`, None where the settings name none."""
+        token = self.settings.get(kind)
+        return (token.get("content") if isinstance(token, dict) else token) or None
+
+    @cached_property
+    def special(self) -> frozenset[int]:
+        """Ids that stand for no text, such as the ends of a chat's turns."""
+        added = self.tokenizer.get_added_tokens_decoder()
+        return frozenset(number for number, token in added.items() if token.special)
+
+    def encoding(self, text: str, special: bool = False) -> Any:
+        """The library's encoding. special: with the tokens that the file puts around a text.
+
+        Raises InstructionError for a word that the tokenizer does not know.
+        """
+        encoding = self.tokenizer.encode(text, add_special_tokens=special)
+        unknown = getattr(self.tokenizer.model, "unk_token", None)
+        if unknown is not None and self.tokenizer.token_to_id(unknown) in encoding.ids:
+            raise InstructionError(
+                f"{text!r} has a word this checkpoint's tokenizer does not know; the model would not read it. "
+                f"Tokens: {encoding.tokens}"
+            )
+        return encoding
+
+    def check_marks(self, text: str) -> None:
+        """Raise InstructionError for a text that holds a special token."""
+        for token in self.tokenizer.get_added_tokens_decoder().values():
+            if token.special and token.content in text:
+                raise InstructionError(
+                    f"the text {text!r} holds {token.content!r}, which stands for something else in the prompt; "
+                    "write it without"
+                )
+
+    def words(self, ids: Sequence[int], ends: Collection[int] = ()) -> str:
+        """The text of ids up to one of `ends`, without special tokens."""
+        answer = list(takewhile(lambda number: number not in ends, ids))
+        return str(self.tokenizer.decode(answer, skip_special_tokens=True)).strip()
+
+
+def positions_of(encoding: Any, start: int, stop: int) -> tuple[bool, ...]:
+    """True for ids, special ones left out, that hold characters from `start` up to `stop` of the text."""
+    return tuple(
+        first < stop and last > start and not special
+        for (first, last), special in zip(encoding.offsets, encoding.special_tokens_mask, strict=True)
+    )
+
+
+def first_behind(before: Sequence[int], extended: Sequence[int], option: str) -> int:
+    """The first id of an option. before, extended: the ids of a prompt without it and with it behind.
+
+    Raises UsageError for an option that changes the prompt's own ids: its logit would be that of another prompt.
+    """
+    count = len(before)
+    if len(extended) == count or extended[:count] != before:
+        raise UsageError(
+            f"the option {option!r} merges with the end of the prompt: {list(extended[count - 2 :])} instead of "
+            f"{list(before[-2:])} and more. Give it as it stands behind the prompt, such as ' A'"
+        )
+    return int(extended[count])
+
+
+def token_ids_of(*stored: Any) -> frozenset[int]:
+    """The ids in values of configurations, each of which is an id, a list of them, or None."""
+    flat = [number for value in stored for number in (value if isinstance(value, list) else [value])]
+    return frozenset(int(number) for number in flat if number is not None)
+
+
+def values_of(file: Path) -> dict[str, Any]:
+    """A file's values; none without it. Raises CheckpointError for one that is not JSON."""
+    if not file.is_file():
+        return {}
+    try:
+        return dict(load_json(file))
+    except ValueError as error:
+        raise CheckpointError(f"{file} is not JSON ({error}); download the checkpoint again") from error
+
+
+@dataclass(frozen=True)
+class Frame:
+    """The fixed strings around a question.
+
+    before: in front of the picture's positions. behind: between them and the question. bare: in front of a
+    question that comes without a picture. end: behind the question; the answer begins there.
+    """
+
+    before: str
+    behind: str
+    bare: str
+    end: str
+
+    def __str__(self) -> str:
+        return f"{self.before}[picture]{self.behind}[question]{self.end} or {self.bare}[question]{self.end}"
+
+
+@dataclass(frozen=True)
+class TokenPrompt:
+    """A whole prompt.
+
+    text: behind the picture's positions. ids: of everything. question: which of the ids are the question.
+    picture: first position of the picture and the one behind its last; equal where there is none.
+    """
+
+    text: str
+    ids: tuple[int, ...]
+    question: tuple[bool, ...]
+    picture: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class FramedText(TokenizerFile):
+    """A model's tokenizer and frame. vocabulary: ids the model has. ends: end tokens of an answer."""
+
+    frame: Frame
+    vocabulary: int
+    ends: frozenset[int]
+
+    @classmethod
+    def of(cls, folder: Path, frame: Frame, config: Any, generation: Path) -> "FramedText":
+        """Read the files in `folder`.
+
+        config: of the language model. generation: folder that may hold generation_config.json.
+        Raises CheckpointError for missing files and for a tokenizer of another model.
+        """
+        TokenizerFile(folder).check_present()
+        text = cls(folder, frame, int(config.vocab_size), _ends(generation, config))
+        text.check_vocabulary(text.vocabulary)
+        return text
+
+    @cached_property
+    def padding(self) -> int:
+        """The id that pads; it is masked."""
+        content = self.token_of("pad_token")
+        number = self.tokenizer.token_to_id(content) if content else None
+        return 0 if number is None else int(number)
+
+    def check_token(self, token: str, number: int) -> None:
+        """Raise CheckpointError unless the tokenizer knows `token` by the id that the model expects."""
+        if (tokenizer_id := self.tokenizer.token_to_id(token)) != number:
+            raise CheckpointError(
+                f"{self.file} has {token} as id {tokenizer_id}, config.json says {number}. "
+                "The tokenizer belongs to another checkpoint"
+            )
+
+    def prompt(
+        self, question: str, begun: str = "", picture: Sequence[int] | None = None, marks: int = 0
+    ) -> TokenPrompt:
+        """The prompt of a question.
+
+        begun: how the answer has begun already. picture: ids at the positions of a picture, None without one;
+        `marks` of them at either end are no picture but say where it begins and ends.
+        Raises InstructionError for text that holds a token of the frames or one the tokenizer does not know.
+        """
+        self.check_marks(question + begun)
+        lead = self.frame.bare if picture is None else self.frame.behind
+        text = lead + question + self.frame.end + begun
+        before = [] if picture is None else [*self.encoding(self.frame.before).ids, *picture]
+        behind = self.encoding(text)
+        start, stop = len(lead), len(lead) + len(question)
+        is_question = positions_of(behind, start, stop)
+        picture_span = (len(before) - len(picture or ()) + marks, len(before) - marks) if picture else (0, 0)
+        return TokenPrompt(text, (*before, *behind.ids), (*[False] * len(before), *is_question), picture_span)
+
+    def option(self, prompt: TokenPrompt, option: str) -> int:
+        """The first id of `option` behind a prompt. Raises UsageError if it changes the prompt's own ids."""
+        return first_behind(self.encoding(prompt.text).ids, self.encoding(prompt.text + option).ids, option)
+
+    def decode(self, ids: Sequence[int]) -> str:
+        """The text of ids up to an end, without special tokens."""
+        return self.words(ids, self.ends)
+
+
+def _ends(folder: Path, config: Any) -> frozenset[int]:
+    """The end tokens in generation_config.json, or else in the configuration. Raises CheckpointError for none."""
+    stored = values_of(folder / GENERATION_FILE).get("eos_token_id", getattr(config, "eos_token_id", None))
+    numbers = stored if isinstance(stored, list) else [stored]
+    if None in numbers or not numbers:
+        raise CheckpointError(
+            f"neither {folder / GENERATION_FILE} nor config.json names eos_token_id, the end of an answer. "
+            "Copy the file from the model's page"
+        )
+    return frozenset(map(int, numbers))

@@ -1,1 +1,0 @@
-"""Code that vision-language models with text answers share."""

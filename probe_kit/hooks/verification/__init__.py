@@ -1,1 +1,0 @@
-"""Comparison with outputs of the original implementation."""

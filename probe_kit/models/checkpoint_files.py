@@ -1,0 +1,137 @@
+"""Small files of checkpoints: names of tensors, processors, statistics. Imports no torch."""
+
+import re
+from collections.abc import Collection, Mapping, Sequence
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+from probe_kit._system.bounded_json import load_json, read_json_object
+from probe_kit.errors import CheckpointError, UsageError
+
+Renames = tuple[tuple[str, str], ...]
+"""Patterns and replacements, applied in this order."""
+
+LANGUAGE_FIRST: Renames = (
+    (r"^language_model\.lm_head\.", "lm_head."),
+    (r"^language_model\.model\.", "model.language_model."),
+    (r"^(vision_tower|multi_modal_projector)\.", r"model.\1."),
+)
+"""Where files hold a whole language model; files saved by today's transformers stay as they are."""
+
+
+def renamed(name: str, renames: Sequence[tuple[str, str]]) -> str:
+    """The module's name of a tensor that a file calls `name`."""
+    for pattern, replacement in renames:
+        name = re.sub(pattern, replacement, name)
+    return name
+
+
+PROCESSOR_FILE = "preprocessor_config.json"
+
+
+def processor_settings(folder: Path, needed: Sequence[str], optional: Sequence[str] = ()) -> dict[str, Any]:
+    """The named values of the file in `folder`; `optional` ones only where they are set.
+
+    Raises CheckpointError if the file is missing, is not JSON or lacks a needed one.
+    """
+    file = folder / PROCESSOR_FILE
+    if not file.is_file():
+        raise CheckpointError(
+            f"{file} is missing; it defines how pictures are prepared for this checkpoint. "
+            "Copy it from the model's page"
+        )
+    try:
+        values = load_json(file)
+    except ValueError as error:
+        raise CheckpointError(f"{file} is not JSON ({error}); download the checkpoint again") from error
+    if not isinstance(values, dict) or (missing := [name for name in needed if values.get(name) is None]):
+        raise CheckpointError(f"{file} lacks {', '.join(missing) if isinstance(values, dict) else 'named values'}")
+    return {name: values[name] for name in (*needed, *optional) if values.get(name) is not None}
+
+
+def square_side(values: dict[str, Any], folder: Path) -> int:
+    """Pixels of the side of the square that `size` names. Raises CheckpointError if it names none."""
+    size = values["size"]
+    height, width = (size.get(side) if isinstance(size, dict) else size for side in ("height", "width"))
+    if not isinstance(height, int) or height != width:
+        raise CheckpointError(f"{folder / PROCESSOR_FILE} has size {size}; expected a square of so many pixels")
+    return height
+
+
+_REMOTE_CODE = "trust_remote_code"
+
+
+def load_pretrained(loader: Any, source: Path | str, **options: Any) -> Any:
+    """Return `loader.from_pretrained(source, **options)` of a class of transformers.
+
+    A configuration can name Python code in its `auto_map`; without `trust_remote_code=False`, transformers asks on
+    the terminal whether to run it. source: a folder or a hub id.
+    Raises CheckpointError where the object needs such code, OSError for missing files, ValueError for others.
+    """
+    try:
+        return loader.from_pretrained(str(source), trust_remote_code=False, **options)
+    except ValueError as error:
+        if _REMOTE_CODE not in str(error):
+            raise
+        raise CheckpointError(
+            f"{source}: its configuration names Python code (auto_map) for {loader.__name__}, and probe_kit runs "
+            "no code of a checkpoint. Take files that name a class of transformers, such as tokenizer.json with "
+            "tokenizer_class in tokenizer_config.json"
+        ) from error
+
+
+STATISTICS_FILE = "dataset_statistics.json"
+_SHOWN = 40
+
+
+def read_statistics(file: Path) -> dict[str, Any]:
+    """Per data set `{"action": {"q01": …, "q99": …, "mask": …}}`; in the file `action` may be left out.
+
+    Raises CheckpointError for a file that is missing or holds something else.
+    """
+    values = read_json_object(file, CheckpointError, "Take the file that fine-tuning wrote")
+    entries = values.get("norm_stats", values)
+    if not isinstance(entries, dict) or not all(isinstance(entry, dict) for entry in entries.values()):
+        raise CheckpointError(f"{file} holds no statistics per data set. Take the file that fine-tuning wrote")
+    return {key: entry if "action" in entry else {"action": entry} for key, entry in entries.items()}
+
+
+def stored_statistics(
+    folders: Sequence[Path], otherwise: Mapping[str, Any], source: str
+) -> tuple[Mapping[str, Any], str]:
+    """The statistics that count for a checkpoint, and the name of their source, for messages.
+
+    `dataset_statistics.json` of the first folder that has one stands alone: fine-tuning wrote it, and a
+    configuration still lists the data sets of the base. otherwise: those that count without the file, and `source`
+    where they stand. Raises CheckpointError for a file that cannot be read.
+    """
+    for folder in folders:
+        if (file := folder / STATISTICS_FILE).is_file():
+            return read_statistics(file), str(file)
+    return otherwise, source
+
+
+def chosen_name(available: Collection[str], requested: str | None, option: str, source: str) -> str:
+    """The data set, or robot, whose statistics are used: as chosen, or the only one.
+
+    option: of `-M`, for messages. source: the file that holds them. Raises UsageError for a name that is not
+    there, and for several without a choice: no file says whose units the actions get.
+    """
+    names = sorted(available)
+    listed = ", ".join(names[:_SHOWN]) + (f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else "")
+    if requested is None:
+        if len(names) == 1:
+            return names[0]
+        raise UsageError(
+            f"{source} has several action statistics, and nothing says whose units the actions get. Choose one "
+            f"with -M {option}=NAME: {listed}"
+        )
+    if requested not in available:
+        near = get_close_matches(requested, names, n=1)
+        hint = f" Did you mean {near[0]}?" if near else ""
+        raise UsageError(
+            f"{source} has no action statistics of {requested!r}. Choose one with "
+            f"-M {option}=NAME: {listed}.{hint}"
+        )
+    return requested

@@ -1,8 +1,0 @@
-"""The folder of the checkpoints that come with the package. Imports nothing heavy."""
-
-from pathlib import Path
-
-
-def embedded_checkpoint(name: str) -> Path:
-    """Folder of a checkpoint that comes with the package: such as `pi0-tiny` or `vlm-tiny`."""
-    return Path(__file__).parents[1] / "checkpoints" / name

@@ -1,1 +1,0 @@
-"""lerobot's own policies at the size of a checkpoint."""
