@@ -14,7 +14,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from probe_kit.study import load_study, plan_study
-from probe_kit.study.failures import Failure
+from probe_kit.study.cells import Failure
 from probe_kit.study.plan import StudyPlan
 from probe_kit.study.playing import Made, ModelTask, RunTask, play_models
 

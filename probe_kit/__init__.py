@@ -10,7 +10,7 @@ Data flows one way: suite → env → hooks → runs → extract → train → i
 
 from typing import TYPE_CHECKING
 
-from probe_kit._system.lazy import lazy_names
+from probe_kit._system.imports import lazy_names
 from probe_kit.version import __version__ as __version__
 
 if TYPE_CHECKING:

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 import typer.core
 
+from probe_kit._system.escaping import terminal_safe
 from probe_kit._terminal.console import marked, out, say
 from probe_kit._terminal.error_reporting import report_error
+from probe_kit._terminal.field_options import PanelledHelp
 from probe_kit._terminal.interruption import begun
-from probe_kit._terminal.panelled_help import PanelledHelp
-from probe_kit._terminal.plain_text import terminal_safe
 from probe_kit.check_adapter.command import check_adapter
 from probe_kit.demo.commands import demo
 from probe_kit.diagnose.commands import diagnose

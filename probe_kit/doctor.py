@@ -20,7 +20,7 @@ from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
 from probe_kit._system.counting import counted
-from probe_kit._system.installing import install_command
+from probe_kit._system.imports import install_command
 from probe_kit._system.machine import cores_here
 from probe_kit.errors import SceneError
 

@@ -18,10 +18,10 @@ from typing import Any
 import resvg_py
 from PIL import Image
 
-from probe_kit.suite.generators.art import CELL_PIXELS, COLUMNS, FOLDER
-from probe_kit.suite.generators.categories.living_world import CREATURES, THINGS
-from probe_kit.suite.generators.categories.public_info import PICTOGRAMS
-from probe_kit.suite.generators.categories.traffic import ROAD_SIGN_ICONS
+from probe_kit.suite.generators.drawing import CELL_PIXELS, COLUMNS, FOLDER
+from probe_kit.suite.generators.living_world import CREATURES, THINGS
+from probe_kit.suite.generators.public_info import PICTOGRAMS
+from probe_kit.suite.generators.traffic import ROAD_SIGN_ICONS
 
 FLUENT_PACKAGE = "iconify-json-fluent-emoji-flat-1.2.6.tgz"
 MATERIAL_PACKAGE = "iconify-json-ic-1.2.4.tgz"

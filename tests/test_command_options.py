@@ -13,8 +13,8 @@ import typer
 from typer.testing import CliRunner
 
 from probe_kit._tables.printing import STYLES
+from probe_kit._terminal.field_options import HELP_ALL
 from probe_kit._terminal.options import read_categories
-from probe_kit._terminal.panelled_help import HELP_ALL
 from probe_kit.cli import app, commands_of
 from probe_kit.env.arm import ARMS
 from probe_kit.env.scoring import RULES
@@ -41,7 +41,7 @@ from probe_kit.runs.layout import (
 from probe_kit.scene_names import ArmName, Rendering, RuleName, SceneName
 from probe_kit.statistics.folds import FOLD_UNITS, FoldUnit
 from probe_kit.suite.converters.conversion import EVERY_SOURCE
-from probe_kit.suite.wording import WORDINGS, Wording
+from probe_kit.suite.items import WORDINGS, Wording
 from probe_kit.train.choices import CONTROLS, INCOMPLETE, SIDES, TASKS, Control, Incomplete, Side, Task
 
 LEAVES: dict[str, Any] = dict(commands_of(typer.main.get_command(app), None))

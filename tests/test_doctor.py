@@ -12,7 +12,7 @@ import pytest
 from typer.testing import CliRunner
 
 from probe_kit import doctor
-from probe_kit._system.installing import install_command
+from probe_kit._system.imports import install_command
 from probe_kit.cli import app
 from probe_kit.doctor import Finding, State
 

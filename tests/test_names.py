@@ -58,7 +58,7 @@ STORED = {
     ("probe_kit/intervene/results/verdict.py", "place"),
     ("probe_kit/retention/behaviour.py", "one"),
     ("probe_kit/retention/compare/known_used.py", "asked"),
-    ("probe_kit/suite/generators/categories/attribute.py", "thing"),
+    ("probe_kit/suite/generators/attribute.py", "thing"),
 }
 """Keys of tables and of stored results, which the fence holds, and a field that is hashed into items."""
 PRONOUNS = re.compile(

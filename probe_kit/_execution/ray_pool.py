@@ -10,7 +10,7 @@ from queue import SimpleQueue
 from typing import Any, Self
 
 from probe_kit._execution.worker import Lost, Work, serve
-from probe_kit._system.optional_dependencies import require
+from probe_kit._system.imports import require
 from probe_kit.errors import UsageError
 
 AUTO = "auto"

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from probe_kit._system.bounded_files import open_regular
-from probe_kit._system.optional_dependencies import require
+from probe_kit._system.imports import require
 
 MOST_BYTES = 1 << 30
 """Of the cells of one reading, in memory."""

@@ -7,9 +7,9 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from probe_kit._system.escaping import without_places
 from probe_kit._tables.content import Cell, Content, heat_colour
 from probe_kit._tables.numbers import NONE
-from probe_kit._terminal.plain_text import without_places
 
 if TYPE_CHECKING:
     from jinja2 import Environment

@@ -5,10 +5,9 @@ from dataclasses import dataclass, replace
 from math import isinf
 from typing import Literal, Self
 
-from probe_kit._system.column_cells import Cell, number_or_cell, values_of
-from probe_kit._system.table_cells import group_names
+from probe_kit._system.escaping import UNSAFE, terminal_safe
+from probe_kit._system.table_cells import Cell, group_names, number_or_cell, values_of
 from probe_kit._system.text_tables import TextTable
-from probe_kit._terminal.plain_text import UNSAFE, terminal_safe
 from probe_kit.errors import UsageError
 
 Kind = Literal["text", "boolean", "integer", "number"]

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from html import escape
 from typing import Any
 
-from probe_kit._terminal.plain_text import without_places
+from probe_kit._system.escaping import without_places
 
 PROGRESS_MARK = "probe-kit-progress"
 """CSS class of a progress bar, so that a tool that stores notebooks can remove the bars."""

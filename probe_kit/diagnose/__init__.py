@@ -7,7 +7,7 @@ and stores it there.
 
 from typing import TYPE_CHECKING
 
-from probe_kit._system.lazy import lazy_names
+from probe_kit._system.imports import lazy_names
 
 if TYPE_CHECKING:
     from probe_kit.diagnose.diagnosis import diagnose_run, load_diagnosis

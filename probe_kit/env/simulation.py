@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 from probe_kit._system.bounded_files import read_regular
-from probe_kit._system.installing import install_command
+from probe_kit._system.imports import install_command
 from probe_kit.env.rotations import Array
 from probe_kit.env.spec import CameraSpec, LightSpec
 from probe_kit.errors import SceneError

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from probe_kit._system.lazy import lazy_names
+from probe_kit._system.imports import lazy_names
 
 if TYPE_CHECKING:
     from probe_kit.extract.extraction import Extraction, ask_run, extract_run, prepare, prepare_asks

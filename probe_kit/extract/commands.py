@@ -153,7 +153,7 @@ def print_sufficiency(extraction: "Extraction") -> None:
     """Print what the plan is enough for, before any work; too few items in yellow."""
     from rich.table import Table
 
-    from probe_kit.suite.validation.sufficiency import GROUPS_FOR_PROBES, Smallest, sufficiencies
+    from probe_kit.suite.sufficiency import GROUPS_FOR_PROBES, Smallest, sufficiencies
 
     plan, source, suite = extraction.plan, extraction.source, extraction.source.suite
     if suite is None:
@@ -197,7 +197,7 @@ def _describe(stored: Any) -> str:
 
 def _next_command(run: "Run") -> str:
     """Return the command that reads the run: its targets, its probes where it has groups enough, else success."""
-    from probe_kit.suite.validation.sufficiency import probe_command
+    from probe_kit.suite.sufficiency import probe_command
 
     if run.streams and run.inputs is not None:
         return f"probe-kit targets {run.location}"

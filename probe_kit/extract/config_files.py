@@ -9,7 +9,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from probe_kit._system.bounded_json import read_json_object
+from probe_kit._system.bounded_files import read_json_object
 from probe_kit.errors import UsageError
 from probe_kit.extract.settings import Settings
 from probe_kit.extract.sources.kinds import kind_of, kinds_typed

@@ -8,7 +8,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from probe_kit._system.installing import install_command
+from probe_kit._system.imports import install_command
 from probe_kit.errors import DiskSpaceError, MissingExtraError, UsageError
 from probe_kit.extract.config_files import CONFIG, portable
 from probe_kit.extract.needs import planned_sizes

@@ -40,7 +40,7 @@ from probe_kit.runs.layout import MOST_FRAMES
 
 if TYPE_CHECKING:
     from probe_kit.env import SceneSpec
-    from probe_kit.suite.wording import Wording
+    from probe_kit.suite.items import Wording
 
 _PARTS = ("model", "capture", "task", "machine")
 PAPER_PROMPTS = ("p1", "p2", "seen")

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from probe_kit._system.escaping import terminal_safe
 from probe_kit._terminal import options as common
 from probe_kit._terminal.console import err, marked, out, print_json, say
 from probe_kit._terminal.field_options import command_with
-from probe_kit._terminal.plain_text import terminal_safe
 from probe_kit.extract.parts import ActMachine, ModelSettings
 from probe_kit.extract.settings import ExtractSettings
 from probe_kit.extract.sources.environment import EnvOptions

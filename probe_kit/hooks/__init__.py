@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from probe_kit._system.lazy import lazy_names
+from probe_kit._system.imports import lazy_names
 from probe_kit.hooks.capturing.edits import Edit
 from probe_kit.hooks.contract.card import ModelCard
 from probe_kit.hooks.contract.declared import Interventions, Option

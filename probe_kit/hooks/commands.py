@@ -48,7 +48,7 @@ def new_adapter(
 
     The package contains a small example network and passes the contract test. Its README lists what to change.
     """
-    from probe_kit._system.installing import install_folder_command
+    from probe_kit._system.imports import install_folder_command
     from probe_kit.hooks.new_adapter import write_adapter
 
     for path in write_adapter(name, out_folder):

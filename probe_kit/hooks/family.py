@@ -11,7 +11,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
-from probe_kit._system.installing import install_command
+from probe_kit._system.imports import install_command
 from probe_kit._system.machine import check_device_name, what_is_here
 from probe_kit.errors import (
     CheckpointError,

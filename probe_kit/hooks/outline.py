@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from probe_kit._system.bounded_json import load_json
+from probe_kit._system.bounded_files import load_json
 from probe_kit.errors import ProbeKitError
 from probe_kit.hooks.checkpoints.checkpoint import (
     ADAPTER_FILE,

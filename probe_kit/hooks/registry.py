@@ -12,7 +12,7 @@ from importlib import import_module
 from importlib.metadata import EntryPoint
 from typing import TYPE_CHECKING, Any
 
-from probe_kit._system.entry_points import entry_points
+from probe_kit._system.imports import entry_points
 from probe_kit.errors import UnknownModelError, UsageError
 from probe_kit.hooks.family import Family
 

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit._system.bounded_arrays import UNREADABLE, open_arrays
-from probe_kit._system.bounded_json import load_gzipped_json, load_json
+from probe_kit._system.bounded_files import UNREADABLE, load_gzipped_json, load_json, open_arrays
 from probe_kit.errors import UsageError
 from probe_kit.hooks.checkpoints.third_party import in_words, while_loading
 from probe_kit.hooks.family import imported

@@ -5,7 +5,7 @@ Needs the run's policy and pictures again; what is stored needs neither to be re
 
 from typing import TYPE_CHECKING
 
-from probe_kit._system.lazy import lazy_names
+from probe_kit._system.imports import lazy_names
 
 if TYPE_CHECKING:
     from probe_kit.intervene.kinds.attention import (

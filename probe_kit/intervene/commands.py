@@ -13,9 +13,8 @@ from rich.text import Text
 from probe_kit._tables.printing import Format, print_table
 from probe_kit._terminal import options as common
 from probe_kit._terminal.console import counter, marked, out, progress, say, say_note, split
-from probe_kit._terminal.field_options import command_with
+from probe_kit._terminal.field_options import PanelledHelp, command_with
 from probe_kit._terminal.options import LISTED, Names, choices, further_option, one_of
-from probe_kit._terminal.panelled_help import PanelledHelp
 from probe_kit.errors import UsageError
 from probe_kit.extract.moved import MovedOptions, moved_of
 from probe_kit.hooks.contract.declared import Readout

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit._system.bounded_arrays import open_arrays
+from probe_kit._system.bounded_files import open_arrays
 from probe_kit.errors import NoInterventionsError
 from probe_kit.intervene.settings import FORMAT, key_of
 from probe_kit.runs.layout import INTERVENTIONS

@@ -6,7 +6,7 @@ from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
-from probe_kit._system.bounded_json import load_json, read_json_object
+from probe_kit._system.bounded_files import load_json, read_json_object
 from probe_kit.errors import CheckpointError, UsageError
 
 Renames = tuple[tuple[str, str], ...]

@@ -6,7 +6,7 @@ from typing import Annotated, Any, ClassVar, Self
 
 from pydantic import AliasChoices, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
-from probe_kit._system.bounded_json import load_json
+from probe_kit._system.bounded_files import load_json
 from probe_kit._system.complaints import in_words
 from probe_kit.errors import CheckpointError
 

@@ -27,8 +27,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from transformers import Qwen2_5_VLConfig, Qwen2_5_VLForConditionalGeneration
 
-from probe_kit._system.bounded_files import load_yaml
-from probe_kit._system.bounded_json import load_json
+from probe_kit._system.bounded_files import load_json, load_yaml
 from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.models.building import build_empty, fill_rotary, frequencies, without_precision
 from probe_kit.models.config_file import ConfigFile, Count, Index, part

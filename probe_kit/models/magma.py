@@ -31,8 +31,8 @@ from torch import Tensor, nn
 from transformers import LlamaConfig, LlamaForCausalLM
 from transformers.utils.chat_template_utils import render_jinja_template
 
-from probe_kit._system.bounded_json import load_json
-from probe_kit._system.optional_dependencies import require
+from probe_kit._system.bounded_files import load_json
+from probe_kit._system.imports import require
 from probe_kit.errors import CheckpointError
 from probe_kit.models.building import build_empty, fill_decoder_rotary
 from probe_kit.models.config_file import STORED_TYPE, ConfigFile, Count, Index, part

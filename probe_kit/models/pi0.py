@@ -23,7 +23,7 @@ from lerobot.policies.pi05.configuration_pi05 import PI05Config
 from lerobot.policies.pi05.modeling_pi05 import PI05Policy
 from torch import Tensor, nn
 
-from probe_kit._system.bounded_json import load_json
+from probe_kit._system.bounded_files import load_json
 from probe_kit.models.building import building_device, replaced
 from probe_kit.models.config_file import ConfigFile, Count
 

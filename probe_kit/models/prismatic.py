@@ -30,8 +30,8 @@ from torch import Tensor, nn
 from torchvision.transforms.v2 import InterpolationMode, functional
 from transformers import CONFIG_MAPPING, AutoModelForCausalLM
 
-from probe_kit._system.bounded_json import load_json
-from probe_kit._system.optional_dependencies import require
+from probe_kit._system.bounded_files import load_json
+from probe_kit._system.imports import require
 from probe_kit.errors import CheckpointError
 from probe_kit.models.building import build_empty, fill_decoder_rotary
 from probe_kit.models.config_file import ConfigFile, Count, Index

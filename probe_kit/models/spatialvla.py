@@ -29,7 +29,7 @@ from transformers import (
     ZoeDepthForDepthEstimation,
 )
 
-from probe_kit._system.bounded_json import load_json
+from probe_kit._system.bounded_files import load_json
 from probe_kit.errors import CheckpointError, UsageError, WeightsError
 from probe_kit.models.building import build_empty, builds_sizes_only, fill_decoder_rotary
 from probe_kit.models.config_file import STORED_TYPE, ConfigFile, Count, Index, part

@@ -24,7 +24,7 @@ from torch.nn import functional
 from transformers import Qwen3VLConfig, Qwen3VLForConditionalGeneration
 from transformers.models.qwen3_vl.modeling_qwen3_vl import Qwen3VLTextRMSNorm, apply_rotary_pos_emb, repeat_kv
 
-from probe_kit._system.bounded_json import load_json
+from probe_kit._system.bounded_files import load_json
 from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.hashing import sha256_json
 from probe_kit.models.bounds import check_deviations

@@ -5,7 +5,7 @@ Reads runs and probe results; needs no simulator and no model.
 
 from typing import TYPE_CHECKING
 
-from probe_kit._system.lazy import lazy_names
+from probe_kit._system.imports import lazy_names
 
 if TYPE_CHECKING:
     from probe_kit.retention.behaviour import (

@@ -4,10 +4,9 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal, Self, get_args
 
-from probe_kit._system.escaping import csv_of_frame
+from probe_kit._system.escaping import csv_of_frame, without_places
 from probe_kit._tables.formats import render
 from probe_kit._tables.table import Table
-from probe_kit._terminal.plain_text import without_places
 from probe_kit.env.scoring import DEFAULT_RULE, SENSITIVITY_RADII, check_rule
 from probe_kit.errors import NoProbesError, NoTrajectoryError, UsageError
 from probe_kit.retention.behaviour import (

@@ -5,7 +5,7 @@ Reading needs neither a simulator nor a model.
 
 from typing import TYPE_CHECKING
 
-from probe_kit._system.lazy import lazy_names
+from probe_kit._system.imports import lazy_names
 
 if TYPE_CHECKING:
     from probe_kit.runs.action_errors import ActionErrors, compare_actions

@@ -28,7 +28,7 @@ from zarr.abc.store import ByteRequest, Store
 from zarr.core.buffer import Buffer, BufferPrototype
 from zarr.storage import WrapperStore
 
-from probe_kit._system.optional_dependencies import require
+from probe_kit._system.imports import require
 from probe_kit.errors import SettingsMismatchError, StoreError, UsageError
 from probe_kit.runs.location import Location, check_size
 

@@ -17,8 +17,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit._system.bounded_arrays import UNREADABLE, open_arrays
-from probe_kit._system.bounded_json import parse_json, read_json_object
+from probe_kit._system.bounded_files import UNREADABLE, open_arrays, parse_json, read_json_object
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import Site, role_of_view
 

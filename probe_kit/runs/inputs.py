@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from zarr.abc.store import Store
 from zarr.core.array_spec import ArrayConfigLike
 
-from probe_kit._system.column_cells import Cell
+from probe_kit._system.table_cells import Cell
 from probe_kit.runs.arrays import ROOM, codecs, open_array
 from probe_kit.runs.layout import CLASSES, INPUTS, TRUTHS
 from probe_kit.runs.rows import Rows

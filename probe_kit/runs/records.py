@@ -18,7 +18,7 @@ from typing import Annotated, Any, ClassVar, NamedTuple, Self
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer, PrivateAttr, ValidationError
 
-from probe_kit._system.bounded_json import parse_strict_json
+from probe_kit._system.bounded_files import parse_strict_json
 from probe_kit._system.complaints import in_words
 from probe_kit.errors import RunDamagedError
 from probe_kit.runs.location import Location

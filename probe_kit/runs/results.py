@@ -17,7 +17,7 @@ from typing import Annotated, Any, BinaryIO, ClassVar
 
 from pydantic import BeforeValidator, ConfigDict, PlainSerializer
 
-from probe_kit._system.bounded_json import parse_json
+from probe_kit._system.bounded_files import parse_json
 from probe_kit.errors import RunDamagedError, UsageError
 from probe_kit.runs.layout import DIAGNOSES, INTERVENTIONS, PROBES
 from probe_kit.runs.records import Record, Sum, digest_of, parse_sum

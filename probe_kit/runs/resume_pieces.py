@@ -9,7 +9,7 @@ from zipfile import ZipFile
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit._system.bounded_arrays import open_arrays
+from probe_kit._system.bounded_files import open_arrays
 from probe_kit.errors import RunDamagedError
 from probe_kit.runs.records import DIGEST_BYTES, digest
 from probe_kit.runs.results import PARTIAL

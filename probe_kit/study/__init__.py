@@ -2,19 +2,17 @@
 
 from typing import TYPE_CHECKING
 
-from probe_kit._system.lazy import lazy_names
+from probe_kit._system.imports import lazy_names
 
 if TYPE_CHECKING:
-    from probe_kit.study.data_set import publish_data_set, write_data_set
+    from probe_kit.study.cells import Failure
     from probe_kit.study.drift import CategoryDrift, measure_drift
-    from probe_kit.study.failures import Failure
-    from probe_kit.study.figures import make_figures
-    from probe_kit.study.mistakes import Mistake, StudyFileError
-    from probe_kit.study.pack import pack_study
+    from probe_kit.study.pack import pack_study, publish_data_set, write_data_set
     from probe_kit.study.plan import StudyPlan, plan_study
     from probe_kit.study.playing import Made, Moved, conduct_study, fit_probes
     from probe_kit.study.reading import LoadedStudy, load_study
-    from probe_kit.study.report import write_study_report
+    from probe_kit.study.report import make_figures, write_study_report
+    from probe_kit.study.schema import Mistake, StudyFileError
     from probe_kit.study.tables import make_table
 
 __all__ = [
@@ -44,18 +42,18 @@ __getattr__, __dir__ = lazy_names(
     {
         "LoadedStudy": "reading",
         "load_study": "reading",
-        "Mistake": "mistakes",
-        "StudyFileError": "mistakes",
+        "Mistake": "schema",
+        "StudyFileError": "schema",
         "CategoryDrift": "drift",
         "measure_drift": "drift",
-        "make_figures": "figures",
+        "make_figures": "report",
         "pack_study": "pack",
-        "publish_data_set": "data_set",
-        "write_data_set": "data_set",
+        "publish_data_set": "pack",
+        "write_data_set": "pack",
         "write_study_report": "report",
         "StudyPlan": "plan",
         "plan_study": "plan",
-        "Failure": "failures",
+        "Failure": "cells",
         "Made": "playing",
         "Moved": "playing",
         "conduct_study": "playing",

@@ -27,8 +27,7 @@ from zipfile import ZIP_DEFLATED, BadZipFile, ZipFile, ZipInfo
 
 from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, ValidationError
 
-from probe_kit._system.bounded_files import read_regular
-from probe_kit._system.bounded_json import parse_json
+from probe_kit._system.bounded_files import parse_json, read_regular
 from probe_kit._system.complaints import in_words
 from probe_kit._tables.content import Cell, Heading, Row
 from probe_kit._tables.table import Table

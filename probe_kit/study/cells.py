@@ -1,15 +1,103 @@
-"""Cells: one model in one condition, or asked in one way, with one seed. Known without loading a model."""
+"""Cells: one model in one condition, or asked in one way, with one seed. Known without loading a model.
+
+With the suite as far as a plan needs it, and the failures of cells: `OUT/failures/<run>.json` each, until the
+run or its probes are made. Runs describe themselves, so that a study notes nothing else. No number of a table
+comes from a failure. Each is a file of its own: two processes that play different models of a study need no lock
+between them.
+"""
 
 import json
-from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from functools import cache, cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Literal
 
+from probe_kit.extract.events import traceback_of
 from probe_kit.extract.settings import Settings
 from probe_kit.hashing import canonical_json, sha256_json
-from probe_kit.study.planned_suite import PlannedSuite
+from probe_kit.runs.records import Record
+from probe_kit.runs.store import locate
+from probe_kit.study.schema import Mistake, SuiteTable
+from probe_kit.suite.categories import in_order
+
+
+@dataclass(frozen=True)
+class PlannedSuite:
+    """A suite as far as a plan needs it.
+
+    identity: `name@version`; when a run grows, items are compared by content. items: by category. folder: None for
+    the embedded suite. source: where the numbers of items are from. contents: hash of every item's content by its
+    id, of a suite in a folder; empty for others.
+    """
+
+    identity: str
+    items: Mapping[str, int]
+    folder: Path | None
+    source: str
+    contents: Mapping[str, str] = field(default_factory=dict)
+
+
+def planned_suite(table: SuiteTable) -> tuple[PlannedSuite, list[Mistake]]:
+    """The suite that a file names, and what is wrong with it."""
+    if table.path is None:
+        return _embedded(), []
+    folder = Path(table.path)
+    counts = {slug(name): count for name, count in table.counts.items()}
+    if folder.is_dir():
+        return _from_folder(folder, table.counts)
+    if counts:
+        ordered = {name: counts[name] for name in in_order(counts)}
+        return PlannedSuite(f"not here: {table.path}", ordered, folder, "suite.counts"), []
+    text = f"there is no folder {folder}. Make the suite, or give items per category in [suite.counts] for a plan"
+    return _unknown(table.path, folder, text)
+
+
+def _unknown(name: str, folder: Path, why: str) -> tuple[PlannedSuite, list[Mistake]]:
+    return PlannedSuite(f"not here: {name}", {}, folder, "nothing"), [Mistake(("suite", "path"), why)]
+
+
+def slug(name: str) -> str:
+    """The slug of a category that was named by slug or title, in any case."""
+    return "-".join(name.lower().split())
+
+
+def slugs(names: Sequence[str]) -> tuple[str, ...]:
+    """The same of several, each once, in order."""
+    return tuple(dict.fromkeys(map(slug, names)))
+
+
+@cache
+def _embedded() -> PlannedSuite:
+    from probe_kit.suite.build import ITEMS, default_identity
+    from probe_kit.suite.generators import GENERATORS
+
+    return PlannedSuite(default_identity(), dict.fromkeys(in_order(GENERATORS), ITEMS), None, "the embedded suite")
+
+
+def _from_folder(folder: Path, counts: Mapping[str, int]) -> tuple[PlannedSuite, list[Mistake]]:
+    from probe_kit.errors import SuiteError
+    from probe_kit.suite import load_suite
+    from probe_kit.suite.suite import count_by_category
+
+    try:
+        suite = load_suite(folder)
+    except SuiteError as error:
+        return _unknown(str(folder), folder, str(error))
+    items = count_by_category(suite.items)
+    wrong = [
+        Mistake(
+            ("suite", "counts", name),
+            f"{slug(name)} has {items.get(slug(name), 0)} items in {folder}, not {count}",
+        )
+        for name, count in counts.items()
+        if items.get(slug(name)) != count
+    ]
+    contents = {item.item_id: item.content_sha256 for item in suite.items}
+    identity = f"{suite.name}@{suite.version}"
+    return PlannedSuite(identity, items, folder, str(folder), contents=contents), wrong
+
 
 KEY_DIGITS = 8
 """Of a key in a folder's name; `matching` finds out if two settings ever share them."""
@@ -154,3 +242,82 @@ def checkpoint_stamp(checkpoint: str | None) -> Any:
     files = sorted(folder.rglob("*")) if folder.is_dir() else [folder]
     stats = [(file, file.stat()) for file in files if file.is_file()]
     return [[file.relative_to(folder).as_posix(), stat.st_size, stat.st_mtime_ns] for file, stat in stats]
+
+
+FOLDER = "failures"
+Stage = Literal["checking", "playing", "episodes", "probes", "waiting"]
+_ADVICE = "Delete it; no number comes from it, and `probe-kit study run` then tries again"
+NOT_TRIED_AGAIN: tuple[Stage, ...] = ("playing", "episodes")
+"""The failures that take long, and so are tried again only on request."""
+
+
+class Failure(Record):
+    """Why runs of a model, or probes of a run, were not made.
+
+    stage: `checking` before anything was loaded, `playing` for the whole model, `episodes` for single ones that
+    were given up, `probes`, or `waiting` for a run that is not whole. run: as the plan names it. error: class of
+    the error. when: UTC, ISO 8601.
+    """
+
+    kind: ClassVar[str] = "record of a failure"
+    stage: Stage
+    model: str
+    run: str
+    reason: str
+    error: str = ""
+    traceback: str = ""
+    when: str = ""
+
+    @classmethod
+    def of(cls, stage: Stage, model: str, run: str, error: BaseException) -> "Failure":
+        """Return the failure that an error is, with its traceback and the time."""
+        reason = str(error) or type(error).__name__
+        return cls(
+            stage=stage, model=model, run=run, reason=reason, error=type(error).__name__,
+            traceback=traceback_of(error), when=datetime.now(UTC).isoformat(timespec="seconds"),
+        )  # fmt: skip
+
+    def __str__(self) -> str:
+        if self.stage in ("probes", "waiting"):
+            return f"probes of {self.run}: {self.reason}"
+        return f"{self.model} failed at {self.run}: {self.reason}"
+
+    def same(self, other: "Failure | None") -> bool:
+        """Whether both say the same, at whatever time."""
+        key = (self.stage, self.run, self.error, self.reason)
+        return other is not None and key == (other.stage, other.run, other.error, other.reason)
+
+
+class Failures:
+    """The failures of the study whose runs lie in `out`, a folder or URL; of probes by their table's name."""
+
+    def __init__(self, out: str) -> None:
+        self._location = locate(out)
+
+    def check_place(self) -> None:
+        """Raise DiskSpaceError or StoreError for a place that cannot be written; remove drafts of killed ones."""
+        with self._location.in_words(), self._location.tended(FOLDER):
+            pass
+
+    def of(self, cell: Cell, probes: str = "") -> Failure | None:
+        """Return the failure of a run, or of its probes, None without one. Raises RunDamagedError if changed."""
+        key = _key(cell, probes)
+        if not self._location.exists(key):
+            return None
+        return Failure.read(self._location, key, _ADVICE, run=cell.name)
+
+    def note(self, cell: Cell, failure: Failure, probes: str = "") -> None:
+        """Write a failure, unless the same one is there."""
+        if not failure.same(self.of(cell, probes)):
+            with self._location.in_words():
+                self._location.write(_key(cell, probes), failure.to_bytes())
+
+    def clear(self, cell: Cell, probes: str = "") -> None:
+        """Remove the failure of what is made."""
+        self._location.delete(_key(cell, probes))
+
+
+def _key(cell: Cell, probes: str) -> str:
+    # The folder holds the key of the settings: a failure of other settings is none of this cell.
+    name = "+".join([*cell.folder.split("/"), *([probes] if probes else [])])
+    return f"{FOLDER}/{name}.json"

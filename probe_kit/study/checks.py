@@ -1,4 +1,4 @@
-"""Checks of what does not fit together in a study file, all of whose names are known."""
+"""Checks of a study file: names that nothing has, then what does not fit together where all names are known."""
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from graphlib import CycleError, TopologicalSorter
@@ -7,17 +7,87 @@ from probe_kit.errors import ProbeKitError
 from probe_kit.extract.parts import SCRIPTED
 from probe_kit.hooks.contract.declared import DeclaredStream, check_options
 from probe_kit.hooks.contract.sites import resolve_view, view_names
-from probe_kit.hooks.registry import find_family, get_family
+from probe_kit.hooks.registry import family_names, find_family, get_family
 from probe_kit.runs.store import SCHEMES
 from probe_kit.statistics.label_permutations import permutations_for, smallest_p
 from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.study.cells import FOLDER, PlannedSuite, slug, slugs
 from probe_kit.study.expansion import Member, acts, answers, excludes, members, of_side
-from probe_kit.study.failures import FOLDER
-from probe_kit.study.mistakes import Mistake, Place
-from probe_kit.study.planned_suite import PlannedSuite, slug, slugs
-from probe_kit.study.schema import BlockTable, ModelTable, ProbesTable, Study, TableKind, TableTable
+from probe_kit.study.schema import (
+    BlockTable,
+    Mistake,
+    ModelTable,
+    Place,
+    ProbesTable,
+    Study,
+    TableKind,
+    TableTable,
+    unknown,
+)
 from probe_kit.suite.categories import check_slug
 from probe_kit.train.choices import CORRECT
+
+Use = tuple[Place, str, Iterable[str]]
+"""Path of a list or value, the kind of the names in it, and the names."""
+
+
+def unknown_names(study: Study, suite: PlannedSuite) -> list[Mistake]:
+    """Return a mistake for every name that no table of the file, the suite or probe_kit has."""
+    names = {
+        "family": [*family_names(), *SCRIPTED],
+        "model": list(study.models),
+        "condition": list(study.conditions),
+        "ask": list(study.asks),
+        "condition or ask": [*study.conditions, *study.asks],
+        "block": [block.name for block in study.runs],
+        "group": list(dict.fromkeys(group for model in study.models.values() for group in model.groups)),
+        "comparison": list(study.comparisons),
+        "drift": list(study.drift),
+        "category": list(suite.items),
+    }
+    return [
+        Mistake(path, unknown(kind, name, names[kind]))
+        for path, kind, uses in _uses(study)
+        if kind != "category" or suite.items  # a suite that cannot be read has none
+        for name in uses
+        if name not in names[kind]
+    ]
+
+
+def _uses(study: Study) -> Iterator[Use]:
+    yield ("suite", "categories"), "category", slugs(study.suite.categories or ())
+    for name, model in study.models.items():
+        yield ("models", name, "family"), "family", [model.family]
+        for part in ("vlm", "finetuned_from", "untrained"):
+            yield ("models", name, part), "model", [target] if (target := getattr(model, part)) else []
+    for position, block in enumerate(study.runs):
+        path = ("runs", position)
+        yield (*path, "models"), "model", block.models
+        yield (*path, "conditions"), "condition", block.conditions or ()
+        yield (*path, "asks"), "ask", block.asks or ()
+        yield (*path, "categories"), "category", slugs(block.categories or ())
+    for name, probes in study.probes.items():
+        yield ("probes", name, "runs"), "block", probes.runs
+    for name, comparison in study.comparisons.items():
+        if comparison.pairs is not None:
+            yield ("comparisons", name, "pairs"), "condition or ask", comparison.pairs.conditions
+            yield ("comparisons", name, "pairs"), "model", comparison.pairs.models
+        yield ("comparisons", name, "chain"), "model", comparison.chain or ()
+        yield ("comparisons", name, "groups"), "group", comparison.groups or ()
+    for name, drift in study.drift.items():
+        models = dict.fromkeys(side.partition("/")[0] for pair in drift.pairs for side in pair)
+        yield ("drift", name, "pairs"), "model", models
+    for name, table in study.tables.items():
+        yield ("tables", name, "runs"), "block", table.runs or ()
+        yield ("tables", name, "categories"), "category", slugs(table.categories or ())
+        yield ("tables", name, "comparison"), "comparison", [table.comparison] if table.comparison else []
+        yield ("tables", name, "drift"), "drift", [table.drift] if table.drift else []
+        if table.elsewhere is not None:
+            yield ("tables", name, "elsewhere"), "model", table.elsewhere.values
+    for name, figure in study.figures.items():
+        yield ("figures", name, "runs"), "block", figure.runs
+        yield ("figures", name, "categories"), "category", slugs(figure.categories or ())
+
 
 FEWEST_ITEMS = 10
 """Items of a category that five folds need, where every group is a pair of counterparts."""

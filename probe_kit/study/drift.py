@@ -1,4 +1,7 @@
-"""Drift of every category from one run to another: transfer, own probes, directions, likeness, and a verdict."""
+"""Drift of every category from one run to another: transfer, own probes, directions, likeness, verdict and table.
+
+Stored probes are used on the activations of another run of the same episodes. Nothing is fitted.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -7,8 +10,12 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._tables.content import Number, grouped
+from probe_kit._tables.numbers import number, p_text, percent, points, with_limits
+from probe_kit._tables.table import Table
 from probe_kit.errors import UsageError
 from probe_kit.extract.vqa.scores import side_expected
+from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.sites import PADDING, Site
 from probe_kit.retention.behaviour import ask_of
 from probe_kit.retention.compare.compare import Difference, common_items, wording_of
@@ -17,10 +24,130 @@ from probe_kit.retention.table import retention_table
 from probe_kit.runs.layout import FIRST_FRAME
 from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.estimates.cka import unbiased_cka
+from probe_kit.statistics.label_permutations import flip_groups, max_statistic_p
 from probe_kit.statistics.significance import SIGNIFICANCE
-from probe_kit.study.transfer import Agreement, ProbedRun, Transfer, agreement, transfer
+from probe_kit.suite.categories import category_of
+from probe_kit.train.crossval.task_scores import correctness
+from probe_kit.train.results.probe_curve import ProbeCurve
+from probe_kit.train.results.probe_directions import Direction
 from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.train.results.store import load_results
+
+Features = NDArray[np.float64]
+
+PERMUTATIONS = 999
+"""Of the labels of whole groups, for the p of a transfer."""
+_CONSTANT = 1e-9
+"""Share of the largest deviation below which a feature does not vary."""
+
+
+@dataclass(frozen=True)
+class ProbedRun:
+    """A run of one wording, with its probes."""
+
+    run: RunReader
+    results: ProbeResults
+
+    def features(self, site: Site, view: str, episodes: NDArray[np.str_]) -> Features:
+        """(E, D) of these episodes, in this order."""
+        at = {name: row for row, name in enumerate(self.run.episodes["episode_id"].astype(str))}
+        return np.asarray(self.run.column(site, view)[[at[name] for name in episodes]], np.float64)
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """The accuracy of the probes of one run on the activations of another, at S sites, as shares.
+
+    raw: decisions as they are. recentred: features are first centred and scaled as in the other run's own
+    training folds, without labels. p_fwe: of `recentred`, against the best site under label permutations of whole
+    groups.
+    """
+
+    raw: Features
+    recentred: Features
+    p_fwe: Features
+
+
+def transfer(
+    probed: ProbedRun, other: ProbedRun, category: str, view: str, sites: Sequence[Site], common: NDArray[np.str_]
+) -> Transfer:
+    """Decisions of `probed`'s probes on `other`'s activations of the `common` episodes.
+
+    Each episode is judged by the probe that was trained without its fold. Raises UnknownSiteError for a site
+    without a stored direction.
+    """
+    curve = probed.results.curves[category, view]
+    rows = np.flatnonzero(np.isin(curve.episodes, common))
+    episodes, labels = curve.episodes[rows], curve.labels[rows]
+    raw, recentred = np.empty((2, len(sites), rows.size))
+    for at, site in enumerate(sites):
+        direction = probed.results.direction(category, view, site)
+        of_probed, of_other = (run.features(site, view, episodes) for run in (probed, other))
+        raw[at] = _decisions(direction, of_other, of_other, of_other, curve.fold_of[rows], curve)
+        recentred[at] = _decisions(direction, of_other, of_probed, of_other, curve.fold_of[rows], curve)
+    null = flip_groups(labels, curve.groups[rows], PERMUTATIONS, derive_seed("transfer", category, view))
+    right = np.array([correctness(run[:, None], null).mean(axis=0) for run in recentred])
+    accuracies = (correctness(run, labels[None, :]).mean(axis=1) for run in (raw, recentred))
+    accuracy, aligned = accuracies
+    return Transfer(accuracy, aligned, max_statistic_p(aligned, right))
+
+
+def _decisions(
+    direction: Direction,
+    features: Features,
+    like: Features,
+    origin: Features,
+    fold_of: NDArray[np.int64],
+    curve: ProbeCurve,
+) -> Features:
+    """Return (E,) decisions on features (E, D), moved and scaled from `origin`'s training folds to `like`'s."""
+    decisions = np.empty(len(features))
+    for position, fold in enumerate(np.unique(curve.fold_of)):
+        tested = fold_of == fold
+        moved = features[tested]
+        if like is not origin:
+            moved = _moved(moved, origin[~tested], like[~tested])
+        decisions[tested] = moved @ direction.weights[position].astype(np.float64) + direction.intercepts[position]
+    return decisions
+
+
+def _moved(features: Features, origin: Features, like: Features) -> Features:
+    """Features with means and deviations of `like` instead of those of `origin`; constant ones become means."""
+    spread = origin.std(axis=0)
+    scale = np.divide(like.std(axis=0), spread, out=np.zeros_like(spread), where=spread > _CONSTANT * spread.max())
+    moved: Features = (features - origin.mean(axis=0)) * scale + like.mean(axis=0)
+    return moved
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Cosines of the directions of two runs at a site.
+
+    raw: of their unit vectors. weighted: by the covariance of the second run's activations, which is the
+    correlation of the two decisions. ceiling: mean raw cosine between the folds of the first run.
+    """
+
+    raw: float
+    weighted: float
+    ceiling: float
+
+
+def agreement(first: Direction, second: Direction, features: Features) -> Agreement:
+    """Return the cosines of the directions of two runs. features: (E, D) of the second run."""
+    before, after = first.unit, second.unit
+    varied = features - features.mean(axis=0)
+    # Weights of zero, such as of constant features, have no direction and stay zero.
+    units = first.weights / np.linalg.norm(first.weights, axis=1, keepdims=True).clip(min=1e-30)
+    between = units @ units.T
+    folds = len(units)
+    ceiling = (between.sum() - np.trace(between)) / (folds * (folds - 1))
+    return Agreement(float(before @ after), _cosine(varied @ before, varied @ after), float(ceiling))
+
+
+def _cosine(first: Features, second: Features) -> float:
+    length = float(np.linalg.norm(first) * np.linalg.norm(second))
+    return float(first @ second) / length if length else float("nan")
+
 
 Verdict = Literal["kept", "transfer not shown", "forgotten", "learned", "not shown in either", "not clear"]
 VERDICTS: Mapping[Verdict, str] = {
@@ -283,3 +410,126 @@ def _has_signal(side: ProbedRun, category: str, view: str, site: Site) -> bool:
     scores = side.results.scores
     of_site = scores[(scores["category"] == category) & (scores["view"] == view) & (scores["site"] == str(site))]
     return bool(of_site["signal"].iloc[0])
+
+
+_COLUMNS = (
+    ("", ("runs", "category")),
+    ("change and own probes", ("change", "before %", "after %", "after − before, points")),
+    ("transfer of probes", ("layer", "forth %", "recentred %", "p", "back %", "recentred %")),
+    ("likeness", ("cosine (ceiling)", "CKA")),
+)
+_NOTE = (
+    "before, after: cross-fitted accuracy of own probes, with its 95 % interval",
+    "layer: where the first run's own probes are best",
+    "forth: accuracy of the first run's probes on the second run's activations, nothing is fitted",
+    "back: the reverse",
+    "recentred: after centring and scaling on the other run's training folds, without labels",
+    "p: of the recentred transfer forth, label permutations of whole groups, the best of all layers",
+    "cosine: of the probes' directions, where both sides have signal; ceiling: between folds of the first run",
+    "CKA: unbiased, likeness of all features; it is no measure of loss",
+)
+_LENS = ("logit lens", ("lens before %", "lens after %"))
+_LENS_NOTE = (
+    "lens: share of episodes in which the model's own final norm and head, applied at that layer, name the right "
+    "letter; it says what a layer would answer, not what later layers read"
+)
+
+
+def drift_table(pairs: Mapping[tuple[str, str], Sequence[CategoryDrift]], title: str, view: str) -> Table:
+    """Verdicts with their numbers. pairs: by the labels of both runs, the first one before the second."""
+    drifts = [(names, drift) for names, of_pair in pairs.items() for drift in of_pair]
+    has_lens = any(site.lens for _, drift in drifts for site in drift.sites)
+    cells = tuple(
+        (
+            f"{before} → {after}",
+            category_of(drift.category).title,
+            drift.verdict,
+            *_cells(drift),
+            *_lens(drift)[: 2 * has_lens],
+        )
+        for (before, after), drift in drifts
+    )
+    verdicts = dict.fromkeys(drift.verdict for _, drift in drifts)
+    note = [f"view {view}", *_NOTE, *[_LENS_NOTE][:has_lens], *(f"{name}: {VERDICTS[name]}" for name in verdicts)]
+    alone = {f"{names[0]} → {names[1]}": drift.why_alone for names, drift in drifts if drift.why_alone}
+    note += [f"{name}: own accuracies only, {why}" for name, why in alone.items()]
+    heading = f"Drift: {title}" + (f" ({', '.join(dict.fromkeys(alone.values()))})" if alone else "")
+    numbers = tuple(number for names, drift in drifts for number in _numbers(names, drift, view))
+    groups = (*_COLUMNS, *[_LENS][:has_lens])
+    return Table.of(heading, grouped(*groups), cells, names=2, notes=note, numbers=numbers)
+
+
+def _cells(drift: CategoryDrift) -> tuple[str, ...]:
+    gap = drift.difference
+    accuracies = (
+        _row_key(drift.before),
+        _row_key(drift.after),
+        "–" if gap is None else with_limits(gap.backbone, gap.backbone_ci, points),
+    )
+    if not drift.sites:
+        return (*accuracies, *["–"] * 8)
+    site = drift.sites[drift.best]
+    return (
+        *accuracies,
+        str(site.site.layer),
+        percent(site.raw),
+        percent(site.recentred),
+        p_text(drift.p_transfer),
+        percent(site.raw_back),
+        percent(site.recentred_back),
+        _cosine_text(site),
+        number(site.cka),
+    )
+
+
+def _lens(drift: CategoryDrift) -> tuple[str, str]:
+    lens = drift.sites[drift.best].lens if drift.sites else None
+    return ("–", "–") if lens is None else (percent(lens[0]), percent(lens[1]))
+
+
+def _row_key(row: RetentionRow) -> str:
+    return with_limits(row.backbone.score, row.backbone.ci, percent)
+
+
+def _cosine_text(site: SiteDrift) -> str:
+    return "–" if site.agreement is None else f"{number(site.agreement.raw)} ({number(site.agreement.ceiling)})"
+
+
+def _numbers(names: tuple[str, str], drift: CategoryDrift, view: str) -> list[Number]:
+    """One of the category, then one of each site."""
+    gap = drift.difference
+    names_of_row = {"before": names[0], "after": names[1], "category": drift.category, "view": view}
+    of_category: Number = {
+        **names_of_row,
+        "verdict": drift.verdict,
+        "why_alone": drift.why_alone or None,
+        "episodes": drift.episodes,
+        "accuracy_before": drift.before.backbone.score,
+        "accuracy_before_ci": drift.before.backbone.ci,
+        "accuracy_after": drift.after.backbone.score,
+        "accuracy_after_ci": drift.after.backbone.ci,
+        "difference": None if gap is None else gap.backbone,
+        "difference_ci": None if gap is None else gap.backbone_ci,
+        "p": drift.p_transfer if drift.sites else None,
+    }
+    return [of_category, *({**names_of_row, **_of_site(site)} for site in drift.sites)]
+
+
+def _of_site(site: SiteDrift) -> Number:
+    directions = site.agreement
+    return {
+        "site": str(site.site),
+        "layer": site.site.layer,
+        "transfer": site.raw,
+        "recentred": site.recentred,
+        "p_fwe": site.p_fwe,
+        "transfer_back": site.raw_back,
+        "recentred_back": site.recentred_back,
+        "p_fwe_back": site.p_fwe_back,
+        "cka": site.cka,
+        "cosine": None if directions is None else directions.raw,
+        "cosine_weighted": None if directions is None else directions.weighted,
+        "cosine_ceiling": None if directions is None else directions.ceiling,
+        "lens_before": None if site.lens is None else site.lens[0],
+        "lens_after": None if site.lens is None else site.lens[1],
+    }

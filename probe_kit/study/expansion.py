@@ -9,10 +9,8 @@ from probe_kit.errors import ProbeKitError
 from probe_kit.extract.parts import SCRIPTED, ModelSettings
 from probe_kit.extract.settings import AskSettings, ExtractSettings, Settings
 from probe_kit.hooks.registry import get_family
-from probe_kit.study.cells import Cell, Selection
-from probe_kit.study.mistakes import Mistake, Place
-from probe_kit.study.planned_suite import PlannedSuite, slugs
-from probe_kit.study.schema import AskTable, BlockTable, ConditionTable, ModelTable, Study
+from probe_kit.study.cells import Cell, PlannedSuite, Selection, slugs
+from probe_kit.study.schema import AskTable, BlockTable, ConditionTable, Mistake, ModelTable, Place, Study
 
 
 def answers(model: ModelTable) -> bool:

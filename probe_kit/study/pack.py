@@ -1,18 +1,29 @@
-"""Packing of a study: its runs without activations, its tables, and their sums."""
+"""Packing of a study: its runs without activations, its tables, and their sums.
 
+A data set is a folder as the hub shows it: card, episodes, tables, archive and sums.
+"""
+
+import hashlib
 import json
+import os
 import shutil
-from collections.abc import Collection
+import time
+from collections.abc import Callable, Collection, Hashable, Iterator
 from pathlib import Path
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import probe_kit.version
+from probe_kit._system.bounded_files import read_regular, read_regular_text
+from probe_kit._system.counting import counted
 from probe_kit._system.drafts import draft_of, full_disk_in_words, move_draft
+from probe_kit._system.escaping import markdown_safe
+from probe_kit._system.imports import require
 from probe_kit.errors import (
     DiskSpaceError,
     ProbeKitError,
     RunIncompleteError,
     SettingsMismatchError,
+    StoreError,
     UsageError,
 )
 from probe_kit.runs import copy_run
@@ -20,17 +31,25 @@ from probe_kit.study.archive import (
     PACK_FILE,
     RUNS,
     STUDY_FILE,
+    SUMS_FILE,
     TABLES,
     Pack,
     PackedRun,
     PackedSuite,
+    check_sums,
+    files_of,
+    open_archive,
     table_record,
     write_sums,
     write_zip,
 )
-from probe_kit.study.reading import LoadedStudy
-from probe_kit.study.stored import open_stored
+from probe_kit.study.reading import LoadedStudy, load_study
+from probe_kit.study.stored import open_cell, open_stored
 from probe_kit.study.tables import make_each, make_table
+
+if TYPE_CHECKING:
+    import pandas as pd
+
 
 Extra = Literal["pictures", "trajectories", "directions"]
 EXTRAS: tuple[Extra, ...] = get_args(Extra)
@@ -104,3 +123,205 @@ def _write_tables(study: LoadedStudy, folder: Path, partial: bool) -> dict[str, 
         (folder / f"{name}.md").write_text(table.to_markdown() + "\n", encoding="utf-8")
         (folder / f"{name}.tex").write_text(table.to_latex(), encoding="utf-8")
     return {f"table {name}": why for name, why in missing.items()}
+
+
+ARCHIVE, EPISODES, CARD = "study.zip", "episodes.parquet", "README.md"
+_COLUMNS = {
+    "episode_id": "string", "item_id": "string", "group_id": "string", "category": "string", "layout": "string",
+    "wording": "string", "side_correct": "string", "side_placed": "string", "outcome": "string",
+    "first_frame_sha256": "string", "item_content_sha256": "string", "distance_correct": "float64",
+    "distance_wrong": "float64", "steps": "int64", "seconds_inference": "float64", "seconds_simulation": "float64",
+}  # fmt: skip
+"""Of the episodes of a run, those that are published, as far as a run has them: no text of an item."""
+
+TRIES = 5
+"""Of an upload that a server refuses for now, or whose connection breaks."""
+_PAUSE = 2.0
+"""Seconds before the second try."""
+_FOR_NOW = (408, 425, 429, 500, 502, 503, 504)
+"""Answers of a server that may be another one a moment later: too slow, too early, too often, out of order."""
+
+
+def write_data_set(
+    study: LoadedStudy, folder: Path, partial: bool = False, licence: str | None = None, again: bool = False
+) -> Pack:
+    """Write the data set of a study to `folder`, whole or not at all.
+
+    partial: leave out what is missing. licence: as the hub spells it, such as `cc-by-4.0`; named in the card.
+    again: accept a folder that holds this very data set, such as after an upload that failed.
+    Raises UsageError where anything else lies there, DiskSpaceError, MissingExtraError without pyarrow, and what
+    `pack_study` raises.
+    """
+    require("pyarrow.parquet", "export")
+    if folder.exists() and not again:
+        raise UsageError(f"{folder} exists; choose another --out or remove it")
+    with full_disk_in_words(folder), draft_of(folder) as draft:
+        draft.mkdir()
+        pack = _write(study, draft, partial, licence)
+        if not folder.exists():
+            move_draft(draft, folder)
+            return pack
+        sums = folder / SUMS_FILE
+        if not sums.is_file() or data_set_version(folder) != data_set_version(draft):
+            raise UsageError(f"{folder} exists and holds something else; choose another --out or remove it")
+        check_sums(folder)
+    return pack
+
+
+def _write(study: LoadedStudy, folder: Path, partial: bool, licence: str | None) -> Pack:
+    parquet = require("pyarrow.parquet", "export")
+    pack = pack_study(study, folder / ARCHIVE, partial)
+    packed = load_study(folder / ARCHIVE)  # card and episodes are of what was packed, not of runs that play on
+    table = _episodes(packed)
+    arrow = require("pyarrow", "export").Table.from_pandas(table, preserve_index=False)
+    parquet.write_table(arrow, folder / EPISODES, compression="zstd")
+    source = open_archive(folder / ARCHIVE)
+    assert source is not None, "it was just written"
+    (folder / TABLES).mkdir()
+    for file in files_of(source / TABLES):
+        shutil.copyfile(file, folder / TABLES / file.name)
+    shutil.copyfile(source / PACK_FILE, folder / PACK_FILE)
+    (folder / CARD).write_text(_card(packed, pack, table, licence), encoding="utf-8")
+    write_sums(folder)
+    return pack
+
+
+def _episodes(study: LoadedStudy) -> "pd.DataFrame":
+    """A row per episode of every run: which run, and what happened."""
+    import pandas as pd
+
+    frames = []
+    for cell in study.cells:
+        if not cell.packed_key:
+            continue
+        episodes = open_cell(study, cell, cell.selection, partial=True).run.episodes
+        model, way = cell.model, cell.way
+        label = study.study.models[model].label or model
+        run_columns: dict[str, str | int] = {
+            "system": label, "model": model, "way": way, "seed": cell.seed, "run": cell.name,
+        }  # fmt: skip
+        kinds: dict[Hashable, Any] = {name: kind for name, kind in _COLUMNS.items() if name in episodes}
+        frame = episodes[list(kinds)].astype(kinds)
+        for at, (name, value) in enumerate(run_columns.items()):
+            frame.insert(at, name, value)
+        frames.append(frame)
+    if not frames:
+        raise UsageError("no run of the study is stored, so there is nothing to publish")
+    return pd.concat(frames, ignore_index=True)
+
+
+def _card(study: LoadedStudy, pack: Pack, table: "pd.DataFrame", licence: str | None) -> str:
+    """`README.md`: what the hub reads, then what people read."""
+    import yaml
+
+    features = [{"name": str(name), "dtype": _dtype(kind)} for name, kind in table.dtypes.items()]
+    head: dict[str, Any] = {
+        "pretty_name": study.study.name,
+        **({} if licence is None else {"license": licence}),
+        "tags": ["robotics", "vision-language-action", "interpretability", "probe-kit"],
+        "configs": [{"config_name": "episodes", "data_files": EPISODES}],
+        "dataset_info": {
+            "config_name": "episodes",
+            "features": features,
+            "splits": [{"name": "train", "num_examples": len(table)}],
+        },
+    }
+    front = yaml.safe_dump(head, sort_keys=False, allow_unicode=True)
+    return "\n".join(["---", front.rstrip(), "---", "", *_words(study, pack, len(table)), ""])
+
+
+def _words(study: LoadedStudy, pack: Pack, episodes: int) -> Iterator[str]:
+    yield f"# {markdown_safe(study.study.name)}"
+    yield ""
+    size = f"{counted(len(pack.runs), 'run')}, {counted(episodes, 'episode')}"
+    yield f"A study made with probe_kit {pack.version}: {size}."
+    yield markdown_safe(f"Suite: {pack.suite.identity}. Left out: {', '.join(pack.left_out)}.")
+    yield ""
+    yield f"* `{EPISODES}`: a row per episode of every run"
+    yield f"* `{TABLES}/`: every table as JSON, Markdown and LaTeX"
+    yield f"* `{ARCHIVE}`: the runs without activations; `probe-kit study table {ARCHIVE}` prints the tables"
+    yield f"* `{SUMS_FILE}`: `sha256sum --check {SUMS_FILE}`"
+    if pack.missing:
+        yield ""
+        yield "Not in it:"
+        yield ""
+        yield from (f"* {markdown_safe(f'{name}: {reason}')}" for name, reason in pack.missing.items())
+    yield ""
+    yield "## Tables"
+    for name in study.study.tables:
+        if (record := study.archive and study.archive / TABLES / f"{name}.md") and record.is_file():
+            yield ""
+            yield read_regular_text(record).rstrip()
+
+
+def _dtype(kind: Any) -> str:
+    return kind.name if kind.name in ("float64", "int64", "bool") else "string"
+
+
+def data_set_version(folder: Path) -> str:
+    """Return the name of a data set's content: the beginning of the hash of its sums."""
+    return hashlib.sha256(read_regular(folder / SUMS_FILE)).hexdigest()[:12]
+
+
+# -- upload -------------------------------------------------------------------------------------------------------
+
+
+def publish_data_set(
+    folder: Path, repository: str, pull_request: bool = False, private: bool = False, pause: float = _PAUSE
+) -> str:
+    """Upload a folder of `write_data_set` as a data set; returns the address of the commit or pull request.
+
+    repository: `owner/name`, created if it is not there. The commit is tagged with the version of its content, a
+    pull request is not. The token is the hub's own: HF_TOKEN, or that of `hf auth login`. Files that are there
+    already are not sent again. pause: seconds before the second try, doubled each time.
+    Raises StoreError where the hub refuses, or cannot be reached in TRIES tries.
+    """
+    from huggingface_hub import DiscussionWithDetails, HfApi
+
+    api = HfApi(endpoint=os.environ.get("HF_ENDPOINT"), library_name="probe-kit")
+    version = data_set_version(folder)
+
+    opened: list[DiscussionWithDetails] = []  # kept between tries, so that no second one is opened
+
+    def upload() -> str:
+        if pull_request and not opened:
+            opened.append(api.create_pull_request(repository, f"probe_kit study {version}", repo_type="dataset"))
+        if not pull_request:
+            # None, and not False: an organisation may make what is new private by default.
+            api.create_repo(repository, repo_type="dataset", private=private or None, exist_ok=True)
+        commit = api.upload_folder(
+            repo_id=repository,
+            repo_type="dataset",
+            folder_path=folder,
+            commit_message=f"probe_kit study {version}",
+            revision=opened[0].git_reference if opened else None,
+        )
+        if opened:
+            return opened[0].url
+        api.create_tag(repository, tag=version, repo_type="dataset", exist_ok=True)
+        return str(commit.commit_url)
+
+    return _tried(upload, repository, pause)
+
+
+def _tried(upload: Callable[[], str], repository: str, pause: float) -> str:
+    """The result of an upload that may need several tries."""
+    import httpx
+    from huggingface_hub.errors import HfHubHTTPError
+
+    for attempt in range(TRIES):
+        try:
+            return upload()
+        except (HfHubHTTPError, httpx.TransportError) as error:
+            answer = getattr(error, "response", None)
+            status = None if answer is None else answer.status_code  # None: the connection broke
+            if status is not None and status not in _FOR_NOW:
+                advice = (
+                    "Log in with `hf auth login`" if status in (401, 403) else "Check the name of the repository"
+                )
+                raise StoreError(f"the hub refuses {repository}: status {status}. {advice}") from error
+            if attempt == TRIES - 1:
+                problem = f"status {status}" if status else type(error).__name__
+                raise StoreError(f"{repository} could not be uploaded in {TRIES} tries ({problem})") from error
+        time.sleep(pause * 2**attempt)
+    raise AssertionError("every try returns or raises")

@@ -12,7 +12,7 @@ from typing import Any
 from probe_kit._execution.executor import GivenUp, Pool, TaskQueue, work_off
 from probe_kit._execution.process_pool import ProcessPool, share_of_machine
 from probe_kit._execution.ray_pool import RayPool
-from probe_kit._system.optional_dependencies import require
+from probe_kit._system.imports import require
 from probe_kit.env import SceneSpec
 from probe_kit.errors import (
     DiskSpaceError,
@@ -30,10 +30,8 @@ from probe_kit.extract.rollout.task import task_of
 from probe_kit.extract.settings import Settings
 from probe_kit.runs import seal
 from probe_kit.runs.store import locate
-from probe_kit.study.cells import Cell, Selection
-from probe_kit.study.failures import NOT_TRIED_AGAIN, Failure, Failures
-from probe_kit.study.plan import PlannedCell, StudyPlan, cells_by_model
-from probe_kit.study.probes import probes_of, untrained_cell
+from probe_kit.study.cells import NOT_TRIED_AGAIN, Cell, Failure, Failures, Selection
+from probe_kit.study.plan import PlannedCell, StudyPlan, cells_by_model, probes_of, untrained_cell
 from probe_kit.study.reading import LoadedStudy
 from probe_kit.study.schema import ProbesTable
 from probe_kit.study.stored import open_cell

@@ -16,12 +16,10 @@ from probe_kit._system.complaints import MISSING, UNKNOWN, complaints_of, joined
 from probe_kit.errors import UsageError
 from probe_kit.study import schema
 from probe_kit.study.archive import RUNS, STUDY_FILE, Pack, open_archive
-from probe_kit.study.cells import Cell
-from probe_kit.study.checks import misfits
+from probe_kit.study.cells import Cell, PlannedSuite, planned_suite
+from probe_kit.study.checks import misfits, unknown_names
 from probe_kit.study.expansion import expand
-from probe_kit.study.mistakes import Mistake, Place, StudyFileError, part_in_file
-from probe_kit.study.planned_suite import PlannedSuite, planned_suite
-from probe_kit.study.references import unknown_names
+from probe_kit.study.schema import Mistake, Place, StudyFileError, part_in_file
 
 _MOST_BYTES = 1 << 20
 """Of a study file, which may come with an archive of anyone."""

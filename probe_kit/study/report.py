@@ -1,19 +1,165 @@
-"""The report of a study: one HTML file with its state, every table and figure, and the settings of its runs."""
+"""The figures of a study, and its report: one HTML file with its state, tables, figures, and settings of runs."""
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from probe_kit._system.bounded_files import read_regular
 from probe_kit._system.drafts import write_whole
 from probe_kit._tables.table import Table
-from probe_kit.retention.displays.base.report_figure import ReportFigure
+from probe_kit.errors import UsageError
+from probe_kit.intervene.kinds.site_maps import stored_steering
+from probe_kit.retention.displays import curves_side_by_side, dose_response, layer_curve
+from probe_kit.retention.displays.base.report_figure import ONLY_FILLED, ReportFigure, figure_of
+from probe_kit.retention.displays.base.style import BLUE, VERMILION, footer, panels, plain
+from probe_kit.retention.displays.heat_table import SideTableDisplay
 from probe_kit.retention.report.parts import Picture, citation, data_uri, provenance, render, words_of
-from probe_kit.study.figures import make_figures
+from probe_kit.retention.table import RetentionTable, retention_table
+from probe_kit.study.cells import slugs
 from probe_kit.study.plan import StudyPlan, plan_study
+from probe_kit.study.rates import domain_scores, episodes_per_category
 from probe_kit.study.reading import LoadedStudy
-from probe_kit.study.stored import stored_runs
+from probe_kit.study.schema import FigureKind, FigureTable, unknown
+from probe_kit.study.stored import StoredRuns, stored_runs, study_probes
 from probe_kit.study.tables import make_each, make_table
 from probe_kit.version import __version__
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+def make_figures(study: LoadedStudy, name: str, partial_runs: bool = False) -> list[ReportFigure]:
+    """The figures of one name, from stored runs alone; nothing is drawn yet.
+
+    A figure of the kind `dose` is one per run that was steered; others are one of all runs.
+    partial_runs: accept runs that are missing or unfinished. Raises UsageError for an unknown name, or where no
+    run has what the figure shows, and RunIncompleteError for runs that are missing.
+    """
+    if name not in study.study.figures:
+        raise UsageError(unknown("figure", name, list(study.study.figures)))
+    figure = study.study.figures[name]
+    categories = None if figure.categories is None else slugs(figure.categories)
+    subject = f"the figure {name!r}"
+    runs = stored_runs(study, lambda cell: cell.selected(figure.runs), subject, partial_runs, categories)
+    return _MAKERS[figure.kind](_Source(study, name, figure, runs, categories, runs.labels(study), partial_runs))
+
+
+@dataclass(frozen=True)
+class _Source:
+    """The parts of a figure. categories: slugs, None for all. labels: of the runs by location.
+
+    partial: whether runs that are missing are accepted.
+    """
+
+    study: LoadedStudy
+    name: str
+    figure: FigureTable
+    runs: StoredRuns
+    categories: tuple[str, ...] | None
+    labels: Mapping[str, str]
+    partial: bool
+
+    @property
+    def table(self) -> RetentionTable:
+        """The table of all runs, nothing compared."""
+        runs = [stored.run for stored in self.runs.runs]
+        return retention_table(runs, labels=self.labels, pairs=(), keys=[""] * len(runs))
+
+
+def _curves(source: _Source) -> list[ReportFigure]:
+    """A panel per category and part of the model, a line per system; of one system a line per iteration."""
+    probes = {
+        source.labels[stored.location]: study_probes(
+            source.study, stored, stored.probed.in_wording(), source.partial
+        )
+        for stored in source.runs.runs
+    }
+    with_probes = [
+        (label, results_of_run) for label, results_of_run in probes.items() if results_of_run is not None
+    ]
+    if not with_probes:
+        raise UsageError(
+            f"no run of the figure {source.name!r} has the probes of the file; `probe-kit study run "
+            f"{source.study.typed}` fits them"
+        )
+    names, results = [label for label, _ in with_probes], [results_of_run for _, results_of_run in with_probes]
+    view = source.figure.view or results[0].settings.views[0]
+    if len(results) == 1 and source.categories is None:
+        draw = partial(layer_curve, results[0], view)
+    else:
+        draw = partial(curves_side_by_side, results, names, view, categories=source.categories)
+    reading = f"How often a linear probe names the side of the correct picture, layer by layer. {ONLY_FILLED}."
+    return [ReportFigure(source.name, "Layer curves", "probes", reading, None, draw)]
+
+
+def _sides(source: _Source) -> list[ReportFigure]:
+    display = SideTableDisplay.from_table(source.table)
+    return [ReportFigure(source.name, display.title, "behaviour", display.note, None, partial(figure_of, display))]
+
+
+def _dose(source: _Source) -> list[ReportFigure]:
+    """A figure per run that was steered."""
+    steered = [stored for stored in source.runs.runs if stored_steering(stored.run)]
+    if not steered:
+        raise UsageError(
+            f"no run of the figure {source.name!r} was steered. Steer one with `probe-kit intervene "
+            f"{source.runs.runs[0].location} --kind steer --sites backbone.NN --roles image`"
+        )
+    reading = "Episodes that turn to the side they are pushed to, minus those that turn from it, by coefficient."
+    figures = []
+    for at, stored in enumerate(steered):
+        stem = "-".join(
+            [
+                source.name,
+                stored.cell.model,
+                stored.cell.way,
+                *([str(stored.cell.seed)] if stored.cell.seed else []),
+            ]
+        )
+        title = f"Dose and response: {source.labels[stored.location]}"
+        figures.append(ReportFigure(stem, title, "interventions", reading, at, partial(dose_response, stored.run)))
+    return figures
+
+
+def _overview(source: _Source) -> list[ReportFigure]:
+    reading = "Normalised score of the mean over the categories of a domain: 0 for guessing, 100 for perfection."
+    draw = partial(draw_overview, source.table)
+    return [ReportFigure(source.name, "Score by domain", "behaviour", reading, None, draw)]
+
+
+_MAKERS: Mapping[FigureKind, Callable[[_Source], list[ReportFigure]]] = {
+    "curves": _curves,
+    "sides": _sides,
+    "dose": _dose,
+    "overview": _overview,
+}
+
+
+def draw_overview(table: RetentionTable) -> "Figure":
+    """Bars of the normalised score, a panel per domain on one scale, a bar per system.
+
+    Raises UsageError where no model acted or answered.
+    """
+    scores = domain_scores(table)
+    if not scores:
+        raise UsageError("no model of these runs acted or answered, so there is no score")
+    systems = list(dict.fromkeys(system for of_domain in scores.values() for system in of_domain))
+    figure, grid = panels(len(scores), width=3.1, height=0.24 * len(systems) + 0.8, columns=min(3, len(scores)))
+    for axes, (domain, of_domain) in zip(grid, scores.items(), strict=True):
+        values = [of_domain.get(system, 0.0) for system in systems]
+        for at in (at for at, system in enumerate(systems) if system not in of_domain):
+            axes.text(2, at, "no episodes", fontsize=7, color="0.45", va="center")
+        axes.barh(range(len(systems)), values, color=[BLUE if score >= 0 else VERMILION for score in values])
+        axes.axvline(0, color="0.45", lw=1)
+        plain(axes)
+        axes.set_title(domain, fontsize=9, loc="left")
+    grid[0].set_yticks(range(len(systems)), systems, fontsize=8)
+    grid[0].set_ylim(len(systems) - 0.4, -0.6)
+    grid[0].set_xlim(-105, 105)
+    footer(figure, f"normalised score: 0 guessing, 100 perfection · n = {episodes_per_category(table)}")
+    return figure
 
 
 @dataclass(frozen=True)

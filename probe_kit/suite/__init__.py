@@ -6,9 +6,9 @@ from probe_kit.suite.items import LAYOUTS, Episode, Item, Layout, Side
 from probe_kit.suite.manifest import load_suite
 from probe_kit.suite.own_questions import PicturePair, Terms, suite_from_csv, suite_from_pictures
 from probe_kit.suite.pictures import load_picture
+from probe_kit.suite.rules import Finding
 from probe_kit.suite.suite import Suite
 from probe_kit.suite.validate import Report, validate_suite
-from probe_kit.suite.validation.records import Finding
 
 __all__ = [
     "CATEGORIES",

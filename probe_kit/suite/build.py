@@ -1,11 +1,14 @@
 """Building of the embedded suite `a2a-embedded`: no downloads, and the same bytes for the same options.
 
 Its items are procedural. They follow Act2Answer's procedure with pictures of our own, so results on them must
-never be mixed with, or called, the paper's numbers.
+never be mixed with, or called, the paper's numbers. Each couple of tiles gives two items: the same pictures in
+the same places, each the target once. Neither the pictures alone nor the text alone can give the answer away.
 """
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +16,97 @@ from probe_kit.errors import UsageError
 from probe_kit.hashing import sha256_json, sha256_text
 from probe_kit.suite.categories import CATEGORIES, check_categories
 from probe_kit.suite.generators import GENERATORS
-from probe_kit.suite.generators.generator import SUITE_NAME, SUITE_VERSION
-from probe_kit.suite.generators.twins import draw_twins
-from probe_kit.suite.grouping import with_groups
-from probe_kit.suite.items import Item
+from probe_kit.suite.generators.drawing import Tile
+from probe_kit.suite.generators.generator import SUITE_NAME, SUITE_VERSION, Couple, Generator, draw_couples
+from probe_kit.suite.items import Item, Side, instruction_for, side_words, with_groups
 from probe_kit.suite.manifest import check_foreign_folder, load_suite, save_suite
-from probe_kit.suite.suite import Suite, drawing_libraries, new_suite
+from probe_kit.suite.suite import Picture, Suite, drawing_libraries, make_item, new_suite, picture_of
+
+ATTRIBUTION = "probe_kit"
+LICENSE = "Apache-2.0"
+
+
+@dataclass(frozen=True)
+class Twins:
+    """Two items over the same two pictures."""
+
+    items: tuple[Item, Item]
+    pictures: tuple[Picture, Picture]
+
+
+def draw_twins(category: str, count: int, seed: int) -> Iterator[Twins]:
+    """The first `count` twins of one category; a smaller count gives the beginning of a larger one."""
+    generator = GENERATORS[category]
+    for number, couple in enumerate(islice(draw_couples(generator, seed), count)):
+        pictures = _draw(category, couple.left_tile), _draw(category, couple.right_tile)
+        gen = {
+            "generator": category,
+            "version": SUITE_VERSION,
+            "seed": seed,
+            "couple": number,
+            "left": asdict(couple.left_tile),
+            "right": asdict(couple.right_tile),
+        }
+        sides: tuple[Side, Side] = ("left", "right") if couple.left_asked_first else ("right", "left")
+        first, second = (_item(couple, pictures, side, gen, generator) for side in sides)
+        yield Twins((first, second), pictures)
+
+
+def _draw(category: str, tile: Tile) -> Picture:
+    return picture_of(f"{SUITE_NAME}/{category}/{sha256_json(asdict(tile))[:16]}", tile.draw())
+
+
+def _item(
+    couple: Couple,
+    pictures: tuple[Picture, Picture],
+    side: Side,
+    gen: dict[str, Any],
+    generator: Generator[Any],
+) -> Item:
+    """The item that asks for what lies on `side`; its group is not known yet."""
+    category = gen["generator"]
+    target, distractor = (couple.left, couple.right) if side == "left" else (couple.right, couple.left)
+    pair_id = f"{SUITE_NAME}-{category}-s{gen['seed']}-{gen['couple']:04d}"
+    instruction = instruction_for(target.phrase, "the")
+    tiles = (couple.left_tile, couple.right_tile) if side == "left" else (couple.right_tile, couple.left_tile)
+    content = {"instruction": instruction, "correct_side": side, "gen": gen}
+    return make_item(
+        f"{SUITE_NAME}-{category}-{sha256_json(content)[:10]}",
+        category,
+        side,
+        pictures,
+        transfer_type="procedural",
+        construction="procedural",
+        instruction=instruction,
+        object_phrase=target.phrase,
+        object_article="the",
+        polarity=target.polarity,
+        target_concept=target.name,
+        distractor_concept=distractor.name,
+        pair_id=pair_id,
+        rule_id="procedural",
+        license=LICENSE,
+        attribution=ATTRIBUTION,
+        redistributable=True,
+        contains_real_face=False,
+        source={
+            "benchmark": SUITE_NAME,
+            "version": gen["version"],
+            "split": "eval",
+            "source_id": pair_id,
+            "url": "",
+        },
+        gen=gen,
+        wordings=_wordings(generator, *tiles),
+    )
+
+
+def _wordings(generator: Generator[Any], target: Tile, distractor: Tile) -> dict[str, str]:
+    """Return the item's other wordings; none if the words would fit both tiles or name a side."""
+    name, distractor_name = (generator.name_of(tile) if generator.name_of else "" for tile in (target, distractor))
+    tells = name and name != distractor_name and not side_words(name)
+    return {"named": instruction_for(name, "the")} if tells else {}
+
 
 Progress = Callable[[int, int], None]
 ITEMS = 150
@@ -141,7 +229,7 @@ def _cache_key(options: Mapping[str, Any]) -> str:
     the notice beside it holds its checksums.
     """
     folder = Path(__file__).parent
-    modules = ("build", "categories", "grouping", "items", "making", "manifest", "pictures", "suite", "wording")
+    modules = ("build", "categories", "items", "manifest", "pictures", "suite")
     sources = [
         *sorted((folder / "generators").rglob("*.py")),
         *(folder / f"{name}.py" for name in modules),

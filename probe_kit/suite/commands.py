@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from probe_kit._system.bounded_json import load_json, parse_json
+from probe_kit._system.bounded_files import load_json, parse_json
 from probe_kit._system.counting import counted
 from probe_kit._terminal.console import counter, err, marked, out, print_json, progress
 from probe_kit._terminal.options import AsJson, Categories, Seed, choices, one_of

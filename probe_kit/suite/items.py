@@ -1,9 +1,21 @@
-"""Items and episodes: one question with two pictures, and one rollout of it in one layout."""
+"""Items and episodes: one question with two pictures, and one rollout of it in one layout. Their words and groups.
 
-from dataclasses import dataclass, field, fields
+Of the wordings, `knowledge` is the item's own instruction; `named` says what the correct picture literally
+shows; `side` says where it is; `neutral` asks for any picture. A model that fails `knowledge` and passes `named`
+lacks the knowledge. One that fails `side` lacks the skill. The score of `neutral` is the share that needs no
+instruction.
+
+Folds must not separate a group. Counterparts show the same pictures, the other as target.
+"""
+
+import re
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal
 
+from probe_kit.errors import SuiteError, UsageError
 from probe_kit.hashing import sha256_json
 
 Side = Literal["left", "right"]
@@ -41,7 +53,7 @@ class Item:
 
     `left` and `right` refer to the *original* layout; the swapped layout is derived, never stored.
     `side_word` marks a sign whose name holds a side word, such as "no left turn sign".
-    `wordings`: what else the item can be asked in, by name, see `suite.wording`; no part of the item's identity.
+    `wordings`: what else the item can be asked in, by name, see `WORDINGS`; no part of the item's identity.
     `folder` is what the file names are relative to on this machine; it takes no part in the item's identity.
     """
 
@@ -138,7 +150,7 @@ class Episode:
     @property
     def episode_id(self) -> str:
         """`<item_id>:o` or `<item_id>:s`, and `:<wording>` behind it for all but the item's own words."""
-        is_plain = self.wording in (None, "knowledge")  # `suite.wording` has the name, and imports this module
+        is_plain = self.wording in (None, "knowledge")
         return f"{self.item.item_id}:{self.layout[0]}" + ("" if is_plain else f":{self.wording}")
 
     @property
@@ -162,3 +174,135 @@ class Episode:
 
     def _original(self, side: Side) -> Side:
         return side if self.layout == "original" else other_side(side)
+
+
+VERBATIM = "verbatim"
+"""Rule of items whose instruction is their source's own question, not a sentence of ours."""
+MOST_WORDS = 12
+MOST_CHARACTERS = 80
+_SIDE_WORDS = frozenset(
+    {"left", "right", "first", "second", "leftmost", "rightmost", "centre", "center", "middle"}
+)
+
+
+def instruction_for(object_phrase: str, article: str) -> str:
+    """The imperative that names the object, with `article` "the", or "none" for bare names."""
+    return f"Put the cube on {'the ' if article == 'the' else ''}{object_phrase}"
+
+
+def side_words(text: str) -> tuple[str, ...]:
+    """Words that name a side or a place in a row: they would collide with the answers left and right."""
+    return tuple(word for word in re.findall(r"[a-z]+", text.lower()) if word in _SIDE_WORDS)
+
+
+Wording = Literal["knowledge", "named", "side", "neutral"]
+WORDINGS: tuple[Wording, ...] = ("knowledge", "named", "side", "neutral")
+SIDE = "Put the cube on the {side} picture"
+NEUTRAL = "Put the cube on one of the two pictures"
+"""What `side` and `neutral` say where an item has no words of its own for them."""
+
+
+def check_wordings(names: Sequence[str]) -> tuple[Wording, ...]:
+    """The names, each once. Raises UsageError for an unknown one, for none, and for one that comes twice."""
+    unknown = [name for name in names if name not in WORDINGS]
+    if unknown or not names:
+        problem = repr(unknown[0]) if unknown else "empty"
+        raise UsageError(f"wordings: {problem}; expected some of {', '.join(WORDINGS)}")
+    if len(set(names)) < len(names):
+        raise UsageError(f"wordings {','.join(names)}: one comes twice; name each once")
+    return tuple(name for name in names if name in WORDINGS)
+
+
+def in_words(episode: Episode, wording: Wording) -> Episode | None:
+    """The episode with its instruction in `wording`, or None where the item has none.
+
+    An item's `wordings` say what it has; `{side}` stands for the side of the correct picture in the layout. Raises
+    SuiteError if its wording `side` never says where, because it would then tell both layouts the same.
+    """
+    item = episode.item
+    wording_text = item.wordings.get(wording)
+    if wording == "knowledge":
+        text: str | None = item.instruction
+    elif wording == "side":
+        text = SIDE if wording_text is None else wording_text
+        if "{side}" not in text:
+            raise SuiteError(
+                f"item {item.item_id}: its wording 'side' is {text!r}; expected a text that contains '{{side}}', "
+                "which stands for left or right. Correct it in the suite's metadata."
+            )
+        text = text.replace("{side}", episode.side_correct)
+    else:
+        text = NEUTRAL if wording_text is None and wording == "neutral" else wording_text
+    return None if not text else replace(episode, item=replace(item, instruction=text), wording=wording)
+
+
+def ties(item: Item) -> tuple[str, ...]:
+    """Return the ties of an item to others: its pictures by content, their source identity, and its twins."""
+    return (
+        f"picture {item.left_pixels_sha256}",
+        f"picture {item.right_pixels_sha256}",
+        f"image {item.left_image_id}",
+        f"image {item.right_image_id}",
+        f"pair {item.pair_id}",
+    )
+
+
+def with_groups(items: Sequence[Item], groups: Mapping[str, str] | None = None) -> tuple[Item, ...]:
+    """The items with `group_id` set to their connected component over shared ties.
+
+    groups: by item id, a group that a user gave; it ties as a shared picture does. A group is called by a hash of
+    its members' ids, so the name does not depend on the order of the items.
+    """
+    forest = _Forest()
+    for item in items:
+        for tie in ties(item):
+            forest.join(item.item_id, tie)
+        if groups and item.item_id in groups:
+            forest.join(item.item_id, f"named {groups[item.item_id]}")
+    members: dict[str, list[str]] = {}
+    for item in items:
+        members.setdefault(forest.root(item.item_id), []).append(item.item_id)
+    names = {root: f"g-{sha256_json(sorted(ids))[:12]}" for root, ids in members.items()}
+    return tuple(replace(item, group_id=names[forest.root(item.item_id)]) for item in items)
+
+
+class _Forest:
+    """Union-find over strings."""
+
+    def __init__(self) -> None:
+        self._parent: dict[str, str] = {}
+
+    def root(self, node: str) -> str:
+        self._parent.setdefault(node, node)
+        while self._parent[node] != node:
+            self._parent[node] = self._parent[self._parent[node]]
+            node = self._parent[node]
+        return node
+
+    def join(self, node: str, other: str) -> None:
+        self._parent[self.root(node)] = self.root(other)
+
+
+def counterparts_of(items: Iterable[Item]) -> Mapping[str, Item]:
+    """Return by item id the twin of every item that has one.
+
+    A twin shows the same two pictures, asks for the other one in other words, and is of the same category; how the
+    two lie, which suite they come from and how ids are made plays no part. Of several, the first by item id.
+    """
+    by_pictures: dict[tuple[str, frozenset[str]], list[Item]] = defaultdict(list)
+    for item in items:
+        pictures = frozenset({item.left_pixels_sha256, item.right_pixels_sha256})
+        if len(pictures) == 2:
+            by_pictures[item.category, pictures].append(item)
+    twins: dict[str, Item] = {}
+    for together in by_pictures.values():
+        for item in together:
+            candidates = [other for other in together if _asks_otherwise(item, other)]
+            if candidates:
+                twins[item.item_id] = min(candidates, key=lambda other: other.item_id)
+    return twins
+
+
+def _asks_otherwise(item: Item, other: Item) -> bool:
+    target, other_target = (each.pixels_sha256(each.correct_side) for each in (item, other))
+    return target != other_target and item.instruction != other.instruction

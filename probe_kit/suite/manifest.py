@@ -20,8 +20,8 @@ from probe_kit._system.drafts import draft_of
 from probe_kit._system.escaping import csv_of_rows
 from probe_kit.errors import SuiteError, UsageError
 from probe_kit.suite.items import Item
-from probe_kit.suite.suite import Suite
-from probe_kit.suite.validation.records import (
+from probe_kit.suite.rules import (
+    LOADING_RULES,
     Finding,
     check_card,
     check_record,
@@ -31,7 +31,7 @@ from probe_kit.suite.validation.records import (
     parse_line,
     unique_ids,
 )
-from probe_kit.suite.validation.rules import LOADING_RULES
+from probe_kit.suite.suite import Suite
 
 CARD = "suite.json"
 ITEMS = "items"

@@ -15,15 +15,11 @@ from probe_kit._system.text_tables import TextTable, open_table
 from probe_kit.errors import SuiteError, UsageError
 from probe_kit.hashing import sha256_json
 from probe_kit.suite.categories import check_slug
-from probe_kit.suite.grouping import with_groups
-from probe_kit.suite.items import Item, Side
-from probe_kit.suite.making import Picture, make_item, squared_picture
+from probe_kit.suite.items import Item, Side, instruction_for, side_words, with_groups
 from probe_kit.suite.manifest import check_foreign_folder, save_suite
 from probe_kit.suite.pictures import RESTORE, load_picture
-from probe_kit.suite.suite import Suite, new_suite
-from probe_kit.suite.validation.records import listing
-from probe_kit.suite.validation.rules import LOADING_RULES, pictures_unchanged
-from probe_kit.suite.wording import instruction_for, side_words
+from probe_kit.suite.rules import LOADING_RULES, listing, pictures_unchanged
+from probe_kit.suite.suite import Picture, Suite, make_item, new_suite, squared_picture
 
 COLUMNS = ("instruction", "correct", "wrong")
 FURTHER = ("group", "category", "object", "other_object")

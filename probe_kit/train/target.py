@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit._system.column_cells import Cell
+from probe_kit._system.escaping import terminal_safe
+from probe_kit._system.table_cells import Cell
 from probe_kit._tables.label_table import LabelTable
-from probe_kit._terminal.plain_text import terminal_safe
 from probe_kit.errors import UsageError
 from probe_kit.hashing import derive_seed, sha256_json
 from probe_kit.runs.layout import RECORDED_EPISODES

@@ -22,7 +22,7 @@ from acting_training.frames import Frames
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.models.embedded.tiny import ACTION_DIMS, CHUNK, IDLE_DIMS
 from probe_kit.models.embedded.words import WORDS
-from probe_kit.suite.wording import instruction_for
+from probe_kit.suite.items import instruction_for
 
 SAID_WEIGHT = 0.3
 """Of the word beside the actions."""

@@ -15,7 +15,7 @@ from torch.nn.functional import cross_entropy
 from probe_kit.extract.vqa.phrases import Phrase
 from probe_kit.extract.vqa.templates import ORDERS, P1, P2, SEEN, sides
 from probe_kit.models.embedded.words import END
-from probe_kit.suite.wording import instruction_for
+from probe_kit.suite.items import instruction_for
 from vlm_tiny_training.batches import Pair, Pairs, Pixels, laid_out
 from vlm_tiny_training.heads import Heads, Looked, capturing
 from vlm_tiny_training.painting import Surface

@@ -14,10 +14,16 @@ import numpy as np
 import pytest
 
 import probe_kit
-from probe_kit._system import bounded_arrays, bounded_json
-from probe_kit._system.bounded_arrays import open_arrays
-from probe_kit._system.bounded_files import check_regular, load_yaml, open_regular, read_regular
-from probe_kit._system.bounded_json import load_gzipped_json, load_json
+from probe_kit._system import bounded_files
+from probe_kit._system.bounded_files import (
+    check_regular,
+    load_gzipped_json,
+    load_json,
+    load_yaml,
+    open_arrays,
+    open_regular,
+    read_regular,
+)
 from tests.support.parsed import package_nodes
 
 PACKAGE = Path(probe_kit.__file__).parent
@@ -78,7 +84,7 @@ def test_a_sparse_file_of_a_terabyte_is_refused_by_its_size_alone(tmp_path: Path
 
 
 def test_a_gzip_file_is_unpacked_to_the_bound_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bounded_json, "MOST_BYTES", 1 << 20)
+    monkeypatch.setattr(bounded_files, "MOST_BYTES", 1 << 20)
     for size, fits in (((1 << 20) - 2, True), (1 << 20, False)):
         (tmp_path / "x.gz").write_bytes(gzip.compress(b'"' + b"a" * size + b'"'))
         if fits:
@@ -95,7 +101,7 @@ def test_arrays_are_refused_by_their_size_unpacked(tmp_path: Path, monkeypatch: 
     for source in (tmp_path / "x.npz", content):
         with open_arrays(source) as arrays:
             assert arrays["a"].shape == (1_000_000,)
-    monkeypatch.setattr(bounded_arrays, "MOST_BYTES", 7_999_999)
+    monkeypatch.setattr(bounded_files, "MOST_ARRAY_BYTES", 7_999_999)
     for source in (tmp_path / "x.npz", content):
         with pytest.raises(ValueError, match="its arrays have 8 MB unpacked; expected at most 8 MB"):
             open_arrays(source)
@@ -120,7 +126,6 @@ UNBOUNDED = {
 }  # fmt: skip
 ELSEWHERE = {
     "_system/bounded_files.py": "the reader itself",
-    "_system/bounded_arrays.py": "the reader itself",
     "runs/export/matrices.py": "the matrix that it has just written",
     "_system/parquet_files.py": "the reader itself",
     "_system/machine.py": "files of the system",
@@ -128,7 +133,7 @@ ELSEWHERE = {
     "hooks/new_adapter/__init__.py": "files of the package",
     "hooks/families/shared/statistics_bounds.py": "files of the package",
     "hooks/conformance/loading.py": "a copy of a checkpoint that was read",
-    "suite/generators/art.py": "files of the package",
+    "suite/generators/drawing.py": "files of the package",
     "suite/pictures.py": "`stored_picture`: files of the package",
     "suite/build.py": "files of the package",
     "view/export.py": "files of the package",

@@ -6,21 +6,21 @@ from pathlib import Path
 
 import pytest
 
-from probe_kit._system import installing
-from probe_kit._system.installing import install_command, install_folder_command
+from probe_kit._system import imports
+from probe_kit._system.imports import install_command, install_folder_command
 
-PACKAGE = Path(installing.__file__).parents[1]
+PACKAGE = Path(imports.__file__).parents[1]
 
 
 @pytest.fixture
 def elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(installing, "_is_of_checkout", lambda: False)
+    monkeypatch.setattr(imports, "_is_of_checkout", lambda: False)
 
 
 def test_in_the_environment_of_a_checkout_with_uv_installs(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(installing, "_ROOT", tmp_path)
+    monkeypatch.setattr(imports, "_ROOT", tmp_path)
     monkeypatch.setattr(sys, "prefix", str(tmp_path / ".venv"))
     (tmp_path / "with-uv").touch()
     monkeypatch.chdir(tmp_path)
@@ -34,7 +34,7 @@ def test_in_the_environment_of_a_checkout_with_uv_installs(
 def test_a_checkout_in_the_environment_of_another_project_is_not_changed_by_with_uv(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(installing, "_ROOT", tmp_path / "probe_kit")
+    monkeypatch.setattr(imports, "_ROOT", tmp_path / "probe_kit")
     (tmp_path / "probe_kit").mkdir()
     (tmp_path / "probe_kit" / "with-uv").touch()
     monkeypatch.setattr(sys, "prefix", str(tmp_path / "other"))
@@ -44,10 +44,10 @@ def test_a_checkout_in_the_environment_of_another_project_is_not_changed_by_with
 @pytest.mark.usefixtures("elsewhere")
 def test_pip_is_named_only_where_the_running_python_has_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "executable", "/env/bin/python")
-    monkeypatch.setattr(installing.shutil, "which", lambda _: "/env/bin/python")
-    monkeypatch.setattr(installing, "find_spec", lambda _: object())
+    monkeypatch.setattr(imports.shutil, "which", lambda _: "/env/bin/python")
+    monkeypatch.setattr(imports, "find_spec", lambda _: object())
     assert install_command("ray") == "python -m pip install 'probe-kit[ray]'"
-    monkeypatch.setattr(installing, "find_spec", lambda _: None)
+    monkeypatch.setattr(imports, "find_spec", lambda _: None)
     assert install_command("ray") == "uv pip install --python python 'probe-kit[ray]'"
     assert install_command(rebuild="pybullet") == (
         "uv pip install --python python --reinstall --no-build-isolation pybullet"
@@ -59,8 +59,8 @@ def test_the_python_that_runs_is_named_by_its_path_where_a_shell_finds_another(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(sys, "executable", "/my env/bin/python")
-    monkeypatch.setattr(installing.shutil, "which", lambda _: "/usr/bin/python")
-    monkeypatch.setattr(installing, "find_spec", lambda _: None)
+    monkeypatch.setattr(imports.shutil, "which", lambda _: "/usr/bin/python")
+    monkeypatch.setattr(imports, "find_spec", lambda _: None)
     assert install_command() == "uv pip install --python '/my env/bin/python' probe-kit"
 
 
@@ -69,11 +69,11 @@ def test_a_package_of_the_users_own_is_installed_by_the_installer_that_the_envir
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(sys, "executable", "/env/bin/python")
-    monkeypatch.setattr(installing.shutil, "which", lambda name: "/env/bin/python" if name == "python" else None)
-    monkeypatch.setattr(installing, "find_spec", lambda _: object())
+    monkeypatch.setattr(imports.shutil, "which", lambda name: "/env/bin/python" if name == "python" else None)
+    monkeypatch.setattr(imports, "find_spec", lambda _: object())
     assert install_folder_command(Path("my vla")) == "python -m pip install -e 'my vla'"
-    monkeypatch.setattr(installing, "find_spec", lambda _: None)
-    monkeypatch.setattr(installing, "_ROOT", tmp_path)
+    monkeypatch.setattr(imports, "find_spec", lambda _: None)
+    monkeypatch.setattr(imports, "_ROOT", tmp_path)
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     assert install_folder_command(Path("my-vla")) == "uv pip install --python python -e my-vla"
     (tmp_path / ".uv" / "bin").mkdir(parents=True)
@@ -82,7 +82,7 @@ def test_a_package_of_the_users_own_is_installed_by_the_installer_that_the_envir
 
 
 def test_no_message_names_an_installer_of_its_own() -> None:
-    own = Path(installing.__file__)
+    own = Path(imports.__file__)
     found = [
         f"{path.relative_to(PACKAGE)}:{number}"
         for path in sorted(PACKAGE.rglob("*.py"))

@@ -11,9 +11,9 @@ import pytest
 from probe_kit._system.table_cells import DOUBTFUL, MISSING, group_names, plain_cell, truth_of
 from probe_kit._system.text_tables import open_table
 from probe_kit.errors import ProbeKitError, SuiteError, UsageError
-from probe_kit.suite.converters.benchmarks import mmbench
+from probe_kit.suite.converters import mmbench
+from probe_kit.suite.converters.candidates import MmbenchOptions
 from probe_kit.suite.converters.curation import read_curation
-from probe_kit.suite.converters.options import MmbenchOptions
 from probe_kit.suite.own_questions import read_rows
 from probe_kit.train import Target
 from tests.support.parsed import package_nodes

@@ -9,7 +9,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from probe_kit._terminal.panelled_help import HELP_ALL, MOST_OPTIONS
+from probe_kit._terminal.field_options import HELP_ALL, MOST_OPTIONS
 from probe_kit.cli import app, commands_of
 
 LEAVES: dict[str, Any] = dict(commands_of(typer.main.get_command(app), None))

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from probe_kit._system.escaping import terminal_safe, without_places
 from probe_kit._terminal.notebook import facts_html, rows_html
-from probe_kit._terminal.plain_text import terminal_safe, without_places
 from probe_kit.hooks import load_model
 from probe_kit.models.embedded import embedded_checkpoint
 from probe_kit.retention import retention_table

@@ -6,7 +6,7 @@ import pytest
 from rich.console import Console
 
 from probe_kit._terminal import console
-from probe_kit._terminal.progress_log import EVERY, FIRST, Heartbeat, spoken
+from probe_kit._terminal.console import EVERY, FIRST, Heartbeat, spoken
 
 
 class Clock:

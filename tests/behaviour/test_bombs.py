@@ -22,18 +22,16 @@ from numcodecs import Blosc
 from PIL import Image
 from safetensors.torch import save_file
 
-from probe_kit._system import bounded_json
-from probe_kit._system.bounded_arrays import open_arrays
-from probe_kit._system.bounded_json import load_gzipped_json, parse_json
+from probe_kit._system import bounded_files
+from probe_kit._system.bounded_files import load_gzipped_json, open_arrays, parse_json
 from probe_kit.errors import RunDamagedError, SuiteError, UsageError, WeightsError
 from probe_kit.hooks.checkpoints.weights import read_pickle, read_weights
 from probe_kit.runs import Run, open_run, verify_run
 from probe_kit.runs.arrays import open_array
 from probe_kit.runs.store import locate
 from probe_kit.study import load_study
-from probe_kit.suite import Suite
+from probe_kit.suite import Suite, rules
 from probe_kit.suite.pictures import decode_bytes, rgb_of
-from probe_kit.suite.validation import rules
 from tests.support.little_run import episode, little_plan, little_writer
 from tests.support.rehashing import rehash
 
@@ -174,7 +172,7 @@ def test_arrays_as_numpy_writes_them_are_read(tmp_path: Path) -> None:
 
 def test_many_short_values_are_refused_by_their_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """85 million empty lists are 256 MB of text and 6 GB of Python, and 0.3 MB as gzip."""
-    monkeypatch.setattr(bounded_json, "MOST_VALUES", 1_000)
+    monkeypatch.setattr(bounded_files, "MOST_VALUES", 1_000)
     assert len(parse_json("[" + "[]," * 498 + "0]")) == 499
     for bomb in ("[" + "[]," * 2_000 + "0]", "[" + "0," * 1_100 + "0]", "[" + "{}," * 600 + "0]"):
         (tmp_path / "x.gz").write_bytes(gzip.compress(bomb.encode()))

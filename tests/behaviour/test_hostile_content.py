@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 from typer.testing import CliRunner
 
-from probe_kit._terminal.plain_text import UNSAFE
+from probe_kit._system.escaping import UNSAFE
 from probe_kit.cli import app
 from probe_kit.hooks import registry
 from probe_kit.hooks.family import Family

@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from probe_kit._terminal.plain_text import UNSAFE
+from probe_kit._system.escaping import UNSAFE
 from probe_kit.cli import app, commands_of
 from probe_kit.suite import Suite
 from tests.support.little_run import write_little_run

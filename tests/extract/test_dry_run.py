@@ -20,7 +20,7 @@ from probe_kit.hooks.contract.sites import PADDING
 from probe_kit.hooks.registry import own_families
 from probe_kit.runs.disk import in_units
 from probe_kit.suite import Suite, build_suite, default_suite, load_suite
-from probe_kit.suite.validation.sufficiency import sufficiencies
+from probe_kit.suite.sufficiency import sufficiencies
 from tests.support.every_checkpoint import WRITERS, families
 from tests.support.pi0_checkpoints import write_intact
 from tests.support.pi05_checkpoints import write_pi05

@@ -10,7 +10,7 @@ import psutil
 import pytest
 
 from probe_kit._execution.executor import WorkerLostWarning
-from probe_kit._system.installing import install_command
+from probe_kit._system.imports import install_command
 from probe_kit.env import SceneSpec
 from probe_kit.errors import MissingExtraError
 from probe_kit.extract import ExtractSettings, extract_run

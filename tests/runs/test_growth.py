@@ -25,7 +25,7 @@ from probe_kit.runs.store import locate
 from probe_kit.runs.thumbnails import as_thumbnail, thumbnail_key
 from probe_kit.runs.writer import RunWriter
 from probe_kit.suite import Suite
-from probe_kit.suite.wording import Wording
+from probe_kit.suite.items import Wording
 from probe_kit.train import load_results, train_probes
 from probe_kit.train.results.inventory import inventory
 from tests.support.changed_suites import without_twins

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import zarr
 
-from probe_kit._system.installing import install_command
+from probe_kit._system.imports import install_command
 from probe_kit.errors import DiskSpaceError, MissingExtraError, SettingsMismatchError, StoreError, UsageError
 from probe_kit.runs.checking import BlankStore
 from probe_kit.runs.folder import Folder

@@ -8,8 +8,7 @@ import pytest
 
 from probe_kit.errors import UsageError
 from probe_kit.hooks import Site
-from probe_kit.study.drift import CategoryDrift, measure_drift, why_alone
-from probe_kit.study.drift_table import drift_table
+from probe_kit.study.drift import CategoryDrift, drift_table, measure_drift, why_alone
 from probe_kit.train import ArrayRun, load_results, train_probes
 from tests.retention.asked_runs import ASK, SaidRun, episodes
 

@@ -7,8 +7,7 @@ import pytest
 
 from probe_kit.errors import RunDamagedError
 from probe_kit.study import Failure, conduct_study, load_study, plan_study
-from probe_kit.study.cells import Cell
-from probe_kit.study.failures import Failures
+from probe_kit.study.cells import Cell, Failures
 from probe_kit.suite import Suite
 from tests.study.broken_files import BASE
 from tests.study.small_study import SCRIPTED, small_study

@@ -11,8 +11,8 @@ from probe_kit.cli import app
 from probe_kit.errors import UsageError
 from probe_kit.retention import retention_table
 from probe_kit.study import LoadedStudy, make_figures
-from probe_kit.study.figures import draw_overview
 from probe_kit.study.rates import domain_scores
+from probe_kit.study.report import draw_overview
 from tests.retention.asked_runs import acted
 
 

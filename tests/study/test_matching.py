@@ -10,10 +10,9 @@ from probe_kit.extract import ExtractSettings
 from probe_kit.retention.compare.compare import common_items
 from probe_kit.runs import Run, open_run
 from probe_kit.runs.store import locate
-from probe_kit.study.cells import Cell
-from probe_kit.study.matching import check_same_items, check_same_weights, differences
-from probe_kit.study.planned_suite import planned_suite
+from probe_kit.study.cells import Cell, planned_suite
 from probe_kit.study.schema import SuiteTable
+from probe_kit.study.stored import check_same_items, check_same_weights, differences
 from probe_kit.suite import Suite
 from tests.support.changed_suites import other_version, save_changed, without_twins
 from tests.support.little_run import episode, little_plan, little_writer

@@ -12,8 +12,8 @@ import pytest
 from probe_kit.retention import RetentionTable, retention_table
 from probe_kit.retention.behaviour import Regime, regime
 from probe_kit.retention.rows.row import RetentionRow
-from probe_kit.study.compared import difference_table, group_table, vlm_vla_table
 from probe_kit.study.rates import score_table, sides_table, success_table
+from probe_kit.study.tables import difference_table, group_table, vlm_vla_table
 from probe_kit.suite.categories import category_of
 from tests.retention.asked_runs import SaidRun
 from tests.study.paper_runs import paper, run_of

@@ -9,7 +9,7 @@ import pytest
 from probe_kit._execution.executor import GivenUp, TaskQueue
 from probe_kit.extract import ExtractSettings
 from probe_kit.study import playing
-from probe_kit.study.failures import Failure
+from probe_kit.study.cells import Failure
 from probe_kit.study.playing import Made, ModelTask, Moved, RunTask
 
 SETTINGS = ExtractSettings("expert")

@@ -13,7 +13,7 @@ from probe_kit.cli import app
 from probe_kit.errors import StoreError, UsageError
 from probe_kit.runs import open_run
 from probe_kit.study import LoadedStudy, load_study, make_table, publish_data_set, write_data_set
-from probe_kit.study.data_set import data_set_version
+from probe_kit.study.pack import data_set_version
 from tests.support.hub_stand_in import Hub, hub
 
 TOKEN = "hf_secretsecretsecretsecretsecretsec"

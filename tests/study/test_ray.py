@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from probe_kit._execution.executor import WorkerLostWarning
-from probe_kit._system.installing import install_command
+from probe_kit._system.imports import install_command
 from probe_kit.errors import MissingExtraError
 from probe_kit.runs.layout import COMMITS
 from probe_kit.study import conduct_study, load_study, plan_study

@@ -20,8 +20,8 @@ from probe_kit.retention.compare.known_used import match_runs
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.statistics.paired_tests import holm
 from probe_kit.study import LoadedStudy, load_study, make_table, write_study_report
-from probe_kit.study.compared import difference_table, stages_table
 from probe_kit.study.rates import caption, score_table, success_table, vlm_table
+from probe_kit.study.tables import difference_table, stages_table
 from tests.retention.asked_runs import SaidRun, acted, asked, probes
 from tests.view.payload_reader import read_payload
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from probe_kit.hooks.contract.sites import Site
-from probe_kit.study.probes import is_of_network
+from probe_kit.study.plan import is_of_network
 from probe_kit.train.results.control_scores import UntrainedScore
 from probe_kit.train.results.probe_curve import ProbeCurve
 

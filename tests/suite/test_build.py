@@ -184,7 +184,7 @@ def test_another_version_of_what_draws_is_another_suite_in_the_cache(
     assert default_suite(["color"], 2).folder != before
 
 
-@pytest.mark.parametrize("source", ["wording.py", "pictures.py", "grouping.py", "generators/canvas.py"])
+@pytest.mark.parametrize("source", ["items.py", "pictures.py", "suite.py", "generators/drawing.py"])
 def test_other_code_that_draws_or_words_is_another_suite_in_the_cache(
     source: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -5,8 +5,7 @@ from dataclasses import replace
 import pytest
 
 from probe_kit.suite import Item, Suite
-from probe_kit.suite.grouping import counterparts_of, with_groups
-from probe_kit.suite.items import other_side
+from probe_kit.suite.items import counterparts_of, other_side, with_groups
 
 
 def stranger(item: Item, name: str) -> Item:

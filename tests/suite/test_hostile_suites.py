@@ -11,8 +11,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from probe_kit._system.bounded_json import parse_json
-from probe_kit._terminal.plain_text import UNSAFE
+from probe_kit._system.bounded_files import parse_json
+from probe_kit._system.escaping import UNSAFE
 from probe_kit.cli import app
 from probe_kit.errors import SuiteError
 from probe_kit.suite import Suite, load_suite

@@ -10,7 +10,7 @@ import pytest
 
 from probe_kit.statistics.folds import assign_folds
 from probe_kit.suite import Item, Suite, build_suite, load_suite, validate_suite
-from probe_kit.suite.leakage import Baseline, limit_for, run_baselines
+from probe_kit.suite.validate import Baseline, limit_for, run_baselines
 
 
 def part(suite: Suite, keep: Callable[[Item], bool]) -> Suite:
@@ -52,7 +52,7 @@ def test_text_gives_the_answer_away_if_a_layout_is_tied_to_it(embedded: Suite) -
 
 
 def test_folds_never_separate_layouts_or_twins(embedded: Suite, monkeypatch: pytest.MonkeyPatch) -> None:
-    from probe_kit.suite import leakage as baselines
+    from probe_kit.suite import validate as baselines
 
     made = []
 

@@ -4,10 +4,9 @@ import pytest
 
 from probe_kit.errors import SuiteError, UsageError
 from probe_kit.suite import Episode, build_suite, validate_suite
-from probe_kit.suite.generators.categories.public_info import PICTOGRAMS
-from probe_kit.suite.items import Item
-from probe_kit.suite.validation.records import check_record
-from probe_kit.suite.wording import WORDINGS, check_wordings, in_words, side_words
+from probe_kit.suite.generators.public_info import PICTOGRAMS
+from probe_kit.suite.items import WORDINGS, Item, check_wordings, in_words, side_words
+from probe_kit.suite.rules import check_record
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from probe_kit._execution.executor import WorkerLostWarning
-from probe_kit._system.installing import install_command
+from probe_kit._system.imports import install_command
 from probe_kit.errors import MissingExtraError, TooFewGroupsError, UsageError, WorkerDiedError
 from probe_kit.hooks import Site
 from probe_kit.statistics.label_permutations import flip_items

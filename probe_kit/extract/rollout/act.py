@@ -3,8 +3,7 @@
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
-from probe_kit._system.bounded_files import read_regular
-from probe_kit._system.bounded_json import parse_json
+from probe_kit._system.bounded_files import parse_json, read_regular
 from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.extract.needs import PlannedSizes
 from probe_kit.extract.parts import SCRIPTED

@@ -26,7 +26,7 @@ from probe_kit.extract.vqa.templates import Order, sides
 from probe_kit.hooks.checkpoints.third_party import copied
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.runs.layout import StoredStream
-from probe_kit.suite.wording import side_words
+from probe_kit.suite.items import side_words
 
 if TYPE_CHECKING:
     from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit._terminal.plain_text import terminal_safe
+from probe_kit._system.escaping import terminal_safe
 from probe_kit.errors import (
     CheckpointError,
     ObservationError,

@@ -8,7 +8,7 @@ import warnings
 from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
-from probe_kit._system.entry_points import entry_points
+from probe_kit._system.imports import entry_points
 from probe_kit._terminal.field_options import options_of
 from probe_kit.errors import UsageError
 from probe_kit.extract.sources.environment import EnvSource

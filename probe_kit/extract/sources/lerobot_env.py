@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit._system.optional_dependencies import require
+from probe_kit._system.imports import require
 from probe_kit.errors import MissingExtraError, OwnEnvironmentError, UsageError
 from probe_kit.extract.sources.environment_contract import SUCCESS, EnvEpisode, Step
 from probe_kit.hooks.contract.observation import Observation

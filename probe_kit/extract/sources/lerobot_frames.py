@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit._system.optional_dependencies import require
+from probe_kit._system.imports import require
 from probe_kit._system.parquet_files import open_parquet, read_parquet
 from probe_kit.errors import RecordingError
 from probe_kit.extract.sources.lerobot_folder import LeRobotFolder

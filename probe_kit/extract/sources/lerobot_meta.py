@@ -9,8 +9,8 @@ from math import isfinite
 from pathlib import Path
 from typing import Any, Self
 
-from probe_kit._system.bounded_json import read_json_object
-from probe_kit._system.optional_dependencies import require
+from probe_kit._system.bounded_files import read_json_object
+from probe_kit._system.imports import require
 from probe_kit._system.parquet_files import open_parquet, read_parquet
 from probe_kit.errors import RecordingError
 from probe_kit.extract.sources.hashed_files import HashedFiles

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from probe_kit._system.entry_points import entry_points
-from probe_kit._terminal.plain_text import UNSAFE
+from probe_kit._system.escaping import UNSAFE
+from probe_kit._system.imports import entry_points
 from probe_kit.errors import ObservationError, OwnEnvironmentError, ProbeKitError, UsageError
 from probe_kit.extract.sources.environment import LEROBOT, EnvSource
 from probe_kit.extract.sources.environment_contract import SUCCESS, EnvEpisode, OwnEnvironment, Step

@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator
 
 from probe_kit._system.bounded_files import read_regular
+from probe_kit._system.escaping import UNSAFE, terminal_safe
 from probe_kit._system.table_cells import group_names
 from probe_kit._system.text_tables import MOST_BYTES, TextTable, open_table
 from probe_kit._tables.label_table import LabelTable
-from probe_kit._terminal.plain_text import UNSAFE, terminal_safe
 from probe_kit.errors import RecordingError, UsageError
 from probe_kit.extract.plan import Row
 from probe_kit.extract.sources.player import SIDE, Answer, InputsPlayer, Opens

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit._system.counting import spanned
-from probe_kit._terminal.plain_text import terminal_safe
+from probe_kit._system.escaping import terminal_safe
 from probe_kit.errors import ObservationError, RecordingError
 from probe_kit.extract.plan import Row
 from probe_kit.extract.sources.lerobot_folder import MOST_FRAMES, LeRobotFolder, fetched, open_lerobot

@@ -17,7 +17,7 @@ from probe_kit.extract.parts import LARGEST, Scene, option_of
 from probe_kit.extract.sources.source import SourceSettings
 from probe_kit.runs.origin import OF_SCENE
 from probe_kit.scene_names import ArmName, Rendering
-from probe_kit.suite.wording import WORDINGS, Wording, check_wordings
+from probe_kit.suite.items import WORDINGS, Wording, check_wordings
 
 if TYPE_CHECKING:
     from probe_kit.env import SceneSpec
@@ -90,7 +90,7 @@ class SceneSettings(SourceSettings):
     """Questions of a suite in the built-in scene.
 
     suite: suite folder; None for the embedded suite. categories: slugs; None for all of the suite. items: items
-    per category; None for all. wordings: names of `suite.wording`, each a condition of the run; None for the
+    per category; None for all. wordings: of `suite.items.WORDINGS`, each a condition of the run; None for the
     items' own words alone. scene: by default the model's own, see `Family.home`.
     """
 

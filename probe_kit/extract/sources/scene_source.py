@@ -22,8 +22,8 @@ from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.sites import CAMERA
 from probe_kit.suite import Episode, Suite, default_suite, load_suite
 from probe_kit.suite.build import ITEMS, default_folder
-from probe_kit.suite.validation.sufficiency import Smallest
-from probe_kit.suite.wording import Wording, in_words
+from probe_kit.suite.items import Wording, in_words
+from probe_kit.suite.sufficiency import Smallest
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy

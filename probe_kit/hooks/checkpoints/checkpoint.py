@@ -11,8 +11,14 @@ from typing import Any, NamedTuple
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
-from probe_kit._system.bounded_files import MOST_BYTES, check_regular, load_yaml, read_regular, read_regular_text
-from probe_kit._system.bounded_json import load_json
+from probe_kit._system.bounded_files import (
+    MOST_BYTES,
+    check_regular,
+    load_json,
+    load_yaml,
+    read_regular,
+    read_regular_text,
+)
 from probe_kit.errors import CheckpointError, UsageError, WeightsError
 from probe_kit.models.bounds import check_sizes
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from probe_kit._system.bounded_json import read_json, read_json_object
+from probe_kit._system.bounded_files import read_json, read_json_object
 from probe_kit.errors import CheckpointError, WeightsError
 from probe_kit.hooks.checkpoints.checkpoint import (
     ADAPTER_FILE,

@@ -23,7 +23,7 @@ from typing import Any, TextIO
 import numpy as np
 from rich.file_proxy import FileProxy
 
-from probe_kit._terminal.plain_text import terminal_safe
+from probe_kit._system.escaping import terminal_safe
 from probe_kit.errors import CheckpointError, InstructionError, PolicyFailedError, ProbeKitError, WeightsError
 from probe_kit.hooks.checkpoints.folders import with_adapters_named
 from probe_kit.hooks.contract.observation import Observation

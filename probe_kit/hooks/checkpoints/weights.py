@@ -15,8 +15,8 @@ import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
-from probe_kit._system.bounded_json import load_json
-from probe_kit._system.optional_dependencies import require
+from probe_kit._system.bounded_files import load_json
+from probe_kit._system.imports import require
 from probe_kit.errors import WeightsError
 from probe_kit.hooks.checkpoints.checkpoint import check_unambiguous, shard_name
 from probe_kit.hooks.checkpoints.folders import SCALING, AdapterFiles, adapter_in

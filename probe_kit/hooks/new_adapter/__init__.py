@@ -14,7 +14,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from string import Template
 
-from probe_kit._system.installing import install_here_command
+from probe_kit._system.imports import install_here_command
 from probe_kit.errors import UsageError
 from probe_kit.hooks.registry import family_names
 from probe_kit.version import __version__

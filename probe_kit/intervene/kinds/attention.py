@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit._system.bounded_arrays import open_arrays
+from probe_kit._system.bounded_files import open_arrays
 from probe_kit.errors import CaptureChangedActionError, CaptureError, EmptyRoleError, UsageError
 from probe_kit.hooks.contract.declared import InterventionKind
 from probe_kit.hooks.contract.observation import Observation

@@ -12,7 +12,7 @@ Nothing is stored; `run_intervention` makes the same patches, stores them, and g
 
 from typing import TYPE_CHECKING
 
-from probe_kit._system.lazy import lazy_names
+from probe_kit._system.imports import lazy_names
 
 if TYPE_CHECKING:
     from probe_kit.hooks.capturing.readouts import logit_lens, project_heads

@@ -21,9 +21,7 @@ from probe_kit.runs.layout import FIRST_FRAME
 from probe_kit.runs.origin import OF_SCENE
 from probe_kit.runs.reader import origin_of
 from probe_kit.runs.run import Run
-from probe_kit.suite.grouping import counterparts_of
-from probe_kit.suite.items import Episode, Item, Layout
-from probe_kit.suite.wording import check_wordings, in_words
+from probe_kit.suite.items import Episode, Item, Layout, check_wordings, counterparts_of, in_words
 from probe_kit.train.data.run_suite import suite_of
 
 if TYPE_CHECKING:

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 from probe_kit._system.counting import enumerated
 from probe_kit._system.drafts import write_whole
+from probe_kit._system.escaping import without_places
 from probe_kit._tables.content import heat_key
 from probe_kit._tables.table import Table
-from probe_kit._terminal.plain_text import without_places
 from probe_kit.errors import UsageError
 from probe_kit.retention.columns.comparisons import known_used_tables
 from probe_kit.retention.columns.tables import SUBJECTS

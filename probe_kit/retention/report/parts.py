@@ -11,9 +11,9 @@ from typing import Any
 from urllib.parse import quote
 from xml.etree import ElementTree
 
+from probe_kit._system.escaping import without_places
 from probe_kit._tables.html import environment
 from probe_kit._tables.table import Table
-from probe_kit._terminal.plain_text import without_places
 from probe_kit.retention.behaviour import ask_of
 from probe_kit.retention.columns.sentences import VERDICT_HELP
 from probe_kit.retention.columns.text import TERMS

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from probe_kit._system.imports import require
 from probe_kit._system.machine import same_scheduling
-from probe_kit._system.optional_dependencies import require
 from probe_kit.env.scoring import MOTION, STATE
 from probe_kit.errors import UsageError
 from probe_kit.runs.run import Run

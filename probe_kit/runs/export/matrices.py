@@ -11,7 +11,7 @@ import numpy as np
 from numpy.lib.format import open_memmap
 from numpy.typing import NDArray
 
-from probe_kit._system.optional_dependencies import require
+from probe_kit._system.imports import require
 from probe_kit.errors import UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.sites import Site

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from probe_kit._system.optional_dependencies import require
+from probe_kit._system.imports import require
 from probe_kit.runs.export.vectors import POOLED, Block, StreamChoice, blocks
 from probe_kit.runs.run import Run
 

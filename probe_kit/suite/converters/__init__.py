@@ -1,7 +1,6 @@
 """Converters: Act2Answer items from published benchmarks, and from sets in Act2Answer's own format."""
 
-from probe_kit.suite.converters.conversion import PAPER_ITEMS, PAPER_POOL, SOURCES, convert
-from probe_kit.suite.converters.options import (
+from probe_kit.suite.converters.candidates import (
     Act2AnswerOptions,
     CompBenchOptions,
     ConvertOptions,
@@ -10,6 +9,7 @@ from probe_kit.suite.converters.options import (
     OkVqaOptions,
     VlThinkOptions,
 )
+from probe_kit.suite.converters.conversion import PAPER_ITEMS, PAPER_POOL, SOURCES, convert
 from probe_kit.suite.converters.rewriting import rewrite
 
 __all__ = [

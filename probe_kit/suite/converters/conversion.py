@@ -15,29 +15,28 @@ from probe_kit._system.bounded_files import open_regular
 from probe_kit.errors import SuiteError, UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.suite.categories import check_categories
-from probe_kit.suite.converters.benchmarks import act2answer, compbench, iconqa, mmbench, okvqa, vlthink
-from probe_kit.suite.converters.benchmarks.act2answer import SOURCE as ACT2ANSWER
-from probe_kit.suite.converters.candidates import Candidate, Reading, SourcePicture, Wording
-from probe_kit.suite.converters.curation import apply_curation, read_curation, write_curation
-from probe_kit.suite.converters.filters import picture_problem, text_problem
-from probe_kit.suite.converters.llm import propose_wording
-from probe_kit.suite.converters.options import (
+from probe_kit.suite.converters import act2answer, compbench, iconqa, mmbench, okvqa, vlthink
+from probe_kit.suite.converters.act2answer import SOURCE as ACT2ANSWER
+from probe_kit.suite.converters.candidates import (
+    Candidate,
     CompBenchOptions,
     ConvertOptions,
     IconQaOptions,
     MmbenchOptions,
     OkVqaOptions,
+    Reading,
+    SourcePicture,
     VlThinkOptions,
+    Wording,
     options_from,
 )
+from probe_kit.suite.converters.curation import apply_curation, read_curation, write_curation
 from probe_kit.suite.converters.pairing import Bundle, Proposal, emit, pair_candidates, sample
-from probe_kit.suite.converters.rewriting import rewrite
-from probe_kit.suite.grouping import with_groups
-from probe_kit.suite.items import Item
+from probe_kit.suite.converters.rewriting import picture_problem, propose_wording, rewrite, text_problem
+from probe_kit.suite.items import Item, instruction_for, with_groups
 from probe_kit.suite.manifest import check_foreign_folder, save_suite
 from probe_kit.suite.pictures import Look, look_of
 from probe_kit.suite.suite import Suite, new_suite
-from probe_kit.suite.wording import instruction_for
 
 VERSION = "1.0.0"
 # Table of tasks of the paper: what its authors found and what they kept. Concepts, where the source is boards.

@@ -8,8 +8,7 @@ from typing import Any
 
 from PIL import Image
 
-from probe_kit._system.bounded_files import read_regular
-from probe_kit._system.bounded_json import parse_json
+from probe_kit._system.bounded_files import parse_json, read_regular
 from probe_kit._system.drafts import write_whole
 from probe_kit._system.escaping import csv_of_rows
 from probe_kit._system.table_cells import is_missing, plain_cell, truth_of
@@ -17,7 +16,7 @@ from probe_kit._system.text_tables import open_table
 from probe_kit.errors import SuiteError
 from probe_kit.suite.converters.candidates import SourcePicture, Wording
 from probe_kit.suite.converters.pairing import Proposal
-from probe_kit.suite.wording import instruction_for
+from probe_kit.suite.items import instruction_for
 
 STATUSES = ("pending", "accept", "reject", "edited")
 COLUMNS = (

@@ -10,9 +10,8 @@ from PIL import Image
 
 from probe_kit.hashing import sha256_json
 from probe_kit.suite.converters.candidates import Candidate, Reading, SourcePicture, Wording
-from probe_kit.suite.items import Item, Side, other_side
-from probe_kit.suite.making import Picture, make_item, squared_picture
-from probe_kit.suite.wording import instruction_for
+from probe_kit.suite.items import Item, Side, instruction_for, other_side
+from probe_kit.suite.suite import Picture, make_item, squared_picture
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,28 @@
-"""Rewriting of a benchmark's question to a phrase that names the correct picture: an ordered rule table."""
+"""Words of converted questions: an ordered rule table names the correct picture; and filters.
 
+Optionally a language model proposes a wording where no rule matches. A person must accept it.
+"""
+
+import json
+import os
 import re
+import unicodedata
+import urllib.error
+import urllib.request
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
-from probe_kit.suite.converters.candidates import Wording
+import numpy as np
+from PIL import Image
+
+from probe_kit._system.bounded_files import MOST_BYTES, parse_json, read_regular_text
+from probe_kit._system.drafts import write_whole
+from probe_kit.errors import SuiteError, UsageError
+from probe_kit.hashing import sha256_json, sha256_text
+from probe_kit.suite.converters.candidates import Candidate, ConvertOptions, Wording
+from probe_kit.suite.items import instruction_for, side_words
 
 # Opposites that were looked at one by one. Any other comparative is negated as "less" and its base.
 ANTONYMS = {
@@ -233,3 +251,116 @@ _TABLE: tuple[_Rule, ...] = (
     _rule("R7", r"which (?:shape|figure|letter|object|one) has (?P<y>(?:a |no )?lines? of symmetry)", _with),
     _rule("R8", r"which (?:.+?) (?:shows|is) an? (?P<noun>.+)", _noun),
 )
+
+
+_LEAST_EDGE_ENERGY = 0.25  # of the original, after a picture was as small as on the screen
+
+
+def picture_problem(image: Image.Image, options: ConvertOptions, least_side: int | None = None) -> str | None:
+    """Why the picture cannot be used, None if it can."""
+    if min(image.size) < (options.min_side if least_side is None else least_side):
+        return "picture too small"
+    if max(image.size) > options.max_aspect * min(image.size):
+        return "picture too long"
+    grey = np.asarray(image.convert("L"), np.float64)
+    if max(grey.std(), np.asarray(image, np.float64).std(axis=(0, 1)).max()) < options.min_spread:
+        return "picture nearly blank"
+    if options.legible_at is not None and _edges_lost(image, options.legible_at):
+        return "picture not legible on a tile"
+    return None
+
+
+def _edges_lost(image: Image.Image, tile: int) -> bool:
+    small = image.resize((tile, tile), Image.Resampling.LANCZOS).resize(image.size, Image.Resampling.BICUBIC)
+    return _edge_energy(small) < _LEAST_EDGE_ENERGY * _edge_energy(image)
+
+
+def _edge_energy(image: Image.Image) -> float:
+    grey = np.asarray(image.convert("L"), np.float64)
+    return float(sum((np.diff(grey, axis=axis) ** 2).sum() for axis in (0, 1)))
+
+
+def text_problem(instruction: str, phrase: str, options: ConvertOptions) -> str | None:
+    """Why the instruction cannot be used, None if it can."""
+    text = unicodedata.normalize("NFKC", instruction)
+    checks: dict[str, Callable[[], bool]] = {
+        "instruction has too many words": lambda: len(text.split()) > options.max_words,
+        "instruction too long": lambda: len(text) > options.max_characters,
+        "instruction is more than one sentence": lambda: any(
+            mark in text.rstrip(".") for mark in (". ", "? ", "! ", "\n")
+        ),
+        "instruction ends with a period": lambda: text.endswith("."),
+        "instruction is not plain ASCII": lambda: (
+            not options.allow_unicode and not (text.isascii() and text.isprintable())
+        ),
+        "instruction names no object": lambda: not phrase.strip(),
+        "instruction names a side": lambda: bool(side_words(text)),
+    }
+    return next((reason for reason, failed in checks.items() if failed()), None)
+
+
+_TIMEOUT_SECONDS = 60
+_PROMPT = """Rewrite a question about two pictures as a command that names the picture that answers it.
+Answer with one JSON object: instruction (starts with "Put the cube on"), object (the words after that, without
+a leading article), polarity (pos, neg or none), keep (false if choosing one of two pictures is no answer)."""
+
+
+def propose_wording(candidate: Candidate, options: ConvertOptions) -> Wording | None:
+    """Return the wording that the service proposes, None if it proposes nothing usable.
+
+    Replies are kept in `llm_cache`, so that the same conversion needs no network again. Raises UsageError for
+    incomplete options, and SuiteError if the service does not answer.
+    """
+    if options.llm_base is None:
+        return None
+    if not options.llm_model or not options.llm_cache:
+        raise UsageError(
+            "llm_base needs llm_model and llm_cache as well. Name the model and a folder for replies."
+        )
+    question = {"question": candidate.question, "answer": candidate.answer}
+    key = sha256_json([options.llm_model, _PROMPT, question])
+    cached = Path(options.llm_cache) / f"{key}.json"
+    if not cached.is_file():
+        reply = _ask(options.llm_base, options.llm_model, json.dumps(question, ensure_ascii=False))
+        write_whole(cached, reply)
+    return _usable(read_regular_text(cached), options.llm_model)
+
+
+def _ask(base: str, model: str, question: str) -> str:
+    body = {
+        "model": model,
+        "temperature": 0,
+        "response_format": {"type": "json_object"},
+        "messages": [{"role": "system", "content": _PROMPT}, {"role": "user", "content": question}],
+    }
+    request = urllib.request.Request(
+        f"{base.rstrip('/')}/chat/completions",
+        data=json.dumps(body).encode(),
+        headers={
+            "Content-Type": "application/json",
+            "Authorization": f"Bearer {os.environ.get('PROBE_KIT_LLM_KEY', '')}",
+        },
+    )
+    try:
+        with urllib.request.urlopen(request, timeout=_TIMEOUT_SECONDS) as response:
+            content = parse_json(response.read(MOST_BYTES))["choices"][0]["message"]["content"]
+    except (urllib.error.URLError, TimeoutError, ValueError, KeyError, IndexError, TypeError) as problem:
+        raise SuiteError(
+            f"{base} gave no usable reply ({problem!r}). Check llm_base, or leave it out."
+        ) from problem
+    return str(content)
+
+
+def _usable(reply: str, model: str) -> Wording | None:
+    try:
+        proposal: Any = parse_json(reply)
+    except ValueError:
+        return None
+    if not isinstance(proposal, dict) or proposal.get("keep") is not True:
+        return None
+    phrase, instruction = str(proposal.get("object", "")).strip(), str(proposal.get("instruction", "")).strip()
+    for article in ("the", "none"):
+        if phrase and instruction == instruction_for(phrase, article):
+            origin = {"model": model, "prompt_sha256": sha256_text(_PROMPT), "raw": reply}
+            return Wording(phrase, "llm", article=article, proposed_by=origin)
+    return None

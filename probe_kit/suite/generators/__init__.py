@@ -2,20 +2,18 @@
 
 from typing import Any
 
-from probe_kit.suite.generators.canvas import Tile
-from probe_kit.suite.generators.categories.attribute import ATTRIBUTE
-from probe_kit.suite.generators.categories.color import COLOR
-from probe_kit.suite.generators.categories.counting import COUNTING
-from probe_kit.suite.generators.categories.emotion import EMOTION
-from probe_kit.suite.generators.categories.living_world import LIVING_WORLD
-from probe_kit.suite.generators.categories.public_info import PUBLIC_INFO
-from probe_kit.suite.generators.categories.shape import SHAPE
-from probe_kit.suite.generators.categories.state import STATE
-from probe_kit.suite.generators.categories.symmetry import SYMMETRY
-from probe_kit.suite.generators.categories.time import TIME
-from probe_kit.suite.generators.categories.traffic import TRAFFIC
+from probe_kit.suite.generators.attribute import ATTRIBUTE
+from probe_kit.suite.generators.counting import COUNTING
+from probe_kit.suite.generators.drawing import Tile
+from probe_kit.suite.generators.emotion import EMOTION
 from probe_kit.suite.generators.generator import Concept, Generator
-from probe_kit.suite.wording import instruction_for
+from probe_kit.suite.generators.living_world import LIVING_WORLD
+from probe_kit.suite.generators.public_info import PUBLIC_INFO
+from probe_kit.suite.generators.shapes import COLOR, SHAPE, SYMMETRY
+from probe_kit.suite.generators.state import STATE
+from probe_kit.suite.generators.time import TIME
+from probe_kit.suite.generators.traffic import TRAFFIC
+from probe_kit.suite.items import instruction_for
 
 __all__ = ["GENERATORS", "Concept", "Generator", "Tile", "vocabulary"]
 

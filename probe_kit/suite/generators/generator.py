@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from probe_kit.hashing import derive_seed, sha256_json
-from probe_kit.suite.generators.canvas import Tile
+from probe_kit.suite.generators.drawing import Tile
 
 
 @dataclass(frozen=True)

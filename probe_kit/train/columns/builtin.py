@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit._system.column_cells import Cell
+from probe_kit._system.table_cells import Cell
 from probe_kit.errors import UsageError
 from probe_kit.runs.action_errors import compare_actions, why_not_compared
 from probe_kit.runs.reader import RunReader, reached_calls

@@ -11,12 +11,12 @@ from uuid import UUID
 import numpy as np
 
 from probe_kit._system.bounded_files import check_regular
-from probe_kit._system.column_cells import Cell
-from probe_kit._system.optional_dependencies import require
+from probe_kit._system.escaping import UNSAFE, terminal_safe
+from probe_kit._system.imports import require
 from probe_kit._system.parquet_files import open_parquet, read_parquet
+from probe_kit._system.table_cells import Cell
 from probe_kit._system.text_tables import MOST_BYTES, cell_of, open_table
 from probe_kit._tables.label_table import LabelTable
-from probe_kit._terminal.plain_text import UNSAFE, terminal_safe
 from probe_kit.errors import UsageError
 
 if TYPE_CHECKING:

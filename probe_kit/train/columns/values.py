@@ -7,7 +7,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit._system.column_cells import Cell
+from probe_kit._system.table_cells import Cell
 from probe_kit.errors import UsageError
 from probe_kit.train.choices import TASKS, Task
 

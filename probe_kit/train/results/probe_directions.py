@@ -8,7 +8,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit._system.bounded_arrays import open_arrays
+from probe_kit._system.bounded_files import open_arrays
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.runs.direction_files import about_direction, write_directions
 from probe_kit.runs.results import Bundle

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from probe_kit._system.bounded_arrays import UNREADABLE, open_arrays
+from probe_kit._system.bounded_files import UNREADABLE, open_arrays
 from probe_kit._system.escaping import csv_of_frame
 from probe_kit.errors import NoProbesError, RunDamagedError, UsageError
 from probe_kit.hashing import sha256_json

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from probe_kit._terminal.plain_text import terminal_safe, without_places
+from probe_kit._system.escaping import terminal_safe, without_places
 
 LOG_ODDS_SCALE = 256
 """Steps per unit of log-odds: the error is below 0.002."""

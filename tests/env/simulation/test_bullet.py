@@ -7,7 +7,7 @@ import numpy as np
 import pybullet
 import pytest
 
-from probe_kit._system.installing import install_command
+from probe_kit._system.imports import install_command
 from probe_kit.env.simulation import BulletClient
 
 

@@ -18,7 +18,7 @@ import pytest
 import torch
 
 from probe_kit._execution.executor import WorkerLostWarning
-from probe_kit._terminal.plain_text import UNSAFE
+from probe_kit._system.escaping import UNSAFE
 from probe_kit.env import SceneSpec
 from probe_kit.errors import CaptureChangedActionError, EpisodesFailedError, PolicyFailedError, UsageError
 from probe_kit.extract import ExtractSettings, extract_run

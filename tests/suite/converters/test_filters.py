@@ -3,7 +3,7 @@ import pytest
 from PIL import Image
 
 from probe_kit.suite.converters import ConvertOptions
-from probe_kit.suite.converters.filters import picture_problem, text_problem
+from probe_kit.suite.converters.rewriting import picture_problem, text_problem
 from probe_kit.suite.pictures import look_of
 
 OPTIONS = ConvertOptions()

@@ -10,10 +10,10 @@ import pytest
 
 from probe_kit.hashing import sha256_json
 from probe_kit.suite import build_suite
+from probe_kit.suite.build import draw_twins
 from probe_kit.suite.generators import GENERATORS
+from probe_kit.suite.generators.drawing import COLORS, INK_CONTRAST, background_for, lightness
 from probe_kit.suite.generators.generator import draw_couples
-from probe_kit.suite.generators.palette import COLORS, INK_CONTRAST, background_for, lightness
-from probe_kit.suite.generators.twins import draw_twins
 
 COLOURFUL = ("attribute", "color", "shape", "traffic")
 DRAWN_FROM = "091f29c53352e411b1b0b3458a1487bd2be7256957eef7daecb189dc284b8872"

@@ -13,20 +13,28 @@ from PIL import Image
 
 from probe_kit.suite import CATEGORIES
 from probe_kit.suite.generators import GENERATORS, Concept, vocabulary
-from probe_kit.suite.generators.art import FOLDER as ART
-from probe_kit.suite.generators.art import color_icon, mask_icon
-from probe_kit.suite.generators.canvas import Canvas, Placement, Points
-from probe_kit.suite.generators.categories.attribute import GRADABLES
-from probe_kit.suite.generators.categories.counting import GLYPHS
-from probe_kit.suite.generators.categories.living_world import CREATURES, THINGS
-from probe_kit.suite.generators.categories.public_info import PICTOGRAMS
-from probe_kit.suite.generators.categories.state import TWO_STATES
-from probe_kit.suite.generators.categories.symmetry import mirror_overlap
-from probe_kit.suite.generators.categories.traffic import ROAD_SIGN_ICONS, ROAD_SIGNS
+from probe_kit.suite.generators.attribute import GRADABLES
+from probe_kit.suite.generators.counting import GLYPHS
+from probe_kit.suite.generators.drawing import (
+    COLORS,
+    INK_CONTRAST,
+    Canvas,
+    Placement,
+    Points,
+    background_for,
+    color_icon,
+    jittered,
+    lightness,
+    mask_icon,
+)
+from probe_kit.suite.generators.drawing import FOLDER as ART
 from probe_kit.suite.generators.generator import Couple, draw_couples, visiting_order
-from probe_kit.suite.generators.outlines import OUTLINES
-from probe_kit.suite.generators.palette import COLORS, INK_CONTRAST, background_for, jittered, lightness
-from probe_kit.suite.wording import MOST_WORDS, instruction_for, side_words
+from probe_kit.suite.generators.living_world import CREATURES, THINGS
+from probe_kit.suite.generators.public_info import PICTOGRAMS
+from probe_kit.suite.generators.shapes import OUTLINES, mirror_overlap
+from probe_kit.suite.generators.state import TWO_STATES
+from probe_kit.suite.generators.traffic import ROAD_SIGN_ICONS, ROAD_SIGNS
+from probe_kit.suite.items import MOST_WORDS, instruction_for, side_words
 
 THUMBNAILS = Path(__file__).with_name("thumbnails.png")
 

@@ -15,7 +15,7 @@ from probe_kit.statistics.sufficiency import (
     groups_for_signal,
 )
 from probe_kit.suite import Suite
-from probe_kit.suite.validation.sufficiency import Smallest, Sufficiency, sufficiencies
+from probe_kit.suite.sufficiency import Smallest, Sufficiency, sufficiencies
 
 
 def by_name(suite: Suite, scored: bool = True, probed: bool = True) -> dict[str, Sufficiency]:

@@ -12,7 +12,7 @@ import pytest
 from probe_kit.errors import SuiteError
 from probe_kit.suite import Suite, load_suite
 from probe_kit.suite.pictures import decode_picture
-from probe_kit.suite.validation.records import Finding, listing
+from probe_kit.suite.rules import Finding, listing
 from tests.support.changed_suites import save_changed
 
 Record = dict[str, Any]

@@ -21,7 +21,7 @@ from probe_kit.runs.store import locate
 from probe_kit.runs.writer import RunWriter
 from probe_kit.suite import Suite, build_suite
 from probe_kit.suite.build import default_folder
-from probe_kit.suite.wording import Wording
+from probe_kit.suite.items import Wording
 from probe_kit.train import ArrayRun, train_probes
 from probe_kit.train.data.run_suite import suite_of
 from tests.support.changed_suites import CHANGES, other_name, save_changed

@@ -28,7 +28,7 @@ from lerobot.policies.groot.utils import stat_dim_from_entry
 from torch import Tensor
 from transformers import BatchFeature
 
-from probe_kit._system.bounded_json import read_json_object
+from probe_kit._system.bounded_files import read_json_object
 from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE
 from probe_kit.hooks.checkpoints.folders import inside_or_hub

@@ -28,7 +28,7 @@ from torch import Tensor
 from torchvision.transforms.v2 import functional
 from transformers import AutoTokenizer, Qwen2VLImageProcessor, Qwen3VLProcessor, Qwen3VLVideoProcessor
 
-from probe_kit._system.bounded_json import read_json_object
+from probe_kit._system.bounded_files import read_json_object
 from probe_kit.errors import CheckpointError, InstructionError
 from probe_kit.hooks.checkpoints.checkpoint import shard_name
 from probe_kit.hooks.families.shared.kinds import IMAGES, STATE

@@ -15,7 +15,7 @@ from typing import Any
 
 from safetensors.torch import save_file
 
-from probe_kit._system.bounded_json import load_json
+from probe_kit._system.bounded_files import load_json
 from probe_kit._system.drafts import draft_of
 from probe_kit.errors import CheckpointError, ProbeKitError, UsageError
 from probe_kit.hooks.checkpoints.checkpoint import PATTERNS, hub_files, side_files

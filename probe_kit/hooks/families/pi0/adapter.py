@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from probe_kit._system.bounded_json import load_json
+from probe_kit._system.bounded_files import load_json
 from probe_kit.errors import CheckpointError
 from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, without_revision
 from probe_kit.hooks.contract.card import EMBEDDED

@@ -35,7 +35,7 @@ from scipy.fft import idct  # type: ignore[import-untyped]
 from tokenizers import Tokenizer
 from torch import Tensor, nn
 
-from probe_kit._system.bounded_json import load_json
+from probe_kit._system.bounded_files import load_json
 from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.hooks.checkpoints.folders import inside_or_hub
 from probe_kit.hooks.contract.model import Unembedding

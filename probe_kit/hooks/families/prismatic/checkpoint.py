@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from probe_kit._system.optional_dependencies import require
+from probe_kit._system.imports import require
 from probe_kit.errors import CheckpointError, UsageError, WeightsError
 from probe_kit.hooks.checkpoints.checkpoint import PATTERNS, RUN_WEIGHTS, chosen_dtype
 from probe_kit.hooks.checkpoints.folders import AdapterFiles, adapter_in, checkpoint_folder

@@ -10,7 +10,7 @@ import torch
 from huggingface_hub.errors import StrictDataclassError
 from torch import Tensor, nn
 
-from probe_kit._system.bounded_json import load_json
+from probe_kit._system.bounded_files import load_json
 from probe_kit.errors import CheckpointError, UsageError, WeightsError
 from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, chosen_dtype, content_hashes, side_files
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder

@@ -11,7 +11,7 @@ from peft import LoraConfig, get_peft_model
 from safetensors.torch import load_file, save_file
 from torch import nn
 
-from probe_kit._system.installing import install_command
+from probe_kit._system.imports import install_command
 from probe_kit.errors import CheckpointError, MissingExtraError, UsageError, WeightsError
 from probe_kit.hooks.families.openvla.adapter import load_openvla
 from probe_kit.hooks.families.prismatic.checkpoint import load_checkpoint, quantise

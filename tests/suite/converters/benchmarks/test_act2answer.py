@@ -11,7 +11,7 @@ import pytest
 from probe_kit.errors import SuiteError, UnknownCategoryError, UsageError
 from probe_kit.suite import load_suite, validate_suite
 from probe_kit.suite.converters import convert
-from probe_kit.suite.converters.benchmarks.act2answer import BoundingBoxWarning, object_of
+from probe_kit.suite.converters.act2answer import BoundingBoxWarning, object_of
 from tests.conftest import SHARED
 from tests.support.act2answer_tiles import art, write_tile
 

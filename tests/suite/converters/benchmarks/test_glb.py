@@ -8,9 +8,9 @@ import pytest
 from PIL import Image
 
 from probe_kit.errors import SuiteError
-from probe_kit.suite.converters.benchmarks.glb import read_tile
-from probe_kit.suite.converters.benchmarks.vlthink import upright_board
-from probe_kit.suite.converters.files import trimmed
+from probe_kit.suite.converters.act2answer import read_tile
+from probe_kit.suite.converters.candidates import trimmed
+from probe_kit.suite.converters.vlthink import upright_board
 from tests.conftest import SHARED
 from tests.support.act2answer_tiles import THICKNESS, WIDTH, art, write_tile
 

@@ -8,7 +8,7 @@ import pytest
 from probe_kit.errors import SuiteError
 from probe_kit.suite import load_picture, validate_suite
 from probe_kit.suite.converters import convert
-from probe_kit.suite.converters.benchmarks.vlthink import upright_board
+from probe_kit.suite.converters.vlthink import upright_board
 
 REAL = Path(os.environ.get("PROBE_KIT_SHARED", Path(__file__).parents[5] / "shared")) / "data" / "vl-think"
 

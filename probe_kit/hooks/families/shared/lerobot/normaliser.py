@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import load_file
 
-from probe_kit._system.bounded_files import read_regular
-from probe_kit._system.bounded_json import parse_json
+from probe_kit._system.bounded_files import parse_json, read_regular
 from probe_kit.errors import CheckpointError
 from probe_kit.hooks.checkpoints.checkpoint import shard_name
 from probe_kit.hooks.families.shared.lerobot.pipelines import (

@@ -8,7 +8,7 @@ from typing import Any
 
 from safetensors import SafetensorError, safe_open
 
-from probe_kit._system.bounded_json import read_json_object
+from probe_kit._system.bounded_files import read_json_object
 from probe_kit.errors import CheckpointError
 from probe_kit.hooks.checkpoints.checkpoint import shard_name
 

@@ -19,7 +19,7 @@ from lerobot.configs.policies import PreTrainedConfig
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from probe_kit._system.bounded_json import read_json_object
+from probe_kit._system.bounded_files import read_json_object
 from probe_kit.errors import CheckpointError, InstructionError, ObservationError
 from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, SMALL_FILES, side_files
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder

@@ -1,0 +1,128 @@
+"""Imports: lazy names of packages, entry points, optional libraries, and the command that installs one."""
+
+import shlex
+import shutil
+import sys
+from collections.abc import Callable, Mapping
+from functools import lru_cache
+from importlib import import_module, metadata
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from probe_kit.errors import MissingExtraError
+
+
+def lazy_names(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """The module-level `__getattr__` and `__dir__` (PEP 562) of `package`.
+
+    `dir`, `help` and the completion of names find `homes` among the names of the package; `dir` imports nothing.
+    homes: name → module inside the package, `module:other_name` where it is called otherwise there, or `module:`
+    where the name is the module's own; a module of another package begins with `probe_kit.`.
+    """
+
+    def load(name: str) -> Any:
+        if name not in homes:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        module, colon, original = homes[name].partition(":")
+        home = import_module(module if module.startswith("probe_kit.") else f"{package}.{module}")
+        return home if colon and not original else getattr(home, original or name)
+
+    def names() -> list[str]:
+        return sorted({*vars(sys.modules[package]), *homes})
+
+    return load, names
+
+
+def entry_points(group: str) -> tuple[metadata.EntryPoint, ...]:
+    """Return the entry points of a group, read again where a folder of the import path has changed."""
+    return tuple(_read(tuple((folder, _modified(folder)) for folder in sys.path)).select(group=group))
+
+
+@lru_cache(maxsize=1)
+def _read(_path: tuple[tuple[str, int], ...]) -> metadata.EntryPoints:
+    # Reads the metadata of every installed package, which takes 40 ms; a study asks a thousand times.
+    return metadata.entry_points()
+
+
+def _modified(folder: str) -> int:
+    try:
+        return Path(folder).stat().st_mtime_ns
+    except OSError:  # the import path may name what is not there
+        return 0
+
+
+def require(module: str, extra: str) -> Any:
+    """The module, or MissingExtraError naming the extra of probe-kit that brings it."""
+    try:
+        return import_module(module)
+    except ImportError as error:
+        raise MissingExtraError(
+            f"this needs {module.partition('.')[0]}, which is not installed; `{install_command(extra)}`"
+        ) from error
+
+
+_ROOT = Path(__file__).parents[2]
+
+
+def install_command(extra: str = "", rebuild: str = "") -> str:
+    """Shell command that installs probe_kit again, with an extra or with one package built anew.
+
+    In a checkout's own environment it is `./with-uv`, which brings uv. Elsewhere it is the pip of the running
+    Python, or `uv pip` where that Python has none. rebuild: a package that needs numpy while it is compiled.
+    """
+    if _is_of_checkout():
+        options = [f"--extra {extra}"] * bool(extra) + [f"--reinstall-package {rebuild}"] * bool(rebuild)
+        return " ".join([_with_uv(), *options, "probe-kit doctor"])
+    if rebuild:
+        again = "--force-reinstall" if _has_pip() else "--reinstall"
+        return f"{_installer()} {again} --no-build-isolation {rebuild}"
+    name = f"probe-kit[{extra}]" if extra else "probe-kit"
+    return f"{_installer()} {shlex.quote(name)}"
+
+
+def install_folder_command(folder: Path) -> str:
+    """Shell command that installs the package in `folder`, which stays editable, for the Python that runs."""
+    return f"{_installer()} -e {shlex.quote(str(folder))}"
+
+
+def install_here_command() -> str:
+    """The same for the folder in which the shell is, in an activated environment.
+
+    It holds on any machine, unless uv is the one that `with-uv` fetched into its folder.
+    """
+    return "pip install -e ." if _has_pip() else f"{_uv()} pip install -e ."
+
+
+def _is_of_checkout() -> bool:
+    """Whether the running Python is the environment that `with-uv` makes in its folder."""
+    return (_ROOT / "with-uv").is_file() and Path(sys.prefix).resolve().is_relative_to(_ROOT.resolve())
+
+
+def _with_uv() -> str:
+    return "./with-uv" if Path.cwd() == _ROOT else shlex.quote(str(_ROOT / "with-uv"))
+
+
+def _has_pip() -> bool:
+    return find_spec("pip") is not None
+
+
+def _installer() -> str:
+    if _has_pip():
+        return f"{_python()} -m pip install"
+    return f"{_uv()} pip install --python {_python()}"
+
+
+def _uv() -> str:
+    """The uv that a shell finds, or that `with-uv` uses."""
+    usual = (Path.home() / ".local/bin/uv", Path.home() / ".cargo/bin/uv", _ROOT / ".uv/bin/uv")
+    if shutil.which("uv") is not None:
+        return "uv"
+    return next((shlex.quote(str(path)) for path in usual if path.is_file()), "uv")
+
+
+def _python() -> str:
+    """The running Python as a shell finds it."""
+    name = Path(sys.executable).name
+    path = shutil.which(name)
+    return name if path is not None and Path(path) == Path(sys.executable) else shlex.quote(sys.executable)

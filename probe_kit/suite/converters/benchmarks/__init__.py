@@ -1,1 +1,0 @@
-"""The source benchmarks, a module each."""

@@ -1,1 +1,0 @@
-"""The categories of the embedded suite, a module each."""

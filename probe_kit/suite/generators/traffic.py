@@ -1,0 +1,282 @@
+"""Traffic: "no entry sign" against another road sign, of the same family in half of the pairs.
+
+The names hold no side words: signs that turn left or right are not in this suite.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from probe_kit.suite.generators.drawing import (
+    FULL_DISK,
+    RGB,
+    Canvas,
+    Pen,
+    Placement,
+    Points,
+    Tile,
+    background_for,
+    ellipse,
+    mask_icon,
+    on_hues,
+    polygon,
+    random_placement,
+    rectangle,
+    tinted,
+)
+from probe_kit.suite.generators.generator import Concept, Generator, half_within, none_alike
+
+_RED: RGB = (200, 20, 34)
+_BLUE: RGB = (16, 76, 170)
+_YELLOW: RGB = (250, 200, 20)
+_GREEN: RGB = (24, 150, 60)
+_WHITE: RGB = (250, 250, 250)
+_BLACK: RGB = (22, 22, 22)
+
+_TRIANGLE = polygon((0, -0.92), (0.94, 0.72), (-0.94, 0.72))
+_BAR = 0.14
+_STROKE = 0.16
+
+Draw = Callable[[Pen], None]
+
+
+@dataclass(frozen=True)
+class RoadSign:
+    """A sign with its family, which is also its shape, and how to draw it in the unit disk."""
+
+    name: str
+    family: str
+    edge: RGB
+    draw: Draw
+
+
+def _disk(pen: Pen, radius: float, color: RGB) -> None:
+    pen.fill(ellipse(0, 0, radius, radius), color)
+
+
+def _warning(symbol: Draw) -> Draw:
+    def draw(pen: Pen) -> None:
+        pen.fill(_TRIANGLE, _RED)
+        pen.fill(_TRIANGLE * 0.72 + np.array([0, 0.06]), _WHITE)
+        symbol(pen)
+
+    return draw
+
+
+def _ring(symbol: Draw, field: RGB = _WHITE, bars: int = 0) -> Draw:
+    def draw(pen: Pen) -> None:
+        _disk(pen, 0.92, _RED)
+        _disk(pen, 0.74, field)
+        symbol(pen)
+        for slope in (1, -1)[:bars]:
+            pen.line(polygon((-0.56, -0.56 * slope), (0.56, 0.56 * slope)), _RED, _BAR)
+
+    return draw
+
+
+def _order(symbol: Draw) -> Draw:
+    def draw(pen: Pen) -> None:
+        _disk(pen, 0.92, _BLUE)
+        symbol(pen)
+
+    return draw
+
+
+def _notice(symbol: Draw) -> Draw:
+    def draw(pen: Pen) -> None:
+        pen.fill(rectangle(-0.78, -0.78, 0.78, 0.78), _BLUE)
+        symbol(pen)
+
+    return draw
+
+
+def _icon(name: str, color: RGB, height: float, y: float = 0) -> Draw:
+    return lambda pen: pen.stamp(tinted(mask_icon(name), color), 0, y, height)
+
+
+def _text(text: str, color: RGB, height: float) -> Draw:
+    return lambda pen: pen.text(text, 0, 0, height, color)
+
+
+def _fills(color: RGB, *shapes: Points) -> Draw:
+    def draw(pen: Pen) -> None:
+        for points in shapes:
+            pen.fill(points, color)
+
+    return draw
+
+
+_blacks, _whites = partial(_fills, _BLACK), partial(_fills, _WHITE)
+
+
+def _strokes(*lines: Points) -> Draw:
+    def draw(pen: Pen) -> None:
+        for points in lines:
+            pen.line(points, _BLACK, _STROKE)
+
+    return draw
+
+
+def _nothing(_pen: Pen) -> None:
+    pass
+
+
+_ARROW = polygon((-0.12, 0.6), (-0.12, -0.1), (-0.38, -0.1), (0, -0.62), (0.38, -0.1), (0.12, -0.1), (0.12, 0.6))
+
+
+def _stop(pen: Pen) -> None:
+    angles = np.deg2rad(np.arange(22.5, 360, 45))
+    octagon = 0.95 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    pen.fill(octagon, _RED)
+    pen.outline(octagon * 0.86, _WHITE, 0.07)
+    pen.text("STOP", 0, 0, 0.42, _WHITE)
+
+
+def _give_way(pen: Pen) -> None:
+    pen.fill(-_TRIANGLE, _RED)
+    pen.fill(-(_TRIANGLE * 0.66 + np.array([0, 0.07])), _WHITE)
+
+
+def _priority_road(pen: Pen) -> None:
+    diamond = polygon((0, -0.95), (0.95, 0), (0, 0.95), (-0.95, 0))
+    for scale, color in ((1.0, _BLACK), (0.93, _WHITE), (0.66, _YELLOW)):
+        pen.fill(diamond * scale, color)
+
+
+def _end_of_restrictions(pen: Pen) -> None:
+    _disk(pen, 0.92, _BLACK)
+    _disk(pen, 0.84, _WHITE)
+    for offset in (-0.24, 0, 0.24):
+        pen.line(polygon((offset - 0.42, offset + 0.42), (offset + 0.42, offset - 0.42)) * 1.05, _BLACK, 0.09)
+
+
+def _traffic_lights(pen: Pen) -> None:
+    pen.fill(rectangle(-0.24, -0.42, 0.24, 0.64), _BLACK)
+    for y, color in ((-0.22, _RED), (0.11, _YELLOW), (0.44, _GREEN)):
+        pen.fill(ellipse(0, y, 0.14, 0.14), color)
+
+
+def _falling_rocks(pen: Pen) -> None:
+    pen.fill(polygon((-0.5, 0.56), (-0.5, 0.1), (-0.28, -0.14), (-0.2, 0.14), (0.02, 0.34), (0.14, 0.56)), _BLACK)
+    for x, y, size in ((0.04, -0.1, 0.12), (0.26, 0.18, 0.12), (0.42, 0.44, 0.11)):
+        pen.fill(ellipse(x, y, size, size), _BLACK)
+
+
+def _roundabout(pen: Pen) -> None:
+    for start in (0, 120, 240):
+        pen.line(ellipse(0, 0, 0.5, 0.5, start, start + 62), _WHITE, 0.17)
+        tip = np.deg2rad(start + 100)
+        heading = np.array([-np.sin(tip), np.cos(tip)])
+        outward = np.array([np.cos(tip), np.sin(tip)])
+        base = 0.5 * np.array([np.cos(np.deg2rad(start + 66)), np.sin(np.deg2rad(start + 66))])
+        pen.fill(np.stack([base + 0.26 * outward, base - 0.26 * outward, base + 0.4 * heading]), _WHITE)
+
+
+def _no_overtaking(pen: Pen) -> None:
+    for x, color in ((-0.3, _RED), (0.3, _BLACK)):
+        pen.stamp(tinted(mask_icon("directions-car"), color), x, 0, 0.66)
+
+
+def _dead_end(pen: Pen) -> None:
+    pen.fill(rectangle(-0.14, -0.3, 0.14, 0.78), _WHITE)
+    pen.fill(rectangle(-0.5, -0.58, 0.5, -0.26), _RED)
+
+
+def _crosswalk(pen: Pen) -> None:
+    pen.fill(polygon((0, -0.7), (0.72, 0.62), (-0.72, 0.62)), _WHITE)
+    pen.stamp(tinted(mask_icon("directions-walk"), _BLACK), 0, 0.16, 0.86)
+
+
+def _speed_limit(limit: int) -> RoadSign:
+    return RoadSign(f"speed limit {limit}", "prohibition", _RED, _ring(_text(str(limit), _BLACK, 0.56)))
+
+
+_warned = partial(RoadSign, family="warning", edge=_RED)
+_forbidden = partial(RoadSign, family="prohibition", edge=_RED)
+_ordered = partial(RoadSign, family="mandatory", edge=_BLUE)
+_noticed = partial(RoadSign, family="information", edge=_BLUE)
+
+_BUMPS = np.vstack([ellipse(-0.22, 0.42, 0.24, 0.3, 180, 360), ellipse(0.22, 0.42, 0.24, 0.3, 180, 360)])
+_DIAGONAL = polygon((-0.3, -0.12), (0.3, 0.48))
+_SLOPE = polygon((-0.54, 0.56), (-0.54, 0.36), (0.3, -0.1), (0.54, 0.56))
+_NARROWING = polygon((0.34, 0.6), (0.34, 0.3), (0.14, 0.1), (0.14, -0.3))
+_ALL = (
+    _warned("danger", draw=_warning(_blacks(rectangle(-0.1, -0.36, 0.1, 0.26), ellipse(0, 0.46, 0.12, 0.12)))),
+    _warned("traffic lights", draw=_warning(_traffic_lights)),
+    _warned("falling rocks", draw=_warning(_falling_rocks)),
+    _warned("road works", draw=_warning(_icon("construction", _BLACK, 0.82, 0.2))),
+    _warned("railway crossing", draw=_warning(_icon("train", _BLACK, 0.84, 0.18))),
+    _warned("bumpy road", draw=_warning(_blacks(_BUMPS, rectangle(-0.56, 0.4, 0.56, 0.54)))),
+    _warned("narrow road", draw=_warning(_strokes(_NARROWING, _NARROWING * np.array([-1, 1])))),
+    _warned("crossroads", draw=_warning(_strokes(_DIAGONAL, _DIAGONAL * np.array([-1, 1])))),
+    _warned("steep hill", draw=_warning(_blacks(_SLOPE))),
+    _warned("icy road", draw=_warning(_icon("ac-unit", _BLACK, 0.84, 0.18))),
+    _forbidden("no entry", draw=_ring(_whites(rectangle(-0.6, -0.18, 0.6, 0.18)), field=_RED)),
+    _forbidden("road closed", draw=_ring(_nothing)),
+    *(_speed_limit(limit) for limit in (30, 50, 80)),
+    _forbidden("no parking", draw=_ring(_nothing, field=_BLUE, bars=1)),
+    _forbidden("no stopping", draw=_ring(_nothing, field=_BLUE, bars=2)),
+    _forbidden("no bicycles", draw=_ring(_icon("pedal-bike", _BLACK, 1.05))),
+    _forbidden("no trucks", draw=_ring(_icon("local-shipping", _BLACK, 1.0))),
+    _forbidden("no pedestrians", draw=_ring(_icon("directions-walk", _BLACK, 1.1))),
+    _forbidden("no motorcycles", draw=_ring(_icon("two-wheeler", _BLACK, 1.08))),
+    _forbidden("no overtaking", draw=_ring(_no_overtaking)),
+    _ordered("straight ahead", draw=_order(_whites(_ARROW))),
+    _ordered("roundabout", draw=_order(_roundabout)),
+    _ordered("bicycle path", draw=_order(_icon("pedal-bike", _WHITE, 1.25))),
+    _ordered("footpath", draw=_order(_icon("directions-walk", _WHITE, 1.3))),
+    _noticed("parking", draw=_notice(_text("P", _WHITE, 0.95))),
+    _noticed("hospital", draw=_notice(_text("H", _WHITE, 0.9))),
+    _noticed("dead end", draw=_notice(_dead_end)),
+    _noticed("crosswalk", draw=_notice(_crosswalk)),
+    _noticed("bus stop", draw=_notice(_icon("directions-bus", _WHITE, 1.3))),
+    RoadSign("stop", "priority", _RED, _stop),
+    RoadSign("give way", "priority", _RED, _give_way),
+    RoadSign("priority road", "priority", _BLACK, _priority_road),
+    RoadSign("end of restrictions", "priority", _BLACK, _end_of_restrictions),
+)
+ROAD_SIGNS: dict[str, RoadSign] = {sign.name: sign for sign in _ALL}
+ROAD_SIGN_ICONS = (
+    *("construction", "train", "ac-unit", "pedal-bike", "local-shipping", "directions-walk", "two-wheeler"),
+    *("directions-car", "directions-bus"),
+)
+
+# Too much alike on a small tile.
+LOOK_ALIKES: tuple[set[str], ...] = (
+    {"no bicycles", "no motorcycles"},
+    {"speed limit 30", "speed limit 50", "speed limit 80"},
+)
+
+
+@dataclass(frozen=True)
+class SignPost(Tile):
+    """Everything the picture is drawn from; `ink` is the colour of the sign's edge."""
+
+    sign: str
+    placement: Placement
+
+    def _paint(self, canvas: Canvas) -> None:
+        ROAD_SIGNS[self.sign].draw(canvas.pen(self.placement))
+
+
+def _sign_post(concept: Concept, rng: np.random.Generator) -> SignPost:
+    ink = ROAD_SIGNS[concept.name].edge
+    placement = random_placement(rng, FULL_DISK, turn=8, mirrored=False)
+    return SignPost(concept.name, placement, ink=ink, background=background_for(ink, rng))
+
+
+def _tiles(left: Concept, right: Concept, rng: np.random.Generator) -> tuple[SignPost, SignPost]:
+    return on_hues(_sign_post(left, rng), _sign_post(right, rng), rng)
+
+
+TRAFFIC = Generator(
+    category="traffic",
+    pairs=half_within(
+        [Concept(name, f"{name} sign") for name in ROAD_SIGNS],
+        family=lambda concept: ROAD_SIGNS[concept.name].family,
+        allowed=none_alike(LOOK_ALIKES),
+    ),
+    tiles=_tiles,
+)

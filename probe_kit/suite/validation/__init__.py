@@ -1,1 +1,0 @@
-"""Validation rules: E rules make a suite unusable, W rules are warnings."""
