@@ -34,8 +34,7 @@ from capture_subjects import LARGER, Subject, hidden_states, subject
 from numpy.typing import NDArray
 from torch import Tensor
 
-from probe_kit.extract.rollout.capturing import Capturer, stored_streams
-from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
+from probe_kit.extract.rollout.capturing import Capturer, EpisodeBuffers, stored_streams
 from probe_kit.hooks import capture, pool
 from probe_kit.hooks.contract.sites import Site, view_names
 

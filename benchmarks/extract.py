@@ -20,8 +20,8 @@ import zarr
 from probe_kit.env import SceneSpec
 from probe_kit.extract import Extraction, ExtractSettings, prepare
 from probe_kit.extract.plan import Plan
-from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
-from probe_kit.extract.rollout.episode_loop import Rollout
+from probe_kit.extract.rollout.capturing import EpisodeBuffers
+from probe_kit.extract.rollout.worker import Rollout
 from probe_kit.hooks import Observation
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.models.building import initialise

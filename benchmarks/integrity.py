@@ -25,9 +25,10 @@ import google_crc32c
 import numpy as np
 
 from probe_kit.env import SceneSpec
-from probe_kit.extract.plan import Plan, Row
-from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
-from probe_kit.extract.rollout.episode_loop import Rollout
+from probe_kit.extract.plan import Plan
+from probe_kit.extract.rollout.capturing import EpisodeBuffers
+from probe_kit.extract.rollout.worker import Rollout
+from probe_kit.extract.sources.player import Row
 from probe_kit.extract.sources.scene import SceneSettings
 from probe_kit.extract.sources.scene_source import SceneSource, scene_row
 from probe_kit.runs import open_run, seal, verify_run

@@ -13,7 +13,7 @@ from itertools import cycle, islice
 from pathlib import Path
 
 from probe_kit.env import SceneSpec
-from probe_kit.extract.sources.scene_player import ScenePlayer
+from probe_kit.extract.sources.scene_source import ScenePlayer
 from probe_kit.extract.sources.source import Played
 from probe_kit.suite import build_suite
 from tests.support.plans import make_plan

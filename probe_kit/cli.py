@@ -22,12 +22,8 @@ from probe_kit.check_adapter.command import check_adapter
 from probe_kit.demo.commands import demo
 from probe_kit.diagnose.commands import diagnose
 from probe_kit.doctor_command import doctor
-from probe_kit.extract.ask_commands import ask
-from probe_kit.extract.commands import extract
-from probe_kit.extract.model_commands import models
-from probe_kit.extract.run_commands import app as run_app
-from probe_kit.extract.source_commands import app as dataset_app
-from probe_kit.extract.source_commands import check_environment
+from probe_kit.extract.commands import ask, extract
+from probe_kit.extract.inspect_commands import check_environment, dataset_app, models, run_app
 from probe_kit.hooks.commands import new_adapter, verify
 from probe_kit.intervene.commands import KindHelp, intervene
 from probe_kit.intervene.run_commands import list_runs, show

@@ -14,7 +14,7 @@ from probe_kit._terminal.console import counter, progress
 from probe_kit.demo.organisms import TRAINED, VLM
 from probe_kit.env import SceneSpec
 from probe_kit.extract import AskSettings, ExtractSettings, ask_run, extract_run
-from probe_kit.extract.vqa.templates import TEMPLATES
+from probe_kit.extract.prompts import TEMPLATES
 from probe_kit.retention import RetentionRow, retention_table
 from probe_kit.retention.behaviour import ask_of
 from probe_kit.retention.columns.sentences import verdict

@@ -19,9 +19,9 @@ from probe_kit.cli import app, commands_of
 from probe_kit.env.arm import ARMS
 from probe_kit.env.scoring import RULES
 from probe_kit.env.spec import PRESETS
-from probe_kit.extract.command_options import Sizes
+from probe_kit.extract.commands import Sizes
+from probe_kit.extract.prompts import QUERIES, Picture, Query
 from probe_kit.extract.protocols import SCENES
-from probe_kit.extract.vqa.phrases import QUERIES, Picture, Query
 from probe_kit.hooks.contract.declared import ROTATIONS, ProtocolName, Readout
 from probe_kit.hooks.family import Dtype
 from probe_kit.intervene.kinds import kind_names

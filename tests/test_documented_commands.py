@@ -161,8 +161,8 @@ LOOKED_FOR = {
 
 def _stop_with(*asked: Any, **_: Any) -> Any:
     """In place of loading a model: what can be wrong with the settings before."""
+    from probe_kit.extract.extraction import check_meaningless
     from probe_kit.extract.parts import SCRIPTED
-    from probe_kit.extract.preparation import check_meaningless
     from probe_kit.extract.settings import AskSettings, ExtractSettings
     from probe_kit.hooks.contract.declared import check_options
     from probe_kit.hooks.registry import find_family

@@ -15,7 +15,7 @@ from typing import Literal, get_args
 from probe_kit._tables.numbers import number, percent
 from probe_kit._tables.table import Cell, Table, grouped
 from probe_kit.extract import AskSettings, ExtractSettings, ask_run, extract_run
-from probe_kit.extract.vqa.templates import TEMPLATES
+from probe_kit.extract.prompts import TEMPLATES
 from probe_kit.intervene import ImageSwap, ReplaySource, run_intervention
 from probe_kit.retention import RetentionRow, retention_table
 from probe_kit.retention.columns.columns import FOLLOWS, MARGIN

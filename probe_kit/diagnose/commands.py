@@ -13,15 +13,15 @@ from probe_kit._terminal.field_options import command_with
 from probe_kit._terminal.options import further_option
 from probe_kit.diagnose.choices import FRAMES
 from probe_kit.errors import UsageError
-from probe_kit.extract import command_options as start
-from probe_kit.extract.moved import MovedOptions, moved_of
+from probe_kit.extract import commands as start
+from probe_kit.extract.config_files import MovedOptions, moved_of
 from probe_kit.extract.settings import ExtractSettings
 from probe_kit.intervene.commands import PairTable
 
 if TYPE_CHECKING:
     from probe_kit.diagnose.results import Diagnosis
     from probe_kit.extract.extraction import Extraction
-    from probe_kit.extract.plan import Row
+    from probe_kit.extract.sources.player import Row
     from probe_kit.intervene import ReplaySource
     from probe_kit.intervene.settings import PairRow
     from probe_kit.runs import Run

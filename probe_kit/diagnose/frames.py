@@ -12,7 +12,7 @@ import pandas as pd
 from probe_kit._system.counting import counted
 from probe_kit.diagnose.choices import LEAST_GROUPS, count_groups
 from probe_kit.errors import UsageError
-from probe_kit.extract.sources.donors import Frame
+from probe_kit.extract.sources.inputs import Frame
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.intervene.sessions.observed import ObservedSession
 

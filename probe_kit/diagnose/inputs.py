@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
-from probe_kit.extract.sources.donors import Frame
 from probe_kit.extract.sources.inputs import (
     INSTRUCTION,
     PICTURE,
     STATE,
+    Frame,
     content_of,
     hardly_changed,
     with_other_stop,

@@ -15,8 +15,7 @@ from probe_kit.diagnose.importance import ActionScale, Exchanges, compare_with_b
 from probe_kit.diagnose.inputs import controls_of, inputs_of, spread_of_states, values_of
 from probe_kit.diagnose.results import InputDiagnosis, check_names
 from probe_kit.errors import InstructionError, UsageError
-from probe_kit.extract.sources.donors import Frame, draw_donors
-from probe_kit.extract.sources.inputs import blank_of, with_input
+from probe_kit.extract.sources.inputs import Frame, blank_of, draw_donors, with_input
 from probe_kit.hashing import derive_seed
 
 if TYPE_CHECKING:

@@ -6,13 +6,12 @@ from probe_kit._system.imports import lazy_names
 
 if TYPE_CHECKING:
     from probe_kit.extract.extraction import Extraction, ask_run, extract_run, prepare, prepare_asks
+    from probe_kit.extract.prompts import TEMPLATES
     from probe_kit.extract.settings import AskSettings, ExtractSettings
-    from probe_kit.extract.sources.environment import EnvSource
+    from probe_kit.extract.sources.environment import EnvEpisode, EnvSource, OwnEnvironment, Step
     from probe_kit.extract.sources.environment_check import check_environment
-    from probe_kit.extract.sources.environment_contract import EnvEpisode, OwnEnvironment, Step
     from probe_kit.extract.sources.pictures import PictureFolder
     from probe_kit.extract.sources.recording import LeRobotSource
-    from probe_kit.extract.vqa.templates import TEMPLATES
 
 __all__ = [
     "TEMPLATES",
@@ -35,14 +34,14 @@ __all__ = [
 __getattr__, __dir__ = lazy_names(
     __name__,
     {
-        "TEMPLATES": "vqa.templates",
+        "TEMPLATES": "prompts",
         "AskSettings": "settings",
         "ExtractSettings": "settings",
         "Extraction": "extraction",
-        "EnvEpisode": "sources.environment_contract",
+        "EnvEpisode": "sources.environment",
         "EnvSource": "sources.environment",
-        "OwnEnvironment": "sources.environment_contract",
-        "Step": "sources.environment_contract",
+        "OwnEnvironment": "sources.environment",
+        "Step": "sources.environment",
         "check_environment": "sources.environment_check",
         "LeRobotSource": "sources.recording",
         "PictureFolder": "sources.pictures",

@@ -1,22 +1,107 @@
-"""`probe-kit extract`."""
+"""`probe-kit extract` and `probe-kit ask`."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
 
 from probe_kit._system.counting import counted
 from probe_kit._terminal import options as common
 from probe_kit._terminal.console import counter, err, marked, out, print_json, progress, say
 from probe_kit._terminal.field_options import command_with
-from probe_kit.extract import command_options as start
+from probe_kit._terminal.options import Names, read_size
+from probe_kit.errors import UsageError
 from probe_kit.extract.config_files import read_config
-from probe_kit.extract.settings import ExtractSettings
+from probe_kit.extract.parts import stored_option
+from probe_kit.extract.settings import AskSettings, ExtractSettings
+from probe_kit.extract.sources.scene import SceneOptions
 
 if TYPE_CHECKING:
     from probe_kit.extract import Extraction
     from probe_kit.extract.settings import Settings
     from probe_kit.runs import Run
     from probe_kit.runs.location import Location
+
+
+class Sizes(tuple[tuple[int, int], ...]):
+    """Comma-separated sizes of pictures, (width, height) in pixels each."""
+
+    __slots__ = ()
+
+    @classmethod
+    def parse(cls, text: "str | Sizes") -> "Sizes":
+        """The sizes of `text`, each WIDTHxHEIGHT; a default that is no text is returned as it is."""
+        if not isinstance(text, str):
+            return text
+        return cls(map(read_size, several("--picture-size", text)))
+
+    def __str__(self) -> str:
+        """Return the sizes as they are typed."""
+        return ",".join(f"{width}x{height}" for width, height in self)
+
+
+def several(option: str, text: str | Names) -> Names:
+    """The parts of a comma-separated option. Raises UsageError for none."""
+    parts = Names.parse(text)
+    if not parts:
+        raise UsageError(f"{option} is empty; name at least one")
+    return parts
+
+
+def _prompts(text: str | Names) -> Names:
+    return several("--prompt", text)
+
+
+OutFolder = Annotated[
+    str | None,
+    typer.Option(
+        "--out", metavar="FOLDER", help="Folder or s3://BUCKET/PREFIX/RUN. Default: runs/<model>-<settings hash>."
+    ),
+]
+AskOutFolder = Annotated[
+    str | None,
+    typer.Option(
+        "--out",
+        metavar="FOLDER",
+        help="Folder or URL that holds one run per prompt and size. Default: a folder per run below runs/.",
+    ),
+]
+Prompts = Annotated[
+    Names | None,
+    typer.Option(
+        "--prompt",
+        parser=_prompts,
+        metavar="A,B,…",
+        show_default="p1,p2,seen; instruction where there are no objects",
+        help="Prompts, comma-separated: seen, p1, p2 (from the paper), instruction (the words of the policies) "
+        "or text files. A file contains {object}, and {A} and {B} for the sides.",
+    ),
+]
+PictureSizes = Annotated[
+    Sizes | None,
+    typer.Option(
+        "--picture-size",
+        parser=Sizes.parse,
+        metavar="WxH,…",
+        show_default="224x224",
+        help="Picture sizes in pixels, comma-separated. The paper uses 224x224 and 560x480.",
+    ),
+]
+
+Large = Annotated[
+    bool, stored_option("--yes", help="Begin a run that would take more than 64 GB before compression.")
+]
+
+ConfigFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--config",
+        metavar="FILE",
+        help="Settings of --print-config, or a run whose settings are repeated. Typed options take precedence.",
+    ),
+]
+PrintConfig = Annotated[bool, typer.Option("--print-config", help="Print the settings for --config, and stop.")]
 
 
 LARGE = 64 * 10**9
@@ -26,12 +111,12 @@ LARGE = 64 * 10**9
 @command_with(*ExtractSettings.option_models())
 def extract(
     typed: Mapping[str, Any],
-    out_folder: start.OutFolder = None,
-    config: start.ConfigFile = None,
-    print_config: start.PrintConfig = False,
+    out_folder: OutFolder = None,
+    config: ConfigFile = None,
+    print_config: PrintConfig = False,
     dry_run: common.DryRun = False,
     force: common.Force = False,
-    large: start.Large = False,
+    large: Large = False,
 ) -> None:
     """Run a model in every episode and store its activations.
 
@@ -68,7 +153,7 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
     """Print the plan of a run, how much it stores and where."""
     from rich.table import Table
 
-    from probe_kit.extract.needs import space_needed
+    from probe_kit.extract.plan import space_needed
     from probe_kit.runs.disk import in_units
     from probe_kit.runs.growth import growth_at
 
@@ -102,7 +187,7 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
 
 def _weights_row(extraction: "Extraction") -> dict[str, str]:
     """Memory and download of a model whose size is known."""
-    from probe_kit.extract.needs import weights_needed
+    from probe_kit.extract.plan import weights_needed
 
     settings, controller = extraction.settings, extraction.controller
     model: Any = getattr(controller, "model", None)
@@ -128,7 +213,7 @@ def _units_row(settings: "Settings") -> dict[str, str]:
 def check_size(extraction: "Extraction", location: "Location", agreed: bool) -> None:
     """Raise DiskSpaceError for more than 64 GB, unless that was agreed to."""
     from probe_kit.errors import DiskSpaceError
-    from probe_kit.extract.needs import space_needed
+    from probe_kit.extract.plan import space_needed
     from probe_kit.runs.disk import in_units
 
     needed = sum(space_needed(extraction.further_plan(location), extraction.settings).values())
@@ -225,3 +310,76 @@ def _print_outcomes(run: "Run") -> None:
     print_input_notes(run)
     say(marked("next: [bold]{}[/]", _next_command(run)))
     out.print(str(run.location), soft_wrap=True)
+
+
+OWN_SCENE = frozenset(SceneOptions.model_fields) - {"scene"} | {"wordings"}
+"""Fields of a scene that questions leave as they are."""
+
+
+@command_with(*AskSettings.option_models(), offers=lambda name: name not in OWN_SCENE)
+def ask(
+    typed: Mapping[str, Any],
+    prompt: Prompts = None,
+    picture_size: PictureSizes = None,
+    out_folder: AskOutFolder = None,
+    config: ConfigFile = None,
+    dry_run: common.DryRun = False,
+    force: common.Force = False,
+) -> None:
+    """Ask a vision-language model about the first frame of every episode.
+
+    Makes one run per prompt and picture size. Use the --suite, --protocol, --scene and --seed of the policy runs
+    to compare with. Every question is asked in both orders of the options. Answers are read from the text and from
+    the logits of the options. Compare with policies by `probe-kit retention ASKED… ACTED…`, also with
+    --compare stages. Recordings, environments and pictures have no objects: their instruction is the question, and
+    stored activations are probed for their labels.
+
+    The same command resumes interrupted runs. With more items or categories they grow and keep what they have.
+    Other settings in the same folder are an error.
+    """
+    from probe_kit.extract.extraction import prepare_asks
+    from probe_kit.runs.store import locate
+
+    requested = AskSettings.per_prompt_and_size(
+        prompt, picture_size, typed, None if config is None else read_config(config, typed, asks=True)
+    )
+    places = [
+        None if out_folder is None else f"{out_folder.rstrip('/')}/{settings.short_name}" for settings in requested
+    ]
+    runs: list[Run] = []
+    prepared = prepare_asks(requested, places, fetch=not dry_run)
+    for number, folder in enumerate(places):
+        with err.status("loading suite and model"):
+            extraction = next(prepared)
+        location = locate(folder or Path("runs") / extraction.default_name())
+        print_plan(extraction, location)
+        if number == 0:  # of all of them, because they ask about the same items
+            print_sufficiency(extraction)
+        if not dry_run:
+            with progress() as bar:
+                runs.append(extraction.run(location, force=force, progress=counter(bar, "questions")))
+    if not dry_run:
+        _print_answers(runs)
+
+
+def _print_answers(runs: "Sequence[Run]") -> None:
+    """Print how each run went, what to look at, and what to do next."""
+    import pandas as pd
+
+    from probe_kit.runs.reader import SIDE
+
+    for run in runs:
+        episodes = run.episodes
+        counts = ", ".join(f"{name} {count}" for name, count in episodes["outcome"].value_counts().items())
+        unread = episodes.loc[episodes["outcome"] == "oob"].get("parse", pd.Series(dtype=str)).value_counts()
+        reasons = f" ({', '.join(f'{name} {count}' for name, count in unread.items())})" if len(unread) else ""
+        mass = f"; option mass {episodes['option_mass'].mean():.2f}" if "option_mass" in episodes else ""
+        say(f"{run.label}: {counts}{reasons}{mass}")
+        print_input_notes(run)
+        out.print(str(run.location), soft_wrap=True)
+    if SIDE not in runs[0].episodes:
+        step = "targets {}" if runs[0].streams else "labels {}"
+        say(marked(f"next: [bold]probe-kit {step}[/]", runs[0].location))
+        return
+    places = " ".join(str(run.location) for run in runs)
+    say(marked("next: [bold]probe-kit retention {}[/]  add policy runs of the suite", places))

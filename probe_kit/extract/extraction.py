@@ -1,28 +1,42 @@
-"""Extraction: workers play every episode that is not committed; then the run is sealed."""
+"""Extraction from top to bottom: settings, source, checks, model, plan; workers play; the run is sealed."""
 
 import json
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
+import os
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
+from signal import SIGALRM
+from typing import TYPE_CHECKING, Any
 
+from probe_kit._execution.executor import GivenUp, Pool, TaskQueue, work_off
+from probe_kit._execution.process_pool import ProcessPool, share_of_machine
+from probe_kit._execution.ray_pool import RayPool
 from probe_kit._system.counting import counted
+from probe_kit._system.imports import install_command
 from probe_kit._terminal.notebook import notebook_progress
-from probe_kit.errors import EpisodesFailedError, UsageError
-from probe_kit.extract.events import Done, Failed
-from probe_kit.extract.needs import space_needed
-from probe_kit.extract.plan import Plan
-from probe_kit.extract.preparation import CheckCameras, Prepared, load, open_checked
-from probe_kit.extract.rollout.task import task_of
+from probe_kit.errors import DiskSpaceError, EpisodesFailedError, MissingExtraError, UsageError
+from probe_kit.extract.config_files import CONFIG, portable
+from probe_kit.extract.parts import SCRIPTED
+from probe_kit.extract.plan import Plan, planned_sizes, space_needed
+from probe_kit.extract.rollout.calibration import Calibration
+from probe_kit.extract.rollout.controllers import Controller
+from probe_kit.extract.rollout.tasks import task_of
+from probe_kit.extract.rollout.worker import Worker
 from probe_kit.extract.settings import AskSettings, ExtractSettings, Settings, run_label
-from probe_kit.extract.workers import play
-from probe_kit.hashing import canonical_json
+from probe_kit.extract.sources.player import Done, Event, Failed, Row
+from probe_kit.extract.sources.source import Source, raise_together
+from probe_kit.hashing import canonical_json, sha256_json
+from probe_kit.hooks.registry import find_family, get_family
 from probe_kit.runs.commits import failure_key
 from probe_kit.runs.disk import check_if_full
 from probe_kit.runs.growth import check_other_settings, further_rows
 from probe_kit.runs.label import label_run
-from probe_kit.runs.layout import RUN_FILE
+from probe_kit.runs.layout import RUN_FILE, StoredStream
 from probe_kit.runs.location import Location
+from probe_kit.runs.provenance import provenance_here
 from probe_kit.runs.root import read_root
 from probe_kit.runs.run import Run, open_run
 from probe_kit.runs.sealing import seal
@@ -31,6 +45,333 @@ from probe_kit.runs.writer import RunWriter
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Model
+
+
+CheckCameras = Callable[[Sequence[str]], object]
+"""Called with the names of the model's cameras that get a picture; raises UsageError."""
+_OF_THE_CHECKPOINT = ("dtype", "execute", "random_weights", "captured_calls")
+"""Settings whose value the loaded model may decide."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """The beginning of a run: the source is open, the model is loaded and the plan is made.
+
+    source: as the model is shown it. card: the part of the identity that the loaded model decides. controller:
+    None if the model is loaded again by workers elsewhere. calibration: what chose the batch, None if it was not
+    requested or is left to workers. declared: whose sizes the streams have where no model was loaded and the run
+    has no name yet; empty where one was.
+    """
+
+    settings: Settings
+    source: Source[Any]
+    plan: Plan
+    card: dict[str, Any]
+    controller: Controller | None
+    calibration: Calibration | None = None
+    declared: str = ""
+
+    def identity(self) -> dict[str, Any]:
+        """Everything that decides the numbers of an episode: neither which are selected, nor machine and label.
+
+        Runs with equal identity have equal numbers in the episodes that both have.
+        """
+        return {**self.settings.identity(), **self.card, **self.plan.identity}
+
+    def provenance(self) -> dict[str, Any]:
+        """The provenance of a process that plays with these settings here; with the decoder of recorded videos."""
+        dtype: str | None = self.card.get("dtype")
+        decoder = {} if self.plan.decoder is None else {"decoder": self.plan.decoder}
+        return provenance_here(self.settings.machine.device, dtype) | decoder
+
+    def writer(self, location: Location) -> RunWriter[Plan]:
+        """A writer of the run at `location`, which it begins or continues.
+
+        Raises SettingsMismatchError if other settings are there.
+        """
+        return RunWriter(location, self.plan, self.identity(), self.provenance(), run_label(self.settings))
+
+    def default_name(self) -> str:
+        """Folder name that repeats for the same settings, so that the same command finds its run again.
+
+        A command with more items finds it too; one with other categories, wordings or another suite does not.
+        """
+        hashed = [self.identity(), *self.plan.name_parts]
+        # Without the weights' hash there is no name yet.
+        return self.settings.folder_name("…" if self.declared else sha256_json(hashed)[:8])
+
+
+def load(
+    settings: Settings,
+    rehearsed: bool = False,
+    location: Location | None = None,
+    model: "Model | None" = None,
+    fetch: bool = True,
+    check_cameras: CheckCameras | None = None,
+) -> Prepared:
+    """Open the source, load the model and plan the rows.
+
+    rehearsed: whether the source was tried before. location: where it will be written, if that is known, so that
+    it is looked at before the model is loaded. model: the policy or answer model of these settings, if it is
+    loaded already; it may be one of your own, and several runs can share it. fetch: False makes the plan of the
+    streams that the model's family declares: without weights, network or GPU. A family that declares none is
+    loaded. check_cameras: called once they are known, before weights are loaded where the checkpoint's files say
+    it, and again of the loaded model.
+    Raises UsageError for a policy of another family or with other weights than the settings name, and what these
+    raise: UnknownModelError, UnknownCategoryError, SuiteError, RecordingError, OwnEnvironmentError, WeightsError …
+    """
+    settings, source = open_checked(settings, location, model is not None, fetch)
+    task = task_of(settings)
+    rows = task.rows(settings, source)
+    if not rehearsed:
+        source.rehearse(rows)
+    if model is not None:
+        task.check_loaded(settings, model)
+    else:
+        raise_together(task.early_checks(settings, source, fetch))
+    if check_cameras is not None and (early := source.shown_cameras(task.declared_cameras(settings))) is not None:
+        check_cameras(early)
+    if not fetch and (sizes := planned_sizes(settings, source.instructions)) is not None:
+        settings = task.planned(settings, sizes)
+        plan = _plan(settings, source, rows, sizes.streams, settings.task.execute or sizes.execute)
+        return Prepared(settings, source, plan, _declared_card(settings), None, declared=sizes.source)
+    settings, source, controller, calibration = task.fit(
+        settings, source, task.load(settings) if model is None else model
+    )
+    if check_cameras is not None and (cameras := source.shown_cameras()) is not None:
+        check_cameras(cameras)
+    rows = task.rows(settings, source)  # of the source as the model is shown it
+    plan = _plan(settings, source, rows, controller.streams, controller.execute)
+    return Prepared(settings, source, plan, controller.identity, controller, calibration)
+
+
+def open_checked(
+    settings: Settings, location: Location | None = None, loaded: bool = False, fetch: bool = True
+) -> tuple[Settings, Source[Any]]:
+    """The settings with what protocol and source decide, and the open source; all is checked that needs no model.
+
+    loaded: the model is there already, and may be one that no name leads to. fetch: see `Family.check`. Raises as
+    `load`.
+    """
+    task = task_of(settings)
+    check_meaningless(settings)
+    settings = settings.followed()
+    if not loaded:
+        check_model(settings, fetch)
+    if location is not None:
+        _check_writable(location)
+    source = task.view_of(settings.source.open(not fetch and _selects_only(settings, location)))
+    if decided := {name: value for name, value in source.decided().items() if name in settings.names()}:
+        settings = settings.changed(**decided)
+    if not loaded and settings.model.family not in SCRIPTED:
+        family = find_family(settings.model.family, tuple(SCRIPTED))
+        family.check_words(task.texts(settings, source), settings.model.checkpoint)
+    if location is not None:
+        _check_other_run(settings, source, location)
+    return settings, source
+
+
+# -- checks that need no model --------------------------------------------------------------------------------
+
+
+def check_meaningless(settings: Settings) -> None:
+    """Raise UsageError for settings that would have no effect with this source, task or model."""
+    model, source = settings.model, settings.source
+    if model.weights_seed and not model.random_weights:
+        raise UsageError(
+            f"--weights-seed {model.weights_seed} seeds random weights, and the checkpoint's were asked for. "
+            "Leave it out, or add --random-weights"
+        )
+    settings.refuse(source.refuses, f"does not apply with {source.shows}; remove it")
+    task_of(settings).check_meaningless(settings)
+
+
+def check_model(settings: Settings, fetch: bool = True) -> None:
+    """Refuse a model, option, device or checkpoint that cannot be used; imports no torch.
+
+    fetch: see `Family.check`. Raises UnknownModelError and what `Family.check` raises.
+    """
+    if settings.machine.ray is not None and find_spec("ray") is None:
+        raise MissingExtraError(f"--ray needs ray, which is not installed; `{install_command('ray')}`")
+    model, scripts = settings.model, tuple(SCRIPTED)
+    family = None if model.family in SCRIPTED else find_family(model.family, scripts)
+    task_of(settings).check_family(settings, family)
+    if family is None:
+        return
+    # Elsewhere there may be other devices than here.
+    device = "cpu" if settings.machine.elsewhere else settings.machine.device
+    family.check(
+        model.checkpoint, device, model.dtype, model.random_weights, model.options, model.weights_seed, fetch
+    )
+
+
+def _check_writable(location: Location) -> None:
+    """Raise UsageError for a place that cannot be written, DiskSpaceError for a read-only disk."""
+    if "://" in location.address:
+        return  # a bucket says so itself, and creating anything there is no check
+    folder = Path(location.address)
+    nearest = next(parent for parent in (folder, *folder.parents) if parent.exists())
+    if not nearest.is_dir():
+        raise UsageError(f"{location} cannot be used: {nearest} is not a folder. Give another path")
+    if os.statvfs(nearest).f_flag & os.ST_RDONLY:
+        raise DiskSpaceError(
+            f"{location} cannot be used: the disk of {nearest} is read-only. Choose another --out"
+        )
+    if not os.access(nearest, os.W_OK | os.X_OK):
+        raise UsageError(f"{location} cannot be used: {nearest} cannot be written. Give another path")
+
+
+def _check_other_run(settings: Settings, source: Source[Any], location: Location) -> None:
+    """Raise SettingsMismatchError for a place where a run lies that has other settings or cannot grow so.
+
+    Only what is known without the model is compared; the writer compares all of it. Raises RunDamagedError if what
+    lies there was changed.
+    """
+    early = source.known_early()
+    with location.in_words():
+        if early is None or not location.exists(RUN_FILE):
+            return
+        root = read_root(location)
+        root.check_continuable()
+        decided = {name: value for name, value in settings.identity().items() if name not in _OF_THE_CHECKPOINT}
+        requested = json.loads(canonical_json({**decided, **early}))
+        stored = {name: root.own_settings[name] for name in requested if name in root.own_settings}
+        check_other_settings(stored, {name: requested[name] for name in stored}, str(location))
+        if root.plan:
+            rows = task_of(settings).rows(settings, source)
+            further_rows(root.plan, [row.to_json() for row in rows], str(location))
+
+
+def _selects_only(settings: Settings, location: Location | None) -> bool:
+    """Whether nothing but the items themselves is asked of the suite.
+
+    Names of runs that are known before they are played hold the hash of the whole suite, and so does a run that is
+    there; questions name objects of all its items.
+    """
+    if task_of(settings).names_all_items:
+        return False
+    if location is None:
+        family = get_family(settings.model.family)
+        return family is not None and bool(family.declared)
+    with location.in_words():
+        return not location.exists(RUN_FILE)
+
+
+def check_unloaded(settings: Settings, source: Source[Any]) -> None:
+    """Raise as `load` what a model, its options and its words say of a source before weights are loaded."""
+    check_meaningless(settings)
+    check_model(settings)
+    raise_together(task_of(settings).early_checks(settings, source, fetch=True))
+
+
+# -- the plan -------------------------------------------------------------------------------------------------
+
+
+def _plan(
+    settings: Settings,
+    source: Source[Any],
+    rows: tuple[Row, ...],
+    streams: Iterable[StoredStream],
+    execute: int,
+) -> Plan:
+    """The plan of rows that store these streams. execute: actions per inference, 0 where none are predicted."""
+    capture, streams = settings.capture, tuple(streams)
+    size = sum(stream.raw_bytes(capture.tokens == "all", capture.calls, capture.later_views) for stream in streams)
+    return Plan(
+        rows,
+        streams,
+        size * len(rows),
+        source.identity(execute),
+        {**source.selection(rows), CONFIG: portable(settings)},
+        source.name_parts(),
+        source.suite_parent,
+        source.decoder,
+    )
+
+
+def _declared_card(settings: Settings) -> dict[str, Any]:
+    """The part of the identity of a model that was not loaded."""
+    requested: Mapping[str, Any] = {"dtype": settings.model.dtype, "execute": settings.task.execute}
+    declared = {name: value for name, value in requested.items() if value is not None}
+    model = {"model": settings.model.family, "random_weights": settings.model.random_weights}
+    return {**model, "weights_sha256": None, **declared}
+
+
+def play(prepared: Prepared, writer: RunWriter[Plan], numbers: list[int]) -> Generator[Event]:
+    """Play episodes where the settings say; yields `Done` of each, or `Failed` once it is given up.
+
+    In this process with the model that is loaded, else in workers with one of their own, to which only episode
+    numbers are sent. An episode that fails, or is lost with its worker, is tried once more.
+    Raises what a worker raises, WorkerDiedError if workers die before they begin, MissingExtraError without Ray,
+    and UsageError if no cluster answers.
+    """
+    queue = TaskQueue(((number, number) for number in numbers), "episode")
+    settings = prepared.settings
+    if settings.machine.ray or settings.machine.workers:
+        events = work_off(_pool(settings, writer.location.address), queue)
+    else:
+        events = _played_here(prepared, writer, queue, len(numbers))
+    for slot, event in events:
+        if isinstance(event, GivenUp):
+            yield Failed(event.task, f"the worker that played it was lost: {event.reason}")
+        elif isinstance(event, Done):
+            queue.end(slot, event.number)
+            yield event
+        elif not queue.retry(slot, event.number):
+            yield event
+
+
+def play_episodes(
+    setup: tuple[Settings, str], take: Callable[[], int | None], report: Callable[[Event], None]
+) -> None:
+    """The work of a worker elsewhere: load the model, then play what is handed out."""
+    with load_worker(*setup) as worker:
+        while True:
+            for event in worker.run(take):
+                report(event)
+
+
+@contextmanager
+def load_worker(settings: Settings, run: str) -> Iterator[Worker]:
+    """A worker for a run that exists, with a model of its own; the run is held while the body runs.
+
+    Raises SettingsMismatchError if they differ, or if this machine gives other numbers than those before it.
+    """
+    prepared = load(settings, rehearsed=True)
+    assert prepared.controller is not None
+    writer = prepared.writer(locate(run))
+    with writer.joined():
+        writer.begin(settings.machine.allow_mixed)
+        episodes = len(writer.remaining())
+        with Worker(writer, prepared.settings, prepared.controller, prepared.source, episodes) as worker:
+            yield worker
+
+
+def _played_here(
+    prepared: Prepared, writer: RunWriter[Plan], queue: TaskQueue[int], episodes: int
+) -> Iterator[tuple[int, Event]]:
+    assert prepared.controller is not None
+    with Worker(writer, prepared.settings, prepared.controller, prepared.source, episodes) as worker:
+        while not queue.finished:
+            yield from ((0, event) for event in worker.run(lambda: queue.take(0)))
+
+
+def _pool(settings: Settings, run: str) -> Pool:
+    if settings.machine.ray:
+        return RayPool(play_episodes, (settings, run), settings.machine.ray, partial(_gpus, settings))
+    share = partial(share_of_machine, size=settings.machine.workers, device=settings.machine.device)
+    limit = settings.machine.inference_limit
+    exits = {
+        -SIGALRM: f"was ended, because a call of its model took longer than --inference-limit {limit:g} s"
+    } if limit is not None else None  # fmt: skip
+    return ProcessPool(play_episodes, (settings, run), settings.machine.workers, share, exits)
+
+
+def _gpus(settings: Settings, resources: Mapping[str, Any]) -> list[int]:
+    """The GPUs of each actor: as many actors as GPUs, or as the settings say."""
+    gpus = int(resources.get("GPU", 0)) if settings.machine.device.startswith("cuda") else 0
+    return [1 if gpus else 0] * (settings.machine.workers or max(1, gpus))
+
 
 Progress = Callable[[int, int, str], None]
 # If this many episodes were given up and none succeeded, something is wrong with all of them.

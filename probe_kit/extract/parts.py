@@ -17,8 +17,7 @@ from probe_kit._terminal.console import whole_number
 from probe_kit._terminal.field_options import Part
 from probe_kit._terminal.options import further_option, speed_option
 from probe_kit.errors import UsageError
-from probe_kit.extract.vqa.phrases import Picture, Query
-from probe_kit.extract.vqa.templates import P1, Template, find_template
+from probe_kit.extract.prompts import P1, Picture, Query, Template, find_template
 from probe_kit.hooks import family as hook_family
 from probe_kit.hooks.capturing.edits import Edit, Vectors
 from probe_kit.hooks.contract.declared import ProtocolName, Rotation, read_pairs

@@ -1,63 +1,22 @@
-"""The plan of a run: its rows, their order and their estimated cost, computed before anything is written."""
+"""The plan of a run: its rows and their order, and the disk space and memory that it needs. Writes nothing."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
+import numpy as np
+
+from probe_kit.errors import ProbeKitError
+from probe_kit.extract.settings import Settings
+from probe_kit.extract.sources.player import Row
+from probe_kit.hooks.contract.sites import view_names
+from probe_kit.hooks.family import DTYPES
 from probe_kit.runs.layout import StoredStream
 
-
-@dataclass(frozen=True)
-class Row:
-    """One row of a plan, whatever its source: an episode of a scene, a stretch of a recording, a picture.
-
-    index: its number in the run, where its objects lie. In a run that grew, numbers are not in the plan's order.
-    columns: the row as flat columns, of which every source has `episode_id`, `item_id`, `category`, `group_id`,
-    `instruction` and `policy_seed`. content: what the source's player plays. frames: recorded frames that the
-    inferences see; None where every inference sees what the actions before it led to.
-    """
-
-    index: int
-    columns: Mapping[str, Any]
-    content: Any = None
-    frames: Sequence[int] | None = None
-
-    @property
-    def episode_id(self) -> str:
-        """Its id, the same in every selection."""
-        return str(self.columns["episode_id"])
-
-    @property
-    def category(self) -> str:
-        """The category that tables group it by."""
-        return str(self.columns["category"])
-
-    @property
-    def instruction(self) -> str:
-        """The words that the model reads."""
-        return str(self.columns["instruction"])
-
-    @property
-    def policy_seed(self) -> int:
-        """The seed from which every inference of the row derives its own."""
-        return int(self.columns["policy_seed"])
-
-    def numbered(self, index: int) -> Self:
-        """The same row under another number."""
-        return replace(self, index=index)
-
-    def control_step(self, call: int, executed: int) -> int:
-        """The step that inference `call` sees: a recorded frame, or as many actions as were executed before."""
-        return executed if self.frames is None else self.frames[call]
-
-    def noise_of(self, call: int) -> int:
-        """The number that the seed of inference `call` is derived from, whichever other frames were chosen."""
-        return call if self.frames is None else self.frames[call]
-
-    def to_json(self) -> dict[str, Any]:
-        """The row as flat columns."""
-        return {"episode": self.index, **self.columns}
+if TYPE_CHECKING:
+    from probe_kit.hooks import Family, Model
+    from probe_kit.hooks.outline import Outline
 
 
 @dataclass(frozen=True)
@@ -104,3 +63,167 @@ class Plan:
     def sites(self) -> int:
         """Number of captured sites per inference."""
         return sum(len(stream.stream.sites()) for stream in self.streams)
+
+
+EPISODE = 40_000
+"""Bytes of an episode's commit, trajectory and files of the file system (measured: 12 to 30 kB)."""
+THUMBNAILS = 15_000
+"""Bytes of the first and last frame of an episode."""
+FRAME = 5_000
+"""Bytes of a small frame where all are kept (measured: 4 kB)."""
+FILM = 1_500_000
+"""Bytes of a film of sixty actions."""
+DECISION = 16
+"""Bytes that probes keep per site and episode: decisions, labels and directions, by category and pooled."""
+_PICTURE, _INSTRUCTION = (480, 640), "put the red block on the green plate to the left"
+"""An observation of usual size, of which tokens are counted where nothing else is asked."""
+REPORT = 5_000_000
+"""Bytes of a report with its figures."""
+
+
+def space_needed(plan: Plan, settings: Settings) -> dict[str, int]:
+    """Bytes by part, uncompressed. Probes are those of one view; more views take as much again each."""
+    return space_of(plan.streams, len(plan.episodes), settings)
+
+
+def space_of(streams: Sequence[StoredStream], episodes: int, settings: Settings) -> dict[str, int]:
+    """The same for a number of episodes that store these streams."""
+    calls, later, with_tokens = (
+        settings.capture.calls,
+        settings.capture.later_views,
+        settings.capture.tokens == "all",
+    )
+    machine, frames = settings.machine, settings.source.steps() + 1
+    films = {"all": episodes, "first": 1, "none": 0}[machine.video]
+    pictures = {"none": 0, "ends": THUMBNAILS, "all": FRAME * frames}[machine.frames]
+    sites = sum(len(stream.stream.sites()) for stream in streams)
+    return {
+        "activations": sum(stream.raw_bytes(with_tokens, calls, later) for stream in streams) * episodes,
+        "columns": sum(stream.raw_bytes(False, calls, later) for stream in streams) * episodes,
+        "episodes": episodes * (EPISODE + pictures) + films * FILM,
+        "probes": sites * episodes * DECISION,
+        "report": REPORT if streams else 0,
+    }
+
+
+@dataclass(frozen=True)
+class PlannedSizes:
+    """The sizes of a model that was not loaded. streams: as a run stores them. source: whose sizes these are.
+
+    outline: the model without numbers, where its configuration is here.
+    """
+
+    streams: tuple[StoredStream, ...]
+    source: str
+    outline: "Outline | None" = None
+
+    @property
+    def execute(self) -> int:
+        """Actions of an inference that are executed; 1 where that is not known, as a model may execute more."""
+        model = None if self.outline is None else self.outline.model
+        return 1 if model is None else max(1, model.card.execute)
+
+
+def planned_sizes(settings: Settings, instructions: Sequence[str] = ()) -> PlannedSizes | None:
+    """The streams of a model by its configuration, where that is here, else as its family declares them.
+
+    instructions: texts that it will read, for the number of tokens; else one of about ten words.
+    Returns None for a model that declares none. Reads no weights and asks no network. Raises what loading raises
+    for a checkpoint in a folder.
+    """
+    from probe_kit.hooks.registry import get_family
+
+    family = get_family(settings.model.family)
+    declared = None if family is None else family.declared_streams(settings.model.options)
+    if family is None or declared is None:
+        return None
+    outline = family.outline(settings.model.checkpoint, settings.model.options, settings.model.dtype)
+    if outline is None or outline.model is None:
+        streams = [
+            StoredStream.of(declared_stream.stream, declared_stream.tokens, view_names(declared_stream.roles))
+            for declared_stream in declared
+        ]
+        why = "" if outline is None else f", because its own configuration cannot be read here: {outline.reason}"
+        source = f"of the released size{why}"
+    else:
+        tokens = _tokens(outline.model, instructions or (_INSTRUCTION,))
+        average = {declared_stream.stream.name: declared_stream.tokens for declared_stream in declared}
+        names = outline.model.role_names
+        streams = [
+            StoredStream.of(stream, tokens.get(name, average.get(name, 1)), view_names(names[name]))
+            for name, stream in outline.model.streams.items()
+        ]
+        counted = (
+            "" if tokens else "; its tokenizer is not here, so that numbers of tokens are of the released size"
+        )
+        source = f"of the checkpoint's configuration{counted}"
+    return PlannedSizes(tuple(streams) if settings.capture.tokens != "none" else (), source, outline)
+
+
+def _tokens(model: "Model", instructions: Sequence[str]) -> dict[str, int]:
+    """The longest sequence of every stream; empty where its tokenizer or processor is not here."""
+    from probe_kit.hooks.checkpoints.checkpoint import without_network
+    from probe_kit.hooks.contract.observation import Observation
+
+    picture, state = np.zeros((*_PICTURE, 3), np.uint8), np.zeros(8, np.float32)
+    example = Observation(picture, state, max(instructions, key=len), np.eye(3, dtype=np.float32))
+    try:
+        with without_network():
+            roles = model.roles([example])
+    except Exception:  # noqa: BLE001 - whatever is missing, the number of the released size stands for it
+        return {}
+    return {name: max(len(row) for row in rows) for name, rows in roles.items()}
+
+
+def _parameters(
+    family: "Family", checkpoint: str | None, options: Mapping[str, Any], dtype: str | None
+) -> int | None:
+    """Parameters of a network of the configuration that is here; None where it is not, or cannot be built."""
+    try:
+        outline = family.outline(checkpoint, options, dtype)
+    except ProbeKitError:  # a plan or a run of this checkpoint says what is wrong with it
+        return None
+    return None if outline is None or outline.model is None else outline.model.card.parameters
+
+
+def weights_needed(
+    model: str,
+    checkpoint: str | None,
+    options: Mapping[str, Any],
+    dtype: str | None,
+    parameters: int | None = None,
+) -> str:
+    """Memory for the weights and the size of a download, in words; empty for a model that declares no size.
+
+    Of the checkpoint's configuration where it is here, else of the released size. dtype: None for both.
+    parameters: of a model that is loaded; None for one that is not. No network
+    is asked: a download is counted from the index of the weights in the cache, else estimated from the number of
+    parameters, whose stored precision is not known.
+    """
+    from probe_kit.hooks.registry import get_family
+    from probe_kit.runs.disk import in_units
+
+    family = get_family(model)
+    if family is None or family.weights_bytes(options) is None:
+        return ""
+    count = _parameters(family, checkpoint, options, dtype) if parameters is None else parameters
+    sizes = {name: in_units(family.weights_bytes(options, name, count) or 0) for name in DTYPES}
+    memory_by_dtype = {name: in_units(family.memory_bytes(options, name, count) or 0) for name in DTYPES}
+    every = (
+        memory_by_dtype["float32"]
+        if family.always_float32
+        else " or ".join(f"{size} in {name}" for name, size in memory_by_dtype.items())
+    )
+    memory = next((size for name, size in memory_by_dtype.items() if name == dtype), every)
+    download = "nothing to download"
+    if not family.is_here(checkpoint, options):
+        counted = family.bytes_to_fetch(checkpoint, options)
+        download = (
+            f"download {in_units(counted)}"
+            if counted
+            else (
+                f"download about {sizes['bfloat16']} or {sizes['float32']}, as stored, estimated from the "
+                "parameters"
+            )
+        )
+    return f"memory {memory} for weights, more for activations; {download}"

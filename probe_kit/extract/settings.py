@@ -28,11 +28,11 @@ from probe_kit.extract.parts import (
     ModelSettings,
     read_options,
 )
+from probe_kit.extract.prompts import INSTRUCTION, find_template
 from probe_kit.extract.protocols import has_network, protocol_identity, protocol_row, scene_of
 from probe_kit.extract.sources.kinds import SOURCES, kind_of, kinds_typed
 from probe_kit.extract.sources.scene import SceneOptions, SceneSettings
 from probe_kit.extract.sources.source import SourceSettings
-from probe_kit.extract.vqa.templates import INSTRUCTION, find_template
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.checkpoints.checkpoint import is_on_hub
 from probe_kit.hooks.contract.declared import PLAIN
@@ -81,10 +81,9 @@ class Settings(Part):
     """Settings of a run of any kind; the defaults are the command line's.
 
     label: the name of the run in tables and legends; None for the model and what sets it apart, see `run_label`.
-    opens: MODULE:CLASS of the task, which is imported when a run is prepared. asks: whether the model is asked.
+    asks: whether the model is asked, and does not act.
     """
 
-    opens: ClassVar[str]
     asks: ClassVar[bool] = False
 
     model: ModelSettings
@@ -312,8 +311,6 @@ class ExtractSettings(Settings):
     user's own, in which it acts.
     """
 
-    opens = "probe_kit.extract.rollout.act:Act"
-
     capture: Capture
     task: ActTask
     machine: ActMachine
@@ -373,7 +370,6 @@ class AskSettings(Settings):
     the words of its instruction about the first observation of each row.
     """
 
-    opens = "probe_kit.extract.rollout.ask:Ask"
     asks = True
 
     capture: AskCapture

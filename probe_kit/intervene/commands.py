@@ -16,7 +16,7 @@ from probe_kit._terminal.console import counter, marked, out, progress, say, say
 from probe_kit._terminal.field_options import PanelledHelp, command_with
 from probe_kit._terminal.options import LISTED, Names, choices, further_option, one_of
 from probe_kit.errors import UsageError
-from probe_kit.extract.moved import MovedOptions, moved_of
+from probe_kit.extract.config_files import MovedOptions, moved_of
 from probe_kit.hooks.contract.declared import Readout
 from probe_kit.intervene.kinds import every_kind, kind_names, kind_of
 from probe_kit.suite.categories import category_of

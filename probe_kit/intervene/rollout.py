@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import CaptureChangedActionError, NoTrajectoryError
-from probe_kit.extract.rollout.executed_actions import executed_actions
+from probe_kit.extract.rollout.controllers import executed_actions
 from probe_kit.extract.sources.player import Answer, Ending
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.capturing.edits import EditLog

@@ -14,8 +14,8 @@ from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-from probe_kit.extract.events import traceback_of
 from probe_kit.extract.settings import Settings
+from probe_kit.extract.sources.player import traceback_of
 from probe_kit.hashing import canonical_json, sha256_json
 from probe_kit.runs.records import Record
 from probe_kit.runs.store import locate

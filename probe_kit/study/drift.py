@@ -14,7 +14,7 @@ from probe_kit._tables.content import Number, grouped
 from probe_kit._tables.numbers import number, p_text, percent, points, with_limits
 from probe_kit._tables.table import Table
 from probe_kit.errors import UsageError
-from probe_kit.extract.vqa.scores import side_expected
+from probe_kit.extract.rollout.answers import side_expected
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.sites import PADDING, Site
 from probe_kit.retention.behaviour import ask_of

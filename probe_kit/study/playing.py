@@ -24,9 +24,8 @@ from probe_kit.errors import (
     WorkerDiedError,
 )
 from probe_kit.extract import prepare
-from probe_kit.extract.extraction import Extraction
-from probe_kit.extract.preparation import open_checked
-from probe_kit.extract.rollout.task import task_of
+from probe_kit.extract.extraction import Extraction, open_checked
+from probe_kit.extract.rollout.tasks import task_of
 from probe_kit.extract.settings import Settings
 from probe_kit.runs import seal
 from probe_kit.runs.store import locate
@@ -221,13 +220,13 @@ class _Loaded:
     """The model as policy and as VLM, loaded on first use."""
 
     def __init__(self) -> None:
-        self._by_task: dict[str, Any] = {}
+        self._by_task: dict[bool, Any] = {}
 
     def prepare(self, settings: Settings, location: str) -> Extraction:
         """Prepare an extraction with the loaded model."""
-        if settings.opens not in self._by_task:
-            self._by_task[settings.opens] = task_of(settings).load(settings)
-        return prepare(settings, location, self._by_task[settings.opens])
+        if settings.asks not in self._by_task:
+            self._by_task[settings.asks] = task_of(settings).load(settings)
+        return prepare(settings, location, self._by_task[settings.asks])
 
 
 # -- all models --------------------------------------------------------------------------------------------------

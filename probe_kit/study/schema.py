@@ -17,8 +17,8 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from probe_kit._system.complaints import shortened
 from probe_kit.errors import UsageError
 from probe_kit.extract.parts import ModelSettings
+from probe_kit.extract.prompts import Picture, Query
 from probe_kit.extract.sources.scene import SceneOptions
-from probe_kit.extract.vqa.phrases import Picture, Query
 from probe_kit.hooks.contract.declared import ProtocolName
 from probe_kit.runs.layout import AskTokens, LaterViews
 from probe_kit.scene_names import SceneName

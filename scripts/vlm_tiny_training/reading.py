@@ -12,8 +12,7 @@ from tokenizers import Tokenizer
 from torch import Tensor, nn
 from torch.nn.functional import cross_entropy
 
-from probe_kit.extract.vqa.phrases import Phrase
-from probe_kit.extract.vqa.templates import ORDERS, P1, P2, SEEN, sides
+from probe_kit.extract.prompts import ORDERS, P1, P2, SEEN, Phrase, sides
 from probe_kit.models.embedded.words import END
 from probe_kit.suite.items import instruction_for
 from vlm_tiny_training.batches import Pair, Pairs, Pixels, laid_out

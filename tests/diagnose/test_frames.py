@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 
 from probe_kit.diagnose.frames import LEAST_GROUPS, frames_of, order_of_first_frames
-from probe_kit.extract.sources.donors import Frame
+from probe_kit.extract.sources.inputs import Frame
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.intervene.sessions.observed import ObservedSession
 

@@ -16,7 +16,7 @@ from probe_kit.diagnose.measure import InputExchange, count_inferences
 from probe_kit.diagnose.results import Diagnosis, InputDiagnosis, SitePassage, Verdict, describe_passage, exit_code
 from probe_kit.diagnose.sentences import sentence, sentences
 from probe_kit.errors import InstructionError, UsageError
-from probe_kit.extract.sources.donors import Frame
+from probe_kit.extract.sources.inputs import Frame
 from probe_kit.hooks.contract.observation import Observation
 
 WORDS = ["lift the cube", "open the drawer", "push the plate", "turn the knob"]

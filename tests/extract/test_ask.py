@@ -12,11 +12,11 @@ import torch
 from probe_kit.env import SceneSpec
 from probe_kit.errors import InstructionError, SettingsMismatchError, UsageError
 from probe_kit.extract import AskSettings, ExtractSettings, ask_run, extract_run, prepare, prepare_asks
+from probe_kit.extract.prompts import P1, P2, SEEN, Template
 from probe_kit.extract.rollout.answer_controller import AnswerController
+from probe_kit.extract.rollout.capturing import EpisodeBuffers
 from probe_kit.extract.rollout.controllers import Turn
-from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
-from probe_kit.extract.rollout.task import task_of
-from probe_kit.extract.vqa.templates import P1, P2, SEEN, Template
+from probe_kit.extract.rollout.tasks import task_of
 from probe_kit.hooks import AnswerModel, Prompt, Reading, Site
 from probe_kit.retention import success_rate
 from probe_kit.runs import Run, open_run, verify_run

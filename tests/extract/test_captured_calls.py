@@ -20,8 +20,8 @@ from probe_kit.errors import (
     UsageError,
 )
 from probe_kit.extract import ExtractSettings, extract_run, prepare
-from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
-from probe_kit.extract.rollout.episode_loop import Rollout
+from probe_kit.extract.rollout.capturing import EpisodeBuffers
+from probe_kit.extract.rollout.worker import Rollout
 from probe_kit.hooks import Site
 from probe_kit.retention import retention_table
 from probe_kit.retention.displays import collect_figures

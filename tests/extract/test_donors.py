@@ -5,8 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from probe_kit.extract.sources.donors import NEAREST, Frame, draw_donors
-from probe_kit.extract.sources.inputs import same_input
+from probe_kit.extract.sources.inputs import NEAREST, Frame, draw_donors, same_input
 from probe_kit.hooks import Observation
 
 GROUPS = 12

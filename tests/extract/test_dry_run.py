@@ -13,8 +13,7 @@ from torch import nn
 from probe_kit.errors import CheckpointError, InstructionError, UsageError
 from probe_kit.extract import AskSettings, ExtractSettings, prepare
 from probe_kit.extract.extraction import prepare_asks
-from probe_kit.extract.needs import weights_needed
-from probe_kit.extract.plan import Plan
+from probe_kit.extract.plan import Plan, weights_needed
 from probe_kit.hooks import load_model
 from probe_kit.hooks.contract.sites import PADDING
 from probe_kit.hooks.registry import own_families

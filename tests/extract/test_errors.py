@@ -23,9 +23,9 @@ from probe_kit.errors import (
     UsageError,
 )
 from probe_kit.extract import Extraction, ExtractSettings, extract_run, prepare
+from probe_kit.extract.extraction import play_episodes
 from probe_kit.extract.sources.player import LocalPlayer, ProcessPlayer
-from probe_kit.extract.sources.scene_player import ScenePlayer
-from probe_kit.extract.workers import play_episodes
+from probe_kit.extract.sources.scene_source import ScenePlayer
 from probe_kit.hooks import Observation
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.runs import open_run

@@ -20,7 +20,7 @@ from probe_kit.errors import (
     UsageError,
 )
 from probe_kit.extract import ExtractSettings, extract_run, prepare
-from probe_kit.extract.rollout.task import task_of
+from probe_kit.extract.rollout.tasks import task_of
 from probe_kit.hooks import Site, Tap
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.runs import open_run

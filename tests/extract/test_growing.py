@@ -11,7 +11,7 @@ from probe_kit.cli import app
 from probe_kit.env import SceneSpec
 from probe_kit.errors import SettingsMismatchError
 from probe_kit.extract import AskSettings, ExtractSettings, ask_run, extract_run, prepare
-from probe_kit.extract.vqa.templates import find_template
+from probe_kit.extract.prompts import find_template
 from probe_kit.runs import Run, label_run, open_run, verify_run
 from probe_kit.suite import Suite
 

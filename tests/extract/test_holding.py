@@ -8,7 +8,7 @@ import pytest
 
 from probe_kit.env import SceneSpec
 from probe_kit.extract import ExtractSettings, extract_run, prepare
-from probe_kit.extract.workers import play_episodes
+from probe_kit.extract.extraction import play_episodes
 from probe_kit.runs.folder import Folder
 from probe_kit.runs.layout import RUN_FILE
 from probe_kit.suite import Suite

@@ -63,7 +63,7 @@ def elsewhere(monkeypatch: pytest.MonkeyPatch, **changes: object) -> None:
         rest = {name: value for name, value in changes.items() if name not in versions}
         return {**record, **rest, "versions": {**record["versions"], **versions}}
 
-    monkeypatch.setattr("probe_kit.extract.preparation.provenance_here", there)
+    monkeypatch.setattr("probe_kit.extract.extraction.provenance_here", there)
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from probe_kit.cli import app
 from probe_kit.env import SceneSpec
 from probe_kit.errors import IgnoredInputsError, InstructionError
 from probe_kit.extract import AskSettings, ExtractSettings, LeRobotSource, ask_run, prepare
-from probe_kit.extract.rollout.input_check import varied
+from probe_kit.extract.rollout.controllers import varied
 from probe_kit.extract.sources.inputs import PICTURE, same_input
 from probe_kit.hooks import Edit, Observation, Policy, Site, Tap
 from probe_kit.hooks.families.pi0.adapter import load_pi0_tiny

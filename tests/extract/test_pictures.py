@@ -17,7 +17,7 @@ from probe_kit.cli import app
 from probe_kit.diagnose.diagnosis import diagnose_run
 from probe_kit.errors import ProbeKitError, RecordingError, TooFewGroupsError, UsageError
 from probe_kit.extract import ExtractSettings, PictureFolder, extract_run, prepare
-from probe_kit.extract.moved import moved_of
+from probe_kit.extract.config_files import moved_of
 from probe_kit.extract.rollout.worker import torch_threads
 from probe_kit.extract.sources.pictures import PictureSource
 from probe_kit.hashing import derive_seed

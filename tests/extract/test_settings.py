@@ -17,8 +17,8 @@ from probe_kit.env.spec import PRESETS
 from probe_kit.errors import UsageError
 from probe_kit.extract import AskSettings, EnvSource, ExtractSettings, LeRobotSource, extract_run, prepare
 from probe_kit.extract.config_files import read_config
+from probe_kit.extract.extraction import open_checked
 from probe_kit.extract.parts import ModelSettings
-from probe_kit.extract.preparation import open_checked
 from probe_kit.extract.settings import SOURCES, run_label
 from probe_kit.hooks import Edit, Site
 from probe_kit.suite import Suite, load_suite

@@ -16,7 +16,7 @@ from probe_kit.env import SceneSpec
 from probe_kit.errors import EpisodesFailedError, RunIncompleteError, StageDiedError
 from probe_kit.extract import ExtractSettings, extract_run, prepare
 from probe_kit.extract.sources.player import ProcessPlayer
-from probe_kit.extract.sources.scene_player import ScenePlayer
+from probe_kit.extract.sources.scene_source import ScenePlayer
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.runs import open_run
 from probe_kit.suite import Suite, build_suite

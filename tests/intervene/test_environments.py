@@ -11,7 +11,7 @@ import pytest
 
 from probe_kit.errors import OtherFramesError, SettingsMismatchError, UsageError
 from probe_kit.extract import EnvSource, ExtractSettings, prepare
-from probe_kit.extract.moved import moved_of
+from probe_kit.extract.config_files import moved_of
 from probe_kit.hooks import Observation
 from probe_kit.intervene import AttentionReadout, ImageSwap, InstructionSwap, Interchange, run_intervention
 from probe_kit.intervene.sessions.observed import ObservedSession

@@ -22,7 +22,7 @@ from probe_kit.errors import (
     UsageError,
 )
 from probe_kit.extract import ExtractSettings
-from probe_kit.extract.sources.scene_player import ScenePlayer
+from probe_kit.extract.sources.scene_source import ScenePlayer
 from probe_kit.intervene import (
     ImageSwap,
     InstructionSwap,

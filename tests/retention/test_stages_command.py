@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 from probe_kit.cli import app
 from probe_kit.env import SceneSpec
 from probe_kit.extract import AskSettings, ExtractSettings, ask_run, extract_run
-from probe_kit.extract.vqa.templates import TEMPLATES
+from probe_kit.extract.prompts import TEMPLATES
 from probe_kit.retention.behaviour import scored
 from probe_kit.retention.compare.known_used import match_runs
 from probe_kit.runs import Run

@@ -16,8 +16,8 @@ from zarr.core.buffer import Buffer
 from zarr.storage import LocalStore
 
 from probe_kit.extract.plan import Plan
-from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
-from probe_kit.extract.rollout.episode_loop import Rollout
+from probe_kit.extract.rollout.capturing import EpisodeBuffers
+from probe_kit.extract.rollout.worker import Rollout
 from probe_kit.runs import sealing, writer
 from probe_kit.runs.commits import Commit
 from probe_kit.runs.layout import StoredStream

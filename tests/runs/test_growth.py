@@ -16,7 +16,7 @@ import zarr
 from probe_kit.errors import NoProbesError, RunDamagedError, RunIncompleteError, SettingsMismatchError
 from probe_kit.extract import Extraction, ExtractSettings
 from probe_kit.extract.plan import Plan
-from probe_kit.extract.vqa.phrases import QUERIES, phrases
+from probe_kit.extract.prompts import QUERIES, phrases
 from probe_kit.runs import Run, open_run, seal, verify_run
 from probe_kit.runs.folder import Folder
 from probe_kit.runs.growth import growth_at

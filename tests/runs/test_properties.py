@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule, run_state_machine_as_test
 
 from probe_kit.extract.plan import Plan
-from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
-from probe_kit.extract.rollout.episode_loop import Rollout
+from probe_kit.extract.rollout.capturing import EpisodeBuffers
+from probe_kit.extract.rollout.worker import Rollout
 from probe_kit.runs import Run, open_run, seal, verify_run
 from probe_kit.runs.layout import StoredStream
 from probe_kit.runs.run import NotSealedWarning

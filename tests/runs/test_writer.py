@@ -3,8 +3,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
-from probe_kit.extract.rollout.episode_loop import Rollout
+from probe_kit.extract.rollout.capturing import EpisodeBuffers
+from probe_kit.extract.rollout.worker import Rollout
 from probe_kit.hooks.contract.sites import Site, Stream
 from probe_kit.runs import open_run, seal, verify_run
 from probe_kit.runs.layout import StoredStream

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from probe_kit.extract.needs import EPISODE, THUMBNAILS
+from probe_kit.extract.plan import EPISODE, THUMBNAILS
 from probe_kit.runs.layout import StoredStream
 from probe_kit.study import LoadedStudy, StudyPlan, load_study
 from probe_kit.study.cells import Cell

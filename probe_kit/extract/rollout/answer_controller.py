@@ -12,24 +12,28 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from probe_kit.errors import PolicyFailedError, UsageError
+from probe_kit.extract.prompts import Order, Phrase, phrases, side_by_side, sides
+from probe_kit.extract.rollout.answers import (
+    Choice,
+    Said,
+    letter_margins,
+    outcome_of,
+    read_answer,
+    side_expected,
+    side_said,
+)
 from probe_kit.extract.rollout.capturing import stored_streams
-from probe_kit.extract.rollout.controllers import Inference, ModelController, Turn
-from probe_kit.extract.rollout.input_check import varied
+from probe_kit.extract.rollout.controllers import Inference, ModelController, Turn, varied
 from probe_kit.extract.settings import AskSettings
 from probe_kit.extract.sources.inputs import PICTURE
 from probe_kit.extract.sources.source import Source
-from probe_kit.extract.vqa.parsing import Said, read_answer
-from probe_kit.extract.vqa.phrases import Phrase, phrases
-from probe_kit.extract.vqa.pictures import side_by_side
-from probe_kit.extract.vqa.scores import Choice, letter_margins, outcome_of, side_expected, side_said
-from probe_kit.extract.vqa.templates import Order, sides
 from probe_kit.hooks.checkpoints.third_party import copied
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.runs.layout import StoredStream
 from probe_kit.suite.items import side_words
 
 if TYPE_CHECKING:
-    from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
+    from probe_kit.extract.rollout.capturing import EpisodeBuffers
     from probe_kit.hooks import AnswerModel, Prompt, Reading, Roles
 
 

@@ -15,11 +15,10 @@ import numpy as np
 from probe_kit._system.machine import cores_here
 from probe_kit.env.arm import ACTION_SIZE
 from probe_kit.errors import UsageError
-from probe_kit.extract.plan import Row
 from probe_kit.extract.rollout.controllers import PolicyController
 from probe_kit.extract.rollout.worker import torch_threads
 from probe_kit.extract.settings import ExtractSettings
-from probe_kit.extract.sources.player import Ending
+from probe_kit.extract.sources.player import Ending, Row
 from probe_kit.extract.sources.source import Played, Source
 from probe_kit.hooks.contract.observation import Observation
 

@@ -1,24 +1,29 @@
-"""Tasks of a model, act and capture: a policy whose inferences are captured, or a script that needs none."""
+"""Controllers: a policy whose inferences are captured, or a script; actions as executed; the input check.
+
+The check decides only that an input is dead: one inference cannot show that a model uses it. `probe-kit diagnose`
+does.
+"""
 
 import warnings
 from abc import ABC
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from itertools import islice
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.env.arm import ACTION_SIZE
-from probe_kit.errors import PolicyFailedError, ProbeKitError
-from probe_kit.extract.plan import Row
+from probe_kit.env.rotations import from_rpy, to_vector
+from probe_kit.errors import IgnoredInputsError, InstructionError, PolicyFailedError, ProbeKitError
 from probe_kit.extract.rollout.capturing import SMALL, Capturer, stored_streams
-from probe_kit.extract.rollout.executed_actions import executed_actions
-from probe_kit.extract.rollout.input_check import Reach, check_inputs, check_not_ignored, varied
 from probe_kit.extract.settings import ExtractSettings
-from probe_kit.extract.sources.source import Source
-from probe_kit.extract.sources.units import check_predictions
+from probe_kit.extract.sources.inputs import INSTRUCTION, PICTURE, blank_of, same_input, with_input
+from probe_kit.extract.sources.player import Row
+from probe_kit.extract.sources.source import Source, check_predictions
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.checkpoints.third_party import begin_randomness, copied, while_acting
 from probe_kit.hooks.contract.declared import PLAIN, Rotation
@@ -27,9 +32,175 @@ from probe_kit.runs.certificates import INPUT_CHECK
 from probe_kit.runs.layout import StoredStream
 
 if TYPE_CHECKING:
-    from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers
+    from torch import Tensor
+
+    from probe_kit.extract.rollout.capturing import EpisodeBuffers
     from probe_kit.extract.settings import Settings
-    from probe_kit.hooks import Model, Policy
+    from probe_kit.hooks import Model, Policy, Site
+
+
+Reach = Literal["output", "last layer", "nothing", "not the output", "not tested"]
+"""The last thing on the way to the output that changed with an input; "not the output" where no layer was read."""
+MOST_TEXTS = 32
+"""Other instructions that are searched for one with as many tokens; each of them is tokenised."""
+Ids = Callable[[str], tuple[int, ...] | None]
+
+
+def check_inputs[Question](
+    model: "Model",
+    infer: Callable[[Question], NDArray[np.float32]],
+    clean: Question,
+    variants: Mapping[str, Iterable[Question]],
+    last: "Site | None",
+    around: Callable[[Question], AbstractContextManager[None]],
+) -> dict[str, Reach]:
+    """Return, by input, how far a change of it came.
+
+    infer: one inference, always with the same seed. variants: by input, observations or prompts that differ from
+    the clean one in it alone; the first that the model takes is used, and none leaves the input untested.
+    last: the last residual before the output; None where no site may be captured. around: what the run does to
+    the model at every inference.
+    """
+    if not variants:
+        return {}
+
+    def infer_as_run(question: Question) -> NDArray[np.float32]:
+        with around(question):
+            return infer(question)
+
+    def residual(site: "Site", question: Question) -> "Tensor":
+        from probe_kit.hooks import capture
+
+        # The capture is entered last, so that it reads what edits left.
+        with around(question), capture(model, [site]) as cache:
+            infer(question)
+        return cache[site]
+
+    output = infer_as_run(clean)
+    layer = None if last is None else partial(residual, last)
+    return {name: _reach(infer_as_run, layer, clean, output, changed) for name, changed in variants.items()}
+
+
+def _reach[Question](
+    infer: Callable[[Question], NDArray[np.float32]],
+    residual: "Callable[[Question], Tensor] | None",
+    clean: Question,
+    output: NDArray[np.float32],
+    variants: Iterable[Question],
+) -> Reach:
+    for variant in variants:
+        try:
+            changed = infer(variant)
+        except InstructionError:  # the model cannot take this one in; the next may do
+            continue
+        if not np.array_equal(changed, output, equal_nan=True):
+            return "output"
+        if residual is None:
+            return "not the output"
+        # Actions that are chosen among bins stay the same under small changes; the layer before them does not.
+        return "nothing" if _same(residual(clean), residual(variant)) else "last layer"
+    return "not tested"
+
+
+def _same(first: "Tensor", second: "Tensor") -> bool:
+    return first.shape == second.shape and bool((first == second).all())
+
+
+def varied(
+    clean: Observation, texts: Iterable[str], ids: Ids, absent: Collection[str] = ()
+) -> dict[str, Iterator[Observation]]:
+    """Return, by input, observations that differ from a clean one in it alone, the best first.
+
+    texts: other instructions. ids: the tokens of a text, None if unknown. absent: inputs that the model has not.
+    """
+    variants = {PICTURE: _without_picture(clean), INSTRUCTION: _with_other_words(clean, texts, ids)}
+    return {name: observations for name, observations in variants.items() if name not in absent}
+
+
+def _without_picture(clean: Observation) -> Iterator[Observation]:
+    blank = with_input(clean, PICTURE, blank_of([clean]))
+    # A picture of one colour is its own blank: then nothing would change, and no input could be called dead.
+    if not same_input(clean, blank, PICTURE):
+        yield blank
+
+
+def _with_other_words(clean: Observation, texts: Iterable[str], ids: Ids) -> Iterator[Observation]:
+    """Other instructions, then the words in reverse; those of as many tokens first.
+
+    A model that reads no word still notices how many there are.
+    """
+    words = clean.instruction
+    candidates = dict.fromkeys([*islice(texts, MOST_TEXTS), " ".join(reversed(words.split()))])
+    candidates.pop(words, None)
+    length = _length(words, ids)
+    for text in sorted(candidates, key=lambda text: _length(text, ids) != length):
+        yield replace(clean, instruction=text)
+
+
+def _length(text: str, ids: Ids) -> int | None:
+    try:
+        tokens = ids(text)
+    except InstructionError:
+        return None
+    return None if tokens is None else len(tokens)
+
+
+def check_not_ignored(reaches: Mapping[str, Reach], model: str) -> None:
+    """Raise IgnoredInputsError if inputs were tested and none of them changes anything that was read."""
+    tested = [name for name, reach in reaches.items() if reach != "not tested"]
+    # One dead input is a finding, which the certificate keeps; only where none arrives a run would be void.
+    if len(tested) > 1 and all(reaches[name] in ("nothing", "not the output") for name in tested):
+        layer = ", nor of its last layer" if "nothing" in reaches.values() else ""
+        raise IgnoredInputsError(
+            f"another {' and another '.join(tested)} changed no number of the first output of {model}{layer}; "
+            "expected at least one of them to. `probe-kit diagnose` takes the same settings and says "
+            "where they are lost. --accept-ignored-inputs extracts it nevertheless"
+        )
+
+
+_TURN = slice(3, 6)
+"""Roll, pitch and yaw among the seven numbers of an action."""
+_GRIPPER_OPEN = 0.5
+"""The number of an open gripper is 1, of a closed one 0."""
+
+
+def executed_actions(
+    chunks: Sequence[NDArray[np.float32]], execute: int, exponent: float | None, rotation: Rotation = PLAIN
+) -> NDArray[np.float32]:
+    """(n, 7) float32: what is executed after the newest of an episode's chunks (chunk, 7), oldest first.
+
+    execute: actions of its head. exponent: of `ensemble`, which makes one action of all chunks; None to take the
+    head. rotation: see `ProtocolRow.rotation`.
+    """
+    actions = chunks[-1][:execute] if exponent is None else ensemble(chunks, exponent)[None]
+    return actions if rotation == PLAIN else with_rotation_vectors(actions)
+
+
+def with_rotation_vectors(actions: NDArray[np.float32]) -> NDArray[np.float32]:
+    """A copy of actions (n, 7) with axis times angle, in radians, in place of roll, pitch and yaw.
+
+    Axis and angle are those of R = Rz(yaw) Ry(pitch) Rx(roll), as `euler2axangle` of transforms3d gives them. The
+    released evaluation converts so, and its controller reads the three numbers as Euler angles.
+    """
+    converted = actions.copy()
+    converted[:, _TURN] = [to_vector(from_rpy(angles)) for angles in actions[:, _TURN].astype(np.float64)]
+    return converted
+
+
+def ensemble(chunks: Sequence[NDArray[np.float32]], exponent: float) -> NDArray[np.float32]:
+    """(7,) float32: the action for this step, from the chunks (chunk, 7) of an episode's inferences, oldest first.
+
+    There is an inference per step, so a chunk made n steps ago contributes its n-th action, and one that is too
+    old not at all. Weights grow by e^exponent from each chunk to the next; the gripper is open or closed by their
+    majority.
+    """
+    length = len(chunks[-1])
+    # `reversed` counts ages from the newest chunk; the last [::-1] puts the oldest first again, as weights count.
+    plans = np.array([chunk[age] for age, chunk in enumerate(reversed(chunks[-length:]))], np.float64)[::-1]
+    weights = np.exp(exponent * np.arange(len(plans)))
+    action = np.asarray(weights @ plans / weights.sum(), np.float32)
+    action[-1] = action[-1] > _GRIPPER_OPEN
+    return action
 
 
 def count_lost_words(pack: Callable[[str], Sequence[int] | None], instruction: str) -> int:

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from probe_kit.errors import MissingExtraError, ProbeKitError, UsageError
-from probe_kit.extract.sources.environment import EnvSource
-from probe_kit.extract.sources.environment_contract import EnvEpisode, OwnEnvironment, Step
-from probe_kit.extract.sources.opening import (
+from probe_kit.extract.sources.environment import EnvEpisode, EnvSource, OwnEnvironment, Step
+from probe_kit.extract.sources.environment_source import (
     checked_step,
     fact_values,
     listed_episodes,

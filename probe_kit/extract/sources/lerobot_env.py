@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from probe_kit._system.imports import require
 from probe_kit.errors import MissingExtraError, OwnEnvironmentError, UsageError
-from probe_kit.extract.sources.environment_contract import SUCCESS, EnvEpisode, Step
+from probe_kit.extract.sources.environment import SUCCESS, EnvEpisode, Step
 from probe_kit.hooks.contract.observation import Observation
 
 IMAGE, IMAGES, STATE = "observation.image", "observation.images.", "observation.state"

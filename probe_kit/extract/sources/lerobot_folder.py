@@ -5,18 +5,34 @@ file that meta does not name is never read.
 """
 
 import glob
+import logging
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit._system.imports import require
+from probe_kit._system.parquet_files import open_parquet, read_parquet
 from probe_kit.errors import RecordingError, UsageError
-from probe_kit.extract.sources.hashed_files import HashedFiles
-from probe_kit.extract.sources.lerobot_meta import IMAGE, KEYS, NUMERIC, EpisodeMeta, LeRobotMeta
+from probe_kit.extract.sources.lerobot_meta import (
+    EXTRA,
+    HALF,
+    IMAGE,
+    KEYS,
+    NUMERIC,
+    EpisodeMeta,
+    HashedFiles,
+    LeRobotMeta,
+)
 from probe_kit.extract.sources.recording import LeRobotSource
 from probe_kit.hooks.checkpoints.checkpoint import OFFLINE_WAY_OUT, hub_reason, unreachable, way_out
+from probe_kit.suite.pictures import LARGEST_PICTURE, decode_bytes
 
 MOST_FRAMES = 64
 """Chosen frames that one row holds."""
@@ -229,3 +245,277 @@ def _download(repo: str, commit: str, patterns: list[str]) -> Path:
             f"{repo}@{commit} cannot be fetched ({hub_reason(error)}). "
             f"{OFFLINE_WAY_OUT if offline else way_out(error)}; or give a folder that exists"
         ) from error
+
+
+OFF_GRID_S = 1e-4
+"""Seconds by which a timestamp may differ from frame / fps, and a picture of a video from its timestamp."""
+MOST_AT_ONCE = 32_000_000
+"""Bytes of columns that are read of a whole file, so that not every episode opens it."""
+OTHER_RATE = 0.05
+"""Share by which the frame rate of a video may differ from the data set's."""
+_EPISODE, _INDEX = "episode_index", "index"
+
+
+@dataclass(frozen=True)
+class _DataFile:
+    """One Parquet file of data. first: of each of its episodes, the row of the first frame.
+
+    latest: by columns the rows that were read last, whole row groups, and the number of the first of them.
+    """
+
+    path: Path
+    first: Mapping[int, int]
+    latest: dict[tuple[str, ...], tuple[Any, int]] = field(default_factory=dict)
+
+
+class LeRobotFrames:
+    """Frames and numbers of chosen episodes, decoded when they are asked for. Opened once per process."""
+
+    def __init__(self, folder: LeRobotFolder) -> None:
+        self.folder = folder
+        self._data_file = lru_cache(maxsize=2)(self._scanned)
+        self._lengths: dict[Path, tuple[float, float]] = {}
+
+    def pictures(self, episode: int, frame: int, cameras: Sequence[str]) -> dict[str, NDArray[np.uint8]]:
+        """(H, W, 3) uint8 by camera; of stored images the very bytes. Raises RecordingError."""
+        return {
+            camera: self._of_video(episode, frame, camera)
+            if self.folder.meta.is_video(camera)
+            else self._of_image(episode, frame, camera)
+            for camera in cameras
+        }
+
+    def numbers(self, episode: int, features: Sequence[str]) -> dict[str, NDArray[np.float64]]:
+        """(T, D) of every feature, of one number (T, 1); an empty cell is NaN.
+
+        Raises RecordingError if the frames are not a grid, or a feature has other numbers than meta says.
+        """
+        columns = list(dict.fromkeys((*features, "frame_index", "timestamp")))
+        table = self._rows(episode, columns)
+        values = {name: self._values(episode, name, table.column(name)) for name in columns}
+        self._check_grid(episode, values["frame_index"][:, 0], values["timestamp"][:, 0])
+        return values
+
+    def check(self, episodes: Sequence[int], cameras: Sequence[str]) -> None:
+        """Raise RecordingError for what the numbers or the files of these episodes cannot be shown for.
+
+        Every video must be as long as its episodes say. Two pictures of the first episode are decoded.
+        """
+        for episode in episodes:
+            self.numbers(episode, ())
+            for camera in filter(self.folder.meta.is_video, cameras):
+                self._check_video(self.folder.episode(episode), camera)
+        for episode in episodes[:1]:
+            for frame in {0, self.folder.lengths[episode] - 1}:
+                self.pictures(episode, frame, cameras)
+
+    # -- rows ------------------------------------------------------------------------------------------
+
+    def _rows(self, episode: int, columns: Sequence[str]) -> Any:
+        """The table (T rows) of an episode. Row groups are kept until another one is read with these columns."""
+        meta, key = self.folder.episode(episode), tuple(columns)
+        data = self._data_file(self.folder.path / meta.file)
+        first = data.first[episode]
+        latest, begin = data.latest.get(key, (None, 0))
+        if latest is None or not begin <= first <= first + meta.length <= begin + latest.num_rows:
+            latest, begin = data.latest[key] = self._read(data.path, key, first, first + meta.length)
+        return latest.slice(first - begin, meta.length)
+
+    def _read(self, path: Path, columns: Sequence[str], first: int, end: int) -> tuple[Any, int]:
+        """Row groups that hold rows `first` to `end`, or all where they are small, and the first row of them."""
+        with _parquet(self.folder, path) as parquet:
+            if missing := [name for name in columns if name not in parquet.schema_arrow.names]:
+                raise RecordingError(
+                    f"{self._where(path)} has no column {missing[0]!r}, which meta/info.json names; it has "
+                    f"{', '.join(parquet.schema_arrow.names)}. Copy the data set again, or repair its meta"
+                )
+            sizes = [parquet.metadata.row_group(number).num_rows for number in range(parquet.num_row_groups)]
+            ends = np.cumsum(sizes)
+            groups = np.flatnonzero((ends > first) & (ends - sizes < end))
+            if _size_of(parquet.metadata, columns) <= MOST_AT_ONCE:
+                groups = np.flatnonzero(sizes)
+            return read_parquet(parquet, columns, groups.tolist()), int((ends - sizes)[groups[0]])
+
+    def _scanned(self, path: Path) -> _DataFile:
+        """A data file whose rows are those that meta says. Raises RecordingError for others."""
+        with _parquet(self.folder, path) as parquet:
+            if missing := [name for name in (_EPISODE, _INDEX) if name not in parquet.schema_arrow.names]:
+                raise RecordingError(
+                    f"{self._where(path)} has no column {missing[0]!r}; expected the columns of format 3.0. Copy "
+                    "the data set again"
+                )
+            table = read_parquet(parquet, [_EPISODE, _INDEX])
+        episodes, indices = (np.asarray(table.column(name).to_pylist(), np.float64) for name in (_EPISODE, _INDEX))
+        expected = {episode.number: episode for episode in self.folder.by_file[path]}
+        begins = dict(zip(*(part.tolist() for part in np.unique(episodes, return_index=True)), strict=True))
+        counts = dict(zip(*(part.tolist() for part in np.unique(episodes, return_counts=True)), strict=True))
+        if strange := [number for number in begins if number not in expected]:
+            raise RecordingError(
+                f"{self._where(path)} holds frames of episode {strange[0]:g}, which meta/episodes does not name "
+                f"in this file; expected {_listed(sorted(expected))}. Copy the data set again, or repair its meta"
+            )
+        first = {}
+        for number, episode in expected.items():
+            if (count := counts.get(number, 0)) != episode.length:
+                raise RecordingError(
+                    f"{self._where(path)} holds {count} frames of episode {number}; meta/episodes says "
+                    f"{episode.length}. Copy the data set again, or repair its meta"
+                )
+            begin = begins[number]
+            rows, due = slice(begin, begin + episode.length), episode.start + np.arange(episode.length)
+            if off := np.flatnonzero((episodes[rows] != number) | (indices[rows] != due)).tolist():
+                raise RecordingError(
+                    f"{self._where(path)}: row {begin + off[0]} has the index {indices[rows][off[0]]:g} and is of "
+                    f"episode {episodes[rows][off[0]]:g}; expected the index {due[off[0]]} of episode {number}. "
+                    "Copy the data set again, or repair its indices"
+                )
+            first[number] = begin
+        return _DataFile(path, first)
+
+    def _values(self, episode: int, name: str, column: Any) -> NDArray[np.float64]:
+        """(T, D) of one column, in the type that meta says."""
+        feature, length = self.folder.features.get(name), self.folder.lengths[episode]
+        width = 1 if feature is None else int(np.prod(feature["shape"]))
+        where = f"{self.folder.path.name}, episode {episode}: {name}"
+        cells = column.to_pylist()
+        if sizes := {len(cell) for cell in cells if isinstance(cell, list)} - {width}:
+            raise RecordingError(
+                f"{where} has {sizes.pop()} numbers in the data and {width} in meta/info.json; expected the "
+                "same. Copy the data set again, or repair its meta"
+            )
+        try:
+            values = np.asarray(cells, np.float64).reshape(length, width)
+        except (TypeError, ValueError) as error:
+            raise RecordingError(
+                f"{where} holds no numbers ({str(error)[:200]}); meta/info.json says "
+                f"{feature and feature['dtype']}. Copy the data set again, or repair its meta"
+            ) from error
+        return (
+            values.astype(np.float32).astype(np.float64) if feature and feature["dtype"] == "float32" else values
+        )
+
+    def _check_grid(self, episode: int, frames: NDArray[np.float64], timestamps: NDArray[np.float64]) -> None:
+        due = np.arange(len(frames))
+        off = np.flatnonzero(
+            ~((frames == due) & (np.abs(timestamps - due / self.folder.fps) <= OFF_GRID_S * (1 + due / 1e4)))
+        )
+        if off.size:
+            line = int(off[0])
+            raise RecordingError(
+                f"{self.folder.path.name}, episode {episode}: line {line} is frame {frames[line]:g} at "
+                f"{timestamps[line]:.4f} s; expected frame {line} at {line / self.folder.fps:.4f} s "
+                f"({self.folder.fps:g} frames per second). Repair the timestamps, or leave the episode out"
+            )
+
+    # -- pictures --------------------------------------------------------------------------------------
+
+    def _of_image(self, episode: int, frame: int, camera: str) -> NDArray[np.uint8]:
+        cell = self._rows(episode, [camera]).column(camera)[frame].as_py()
+        content = cell.get("bytes") if isinstance(cell, dict) else cell
+        where = f"{self.folder.path.name}: the picture of {camera} at frame {frame} of episode {episode}"
+        if not isinstance(content, bytes):
+            path = cell.get("path") if isinstance(cell, dict) else None
+            raise RecordingError(
+                f"{where} is not in the data file"
+                + (f", which names {path}" if path else "")
+                + "; expected the bytes "
+                "of a picture, because only they are hashed. Write the data set again with its pictures in it"
+            )
+        return np.asarray(decode_bytes(content, f"{where}:", RecordingError, "Copy the data set again.")).copy()
+
+    def _of_video(self, episode: int, frame: int, camera: str) -> NDArray[np.uint8]:
+        meta = self.folder.episode(episode)
+        part = meta.videos[camera]
+        path = self.folder.path / part.file
+        self.folder.opened.check(path)
+        moment = part.begin + float(self.numbers(episode, ())["timestamp"][frame, 0])
+        try:
+            with _quiet():
+                from lerobot.datasets.video_utils import decode_video_frames
+
+                decoded = decode_video_frames(path, [moment], OFF_GRID_S, "pyav", return_uint8=True)
+        except Exception as error:
+            raise RecordingError(
+                f"{self.folder.path.name}: {part.file} shows no picture of {camera} at {moment:.4f} s, frame "
+                f"{frame} of episode {episode} ({type(error).__name__}: {str(error)[:300]}). Copy the data set "
+                "again"
+            ) from error
+        return np.ascontiguousarray(decoded[0].numpy().transpose(1, 2, 0))
+
+    def _check_video(self, episode: EpisodeMeta, camera: str) -> None:
+        """Raise RecordingError for a video that ends before an episode, or has another rate than the data set."""
+        part, fps = episode.videos[camera], self.folder.fps
+        duration, rate = self._length_of(self.folder.path / part.file)
+        if duration < part.end - HALF / fps or (rate and abs(rate - fps) > OTHER_RATE * fps):
+            raise RecordingError(
+                f"{self.folder.path.name}: {part.file} lasts {duration:.4f} s at {rate:g} frames per second; "
+                f"meta says {fps:g} frames per second, and that it shows episode {episode.number} until "
+                f"{part.end:.4f} s. Copy the data set again, or repair its meta"
+            )
+
+    def _length_of(self, path: Path) -> tuple[float, float]:
+        """Seconds and frames per second of a video, by its header."""
+        import av
+
+        if path not in self._lengths:
+            self.folder.opened.check(path)
+            try:
+                with av.open(str(path)) as container:
+                    stream = container.streams.video[0]
+                    base = float(stream.time_base or 0)
+                    lasts = stream.duration * base if stream.duration else (container.duration or 0) / 1e6
+                    if max(stream.width, stream.height) > LARGEST_PICTURE:
+                        raise RecordingError(
+                            f"{self._where(path)} claims to be {stream.width}×{stream.height} pixels; at most "
+                            f"{LARGEST_PICTURE} are read. Make it smaller"
+                        )
+                    self._lengths[path] = lasts, float(stream.average_rate or 0)
+            except (av.error.FFmpegError, IndexError, OSError) as error:
+                raise RecordingError(
+                    f"{self._where(path)} is no video that PyAV opens ({str(error)[:200]}). Copy the data set "
+                    "again"
+                ) from error
+        return self._lengths[path]
+
+    def _where(self, path: Path) -> str:
+        return f"{self.folder.path.name}: {path.relative_to(self.folder.path)}"
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """No log of lerobot, which warns of its other decoder once in each process."""
+    level = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        yield
+    finally:
+        logging.disable(level)
+
+
+@contextmanager
+def _parquet(folder: LeRobotFolder, path: Path) -> Iterator[Any]:
+    """A data file, opened as the file that was hashed. Raises RecordingError for one that cannot be read."""
+    pa = require("pyarrow", EXTRA)
+    try:
+        with folder.opened.open(path) as opened, open_parquet(opened, EXTRA) as parquet:
+            yield parquet
+    except (pa.ArrowException, OSError) as error:
+        raise RecordingError(
+            f"{folder.path.name}: {path.relative_to(folder.path)} cannot be read: {str(error)[:300]}. Copy the "
+            "data set again"
+        ) from error
+
+
+def _size_of(metadata: Any, columns: Sequence[str]) -> int:
+    """Bytes of some columns of a Parquet file, uncompressed."""
+    groups = [metadata.row_group(number) for number in range(metadata.num_row_groups)]
+    chunks = (group.column(number) for group in groups for number in range(group.num_columns))
+    return sum(
+        chunk.total_uncompressed_size
+        for chunk in chunks
+        if any(chunk.path_in_schema == name or chunk.path_in_schema.startswith(f"{name}.") for name in columns)
+    )
+
+
+def _listed(numbers: Sequence[int]) -> str:
+    return ", ".join(map(str, numbers[:5])) + (f" and {len(numbers) - 5} more" if len(numbers) > 5 else "")

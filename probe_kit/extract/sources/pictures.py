@@ -19,11 +19,9 @@ from probe_kit._system.table_cells import group_names
 from probe_kit._system.text_tables import MOST_BYTES, TextTable, open_table
 from probe_kit._tables.label_table import LabelTable
 from probe_kit.errors import RecordingError, UsageError
-from probe_kit.extract.plan import Row
-from probe_kit.extract.sources.player import SIDE, Answer, InputsPlayer, Opens
+from probe_kit.extract.sources.player import SIDE, Answer, InputsPlayer, Opens, Row
 from probe_kit.extract.sources.recording import Pixels
-from probe_kit.extract.sources.source import Played, Source, SourceSettings
-from probe_kit.extract.sources.units import predicted_once
+from probe_kit.extract.sources.source import Played, Source, SourceSettings, predicted_once
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.observation import ARM_NUMBERS, Observation
 from probe_kit.hooks.contract.sites import CAMERA

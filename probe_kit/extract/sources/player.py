@@ -1,27 +1,140 @@
-"""`Player`: what shows the observations of a source, in this process or in one of its own."""
+"""`Row` and `Player`: what is played of a source, and what shows it, here or in a process of its own."""
 
+import traceback
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from hashlib import blake2b
 from multiprocessing.connection import Connection
 from time import perf_counter
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
 from probe_kit._execution.child_process import Child
-from probe_kit.errors import ProbeKitError, StageDiedError
-from probe_kit.extract.events import add_traceback
-from probe_kit.extract.plan import Row
+from probe_kit.errors import (
+    ActionError,
+    EmptyRoleError,
+    InstructionError,
+    NonFiniteActivationError,
+    ObservationError,
+    OwnEnvironmentError,
+    PolicyFailedError,
+    ProbeKitError,
+    RecordingError,
+    SceneError,
+    StageDiedError,
+)
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.runs.layout import CAPTURE_ONLY
 from probe_kit.runs.small_frames import SmallFrames
 
+# What one episode can get wrong by itself; everything else is wrong with the whole run and stops it.
+EPISODE_ERRORS = (
+    ActionError,
+    EmptyRoleError,
+    InstructionError,
+    NonFiniteActivationError,
+    ObservationError,
+    OwnEnvironmentError,
+    PolicyFailedError,
+    RecordingError,
+    SceneError,
+    StageDiedError,
+)
+
+
+@dataclass(frozen=True)
+class Done:
+    """Episode `number` is committed."""
+
+    number: int
+    outcome: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Failed:
+    """Episode `number` went wrong. traceback: of its error, empty if its process died."""
+
+    number: int
+    reason: str
+    traceback: str = ""
+
+
+Event = Done | Failed
+
+LONGEST_TRACEBACK = 20_000
+"""Characters of a traceback that are kept: its end, which names the error."""
+
+
+def add_traceback(error: BaseException) -> None:
+    """Store the traceback of `error` in the error itself, so that it survives being sent to another process."""
+    error.__dict__["probe_kit_traceback"] = traceback_of(error)
+
+
+def traceback_of(error: BaseException) -> str:
+    """The traceback of `error`, after that of the process it was sent from."""
+    local = "".join(traceback.format_exception(error))
+    sent: str = error.__dict__.get("probe_kit_traceback", "")
+    return (sent + local)[-LONGEST_TRACEBACK:]
+
+
 SIDE = 32
 """Pixels along the stored pictures."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row of a plan, whatever its source: an episode of a scene, a stretch of a recording, a picture.
+
+    index: its number in the run, where its objects lie. In a run that grew, numbers are not in the plan's order.
+    columns: the row as flat columns, of which every source has `episode_id`, `item_id`, `category`, `group_id`,
+    `instruction` and `policy_seed`. content: what the source's player plays. frames: recorded frames that the
+    inferences see; None where every inference sees what the actions before it led to.
+    """
+
+    index: int
+    columns: Mapping[str, Any]
+    content: Any = None
+    frames: Sequence[int] | None = None
+
+    @property
+    def episode_id(self) -> str:
+        """Its id, the same in every selection."""
+        return str(self.columns["episode_id"])
+
+    @property
+    def category(self) -> str:
+        """The category that tables group it by."""
+        return str(self.columns["category"])
+
+    @property
+    def instruction(self) -> str:
+        """The words that the model reads."""
+        return str(self.columns["instruction"])
+
+    @property
+    def policy_seed(self) -> int:
+        """The seed from which every inference of the row derives its own."""
+        return int(self.columns["policy_seed"])
+
+    def numbered(self, index: int) -> Self:
+        """The same row under another number."""
+        return replace(self, index=index)
+
+    def control_step(self, call: int, executed: int) -> int:
+        """The step that inference `call` sees: a recorded frame, or as many actions as were executed before."""
+        return executed if self.frames is None else self.frames[call]
+
+    def noise_of(self, call: int) -> int:
+        """The number that the seed of inference `call` is derived from, whichever other frames were chosen."""
+        return call if self.frames is None else self.frames[call]
+
+    def to_json(self) -> dict[str, Any]:
+        """The row as flat columns."""
+        return {"episode": self.index, **self.columns}
 
 
 @dataclass(frozen=True)

@@ -13,18 +13,24 @@ from numpy.typing import NDArray
 from probe_kit._system.counting import spanned
 from probe_kit._system.escaping import terminal_safe
 from probe_kit.errors import ObservationError, RecordingError
-from probe_kit.extract.plan import Row
-from probe_kit.extract.sources.lerobot_folder import MOST_FRAMES, LeRobotFolder, fetched, open_lerobot
-from probe_kit.extract.sources.lerobot_frames import LeRobotFrames
+from probe_kit.extract.sources.lerobot_folder import (
+    MOST_FRAMES,
+    LeRobotFolder,
+    LeRobotFrames,
+    fetched,
+    open_lerobot,
+)
 from probe_kit.extract.sources.lerobot_meta import IMAGE
-from probe_kit.extract.sources.player import SIDE, Answer, InputsPlayer, Opens
+from probe_kit.extract.sources.player import SIDE, Answer, InputsPlayer, Opens, Row
 from probe_kit.extract.sources.recording import LeRobotSource, Pairs
-from probe_kit.extract.sources.source import Played, Source, raise_together
-from probe_kit.extract.sources.units import (
+from probe_kit.extract.sources.source import (
     MOST_UNUSUAL,
+    Played,
+    Source,
     check_units,
     other_order,
     predicted_once,
+    raise_together,
     unusual_shares,
 )
 from probe_kit.hashing import derive_seed

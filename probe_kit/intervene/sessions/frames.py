@@ -7,8 +7,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from probe_kit.errors import OtherFramesError, UsageError
-from probe_kit.extract.sources.donors import Frame
-from probe_kit.extract.sources.inputs import INSTRUCTION, PICTURE, STATE
+from probe_kit.extract.sources.inputs import INSTRUCTION, PICTURE, STATE, Frame
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.intervene.sessions.session import ReplaySource
@@ -28,7 +27,7 @@ class Frames:
 
     def __init__(self, run: Run, source: ReplaySource) -> None:
         """Raises UsageError if files of the source are gone, OtherFramesError for another version of it."""
-        from probe_kit.extract.moved import source_again
+        from probe_kit.extract.config_files import source_again
         from probe_kit.extract.sources.source import Played
 
         self.run, inputs = run, stored_inputs_of(run.settings)

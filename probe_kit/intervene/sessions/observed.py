@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
-from probe_kit.extract.sources.donors import Frame, draw_donors
-from probe_kit.extract.sources.inputs import PICTURE, hardly_changed, with_input
+from probe_kit.extract.sources.inputs import PICTURE, Frame, draw_donors, hardly_changed, with_input
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.checkpoints.third_party import copied, while_acting
 from probe_kit.hooks.contract.observation import Observation

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from probe_kit.env import SceneSpec
 from probe_kit.errors import NoTrajectoryError, OtherFramesError
-from probe_kit.extract.plan import Row
-from probe_kit.extract.sources.scene_player import ScenePlayer, Seen
-from probe_kit.extract.sources.scene_source import scene_row
+from probe_kit.extract.sources.player import Row
+from probe_kit.extract.sources.scene_source import ScenePlayer, Seen, scene_row
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.intervene.pairs import Chunk, Pair

@@ -10,15 +10,14 @@ import pytest
 
 from probe_kit.errors import OwnEnvironmentError, UsageError
 from probe_kit.extract import EnvEpisode, EnvSource, Step, check_environment
-from probe_kit.extract.plan import Row
-from probe_kit.extract.sources.environment_source import EnvironmentPlayer
-from probe_kit.extract.sources.opening import (
+from probe_kit.extract.sources.environment_source import (
+    EnvironmentPlayer,
     checked_step,
     factory_of,
     listed_episodes,
     open_environment,
 )
-from probe_kit.extract.sources.player import Ending
+from probe_kit.extract.sources.player import Ending, Row
 from probe_kit.extract.sources.source import Played
 from probe_kit.hooks import Observation
 from tests.support.reach_env import ReachEnv
@@ -226,7 +225,7 @@ def test_the_command_prints_a_line_per_promise_and_exits_with_the_result(
 ) -> None:
     import typer
 
-    from probe_kit.extract.source_commands import check_environment as command
+    from probe_kit.extract.inspect_commands import check_environment as command
 
     run: Callable[..., None] = command
     with pytest.raises(typer.Exit) as ended:

@@ -8,9 +8,8 @@ import pytest
 
 from probe_kit.errors import OwnEnvironmentError, UnitsError
 from probe_kit.extract import EnvSource, ExtractSettings, Step, check_environment, prepare
-from probe_kit.extract.sources.environment_contract import SUCCESS
-from probe_kit.extract.sources.environment_source import EnvironmentPlayer
-from probe_kit.extract.sources.opening import checked_step, open_environment
+from probe_kit.extract.sources.environment import SUCCESS
+from probe_kit.extract.sources.environment_source import EnvironmentPlayer, checked_step, open_environment
 from probe_kit.extract.sources.player import Ending
 from probe_kit.extract.sources.source import Played
 from probe_kit.hooks import Observation

@@ -9,8 +9,8 @@ import pytest
 
 from probe_kit.errors import MissingExtraError, OwnEnvironmentError, UsageError
 from probe_kit.extract import EnvSource, check_environment
+from probe_kit.extract.sources.environment_source import open_environment
 from probe_kit.extract.sources.lerobot_env import LeRobotEnvironment
-from probe_kit.extract.sources.opening import open_environment
 from tests.support.reach_env import Reach
 
 pytestmark = pytest.mark.slow

@@ -19,8 +19,7 @@ from probe_kit.env import SceneSpec
 from probe_kit.errors import RecordingError, SettingsMismatchError, UnitsError, UsageError
 from probe_kit.extract import ExtractSettings, LeRobotSource, extract_run, prepare
 from probe_kit.extract.rollout.controllers import PolicyController, Turn
-from probe_kit.extract.sources.lerobot_folder import open_lerobot
-from probe_kit.extract.sources.lerobot_frames import LeRobotFrames
+from probe_kit.extract.sources.lerobot_folder import LeRobotFrames, open_lerobot
 from probe_kit.extract.sources.player import SIDE
 from probe_kit.extract.sources.recording_source import RecordingSource
 from probe_kit.hooks.contract.observation import Observation
@@ -402,7 +401,7 @@ def test_trap_1_videos_are_decoded_without_torchcodec_and_without_a_word(tmp_pat
         "sys.modules['torchcodec'] = None\n"
         "from probe_kit.extract import LeRobotSource\n"
         "from probe_kit.extract.sources.lerobot_folder import open_lerobot\n"
-        "from probe_kit.extract.sources.lerobot_frames import LeRobotFrames\n"
+        "from probe_kit.extract.sources.lerobot_folder import LeRobotFrames\n"
         f"frames = LeRobotFrames(open_lerobot(LeRobotSource({str(folder)!r})))\n"
         f"seen = frames.pictures(0, 3, [{CAMERA!r}])[{CAMERA!r}]\n"
         "print(seen.shape, abs(int(seen[..., 2].mean()) - 60) < 10)\n"

@@ -8,9 +8,9 @@ import pytest
 
 from probe_kit.errors import MissingExtraError, RecordingError, UsageError
 from probe_kit.extract import ExtractSettings, LeRobotSource, prepare
-from probe_kit.extract.plan import Row
-from probe_kit.extract.preparation import check_meaningless
+from probe_kit.extract.extraction import check_meaningless
 from probe_kit.extract.sources.lerobot_folder import open_lerobot, resolved_commit
+from probe_kit.extract.sources.player import Row
 from probe_kit.extract.sources.recording import read_episodes
 from probe_kit.extract.sources.recording_source import mapped_cameras
 

@@ -19,10 +19,9 @@ from PIL import Image
 
 from probe_kit.errors import InstructionError, RecordingError, SettingsMismatchError, UnitsError
 from probe_kit.extract import ExtractSettings, LeRobotSource, prepare
-from probe_kit.extract.source_commands import show_dataset
-from probe_kit.extract.sources.hashed_files import HashedFiles
-from probe_kit.extract.sources.lerobot_folder import LeRobotFolder, open_lerobot
-from probe_kit.extract.sources.lerobot_frames import LeRobotFrames
+from probe_kit.extract.inspect_commands import show_dataset
+from probe_kit.extract.sources.lerobot_folder import LeRobotFolder, LeRobotFrames, open_lerobot
+from probe_kit.extract.sources.lerobot_meta import HashedFiles
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from tests.extract.recordings.conftest import observations
 from tests.support.lerobot_recordings import CAMERA, FPS, write_recording
@@ -189,7 +188,7 @@ def test_rows_are_the_episodes_own_however_a_file_is_divided(
     copy: Path, groups: int | None, most: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """most: bytes that are read at once of a whole file."""
-    monkeypatch.setattr("probe_kit.extract.sources.lerobot_frames.MOST_AT_ONCE", most)
+    monkeypatch.setattr("probe_kit.extract.sources.lerobot_folder.MOST_AT_ONCE", most)
     pq.write_table(pq.read_table(copy / DATA), copy / DATA, row_group_size=groups)
     np.testing.assert_array_equal(shown_states(copy), WRITTEN)
     frames = LeRobotFrames(opened(copy))

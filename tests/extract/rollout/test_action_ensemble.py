@@ -7,10 +7,9 @@ import pytest
 
 from probe_kit.errors import UsageError
 from probe_kit.extract import ExtractSettings
-from probe_kit.extract.plan import Row
-from probe_kit.extract.rollout.act import check_reachable
-from probe_kit.extract.rollout.controllers import PolicyController, Turn
-from probe_kit.extract.rollout.executed_actions import ensemble
+from probe_kit.extract.rollout.controllers import PolicyController, Turn, ensemble
+from probe_kit.extract.rollout.tasks import check_reachable
+from probe_kit.extract.sources.player import Row
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks import Observation, load_policy
 from probe_kit.suite import Suite

@@ -5,9 +5,8 @@ import pytest
 import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from probe_kit.extract.rollout import episode_buffers as staging
-from probe_kit.extract.rollout.capturing import Capturer, stored_streams
-from probe_kit.extract.rollout.episode_buffers import EpisodeBuffers, copy_aside
+from probe_kit.extract.rollout import capturing as staging
+from probe_kit.extract.rollout.capturing import Capturer, EpisodeBuffers, copy_aside, stored_streams
 from probe_kit.hooks import Observation, Roles
 from probe_kit.hooks.contract.roles import _matrix
 from probe_kit.hooks.families.pi0.adapter import Pi0

@@ -13,11 +13,10 @@ import pytest
 from probe_kit.env import SceneSpec
 from probe_kit.errors import ActionError
 from probe_kit.extract import ExtractSettings, prepare
-from probe_kit.extract.plan import Row
 from probe_kit.extract.rollout.controllers import Inference
-from probe_kit.extract.rollout.episode_loop import EpisodeLoop, Failure, Rollout
-from probe_kit.extract.sources.player import Ending, LocalPlayer, ProcessPlayer
-from probe_kit.extract.sources.scene_player import ScenePlayer
+from probe_kit.extract.rollout.worker import EpisodeLoop, Failure, Rollout
+from probe_kit.extract.sources.player import Ending, LocalPlayer, ProcessPlayer, Row
+from probe_kit.extract.sources.scene_source import ScenePlayer
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.suite import Suite, build_suite
 

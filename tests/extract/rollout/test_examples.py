@@ -7,7 +7,7 @@ from probe_kit.env import SceneSpec
 from probe_kit.env.simulation import Camera
 from probe_kit.errors import UsageError
 from probe_kit.extract import ExtractSettings
-from probe_kit.extract.rollout.task import check_fit
+from probe_kit.extract.rollout.tasks import check_fit
 from probe_kit.extract.sources.scene import SceneSettings
 from probe_kit.extract.sources.scene_source import SceneSource
 from probe_kit.hooks import ModelCard

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from probe_kit.env.rotations import from_euler_xyz
-from probe_kit.extract.rollout.executed_actions import executed_actions, with_rotation_vectors
+from probe_kit.extract.rollout.controllers import executed_actions, with_rotation_vectors
 from probe_kit.intervene.rollout import executed
 
 # 1 % and 99 % quantiles of BridgeData V2's rotations, in radians.

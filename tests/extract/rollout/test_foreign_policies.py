@@ -13,7 +13,7 @@ import pytest
 from probe_kit.env import SceneSpec
 from probe_kit.errors import ActionError, CheckpointError, EpisodesFailedError, PolicyFailedError
 from probe_kit.extract import ExtractSettings, extract_run
-from probe_kit.extract.events import LONGEST_TRACEBACK, add_traceback, traceback_of
+from probe_kit.extract.sources.player import LONGEST_TRACEBACK, add_traceback, traceback_of
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.hooks.family import Family
 from probe_kit.runs import open_run
@@ -150,7 +150,7 @@ def test_a_family_that_cannot_load_says_so_by_name(loader: str, error: type[Exce
 
 
 def test_a_family_that_is_wrong_about_itself_breaks_no_page(monkeypatch: pytest.MonkeyPatch) -> None:
-    from probe_kit.extract.model_commands import _model_rows
+    from probe_kit.extract.inspect_commands import _model_rows
     from probe_kit.hooks import registry
 
     broken = Family("mine", "theirs", None, "x:y", packages=(("nowhere.at.all", "extra"),))

@@ -2,8 +2,8 @@
 
 import pytest
 
-from probe_kit.extract.vqa.parsing import Said, read_answer
-from probe_kit.extract.vqa.templates import P1, SEEN, Order, Template
+from probe_kit.extract.prompts import P1, SEEN, Order, Template
+from probe_kit.extract.rollout.answers import Said, read_answer
 from tests.extract.vqa.answer_cases import (
     AFTER_AUDIT,
     AUDIT_LETTERED,

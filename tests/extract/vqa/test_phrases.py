@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from probe_kit.errors import UsageError
-from probe_kit.extract.vqa.phrases import Phrase, phrases
+from probe_kit.extract.prompts import Phrase, phrases
 from probe_kit.suite import Suite, build_suite
 
 

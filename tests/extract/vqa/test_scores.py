@@ -2,7 +2,7 @@
 
 import pytest
 
-from probe_kit.extract.vqa.scores import Choice, likeliest, outcome_of, side_expected, side_said
+from probe_kit.extract.rollout.answers import Choice, likeliest, outcome_of, side_expected, side_said
 
 
 def test_outcomes_are_right_wrong_or_unread() -> None:

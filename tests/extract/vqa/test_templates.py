@@ -5,8 +5,7 @@ from pathlib import Path
 import pytest
 
 from probe_kit.errors import UsageError
-from probe_kit.extract.vqa.phrases import Phrase
-from probe_kit.extract.vqa.templates import INSTRUCTION, P1, P2, SEEN, TEMPLATES, Template, find_template, sides
+from probe_kit.extract.prompts import INSTRUCTION, P1, P2, SEEN, TEMPLATES, Phrase, Template, find_template, sides
 
 RED = Phrase("red shape", "the")
 CHOICE = "\n\nA left\nB right\n\nAnswer with the option's letter from the given choices directly."

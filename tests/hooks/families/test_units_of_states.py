@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from probe_kit.errors import UnitsError
-from probe_kit.extract.sources.units import check_units, unusual_shares
+from probe_kit.extract.sources.source import check_units, unusual_shares
 from probe_kit.hooks import load_policy
 from probe_kit.hooks.registry import own_families
 from tests.support.every_checkpoint import WRITERS

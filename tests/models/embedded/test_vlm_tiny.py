@@ -10,9 +10,8 @@ from transformers import PaliGemmaForConditionalGeneration
 
 from probe_kit.env import SceneSpec
 from probe_kit.extract import ask_run
+from probe_kit.extract.prompts import ORDERS, TEMPLATES, Phrase
 from probe_kit.extract.settings import AskSettings
-from probe_kit.extract.vqa.phrases import Phrase
-from probe_kit.extract.vqa.templates import ORDERS, TEMPLATES
 from probe_kit.hooks.contract.model import Prompt
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.families.paligemma.adapter import PaliGemma, load_vlm_tiny

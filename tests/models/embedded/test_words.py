@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from probe_kit.cli import app
 from probe_kit.errors import InstructionError
 from probe_kit.extract import AskSettings, ExtractSettings
-from probe_kit.extract.preparation import open_checked
+from probe_kit.extract.extraction import open_checked
 from probe_kit.hooks.registry import find_family
 from probe_kit.models.embedded import embedded_checkpoint
 from probe_kit.models.embedded.words import SPECIAL, WORDS, known_words, words_in

@@ -15,7 +15,7 @@ from probe_kit.cli import app
 from probe_kit.env import SceneSpec
 from probe_kit.errors import SuiteError, SuiteNotFoundError
 from probe_kit.extract import ExtractSettings, extract_run
-from probe_kit.extract.preparation import open_checked
+from probe_kit.extract.extraction import open_checked
 from probe_kit.runs import Run, open_run, seal
 from probe_kit.runs.store import locate
 from probe_kit.runs.writer import RunWriter

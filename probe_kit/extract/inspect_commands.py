@@ -1,0 +1,366 @@
+"""Commands that show: `models`, `run verify|copy|export`, `dataset show` and `check-environment`."""
+
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.text import Text
+
+from probe_kit._system.escaping import terminal_safe
+from probe_kit._terminal import options as common
+from probe_kit._terminal.console import err, marked, out, print_json, print_text, say
+from probe_kit._terminal.field_options import command_with
+from probe_kit._terminal.options import LISTED, AsJson, Names, Partial, RunFolder, check_no_others
+from probe_kit.errors import UsageError
+from probe_kit.extract.parts import ActMachine, ModelSettings
+from probe_kit.extract.settings import ExtractSettings
+from probe_kit.extract.sources.environment import EnvOptions
+from probe_kit.extract.sources.recording import LeRobotSource
+from probe_kit.hooks.contract.card import EMBEDDED
+from probe_kit.runs.layout import DIRECTION_FILES, ExportFormat, SaeDtype
+
+if TYPE_CHECKING:
+    from probe_kit.hooks import Policy
+    from probe_kit.hooks.family import Family
+
+
+def models(
+    name: Annotated[str | None, typer.Argument(help="Model to show. Default: all.")] = None,
+    run: Annotated[str | None, typer.Option(metavar="RUN", help="Show the certificate of this run.")] = None,
+    words: Annotated[
+        bool,
+        typer.Option(
+            "--words", help="List the words that the embedded models know, one per line. Others read any text."
+        ),
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """List the models, one per line. With NAME: its checkpoint, streams, options and missing requirements.
+
+    A third party's model is imported only when it is named.
+    """
+    if words:
+        _print_words(name, run, as_json)
+        return
+    if run is not None:
+        from probe_kit.runs import open_run
+
+        print_json(open_run(run, allow_partial=True).certificate)
+        return
+    rows = _model_rows(name)
+    if as_json:
+        print_json(rows)
+        return
+    if name is None:
+        out.print(_listed(rows))
+        return
+    for row in rows:
+        out.print(marked("[bold]{}[/]  {}", row["model"], row["description"]))
+        for key in ("checkpoint", "streams", "embodiment", "scene", "does", "ready", "weights", "notes"):
+            if row[key]:
+                out.print(marked("  [dim]{}[/] {}", f"{key:10}", row[key]), soft_wrap=True)
+        for protocol, settings in row["protocols"].items():
+            line = ", ".join(f"{name} {value}" for name, value in settings.items())
+            out.print(marked("  [dim]protocol  [/] {}: {}", protocol, line), soft_wrap=True)
+        if (supported := row["interventions"]) is not None:
+            readout = (
+                ""
+                if supported["readout"] == "first-chunk"
+                else "; one action per inference, which says little alone"
+            )
+            supported_options = "; ".join(
+                f"{option} {', '.join(values)}" for option, values in supported["asked_as"].items()
+            )
+            out.print(marked("  [dim]intervene [/] {}", f"{supported_options}{readout}"), soft_wrap=True)
+        for option in row["options"]:
+            default = f" Default {option['default']}." if option["default"] else ""
+            line = f"-M {option['name']}={option['kind'].upper()}  {option['help']}{default}"
+            out.print(marked("  [dim]option    [/] {}", line), soft_wrap=True)
+
+
+def _print_words(name: str | None, run: str | None, as_json: bool) -> None:
+    from probe_kit.extract.parts import SCRIPTED
+    from probe_kit.hooks.registry import find_family, own_families
+
+    check_no_others({"--run": run is not None}, "--words")
+    families = list(own_families().values()) if name is None else [find_family(name, tuple(SCRIPTED))]
+    if not any(family.vocabulary for family in families):
+        raise UsageError(f"{name} reads any text; --words lists those of embedded models. Leave --words out")
+    listed = sorted({word for family in families for word in family.known_words()})
+    if as_json:
+        print_json(listed)
+    else:
+        print_text("\n".join(listed))
+
+
+def _listed(rows: list[dict[str, Any]]) -> Text:
+    """A line per model, its description cut behind a word where the console ends."""
+    lines = [(row["model"], row["does"], _in_a_word(row["ready"]), row["description"]) for row in rows]
+    lines = [("model", "does", "ready", "what it is"), *lines]
+    widths = [max(len(line[column]) for line in lines) for column in range(3)]
+    joined = [
+        "  ".join([*(f"{cell:{width}}" for cell, width in zip(line, widths, strict=False)), line[3]])
+        for line in lines
+    ]
+    cut = [line if len(line) <= out.width else f"{line[: out.width - 1].rpartition(' ')[0]} …" for line in joined]
+    return Text("\n".join([*cut, "A page per model: probe-kit models NAME"]))
+
+
+def _in_a_word(ready: str) -> str:
+    return "download" if ready.startswith("needs download") else "no" if ready.startswith("needs") else ready[:7]
+
+
+def _ready(family: "Family") -> str:
+    """Say if a family can be run here. A third party's family may be wrong about itself, and only about itself."""
+    try:
+        lacking = family.missing()
+    except (ImportError, ValueError, TypeError, AttributeError, OSError) as error:
+        return f"unknown: {type(error).__name__}: {error}"
+    return f"needs {lacking}" if lacking else "yes"
+
+
+def _model_rows(name: str | None) -> list[dict[str, Any]]:
+    from probe_kit.extract.parts import SCRIPTED
+    from probe_kit.extract.plan import weights_needed
+    from probe_kit.hooks.registry import find_family, own_families, third_party_families
+
+    families = list(own_families().values())
+    if name is not None:
+        families = [] if name in SCRIPTED else [find_family(name, tuple(SCRIPTED))]
+    rows = [
+        {
+            "model": family.name,
+            "description": family.description,
+            "checkpoint": family.default_checkpoint or ("your own" if family.needs_checkpoint else EMBEDDED),
+            "streams": family.streams_text(),
+            "embodiment": family.embodiment,
+            "scene": str(family.home),
+            "ready": _ready(family),
+            "weights": weights_needed(family.name, None, {}, None),
+            "notes": family.notes,
+            "does": " and ".join(verb for verb, can in (("acts", family.acts), ("answers", family.reads)) if can),
+            "protocols": {
+                " ".join(filter(None, (protocol, row.variant))): row.settings()
+                for protocol, first in family.protocols.items()
+                for row in first.rows
+            },
+            "interventions": family.interventions_json(),
+            "options": [
+                {"name": option.name, "kind": option.kind.__name__, "help": option.help, "default": option.default}
+                for option in family.options
+            ],
+        }
+        for family in families
+    ]
+    scripted = dict.fromkeys(("checkpoint", "streams", "embodiment", "scene"), "")
+    scripted |= {"weights": "", "ready": "yes", "notes": "no activations"}
+    nothing: dict[str, Any] = {"protocols": {}, "interventions": None, "options": []}
+    rows += [
+        {"model": model, "description": text, **scripted, "does": "acts", **nothing}
+        for model, text in SCRIPTED.items()
+        if name in (None, model)
+    ]
+    third_party = third_party_families() if name is None else {}
+    rows += [
+        {"model": model, "description": text, **dict.fromkeys(scripted, ""), "ready": "?", "does": "?", **nothing}
+        for model, text in third_party.items()
+    ]
+    return rows
+
+
+run_app = typer.Typer(help="Inspect, verify, copy and export runs.", no_args_is_help=True)
+DAMAGED = 1
+
+
+@run_app.command("verify")
+def verify(
+    run: RunFolder,
+    deep: Annotated[bool, typer.Option("--deep", help="Read every byte.")] = False,
+    build: Annotated[
+        bool,
+        typer.Option("--seal", help="First build the columns that make probing fast."),
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Check a run against its stored hashes; exit with 1 if anything is missing or changed."""
+    from probe_kit.runs import seal, verify_run
+
+    if build:
+        say("sealed" if seal(run) else "nothing to seal")
+    audit = verify_run(run, deep)
+    if as_json:
+        print_json({**asdict(audit), "ok": audit.ok, "finished": audit.finished})
+    else:
+        checked = "every byte" if deep else "structure and sizes"
+        sealed = "sealed" if audit.sealed else "not sealed"
+        failed = f", {audit.failed} failed" if audit.failed else ""
+        out.print(f"{audit.committed} of {audit.planned} episodes{failed}, {sealed}; {checked} checked")
+        if audit.ok and not audit.finished:
+            out.print(
+                "whole, but not finished: if it was finished before, this is an older state of it. The same "
+                "`probe-kit extract` continues it",
+                soft_wrap=True,
+            )
+        if audit.left_out:
+            out.print(f"a copy without activations: {', '.join(audit.left_out)}", soft_wrap=True)
+        for stray in audit.strays:
+            out.print(f"belongs to no part of the run: {stray}", highlight=False, markup=False, soft_wrap=True)
+        for problem in audit.problems:
+            out.print(f"damaged: {problem}", soft_wrap=True)
+    if not audit.ok:
+        raise typer.Exit(DAMAGED)
+
+
+@run_app.command("copy")
+def copy(
+    run: RunFolder,
+    out_folder: Annotated[str, typer.Argument(metavar="OUT", help="Folder or URL for the copy.")],
+    pictures: Annotated[bool, typer.Option("--pictures", help="Copy frames and videos too.")] = False,
+    partial: Partial = False,
+) -> None:
+    """Copy a run without its activations: outcomes, probes, interventions and certificates."""
+    from probe_kit.runs import copy_run
+
+    with err.status("copying"):
+        out.print(str(copy_run(run, out_folder, pictures, partial).location), soft_wrap=True)
+
+
+@run_app.command("export")
+def export(
+    run: RunFolder,
+    style: Annotated[
+        ExportFormat,
+        typer.Option(
+            "--format",
+            help="Format. lerobot and sae write a folder; lerobot needs a run with --frames all. directions: for "
+            "intervene --direction FILE#NAME.",
+        ),
+    ],
+    out_file: Annotated[
+        Path | None,
+        typer.Option("--out", metavar="FILE", help="What to write. Default: <run>.<format> beside the run."),
+    ] = None,
+    sites: Annotated[
+        Names | None,
+        typer.Option(
+            "--sites",
+            **LISTED,
+            help="Of parquet, sae and directions: sites, such as backbone.07, expert or expert.*@9. Default: all.",
+        ),
+    ] = None,
+    view: Annotated[
+        str | None,
+        typer.Option(
+            "--view",
+            help="Of parquet, sae and directions: a pooled view, tokens or tokens:ROLE. Default: all pooled "
+            "views, or mean in sae.",
+        ),
+    ] = None,
+    dtype: Annotated[SaeDtype, typer.Option("--dtype", help="Of sae: type of the memory maps.")] = "bfloat16",
+    seed: Annotated[int, typer.Option("--seed", help="Of sae: seed of the order of rows.")] = 0,
+    partial: Partial = False,
+) -> None:
+    """Write a run for other tools: to a file, and its sha256 beside it, or to a folder."""
+    from probe_kit.runs import export_run
+    from probe_kit.runs.store import locate
+
+    location = locate(run)
+    target = out_file or location.path_of_export(f"{location.name}.{DIRECTION_FILES.get(style, style)}")
+    with err.status("exporting"):
+        written = export_run(location, style, target, partial, sites=sites, view=view, dtype=dtype, seed=seed)
+    out.print(str(written), soft_wrap=True)
+
+
+FAILED = 1
+_OFFERED = {
+    "checkpoint", "model_option", "episodes", "select", "camera", "rotate", "instruction", "accept_units",
+}  # fmt: skip
+dataset_app = typer.Typer(help="Inspect data sets of recordings.", no_args_is_help=True)
+
+
+@dataset_app.command("show")
+@command_with(ModelSettings, ActMachine, LeRobotSource, offers=_OFFERED.__contains__)
+def show_dataset(
+    typed: Mapping[str, Any],
+    folder: Annotated[
+        str, typer.Argument(metavar="FOLDER", help="A LeRobotDataset, or USER/NAME@COMMIT of the hub.")
+    ],
+    model: Annotated[str | None, typer.Option("--model", help="Compare with the inputs of this model.")] = None,
+) -> None:
+    """Show what a data set holds and how a model would be shown it. Writes nothing.
+
+    Files, numbers and videos of the chosen episodes are checked. With a model, the state of every chosen frame is
+    compared with the statistics of the checkpoint. What `extract` refuses is an error here too.
+
+    \b
+    probe-kit dataset show FOLDER
+    probe-kit dataset show FOLDER --model pi0 --checkpoint DIR --camera base=observation.images.top
+    """
+    from rich.table import Table
+
+    from probe_kit.extract.extraction import check_unloaded
+    from probe_kit.extract.rollout.tasks import task_of
+    from probe_kit.extract.sources.recording_source import RecordingSource
+
+    settings = ExtractSettings.of_command({**typed, "model": model or "pi0-tiny", "dataset": folder})
+    with err.status("reading the data set"):
+        recording: RecordingSource = settings.source.open()  # type: ignore[assignment]  # of --dataset
+        recording.check_frames()
+        facts = recording.facts()
+    if model is not None:
+        with err.status("loading the model"):
+            check_unloaded(settings, recording)
+            policy: Policy = task_of(settings).load(settings)  # type: ignore[assignment]  # scripts were refused
+            recording, policy = recording.fitted(policy)
+        facts |= recording.facts_of(policy)
+    table = Table(show_header=False, box=None)
+    table.add_column(style="dim", no_wrap=True)
+    table.add_column(overflow="fold")
+    for name, value in facts.items():
+        table.add_row(name, marked("{}", terminal_safe(value)))
+    out.print(table)
+    if model is not None:
+        recording.check_recorded_units(policy, settings.machine.accept_units)
+
+
+def check_environment(
+    environment: Annotated[
+        str,
+        typer.Argument(metavar="MODULE:CLASS", help="Your environment, or lerobot:TYPE such as lerobot:libero."),
+    ],
+    env_options: EnvOptions = None,
+    as_json: common.AsJson = False,
+) -> None:
+    """Check an environment of your own against its contract, without a model.
+
+    Two episodes of five actions are played, twice. Each check is one line: passed or failed, and the promise that
+    is checked. A failure says what was seen and what was expected.
+
+    Example: `probe-kit check-environment kitchen:Kitchen`
+
+    Exits with 1 if a check failed.
+    """
+    from probe_kit.extract import EnvSource
+    from probe_kit.extract import check_environment as checks_of
+
+    source = EnvSource(environment, options=env_options or ())
+    checks = []
+    for check in checks_of(source):
+        checks.append(check)
+        if not as_json:
+            state, colour = ("passed", "green") if check.passed else ("failed", "bold red")
+            out.print(marked(f"[{colour}]{{}}[/] {{}}", f"{state:8}", check.sentence), soft_wrap=True)
+            if check.problem:
+                out.print(marked("         [dim]seen[/] {}", terminal_safe(check.problem)), soft_wrap=True)
+    failed = sum(not check.passed for check in checks)
+    if as_json:
+        listed = [{**asdict(check), "passed": check.passed} for check in checks]
+        print_json({"environment": environment, "passed": not failed, "checks": listed})
+    elif failed:
+        out.print(f"{len(checks) - failed} passed, {failed} failed")
+    else:
+        out.print(f"{len(checks)} passed")
+        say(marked("next: [bold]probe-kit extract --model NAME --env {}[/] --out runs/own", environment))
+    raise typer.Exit(FAILED if failed else 0)
