@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from probe_kit.hashing import derive_seed
-from probe_kit.statistics.estimates.balanced import balanced_sums
-from probe_kit.statistics.estimates.crossfit import CrossFit, Stream, crossfit
+from probe_kit.statistics.crossfit import CrossFit, Stream, balanced_sums, crossfit
 from probe_kit.statistics.folds import fold_numbers, fold_of_groups, sums_by_group
 from probe_kit.train.crossval.nested_folds import nested_folds
 from probe_kit.train.crossval.site_probe import SiteProbe, probe_site
-from probe_kit.train.data.samples import Samples
+from probe_kit.train.samples import Samples
 
 Matrix = NDArray[np.float64]
 WIDTH = 16

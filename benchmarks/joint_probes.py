@@ -31,8 +31,7 @@ from probe_kit.statistics.folds import INNER_FOLDS, OUTER_FOLDS
 from probe_kit.statistics.label_permutations import flip_items
 from probe_kit.train.crossval import logistic_folds as probe
 from probe_kit.train.crossval.joint import can_be_joint, cross_validate_jointly, labels_at_once
-from probe_kit.train.crossval.joint_design import JointSite
-from probe_kit.train.crossval.joint_objective import JointProblems
+from probe_kit.train.crossval.joint_objective import JointProblems, JointSite, NewtonState
 from probe_kit.train.crossval.nested_folds import (
     STRENGTHS,
     FittedFold,
@@ -40,11 +39,10 @@ from probe_kit.train.crossval.nested_folds import (
     NestedFold,
     nested_folds,
 )
-from probe_kit.train.data.samples import Samples
+from probe_kit.train.samples import Samples
+from probe_kit.train.solver.arrays import RowSubset
+from probe_kit.train.solver.design_matrix import IN_MEMORY, Projection
 from probe_kit.train.solver.logistic import LogisticSolver
-from probe_kit.train.solver.mixed_precision import NewtonState
-from probe_kit.train.solver.projection import IN_MEMORY, Projection
-from probe_kit.train.solver.row_subset import RowSubset
 
 
 def samples_of(episodes: int, tokens: int, width: int, signal: float) -> Samples:
@@ -162,7 +160,7 @@ def main() -> None:
     seconds, strengths, decisions = 0.0, np.full(labels.shape[1], arguments.strength), None
     with (
         threadpool_limits(1),
-        patch("probe_kit.train.solver.projection.IN_MEMORY", arguments.rival_memory * 2**30),
+        patch("probe_kit.train.solver.design_matrix.IN_MEMORY", arguments.rival_memory * 2**30),
     ):
         if arguments.part != "alone":
             seconds, found = together(samples, labels, folds, console)

@@ -16,8 +16,8 @@ import pandas as pd
 
 from probe_kit.train import ArrayRun, ProbeSettings, Target
 from probe_kit.train.choices import TASKS
-from probe_kit.train.data.samples import Samples
 from probe_kit.train.problem import Problem, make_problem
+from probe_kit.train.samples import Samples
 from probe_kit.train.target_samples import TargetSamples
 
 GROUPS, EPISODES, FRAMES = 43, 4, 10

@@ -19,14 +19,14 @@ from rich.table import Table
 from threadpoolctl import threadpool_limits
 
 from probe_kit.hashing import derive_seed
+from probe_kit.statistics.bootstrap import explained_interval
 from probe_kit.statistics.folds import SHARED_TRAINING, stratified_folds
-from probe_kit.statistics.paired_bootstrap import SHARED_PROBE, better_than_best, better_than_reference
+from probe_kit.statistics.paired_tests import SHARED_PROBE, better_than_best, better_than_reference
 from probe_kit.statistics.significance import SIGNIFICANCE
-from probe_kit.statistics.student import explained_interval
 from probe_kit.train.crossval.nested_folds import nested_folds
 from probe_kit.train.crossval.site_probe import probe_labels
 from probe_kit.train.crossval.task_scores import squared_deviations
-from probe_kit.train.data.samples import Samples
+from probe_kit.train.samples import Samples
 
 Matrix = NDArray[np.float64]
 Kind = Literal["white", "group", "skewed", "ar"]

@@ -28,8 +28,8 @@ from probe_kit.statistics.label_permutations import pointwise_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train import ArrayRun, ProbeSettings, Target
 from probe_kit.train.choices import TASKS, Task
-from probe_kit.train.data.samples import Samples
 from probe_kit.train.problem import make_problem
+from probe_kit.train.samples import Samples
 from probe_kit.train.target_samples import TargetSamples
 
 GROUPS, EPISODES, FRAMES, WIDTH, SITES, PERMUTATIONS = 20, 2, 8, 12, 3, 99

@@ -28,12 +28,12 @@ from threadpoolctl import threadpool_limits
 
 from probe_kit.statistics.folds import OUTER_FOLDS, Fold, grouped_folds
 from probe_kit.statistics.label_permutations import flip_groups, flip_items, max_statistic_p, pointwise_p
-from probe_kit.statistics.paired_bootstrap import better_than_best, better_than_reference
-from probe_kit.train.controls.features import LAYERS
+from probe_kit.statistics.paired_tests import better_than_best, better_than_reference
+from probe_kit.train.control_features import LAYERS
 from probe_kit.train.crossval.nested_folds import nested_folds
 from probe_kit.train.crossval.site_probe import probe_site
 from probe_kit.train.crossval.task_scores import correctness
-from probe_kit.train.data.samples import Samples
+from probe_kit.train.samples import Samples
 
 SITES, WIDTH, PERMUTATIONS = 2, 6, 39
 LEVEL = 0.05

@@ -28,10 +28,8 @@ from probe_kit.statistics.folds import INNER_FOLDS, OUTER_FOLDS
 from probe_kit.statistics.label_permutations import flip_items
 from probe_kit.train.crossval import logistic_folds as probe
 from probe_kit.train.crossval.nested_folds import nested_folds
-from probe_kit.train.data.samples import Samples
-from probe_kit.train.solver.design_matrix import DenseDesign
-from probe_kit.train.solver.principal_axes import WORTH_NARROWING
-from probe_kit.train.solver.projection import Projection
+from probe_kit.train.samples import Samples
+from probe_kit.train.solver.design_matrix import WORTH_NARROWING, DenseDesign, Projection
 
 
 @dataclass

@@ -19,13 +19,13 @@ from rich.table import Table
 from threadpoolctl import threadpool_limits
 
 from probe_kit.hashing import derive_seed
-from probe_kit.statistics.paired_bootstrap import better_than_best, better_than_reference
+from probe_kit.statistics.paired_tests import better_than_best, better_than_reference
 from probe_kit.statistics.significance import SIGNIFICANCE
-from probe_kit.train.controls.features import LAYERS
+from probe_kit.train.control_features import LAYERS
 from probe_kit.train.crossval.nested_folds import nested_folds
 from probe_kit.train.crossval.site_probe import probe_site
-from probe_kit.train.data.samples import Samples
 from probe_kit.train.power import ALIKE, NEIGHBOURS, simulate
+from probe_kit.train.samples import Samples
 
 SITES, CARRIERS, WIDTH = 7, (3, 4), 16
 Right = NDArray[np.bool_]

@@ -22,7 +22,7 @@ from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.crossval.nested_folds import nested_folds
 from probe_kit.train.crossval.site_probe import probe_site
 from probe_kit.train.crossval.task_scores import correctness
-from probe_kit.train.data.samples import Samples
+from probe_kit.train.samples import Samples
 
 SITES, WIDTH, ITEMS, PERMUTATIONS = 4, 12, 24, 99
 

@@ -25,8 +25,8 @@ from probe_kit.statistics.folds import INNER_FOLDS, OUTER_FOLDS
 from probe_kit.statistics.label_permutations import flip_items
 from probe_kit.train.crossval.nested_folds import STRENGTHS, nested_folds
 from probe_kit.train.crossval.site_probe import probe_site
-from probe_kit.train.data.samples import Samples
-from probe_kit.train.solver.projection import Projection
+from probe_kit.train.samples import Samples
+from probe_kit.train.solver.design_matrix import Projection
 
 WIDTH = 2048
 SUBSET = 4  # label columns scikit-learn fits, at every C, in one inner fold

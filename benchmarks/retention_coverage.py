@@ -25,10 +25,9 @@ from rich.table import Table
 from threadpoolctl import threadpool_limits
 
 from probe_kit.retention.estimators import Rate
-from probe_kit.statistics.estimates.crossfit import CrossFit
-from probe_kit.statistics.estimates.retention import retention
-from probe_kit.statistics.estimates.scores import Scores, accuracy_interval
+from probe_kit.statistics.crossfit import CrossFit
 from probe_kit.statistics.intervals import Interval
+from probe_kit.statistics.retention import Scores, accuracy_interval, retention
 
 SHUFFLES = 20
 STREAMS = ("action", "backbone")

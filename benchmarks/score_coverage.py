@@ -21,12 +21,12 @@ from scipy.special import ndtri
 from threadpoolctl import threadpool_limits
 
 from probe_kit.hashing import derive_seed
-from probe_kit.statistics.estimates.balanced import balanced_sums
-from probe_kit.statistics.estimates.shares import Accuracy, Share
+from probe_kit.statistics.crossfit import balanced_sums
 from probe_kit.statistics.folds import fold_numbers
+from probe_kit.statistics.intervals import Accuracy, Share
 from probe_kit.train.crossval.nested_folds import nested_folds
 from probe_kit.train.crossval.site_probe import probe_site
-from probe_kit.train.data.samples import Samples
+from probe_kit.train.samples import Samples
 
 WIDTH = 8
 ACCURACIES = (0.5, 0.65, 0.75, 0.9, 0.99, 0.9999)

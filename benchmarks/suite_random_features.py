@@ -22,11 +22,10 @@ from probe_kit.hashing import derive_seed
 from probe_kit.hooks import Site
 from probe_kit.suite import Suite, build_suite
 from probe_kit.train import ArrayRun
-from probe_kit.train.controls.features import LAYERS, ControlInputs
+from probe_kit.train.control_features import LAYERS, ControlInputs
 from probe_kit.train.crossval.task_scores import correctness
-from probe_kit.train.data.samples import Samples
-from probe_kit.train.execution import ExecutionSettings
-from probe_kit.train.probe_sweep import Sweep
+from probe_kit.train.probe_sweep import ExecutionSettings, Sweep
+from probe_kit.train.samples import Samples
 
 
 def main() -> None:

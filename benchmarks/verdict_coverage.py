@@ -27,17 +27,15 @@ from scipy.stats import binomtest
 from threadpoolctl import threadpool_limits
 
 from probe_kit.hashing import derive_seed
-from probe_kit.statistics.estimates.balanced import GroupSums, balanced_sums
-from probe_kit.statistics.estimates.crossfit import Stream, crossfit
-from probe_kit.statistics.estimates.shares import Share
-from probe_kit.statistics.estimates.verdict import ABSENT_BELOW, at_most, findable, is_absent
+from probe_kit.statistics.crossfit import GroupSums, Stream, balanced_sums, crossfit
 from probe_kit.statistics.folds import fold_numbers, fold_of_groups, sums_by_group
-from probe_kit.statistics.intervals import difference_interval, mean_interval
+from probe_kit.statistics.intervals import Share, difference_interval, mean_interval
 from probe_kit.statistics.model_groups import exchange_p, is_exchangeable, welch_interval
 from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.statistics.sufficiency import ABSENT_BELOW, at_most, findable, is_absent
 from probe_kit.train.crossval.nested_folds import nested_folds
 from probe_kit.train.crossval.site_probe import probe_site
-from probe_kit.train.data.samples import Samples
+from probe_kit.train.samples import Samples
 
 Sizes = NDArray[np.int64]
 

@@ -23,8 +23,8 @@ from probe_kit.retention import retention_table
 from probe_kit.retention.displays import collect_figures, layer_curve, save_figures
 from probe_kit.retention.report import write_report
 from probe_kit.train import ProbeResults
-from probe_kit.train.columns.builtin import label_frame
-from probe_kit.train.results.score_rows import exceeds_column
+from probe_kit.train.builtin_columns import label_frame
+from probe_kit.train.results.probe_results import exceeds_column
 
 PAGE = Path(__file__).parents[1] / "docs" / "own-data.md"
 FIGURE, FIGURE_DPI = PAGE.with_name("own-data.png"), 110

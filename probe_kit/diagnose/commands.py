@@ -104,7 +104,7 @@ def diagnose(
     from probe_kit.diagnose.paraphrases import read_paraphrases
     from probe_kit.diagnose.results import check_names
     from probe_kit.intervene.pairs import read_pairs
-    from probe_kit.train.train_options import TargetOptions
+    from probe_kit.train.command_options import TargetOptions
 
     # A camera's name is known once the source is open; any other mistake is said before.
     check_names([name.partition(".")[0] for name in require or ()], names_of(()))

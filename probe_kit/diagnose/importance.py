@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from probe_kit._tables.numbers import whole_percent
 from probe_kit.diagnose.results import IDLE, MATTERS, BaseComparison, Change, InputDiagnosis, Verdict
 from probe_kit.hashing import derive_seed
+from probe_kit.statistics.bootstrap import unbounded_student_interval
 from probe_kit.statistics.paired_tests import least_column_p, max_t
 from probe_kit.statistics.significance import SIGNIFICANCE
-from probe_kit.statistics.student import unbounded_student_interval
 
 DECIDES = 0.5
 """Of what all inputs change together: from here on an input decides."""

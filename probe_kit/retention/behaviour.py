@@ -15,12 +15,11 @@ from probe_kit.env.scoring import SENSITIVITY_RADII, success_at
 from probe_kit.errors import UsageError
 from probe_kit.runs.layout import CAPTURE_ONLY
 from probe_kit.runs.reader import RunReader, check_several_wordings, full_name
-from probe_kit.statistics.estimates.shares import Share
+from probe_kit.statistics.intervals import Share
 from probe_kit.statistics.paired_tests import heads_p
 from probe_kit.statistics.significance import chance_margin
 from probe_kit.train.choices import CORRECT, SIDES
-from probe_kit.train.results.probe_results import ProbeResults
-from probe_kit.train.settings import ProbeSettings
+from probe_kit.train.results.probe_results import ProbeResults, ProbeSettings
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -13,20 +13,18 @@ from numpy.typing import NDArray
 from probe_kit.errors import TooFewGroupsError, UnbalancedEpisodesError, UsageError
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.retention.choices import Iterations
-from probe_kit.statistics.estimates.balanced import CHANCE
-from probe_kit.statistics.estimates.crossfit import CrossFit, crossfit
-from probe_kit.statistics.estimates.retention import Ratio, retention
-from probe_kit.statistics.estimates.scores import Scores, accuracy_interval, t_quantile
-from probe_kit.statistics.estimates.shares import Share
-from probe_kit.statistics.estimates.verdict import ABSENT_BELOW, at_most, findable, is_absent, permuted_threshold
+from probe_kit.statistics.crossfit import CHANCE, CrossFit, crossfit
 from probe_kit.statistics.intervals import (
     NO_LIMITS,
     Interval,
+    Share,
     correlation_of,
     difference_interval,
     mean_interval,
     not_surer,
 )
+from probe_kit.statistics.retention import Ratio, Scores, accuracy_interval, retention, t_quantile
+from probe_kit.statistics.sufficiency import ABSENT_BELOW, at_most, findable, is_absent, permuted_threshold
 from probe_kit.train.results.control_scores import RANDOM_FEATURES, UNTRAINED, Controls, Exceeds, has_signal
 from probe_kit.train.results.probe_curve import ProbeCurve
 
@@ -258,7 +256,7 @@ class RetentionEstimate:
     """Retention of two streams.
 
     value: cross-fitted score of the action's best site over that of the backbone's, both above one half (see
-    `probe_kit.statistics.estimates`); NaN where the backbone's is 0, or no score is defined. interval: 95 %,
+    `probe_kit.statistics.crossfit`); NaN where the backbone's is 0, or no score is defined. interval: 95 %,
     Fieller's; without limits where the backbone is not known well enough to divide by. published: the ratio of the
     peaks, as the paper has it. defined: whether the backbone's best site is above chance (family-wise) and better
     than every control that was run; `note` else says what is missing.

@@ -14,7 +14,7 @@ from probe_kit.retention.columns.summary import finding
 from probe_kit.retention.columns.text import NOT_ACTED, model_name, once_per_category
 from probe_kit.retention.compare.compare import Difference
 from probe_kit.retention.rows.row import MEAN, RetentionPart, RetentionRow
-from probe_kit.statistics.estimates.balanced import CHANCE
+from probe_kit.statistics.crossfit import CHANCE
 
 if TYPE_CHECKING:
     import pandas as pd

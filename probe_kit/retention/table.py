@@ -40,7 +40,7 @@ from probe_kit.retention.rows.probe_parts import label_notes, label_rows, read_l
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.runs.location import Location
 from probe_kit.runs.reader import RunReader, check_sides
-from probe_kit.statistics.estimates.verdict import ABSENT_BELOW
+from probe_kit.statistics.sufficiency import ABSENT_BELOW
 from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.train.results.store import is_current, load_side_results
 

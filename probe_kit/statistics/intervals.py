@@ -1,17 +1,26 @@
-"""Intervals of ratios (Fieller), and of differences and means from the intervals of their parts (MOVER).
+"""Intervals of shares, ratios (Fieller), differences and means (MOVER), groups of items as the unit.
 
+Success rates and other outcomes have Korn and Graubard's interval, accuracies of probes have Wilson's: see `Share`
+and `Accuracy`.
+
+Korn and Graubard, “Confidence intervals for proportions with small expected number of positive counts estimated
+from survey data”, Survey Methodology 24 (1998).
+Wilson, “Probable inference, the law of succession, and statistical inference”, Journal of the American Statistical
+Association 22 (1927). Kish, “Survey sampling” (1965), for the design effect.
 Zou and Donner, “Construction of confidence limits about effect measures”, Statistics in Medicine 27 (2008).
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from math import inf, isfinite, isinf, sqrt
-from statistics import fmean
+from statistics import NormalDist, fmean
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from probe_kit.errors import UsageError
+from probe_kit.statistics.significance import SIGNIFICANCE
 
 
 @dataclass(frozen=True)
@@ -108,3 +117,198 @@ def correlation_of(covariance: float, variances: tuple[float, float]) -> float:
 
 def _combined(first: float, second: float, correlation: float) -> float:
     return sqrt(max(0.0, first**2 + second**2 - 2 * correlation * first * second))
+
+
+Matrix = NDArray[np.float64]
+
+TAIL = SIGNIFICANCE / 2
+"""Chance of either side of a two-sided 95 % interval."""
+
+
+@dataclass(frozen=True)
+class Share:
+    """A share of episodes, such as a success rate.
+
+    groups: (G,) names of the groups of items, sorted. sums, sizes: (G,) hits and episodes of each group.
+    """
+
+    groups: NDArray[np.str_]
+    sums: Matrix
+    sizes: Matrix
+
+    @classmethod
+    def of(cls, values: ArrayLike, groups: ArrayLike, weights: ArrayLike | None = None) -> "Share":
+        """The mean of (E,) values from 0 to 1 over the episodes of (E,) groups.
+
+        weights: (E,) how much of an episode counts, such as whether it has an answer; each 1 by default. Groups
+        without weight are left out. Raises UsageError for no episode, or a value that is NaN or outside 0 … 1.
+        """
+        each = np.asarray(values, np.float64)
+        if weights is not None:
+            counted = np.asarray(weights, np.float64)
+            each, groups = each[counted > 0], np.asarray(groups, str)[counted > 0]
+        if each.size == 0:
+            raise UsageError("a share of no episodes; expected at least one")
+        if not ((each >= 0) & (each <= 1)).all():
+            wrong = each[~((each >= 0) & (each <= 1))]
+            raise UsageError(
+                f"{wrong.size} of {each.size} values are no shares, the first is {wrong[0]}; expected 0 to 1. "
+                "Leave out episodes without a value."
+            )
+        names, group_of = np.unique(np.asarray(groups, str), return_inverse=True)
+        weight: Matrix = np.ones(each.size) if weights is None else counted[counted > 0]
+        sums, sizes = (np.bincount(group_of, part).astype(np.float64) for part in (each * weight, weight))
+        return cls(names, sums, sizes)
+
+    @property
+    def value(self) -> float:
+        """Hits over episodes."""
+        return float(self.sums.sum() / self.sizes.sum())
+
+    @property
+    def n_groups(self) -> float:
+        """G*, how many groups of equal size are worth as much: E² / Σ size²."""
+        return effective_groups(self.sizes)
+
+    @property
+    def df(self) -> float:
+        """Degrees of freedom of the variance: G* − 1, at least 1."""
+        return max(self.n_groups - 1, 1.0)
+
+    @property
+    def variance(self) -> float:
+        """The variance of the share, groups as the unit; infinite with a single group."""
+        return self.covariance(self)
+
+    @cached_property
+    def _residuals(self) -> Matrix:
+        residuals: Matrix = (self.sums - self.value * self.sizes) / self.sizes.sum()
+        return residuals
+
+    def covariance(self, other: "Share") -> float:
+        """Covariance of two shares on the same groups; 0 where the groups are not the same."""
+        if not np.array_equal(self.groups, other.groups):
+            return 0.0
+        if self.groups.size == 1:
+            return float("inf")
+        return float(self._residuals @ other._residuals) * self.groups.size / (self.groups.size - 1)
+
+    def correlation(self, other: "Share") -> float:
+        """Correlation of two shares; 0 where the groups are not the same, or one of them does not vary."""
+        return correlation_of(self.covariance(other), (self.variance, other.variance))
+
+    def difference(self, other: "Share") -> Interval:
+        """95 % interval of this share minus another (MOVER), paired where both are of the same groups.
+
+        Where the two agree in all groups it leaves room for unseen ones, see `not_surer`.
+        """
+        related = 0.0
+        if np.array_equal(self.groups, other.groups):
+            variances = self.variance, other.variance
+            shared = not_surer(self.covariance(other), variances, self.groups.size, 1.0)
+            related = correlation_of(shared, variances)
+        return difference_interval(self.value, self.interval(), other.value, other.interval(), related)
+
+    def interval(self) -> Interval:
+        """95 % interval by `share_interval`; 0 to 1 with a single group."""
+        if self.groups.size == 1:
+            return Interval(0.0, 1.0)
+        low, high = share_interval(self.value, self.variance, self.groups.size, self.sizes.sum(), self.df)
+        return Interval(float(low), float(high))
+
+
+class Accuracy(Share):
+    """The held-out accuracy of a probe, with Wilson's interval.
+
+    sums, sizes: (G,) weights of the right and of all decisions of each group, as `balanced_sums` gives them.
+    """
+
+    def interval(self) -> Interval:
+        """95 % interval by `wilson_interval`; 0 to 1 with a single group."""
+        if self.groups.size == 1:
+            return Interval(0.0, 1.0)
+        low, high = wilson_interval(self.value, self.variance, self.n_groups, self.sizes.sum(), self.df)
+        return Interval(float(low), float(high))
+
+
+def effective_groups(sizes: Matrix) -> float:
+    """G* of (G,) sizes: as many groups of equal size vary as little, E² / Σ size²."""
+    return float(sizes.sum() ** 2 / (sizes @ sizes))
+
+
+def effective_episodes(
+    shares: ArrayLike, variances: ArrayLike, n_episodes: float
+) -> tuple[Matrix, Matrix, NDArray[np.bool_]]:
+    """Return shares s within [0, 1], min(s (1 − s) / v, E), and whether all groups agree; arrays of one shape.
+
+    The second is E over the design effect (Kish 1965). It has no meaning where all groups agree.
+    """
+    s, v = np.broadcast_arrays(np.asarray(shares, np.float64).clip(0, 1), variances)
+    agree = (v <= NEGLIGIBLE_VARIANCE) | (s <= 0) | (s >= 1)
+    return s, np.minimum(s * (1 - s) / np.where(agree, 1.0, v), n_episodes), agree
+
+
+def group_shares(sums: Matrix, sizes: Matrix) -> tuple[Matrix, Matrix]:
+    """Shares and their variances, groups as the unit; (S,) each from (S, G) sums and (G,) sizes.
+
+    variance = Σ (sum − share · size)² · G / (G − 1) / E², with E = Σ size. Needs two groups or more.
+    """
+    total, count = sizes.sum(), sizes.size
+    shares: Matrix = sums.sum(axis=1) / total
+    residuals = sums - shares[:, None] * sizes
+    variances: Matrix = (residuals**2).sum(axis=1) * count / (count - 1) / total**2
+    return shares, variances
+
+
+def share_interval(
+    share: ArrayLike,
+    variance: ArrayLike,
+    n_groups: float,
+    n_episodes: float,
+    df: float,
+    tail: float = TAIL,
+) -> tuple[Matrix, Matrix]:
+    """Clopper and Pearson's limits with as many episodes as count (Korn and Graubard 1998), for arrays of shares.
+
+    share, variance: the estimates and their variances with groups as the unit. n_episodes: E of them. df: degrees
+    of freedom of the variance. tail: chance of either side. With
+    n = min(s (1 − s) / v, E) · (t(1 − tail, E − 1) / t(1 − tail, df))² the limits are
+    Beta⁻¹(tail; s n, n − s n + 1) and Beta⁻¹(1 − tail; s n + 1, n − s n). Where nothing varies, n is `n_groups`,
+    whatever their sizes: G groups that are alike with chance p all agree with chance p^G. No share is better known
+    than there. Without this rule a share near 1 of unequal groups with few errors is covered in 88 %.
+    """
+    from scipy.special import betaincinv, stdtrit  # type: ignore[import-untyped]
+
+    s, counting, agree = effective_episodes(share, variance, n_episodes)
+    lost = stdtrit(max(n_episodes - 1, 1), 1 - tail) / stdtrit(df, 1 - tail)
+    n = np.where(agree, n_groups, counting * lost**2)
+    right, wrong = s * n, n - s * n
+    none, all_ = right <= 1e-9, wrong <= 1e-9
+    low = betaincinv(np.where(none, 1.0, right), wrong + 1, tail)
+    high = betaincinv(right + 1, np.where(all_, 1.0, wrong), 1 - tail)
+    perfect = tail ** (1 / n_groups)
+    return np.where(none, 0.0, np.minimum(low, perfect)), np.where(all_, 1.0, np.maximum(high, 1 - perfect))
+
+
+def wilson_interval(
+    share: ArrayLike, variance: ArrayLike, n_groups: float, n_episodes: float, df: float, tail: float = TAIL
+) -> tuple[Matrix, Matrix]:
+    """Return Wilson's limits (1927) with the effective number of episodes, for arrays of accuracies.
+
+    share, variance: the estimates s and their variances v with groups as the unit. n_groups: G, of unequal groups
+    G* (`effective_groups`). n_episodes: E of them. df: degrees of freedom of the variance. tail: chance of either
+    side. n is the number of `effective_episodes`, at least G. With t the quantile of Student's distribution the
+    limits are (s + t²/2n ± t √(s (1 − s)/n + t²/4n²)) / (1 + t²/n). Where all groups agree the variance knows
+    nothing of other groups: n is G, and t is the normal quantile. No accuracy is better known than there.
+    """
+    from scipy.special import stdtrit
+
+    s, counting, agree = effective_episodes(share, variance, n_episodes)
+    n = np.where(agree, n_groups, np.maximum(counting, n_groups))
+    normal = NormalDist().inv_cdf(1 - tail) ** 2
+    square = np.where(agree, normal, stdtrit(df, 1 - tail) ** 2)
+    reach = np.sqrt(square * s * (1 - s) / n + (square / (2 * n)) ** 2)
+    low, high = ((s + square / (2 * n) + sign * reach) / (1 + square / n) for sign in (-1, 1))
+    # Else one group with an error would make an accuracy better known than none does.
+    perfect = n_groups / (n_groups + normal)
+    return np.minimum(low, perfect).clip(0), np.maximum(high, 1 - perfect).clip(max=1)

@@ -23,14 +23,13 @@ from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.retention.table import retention_table
 from probe_kit.runs.layout import FIRST_FRAME
 from probe_kit.runs.reader import RunReader
-from probe_kit.statistics.estimates.cka import unbiased_cka
+from probe_kit.statistics.cka import unbiased_cka
 from probe_kit.statistics.label_permutations import flip_groups, max_statistic_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.suite.categories import category_of
 from probe_kit.train.crossval.task_scores import correctness
 from probe_kit.train.results.probe_curve import ProbeCurve
-from probe_kit.train.results.probe_directions import Direction
-from probe_kit.train.results.probe_results import ProbeResults
+from probe_kit.train.results.probe_results import Direction, ProbeResults
 from probe_kit.train.results.store import load_results
 
 Features = NDArray[np.float64]

@@ -23,8 +23,8 @@ from PIL import Image
 from probe_kit._system.counting import counted
 from probe_kit._system.drafts import write_whole
 from probe_kit.hashing import derive_seed
-from probe_kit.statistics.estimates.shares import Accuracy
 from probe_kit.statistics.folds import OUTER_FOLDS, assign_folds
+from probe_kit.statistics.intervals import Accuracy
 from probe_kit.statistics.significance import chance_margin
 from probe_kit.suite.categories import CATEGORIES, OWN_DOMAIN, category_of
 from probe_kit.suite.items import Episode, Item, Side, counterparts_of

@@ -10,19 +10,15 @@ from probe_kit._system.imports import lazy_names
 if TYPE_CHECKING:
     from probe_kit.runs.reader import RunReader
     from probe_kit.statistics.folds import FOLD_UNITS, FoldUnit
-    from probe_kit.train.array_probe import ArrayProbes, probe
+    from probe_kit.train.array_probe import ArrayProbes, ArrayRun, probe
     from probe_kit.train.choices import CONTROLS, INCOMPLETE, SIDES, Control, Incomplete, Side
-    from probe_kit.train.data.array_run import ArrayRun
     from probe_kit.train.probe_sweep import Progress, train_probes
     from probe_kit.train.results.control_scores import ControlComparison, Controls, ControlScore, UntrainedScore
     from probe_kit.train.results.probe_curve import ProbeCurve
-    from probe_kit.train.results.probe_directions import Direction
-    from probe_kit.train.results.probe_results import ProbeResults
+    from probe_kit.train.results.probe_results import Direction, ProbeResults, ProbeSettings
     from probe_kit.train.results.store import load_results, load_results_by_call, save_results
-    from probe_kit.train.settings import ProbeSettings
     from probe_kit.train.target import Target
-    from probe_kit.train.transfer.transfer import transfer_probes
-    from probe_kit.train.transfer.transfer_results import TransferResults
+    from probe_kit.train.transfer import TransferResults, transfer_probes
 
 __all__ = [
     "CONTROLS",
@@ -60,11 +56,11 @@ __getattr__, __dir__ = lazy_names(
     __name__,
     {
         "ArrayProbes": "array_probe",
-        "ArrayRun": "data.array_run",
+        "ArrayRun": "array_probe",
         "probe": "array_probe",
         "Controls": "results.control_scores",
         "ProbeCurve": "results.probe_curve",
-        "Direction": "results.probe_directions",
+        "Direction": "results.probe_results",
         "ControlComparison": "results.control_scores",
         "FOLD_UNITS": "probe_kit.statistics.folds",
         "FoldUnit": "probe_kit.statistics.folds",
@@ -77,7 +73,7 @@ __getattr__, __dir__ = lazy_names(
         "Side": "choices",
         "Target": "target",
         "ProbeResults": "results.probe_results",
-        "ProbeSettings": "settings",
+        "ProbeSettings": "results.probe_results",
         "Progress": "probe_sweep",
         "RunReader": "probe_kit.runs.reader",
         "UntrainedScore": "results.control_scores",
@@ -85,7 +81,7 @@ __getattr__, __dir__ = lazy_names(
         "load_results": "results.store",
         "save_results": "results.store",
         "train_probes": "probe_sweep",
-        "TransferResults": "transfer.transfer_results",
-        "transfer_probes": "transfer.transfer",
+        "TransferResults": "transfer",
+        "transfer_probes": "transfer",
     },
 )

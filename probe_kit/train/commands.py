@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
     from probe_kit.runs import Run
     from probe_kit.train import ProbeResults, RunReader
+    from probe_kit.train.command_options import TargetOptions, TransferOptions
     from probe_kit.train.results.inventory import Inventory, StoredProbes
-    from probe_kit.train.train_options import TargetOptions, TransferOptions
 
 
 def train(
@@ -61,8 +61,8 @@ def train(
     """
     from probe_kit.runs import open_run
     from probe_kit.runs.direction_files import check_direction_file
-    from probe_kit.train.results.probe_directions import write_direction_file
-    from probe_kit.train.train_options import TargetOptions, TransferOptions
+    from probe_kit.train.command_options import TargetOptions, TransferOptions
+    from probe_kit.train.results.probe_results import write_direction_file
 
     target_options = TargetOptions(target, labels, task, group_by, exchange_within, align_to)
     target_options.check(window)
@@ -172,7 +172,7 @@ def _transfer(
 ) -> None:
     """Fit probes of a target on `run`, score them on `other` with a progress bar, and print the scores."""
     from probe_kit.train import transfer_probes
-    from probe_kit.train.transfer.transfer_summary import transfer_sentences, transfer_table
+    from probe_kit.train.transfer import transfer_sentences, transfer_table
 
     number = _only_call(call, run, "a transfer")
     fitted_on, scored_on = (

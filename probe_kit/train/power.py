@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
-from probe_kit.statistics.estimates.balanced import GroupSums
-from probe_kit.statistics.estimates.verdict import at_most, findable, is_absent
+from probe_kit.statistics.crossfit import GroupSums
 from probe_kit.statistics.folds import OUTER_FOLDS
-from probe_kit.statistics.paired_bootstrap import better_than_best, better_than_reference
+from probe_kit.statistics.paired_tests import better_than_best, better_than_reference
 from probe_kit.statistics.significance import SIGNIFICANCE
-from probe_kit.train.controls.features import LAYERS
+from probe_kit.statistics.sufficiency import at_most, findable, is_absent
+from probe_kit.train.control_features import LAYERS
 
 NEIGHBOURS, ALIKE = 0.9, 0.3
 """Assumed correlation of neighbouring sites, and of the episodes of one group."""

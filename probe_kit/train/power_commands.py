@@ -117,8 +117,8 @@ def _answer(needed: "tuple[Power, int] | None") -> str:
 
 def _print(estimates: "list[Power]") -> None:
     from probe_kit._tables.table import Table
-    from probe_kit.statistics.estimates.verdict import ABSENT_BELOW
     from probe_kit.statistics.significance import detectable
+    from probe_kit.statistics.sufficiency import ABSENT_BELOW
 
     headings = (
         "items",

@@ -27,9 +27,9 @@ from probe_kit.train.choices import EVERYWHERE, Task
 from probe_kit.train.crossval.nested_folds import Matrix, NestedFold, nested_folds
 from probe_kit.train.crossval.site_probe import SiteProbe, probe_labels, probe_site
 from probe_kit.train.crossval.task_scores import chance_level
-from probe_kit.train.data.samples import Samples
 from probe_kit.train.results.probe_curve import ProbeCurve
-from probe_kit.train.settings import ProbeSettings
+from probe_kit.train.results.probe_results import ProbeSettings
+from probe_kit.train.samples import Samples
 from probe_kit.train.target import Target
 from probe_kit.train.target_samples import TargetSamples
 

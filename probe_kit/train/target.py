@@ -21,10 +21,9 @@ from probe_kit.hashing import derive_seed, sha256_json
 from probe_kit.runs.layout import RECORDED_EPISODES
 from probe_kit.runs.reader import RunReader, check_sides
 from probe_kit.statistics.label_permutations import flip_items
+from probe_kit.train.builtin_columns import BuiltinColumn, BuiltinColumns
 from probe_kit.train.choices import SIDES, Task
-from probe_kit.train.columns.builtin import BuiltinColumn, BuiltinColumns
-from probe_kit.train.columns.table import EPISODE, FRAME, INFERENCE, SOURCE, read_table
-from probe_kit.train.columns.values import LabelValues, code_labels
+from probe_kit.train.label_table import EPISODE, FRAME, INFERENCE, SOURCE, LabelValues, code_labels, read_table
 
 if TYPE_CHECKING:
     import pandas as pd

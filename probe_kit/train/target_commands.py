@@ -19,7 +19,7 @@ from probe_kit.train.choices import CORRECT, SIDES, Task
 if TYPE_CHECKING:
     from probe_kit.runs import Run
     from probe_kit.train import RunReader, Target
-    from probe_kit.train.columns.builtin import BuiltinColumn
+    from probe_kit.train.builtin_columns import BuiltinColumn
 
 
 def targets(
@@ -82,7 +82,7 @@ class ListedTarget(NamedTuple):
 
 def listed_targets(run: "RunReader") -> Iterator[ListedTarget]:
     """Yield every target of a run, those too that it cannot give."""
-    from probe_kit.train.columns.builtin import BuiltinColumns
+    from probe_kit.train.builtin_columns import BuiltinColumns
     from probe_kit.train.target import Target
 
     columns = BuiltinColumns(run)
@@ -138,8 +138,7 @@ def _trials_of_a_column(target: "Target", task: str, column: "BuiltinColumn") ->
 
 def _refusal(run: "RunReader", target: "Target", categories: Sequence[str] | None) -> str:
     """Return why `train` refuses a target, by what it checks itself before any probe is fitted; empty if not."""
-    from probe_kit.train.execution import ExecutionSettings
-    from probe_kit.train.probe_sweep import Sweep
+    from probe_kit.train.probe_sweep import ExecutionSettings, Sweep
 
     try:
         with catch_warnings():
@@ -182,7 +181,7 @@ def labels(
     """
     from probe_kit._system.drafts import draft_of
     from probe_kit._system.escaping import csv_of_frame
-    from probe_kit.train.columns.builtin import label_frame, why_no_sim
+    from probe_kit.train.builtin_columns import label_frame, why_no_sim
 
     if out_file.exists():
         name = f"{out_file.stem}-{Path(run).name}{out_file.suffix}"

@@ -13,10 +13,9 @@ from probe_kit.runs import Run
 from probe_kit.runs.arrays import decode_bfloat16
 from probe_kit.runs.layout import MEAN_VIEW
 from probe_kit.runs.rows import Rows
-from probe_kit.train.data.samples import is_token_view
 from probe_kit.train.results.probe_curve import ProbeCurve
-from probe_kit.train.results.probe_directions import Direction, read_directions
-from probe_kit.train.results.probe_results import ProbeResults
+from probe_kit.train.results.probe_results import Direction, ProbeResults, read_directions
+from probe_kit.train.samples import is_token_view
 
 Values = NDArray[np.float64]
 

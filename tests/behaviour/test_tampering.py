@@ -23,7 +23,7 @@ from probe_kit.runs.store import locate
 from probe_kit.runs.thumbnails import read_thumbnail, thumbnail_key
 from probe_kit.suite import Suite
 from probe_kit.train import load_results, train_probes
-from probe_kit.train.results.resume import SweepCheckpoint
+from probe_kit.train.results.store import SweepCheckpoint
 from tests.support.little_run import episode, little_plan, little_writer, write_little_run
 from tests.support.reading import readings
 from tests.support.rehashing import rehash, write_record

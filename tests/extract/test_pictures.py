@@ -28,7 +28,7 @@ from probe_kit.intervene.sessions.observed import ObservedSession
 from probe_kit.intervene.sessions.opening import open_session
 from probe_kit.retention.displays import attention_on_picture
 from probe_kit.runs import open_run, verify_run
-from probe_kit.train.columns.builtin import label_frame
+from probe_kit.train.builtin_columns import label_frame
 from probe_kit.view.catalogue import Catalogue
 from tests.view.payload_reader import floats, read_payload
 

@@ -123,7 +123,7 @@ def test_a_control_is_its_features_and_its_words(use: Callable[[str, str], str])
     code = """
 from types import SimpleNamespace
 from probe_kit.train import CONTROLS
-from probe_kit.train.controls.features import ControlInputs
+from probe_kit.train.control_features import ControlInputs
 
 run = SimpleNamespace(episodes=episodes.assign(instruction="put the cube"), control_features={}, location="run")
 samples = SimpleNamespace(rows=np.arange(3))

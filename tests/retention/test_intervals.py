@@ -22,13 +22,11 @@ from probe_kit.retention import (
 from probe_kit.retention.behaviour import success_share
 from probe_kit.retention.displays import LayerCurveDisplay
 from probe_kit.retention.estimators import PooledScores, Rate, curve_scores, limits
-from probe_kit.statistics.estimates.balanced import GroupSums
-from probe_kit.statistics.estimates.crossfit import crossfit
-from probe_kit.statistics.estimates.retention import retention, retention_difference
-from probe_kit.statistics.estimates.scores import Scores, accuracy_interval
-from probe_kit.statistics.estimates.shares import Share
+from probe_kit.statistics.crossfit import GroupSums, crossfit
+from probe_kit.statistics.intervals import Share
+from probe_kit.statistics.retention import Scores, accuracy_interval, retention, retention_difference
 from probe_kit.train import ArrayRun, ProbeCurve, load_results
-from probe_kit.train.controls.untrained import add_untrained
+from probe_kit.train.controls import add_untrained
 from tests.retention.conftest import runs_in
 from tests.support.inner_qualities import stream_of
 

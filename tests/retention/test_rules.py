@@ -21,7 +21,7 @@ from probe_kit.retention.displays import collect_figures
 from probe_kit.retention.report import report_html
 from probe_kit.retention.rows.outcome_rules import rule_sentence
 from probe_kit.runs import Run, open_run
-from probe_kit.statistics.estimates.shares import Share
+from probe_kit.statistics.intervals import Share
 from probe_kit.suite import build_suite
 from probe_kit.train import ArrayRun
 

@@ -10,7 +10,7 @@ from probe_kit.retention import RetentionTable, retention_table
 from probe_kit.retention.displays import collect_figures
 from probe_kit.retention.report import report_html
 from probe_kit.train import ArrayRun, ProbeResults, load_results, save_results
-from probe_kit.train.settings import ProbeSettings
+from probe_kit.train.results.probe_results import ProbeSettings
 
 ProbedRun = Callable[..., ArrayRun]
 SIGNAL = ([0.5, 0.9, 0.7], [[0.6, 0.7]])

@@ -15,7 +15,7 @@ from probe_kit.runs import ActionErrors, Run, compare_actions, open_run
 from probe_kit.runs.layout import DATASET, OTHER_ACTIONS
 from probe_kit.runs.store import locate
 from probe_kit.runs.writer import RunWriter
-from probe_kit.train.columns.builtin import label_frame
+from probe_kit.train.builtin_columns import label_frame
 from tests.support.recorded_run import ACTION, CALLS, CHUNK, EVERY, SHORT, recorded_plan, write_recorded_run
 
 

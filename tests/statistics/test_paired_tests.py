@@ -1,13 +1,23 @@
 """Exact tests of paired differences, and their corrections."""
 
+from collections.abc import Sequence
 from itertools import product
 from math import comb
+from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.stats import binomtest
 
+from probe_kit.retention import retention_table
+from probe_kit.retention.compare.known_used import OVERALL
+from probe_kit.retention.joins import joins_of
+from probe_kit.retention.rows.row import MEAN
 from probe_kit.statistics.paired_tests import (
+    EXCHANGES,
+    better_than_best,
+    better_than_reference,
     clopper_pearson,
     fisher_p,
     flip_p,
@@ -21,6 +31,7 @@ from probe_kit.statistics.paired_tests import (
     sign_p,
     unit_means,
 )
+from tests.retention.asked_runs import SaidRun, acted, asked
 
 
 @pytest.mark.parametrize(("more", "less"), [(0, 0), (5, 5), (1, 0), (9, 1), (2, 11), (40, 20)])
@@ -188,3 +199,132 @@ def test_columns_that_do_not_differ_are_told_apart_in_five_of_a_hundred_draws(co
         of_group = rng.lognormal(0.0, 2.0, (8, columns))[groups]
         alarms += least_column_p(of_group * rng.lognormal(0.0, 0.5, (16, columns)), groups, seed) < 0.05
     assert alarms <= 0.05 * 400 + 3 * np.sqrt(0.05 * 0.95 * 400)
+
+
+GROUPS = np.repeat(np.arange(40), 4)
+
+
+def right(share: float, sites: int, seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).random((sites, GROUPS.size)) < share
+
+
+def test_a_site_that_is_much_better_than_the_reference_gets_the_smallest_p() -> None:
+    sites = np.concatenate([right(0.9, 1, 0), right(0.6, 3, 1)])
+    p = better_than_reference(sites, right(0.6, 1, 2)[0].astype(float), GROUPS, seed=0)
+    assert p[0] == 1 / (1 + EXCHANGES)
+    assert (p[1:] > 0.05).all()
+
+
+def test_the_best_of_many_equal_sites_is_rarely_better_than_the_reference() -> None:
+    alarms = [
+        better_than_reference(right(0.6, 20, seed), np.full(GROUPS.size, 0.6), GROUPS, seed).min() < 0.05
+        for seed in range(100)
+    ]
+    assert np.mean(alarms) <= 0.05 + 3 * np.sqrt(0.05 * 0.95 / 100)
+
+
+def test_the_best_of_many_sites_is_rarely_better_than_the_best_of_as_many_others() -> None:
+    alarms = [
+        better_than_best(right(0.6, 20, 2 * seed), right(0.6, 20, 2 * seed + 1), GROUPS, seed).min() < 0.05
+        for seed in range(100)
+    ]
+    assert np.mean(alarms) <= 0.05 + 3 * np.sqrt(0.05 * 0.95 / 100)
+
+
+def test_a_signal_in_one_site_is_better_than_the_best_of_the_twin() -> None:
+    here = np.concatenate([right(0.6, 4, 0), right(0.9, 1, 1)])
+    p = better_than_best(here, right(0.6, 7, 2), GROUPS, seed=0)
+    assert p[4] < 0.01
+    assert (p[:4] > 0.05).all()
+
+
+def test_a_model_is_not_better_than_itself() -> None:
+    sites = right(0.7, 5, 0)
+    assert (better_than_best(sites, sites, GROUPS, seed=0) > 0.3).all()
+
+
+SHARES = {"color": (20, 0.9), "shape": (16, 0.7)}
+
+
+def by_chance(seed: int, less: float = 0.0) -> dict[str, np.ndarray]:
+    draw = np.random.default_rng(seed)
+    return {category: draw.random((count, 2)) < share - less for category, (count, share) in SHARES.items()}
+
+
+def stepped(values: Sequence[float]) -> list[float]:
+    """Holm's steps, one by one."""
+    found = [0.0] * len(values)
+    highest = 0.0
+    for rank, place in enumerate(sorted(range(len(values)), key=values.__getitem__)):
+        highest = max(highest, min(1.0, (len(values) - rank) * values[place]))
+        found[place] = highest
+    return found
+
+
+def check(rows: Sequence[tuple[float | None, float | None]], number: int) -> None:
+    """rows: p and corrected p of a family."""
+    assert len(rows) == number
+    values = [p for p, _ in rows if p is not None]
+    assert len(values) == number
+    assert [p_holm for _, p_holm in rows] == [pytest.approx(p) for p in stepped(values)]
+    assert len({round(p, 9) for p in values}) > 2, "the family must hold p-values that differ"
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> list[SaidRun]:
+    vlms = [asked(tmp_path / f"r{n}", by_chance(n), called=f"vlm {n}") for n in range(2)]
+    policies = [acted(tmp_path / f"p{n}", by_chance(9 + n, 0.15 * n), f"policy {n}") for n in range(3)]
+    return [*vlms, *policies]
+
+
+def test_gaps_are_one_family_over_categories_and_pairs_and_means_another(runs: list[SaidRun]) -> None:
+    found = retention_table(runs, vlm_vla=True).vlm_vla
+    assert len({(gap.group, gap.minus) for gap in found}) == 6
+    check([(gap.p, gap.p_holm) for gap in found if gap.category != "mean"], 12)
+    check([(gap.p, gap.p_holm) for gap in found if gap.category == "mean"], 6)
+
+
+def test_differences_are_one_family_and_means_another(runs: list[SaidRun]) -> None:
+    found = retention_table(runs[2:]).differences
+    check([(row.p, row.p_holm) for row in found if row.category != "mean"], 4)
+
+
+def test_joins_that_a_report_shows_together_are_one_family(runs: list[SaidRun]) -> None:
+    table = retention_table(runs)
+    joins = joins_of(runs, table).tables
+    tests = [one for join in joins for row in join.rows if row.category != OVERALL for one in row.comparisons]
+    check([(one.p, one.p_holm) for one in tests], len(list(product(range(2), range(3), SHARES))))
+    summaries = [one for join in joins for row in join.rows if row.category == OVERALL for one in row.comparisons]
+    assert len(summaries) == 6
+    assert all(one.p_holm is None for one in summaries)
+
+
+def test_wordings_of_all_runs_are_one_family_over_categories_and_pairs(tmp_path: Path) -> None:
+    found = retention_table([worded(tmp_path / f"run {seed}", seed) for seed in range(2)]).wordings
+    check([(pair.p, pair.p_holm) for pair in found if pair.category != MEAN], 2 * 3 * 2)
+    check([(pair.p, pair.p_holm) for pair in found if pair.category == MEAN], 2 * 3)
+
+
+class Worded(SaidRun):
+    """A run whose episodes were played in three wordings; tables show the first."""
+
+    wordings = ("knowledge", "named", "side")
+
+    @property
+    def all_wordings(self) -> SaidRun:
+        plain = [acted(Path(str(self.path)), by_chance(self.seed + n, -0.2 * n)).episodes for n in range(3)]
+        tables = [
+            table.assign(wording=name, episode_id=table["episode_id"] + f":{name}")
+            for name, table in zip(self.wordings, plain, strict=True)
+        ]
+        return SaidRun(self.path, "policy", self.suite, pd.concat(tables, ignore_index=True), {})
+
+    @property
+    def seed(self) -> int:
+        return int(self.settings["seed"])
+
+
+def worded(path: Path, seed: int) -> SaidRun:
+    plain = acted(path, by_chance(seed))
+    episodes = plain.episodes.assign(wording="knowledge")
+    return Worded(plain.path, "policy", plain.suite, episodes, {}, settings={"seed": 10 * seed})

@@ -12,11 +12,11 @@ from scipy import stats  # type: ignore[import-untyped]
 
 from probe_kit.errors import TooFewGroupsError
 from probe_kit.statistics.bootstrap import GAINS, group_bootstrap
-from probe_kit.statistics.estimates.verdict import ABSENT_BELOW
 from probe_kit.statistics.label_permutations import ENUMERATED_BELOW, flip_groups, possible_flips, smallest_p
 from probe_kit.statistics.paired_tests import EXACT, max_t, smallest_flip_p
 from probe_kit.statistics.significance import SIGNIFICANCE, chance_margin, items_for_width
 from probe_kit.statistics.sufficiency import (
+    ABSENT_BELOW,
     GROUPS_FOR_PROBES,
     GROUPS_FOR_RETENTION,
     groups_for_absence,

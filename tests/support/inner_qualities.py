@@ -3,8 +3,7 @@
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from probe_kit.statistics.estimates.balanced import GroupSums
-from probe_kit.statistics.estimates.crossfit import CrossFit, Stream, crossfit
+from probe_kit.statistics.crossfit import CrossFit, GroupSums, Stream, crossfit
 from probe_kit.statistics.folds import sums_by_group
 
 

@@ -12,8 +12,7 @@ from threadpoolctl import threadpool_limits
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks import Site, Stream
 from probe_kit.train import ArrayRun, ProbeSettings, Target
-from probe_kit.train.execution import ExecutionSettings
-from probe_kit.train.probe_sweep import Sweep
+from probe_kit.train.probe_sweep import ExecutionSettings, Sweep
 from probe_kit.train.problem import Problem
 
 PlantedRun = Callable[..., ArrayRun]

@@ -22,7 +22,7 @@ from probe_kit.runs.thumbnails import as_thumbnail, thumbnail_key
 from probe_kit.runs.writer import RunWriter
 from probe_kit.suite import Suite
 from probe_kit.train import load_results
-from probe_kit.train.results.probe_directions import read_directions
+from probe_kit.train.results.probe_results import read_directions
 from probe_kit.train.results.store import load_results_by_call
 from probe_kit.view.catalogue import Catalogue
 from probe_kit.view.payloads.coding import pack_floats, pack_log_odds, payload_script

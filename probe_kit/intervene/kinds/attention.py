@@ -26,8 +26,7 @@ from probe_kit.intervene.settings import has_sides
 from probe_kit.intervene.tokens import TILES, role_token_mask, shown_cameras, token_boxes
 from probe_kit.runs.reader import RunReader
 from probe_kit.runs.run import Run
-from probe_kit.statistics.bootstrap import GAINS, units_seed
-from probe_kit.statistics.student import student_interval
+from probe_kit.statistics.bootstrap import GAINS, student_interval, units_seed
 
 if TYPE_CHECKING:
     import pandas as pd

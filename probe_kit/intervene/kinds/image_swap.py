@@ -30,10 +30,9 @@ from probe_kit.intervene.replay import CleanRun, Condition, ControlInput, DonorR
 from probe_kit.intervene.selection import preferred_by_category
 from probe_kit.intervene.settings import FIRST_CHUNK, has_sides
 from probe_kit.runs.reader import RunReader
-from probe_kit.statistics.bootstrap import GAINS, group_bootstrap, units_seed
+from probe_kit.statistics.bootstrap import GAINS, group_bootstrap, unbounded_student_interval, units_seed
 from probe_kit.statistics.paired_tests import paired_greater_p
 from probe_kit.statistics.significance import SIGNIFICANCE
-from probe_kit.statistics.student import unbounded_student_interval
 from probe_kit.statistics.sufficiency import SMALLEST_EFFECT_OF_INTEREST
 from probe_kit.suite.categories import category_of
 

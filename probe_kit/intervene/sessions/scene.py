@@ -21,7 +21,7 @@ from probe_kit.runs.origin import OF_SCENE
 from probe_kit.runs.reader import origin_of
 from probe_kit.runs.run import Run
 from probe_kit.suite.items import Episode, Item, Layout, check_wordings, counterparts_of, in_words
-from probe_kit.train.data.run_suite import suite_of
+from probe_kit.train.run_suite import suite_of
 
 if TYPE_CHECKING:
     from torch import Tensor

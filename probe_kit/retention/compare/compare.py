@@ -27,9 +27,8 @@ from probe_kit.retention.estimators import ACTION, BACKBONE, Limits, PooledScore
 from probe_kit.retention.rows.build import RowWithEstimates
 from probe_kit.retention.rows.row import MEAN, Mode
 from probe_kit.runs.reader import RunReader
-from probe_kit.statistics.estimates.retention import Ratio, retention_difference
-from probe_kit.statistics.estimates.scores import Scores
 from probe_kit.statistics.paired_tests import corrected, flip_gains_p
+from probe_kit.statistics.retention import Ratio, Scores, retention_difference
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -12,9 +12,8 @@ from probe_kit.errors import UsageError
 from probe_kit.retention.estimators import ACTION, BACKBONE, Limits, PooledScores, limits
 from probe_kit.retention.rows.build import RowWithEstimates
 from probe_kit.runs.reader import RunReader
-from probe_kit.statistics.estimates.retention import retention
-from probe_kit.statistics.estimates.scores import Scores
 from probe_kit.statistics.model_groups import exchange_p, is_exchangeable, welch_interval
+from probe_kit.statistics.retention import Scores, retention
 
 _STEP = re.compile(r"(?:^|.*(?:step|checkpoint|ckpt|iter|iteration)s?[-_=]?)0*(\d+)$", re.IGNORECASE)
 """A folder of a training: `020000`, `checkpoint-500`, `step_20000`, `ckpt-3`."""

@@ -36,8 +36,8 @@ from probe_kit.retention.displays.base.style import (
 )
 from probe_kit.retention.estimators import best_site, score_streams
 from probe_kit.runs.reader import RunReader
-from probe_kit.statistics.estimates.balanced import CHANCE
-from probe_kit.statistics.estimates.verdict import FEWEST_PERMUTATIONS
+from probe_kit.statistics.crossfit import CHANCE
+from probe_kit.statistics.sufficiency import FEWEST_PERMUTATIONS
 from probe_kit.train.results.control_scores import has_signal
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeResults

@@ -15,7 +15,7 @@ from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import DOTS, FigureSource, ReportFigure, in_view, view_suffix
 from probe_kit.retention.displays.base.selection import curve_of, known_view, scores_of
 from probe_kit.retention.displays.base.style import FILLED, PARTS, axes_for, caption, legend_above, panels
-from probe_kit.statistics.estimates.balanced import CHANCE
+from probe_kit.statistics.crossfit import CHANCE
 from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:

@@ -36,7 +36,7 @@ from probe_kit.retention.displays.base.style import (
     significance_handles,
 )
 from probe_kit.retention.displays.stream_curve import LayerLine, StreamCurve
-from probe_kit.statistics.estimates.verdict import FEWEST_PERMUTATIONS
+from probe_kit.statistics.sufficiency import FEWEST_PERMUTATIONS
 from probe_kit.train.choices import EVERYWHERE, SIDES
 from probe_kit.train.crossval.task_scores import METRICS
 from probe_kit.train.results.probe_results import ProbeResults

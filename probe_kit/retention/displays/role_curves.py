@@ -26,7 +26,7 @@ from probe_kit.retention.displays.base.style import (
 )
 from probe_kit.retention.displays.layer_curves import draw_line
 from probe_kit.retention.displays.stream_curve import StreamCurve
-from probe_kit.statistics.estimates.balanced import CHANCE
+from probe_kit.statistics.crossfit import CHANCE
 from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:

@@ -19,7 +19,7 @@ from probe_kit.retention.displays.base.report_figure import FigureSource, Report
 from probe_kit.retention.displays.base.selection import scores_of
 from probe_kit.retention.displays.base.style import layer_axis, series
 from probe_kit.runs.reader import RunReader
-from probe_kit.statistics.estimates.balanced import CHANCE
+from probe_kit.statistics.crossfit import CHANCE
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.results.probe_results import ProbeResults
 

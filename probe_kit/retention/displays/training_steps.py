@@ -10,7 +10,7 @@ from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
 from probe_kit.retention.displays.base.report_figure import ReportFigure
 from probe_kit.retention.displays.base.style import caption, legend_above, panels, plain, series
 from probe_kit.retention.rows.row import MEAN
-from probe_kit.statistics.estimates.balanced import CHANCE
+from probe_kit.statistics.crossfit import CHANCE
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

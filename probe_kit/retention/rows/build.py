@@ -41,9 +41,8 @@ from probe_kit.retention.rows.row import (
     SwapEffect,
 )
 from probe_kit.runs.reader import RunReader
-from probe_kit.statistics.estimates.retention import retention
-from probe_kit.statistics.estimates.scores import Scores
-from probe_kit.statistics.estimates.verdict import ABSENT_BELOW
+from probe_kit.statistics.retention import Scores, retention
+from probe_kit.statistics.sufficiency import ABSENT_BELOW
 from probe_kit.train.choices import CORRECT
 from probe_kit.train.results.probe_results import ProbeResults
 
@@ -221,7 +220,7 @@ def mean_row(drawn: Sequence[RowWithEstimates], averaged: Sequence[str]) -> Rete
 
     averaged: fields that are averaged over the categories that have them, as `part.field`; the columns declare
     them, see `probe_kit.retention.columns.columns`. Intervals: of independent
-    categories, see `probe_kit.statistics.estimates`.
+    categories, see `probe_kit.statistics.crossfit`.
     """
     rows = [part.row for part in drawn]
     estimates = [part.estimates for part in drawn]

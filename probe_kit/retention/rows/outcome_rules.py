@@ -11,7 +11,7 @@ from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour import ask_of, capture_only, group_names, shares_of
 from probe_kit.retention.estimators import Limits, limits
 from probe_kit.runs.reader import RunReader
-from probe_kit.statistics.estimates.shares import Share
+from probe_kit.statistics.intervals import Share
 
 if TYPE_CHECKING:
     import pandas as pd

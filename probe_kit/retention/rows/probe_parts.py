@@ -32,9 +32,9 @@ from probe_kit.retention.rows.row import (
     RunInfo,
 )
 from probe_kit.runs.reader import RunReader
-from probe_kit.statistics.estimates.verdict import ABSENT_BELOW, verdict
 from probe_kit.statistics.paired_tests import holm
 from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.statistics.sufficiency import ABSENT_BELOW, verdict
 from probe_kit.train.choices import SIDES
 from probe_kit.train.results.control_scores import Controls, Exceeds, has_signal
 from probe_kit.train.results.probe_curve import ProbeCurve

@@ -9,7 +9,7 @@ from probe_kit.retention.behaviour import SuccessRate, ask_of, capture_only
 from probe_kit.retention.estimators import Limits
 from probe_kit.retention.rows.outcome_rules import OutcomeRuleScores
 from probe_kit.runs.reader import RunReader, full_name
-from probe_kit.statistics.estimates.verdict import Verdict
+from probe_kit.statistics.sufficiency import Verdict
 from probe_kit.train.choices import CORRECT, SIDES, Task
 from probe_kit.train.crossval.task_scores import METRICS
 from probe_kit.train.results.control_scores import has_signal

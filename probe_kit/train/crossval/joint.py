@@ -12,14 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import TooFewGroupsError
-from probe_kit.train.crossval.joint_design import JointSite
-from probe_kit.train.crossval.joint_objective import JointProblems
+from probe_kit.train.crossval.joint_objective import JointProblems, JointSite, solve
 from probe_kit.train.crossval.nested_folds import STRENGTHS, FittedFold, InnerQuality, Matrix, NestedFold, select_c
 from probe_kit.train.crossval.task_scores import log_loss, log_losses
-from probe_kit.train.data.samples import Samples
-from probe_kit.train.solver.backend import Array, array_namespace, to_numpy
-from probe_kit.train.solver.mixed_precision import solve
-from probe_kit.train.solver.projection import IN_MEMORY
+from probe_kit.train.samples import Samples
+from probe_kit.train.solver.arrays import Array, array_namespace, to_numpy
+from probe_kit.train.solver.design_matrix import IN_MEMORY
 
 COLUMN_MEMORY = 2**29
 """Bytes that problems solved at once may take, beyond the samples and what is made of them once."""

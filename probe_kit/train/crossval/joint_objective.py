@@ -1,17 +1,381 @@
-"""Logistic objectives of several training sets of one site, evaluated in shared products."""
+"""Logistic objectives of several training sets of one site in shared products, and Newton's method for them.
 
-from collections.abc import Callable
+The objective is that of `solver.logistic`. Conjugate gradients find every step in float32, which halves their
+time. Far from the optimum the gradient is float32 too; near it the gradient is float64 on the exact data, and no
+problem is given back before this gradient is below the tolerance. So float32 decides how a solution is found,
+never what it is.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import groupby
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.train.crossval.joint_design import Block, JointSite
-from probe_kit.train.solver.backend import Array, array_namespace
-from probe_kit.train.solver.mixed_precision import NewtonState
+from probe_kit.errors import ProbeNotConvergedError
+from probe_kit.train.crossval.nested_folds import NestedFold
+from probe_kit.train.samples import Samples
+from probe_kit.train.solver.arrays import Array, Moments, RowSubset, array_namespace, to_numpy
+from probe_kit.train.solver.design_matrix import narrow_axes
+
+ROWS_PER_BLOCK = 512
+"""8 MB of float64 at a width of 2,048: a block is used twice, so it should stay in the processor's cache."""
+
+ROWS_PER_PRODUCT = 8192
+"""Rows multiplied with themselves at once: products of fewer are slower, float32 sums over more less exact."""
+
+LEAST_SCALE = 0.1
+"""Deviation in a training set, as a share of the site's, below which its probes need axes of their own."""
+
+
+@dataclass(frozen=True)
+class Block:
+    """Consecutive rows of a site, all of episodes that the same outer fold tests.
+
+    rows: of the site. episode: (B,) episode of every row. outer: number of the outer fold that tests them.
+    """
+
+    rows: slice
+    episode: NDArray[np.intp]
+    outer: int
+
+
+@dataclass(frozen=True)
+class TrainingSets:
+    """The F sets of episodes on which probes are trained: of every inner fold, then of every outer one.
+
+    member: (F, E) float32, 1 where an episode belongs to a set. outer: (F,) the outer fold each belongs to, of
+    whose test episodes it has none. counts: (F,) samples. mean, scale: (F, D) float64, what standardises a set,
+    measured from the site's mean in units of its scale.
+    """
+
+    member: NDArray[np.float32]
+    outer: NDArray[np.intp]
+    counts: NDArray[np.float64]
+    mean: Array
+    scale: Array
+
+
+@dataclass(frozen=True)
+class JointSite:
+    """M samples of E episodes, standardised by the site's own mean and scale and sorted by outer fold.
+
+    features: (M, D) raw rows in this order. blocks: they cover all rows.
+    mean, scale: (D,) float64; infinite scale for a feature that never varies. unclear: whether any feature is so
+    near to never varying that training sets may disagree on it.
+    axes: (D, D) float32, principal axes of the standardised samples; variances: (D,) squared lengths along them.
+    turned: (M, D) float32, standardised samples along the axes: they shape steps, never a gradient that counts.
+    """
+
+    features: RowSubset
+    blocks: tuple[Block, ...]
+    mean: Array
+    scale: Array
+    unclear: bool
+    sets: TrainingSets
+    axes: Array
+    variances: Array
+    turned: Array
+
+    @classmethod
+    def of(cls, samples: Samples, folds: Sequence[NestedFold]) -> "JointSite":
+        """The site of `samples`. Memory: their copy in float32, D × D a few times, and a block in float64."""
+        features, blocks = _sorted(samples, folds)
+        xp = array_namespace(features.matrix)
+        mean, scale, rounding = Moments.of(features)
+        unclear = bool(((scale > 0.25 * rounding) & (scale < 4 * rounding)).any())
+        scale[scale <= rounding] = np.inf
+        turned = xp.empty(features.shape, dtype=xp.float32, device=mean.device)
+        moments, member = _Moments(), _members(folds, len(samples.counts))
+        for block in blocks:
+            exact = (features.matrix[features.rows[block.rows]] - mean) / scale
+            turned[block.rows] = exact
+            moments.add(exact, xp.asarray(member[:, block.episode], device=mean.device))
+        counts = member @ samples.counts
+        axes, variances = narrow_axes(_products(turned)), xp.zeros_like(mean)
+        for block in blocks:
+            turned[block.rows] = turned[block.rows] @ axes
+            variances += xp.square(turned[block.rows]).sum(axis=0)
+        outer = np.append(np.repeat(np.arange(len(folds)), [len(f.inner) for f in folds]), np.arange(len(folds)))
+        sets = TrainingSets(member.astype(np.float32), outer, counts, *moments.standard(counts))
+        return cls(features, blocks, mean, scale, unclear, sets, axes, variances, turned)
+
+    @property
+    def alike(self) -> bool:
+        """Whether all training sets drop the site's constant features only, and scale the others about as it does.
+
+        Only then do the site's axes fit them.
+        """
+        varies = np.isfinite(to_numpy(self.scale))
+        return not self.unclear and bool((to_numpy(self.sets.scale)[:, varies] > LEAST_SCALE).all())
+
+    def centred(self, block: Block) -> Array:
+        """(B, D) float64: the block's raw rows without the site's mean."""
+        return self.features.matrix[self.features.rows[block.rows]] - self.mean
+
+
+@dataclass
+class _Moments:
+    """Sums over the rows seen so far, per training set: of every feature, and of its square."""
+
+    sums: Array = 0.0
+    squares: Array = 0.0
+
+    def add(self, exact: Array, member: Array) -> None:
+        self.sums = self.sums + member @ exact
+        self.squares = self.squares + member @ exact**2
+
+    def standard(self, counts: NDArray[np.float64]) -> tuple[Array, Array]:
+        """(F, D) mean and deviation of every training set."""
+        xp = array_namespace(self.sums)
+        size = xp.asarray(counts, device=self.sums.device)[:, None]
+        mean = self.sums / size
+        return mean, xp.sqrt((self.squares / size - mean**2).clip(0.0))
+
+
+def _products(rows: Array) -> Array:
+    """(D, D) moments of (M, D) float32: they precondition only, so float32 will do, in half the time."""
+    parts = (rows[start : start + ROWS_PER_PRODUCT] for start in range(0, len(rows), ROWS_PER_PRODUCT))
+    return sum(part.T @ part for part in parts)
+
+
+def training_sets(folds: Sequence[NestedFold]) -> list[NDArray[np.intp]]:
+    """The episodes of every inner fold's training set, then of every outer one's."""
+    return [inner.train for fold in folds for inner in fold.inner] + [fold.outer.train for fold in folds]
+
+
+def _members(folds: Sequence[NestedFold], episodes: int) -> NDArray[np.float64]:
+    """(F, E) 1 where an episode belongs to a training set."""
+    sets = training_sets(folds)
+    member = np.zeros((len(sets), episodes))
+    for number, members in enumerate(sets):
+        member[number, members] = 1
+    return member
+
+
+def _sorted(samples: Samples, folds: Sequence[NestedFold]) -> tuple[RowSubset, tuple[Block, ...]]:
+    """Rows and blocks, the episodes that an outer fold tests together."""
+    rows = samples.features if isinstance(samples.features, RowSubset) else RowSubset.all(samples.features)
+    order = np.concatenate([fold.outer.test for fold in folds])
+    sorted_ = Samples(rows, samples.counts, samples.means).of(order)
+    assert isinstance(sorted_.features, RowSubset)
+    episode = np.repeat(order, sorted_.counts)
+    sizes = [samples.counts[fold.outer.test].sum() for fold in folds]
+    return sorted_.features, tuple(_blocks(sizes, episode))
+
+
+def _blocks(sizes: Iterable[int], episode: NDArray[np.intp]) -> Iterable[Block]:
+    first = 0
+    for fold, size in enumerate(sizes):
+        for start in range(first, first + size, ROWS_PER_BLOCK):
+            rows = slice(start, min(start + ROWS_PER_BLOCK, first + size))
+            yield Block(rows, episode[rows], fold)
+        first += size
+
+
+TOLERANCE = 1e-9
+"""A solution is accepted when ‖gradient‖ ≤ TOLERANCE · ‖w‖, in float64."""
+NEAR = 0.1
+"""Relative gradient, in float32, after which one more step is made and gradients are float64. A smaller one saves
+none of these: with 1e-3, solving took a sixth longer."""
+MAX_ROUGH_STEPS = 12
+MAX_NEWTON_STEPS = 60
+MAX_CG_STEPS = 200
+MAX_HALVINGS = 30
+"""Bounds of loops. Rough steps may stop short, as exact ones follow; columns whose conjugate gradients do are
+factorised; after the last Newton step `ProbeNotConvergedError` is raised."""
+
+Rows = NDArray[np.intp]
+TINY = float(np.finfo(np.float32).tiny)
+
+
+@dataclass(frozen=True)
+class NewtonState:
+    """The objective of k problems at some weights.
+
+    value: (k,) C · Σ loss + penalty. gradient: (k, R) by weights along axes, float64. size, length: (k,) norms
+    of gradient and weights as scikit-learn's objective has them. curvature: (k, …) what products with the Hessian
+    need.
+    """
+
+    value: Array
+    gradient: Array
+    size: Array
+    length: Array
+    curvature: Array
+
+    @property
+    def relative(self) -> Array:
+        """(k,) size of the gradient in units of the weights."""
+        larger = array_namespace(self.size).maximum(self.length, self.size)
+        return self.size / larger.clip(TINY)
+
+    def only(self, mask: NDArray[np.bool_]) -> "NewtonState":
+        """Some of the problems."""
+        return self if mask.all() else NewtonState(*(part[mask] for part in vars(self).values()))
+
+    def replace(self, mask: NDArray[np.bool_], states: "NewtonState") -> None:
+        """Put `states` in the place of some of the problems."""
+        for part, other in zip(vars(self).values(), vars(states).values(), strict=True):
+            part[mask] = other
+
+
+class Problems(Protocol):
+    """K logistic regressions, a row of R weights for each, the intercept last; `rows` (k,) are some of them.
+
+    Weights are on features, or turned along axes on which Hessians are nearly diagonal.
+    """
+
+    @property
+    def strength(self) -> NDArray[np.float64]:
+        """(K,) C."""
+
+    def point(self, weights: Array, rows: Rows, *, exact: bool) -> NewtonState:
+        """The objective at turned `weights` (k, R), in float32, or at ones on features, exactly: in float64.
+
+        Exact is on the data as they are, whatever the axes are.
+        """
+
+    def turned(self, weights: Array) -> Array:
+        """(k, R) weights on features, along axes."""
+
+    def turned_back(self, weights: Array) -> Array:
+        """(k, R) weights along axes, on features."""
+
+    def rounding(self, rows: Rows) -> Array:
+        """(k,) size of a gradient that is all rounding, in float64."""
+
+    def curved(self, directions: Array, curvature: Array, rows: Rows) -> Array:
+        """Hessian times `directions` (k, R) float32, by the curvature of a point."""
+
+    def diagonal(self, curvature: Array, rows: Rows) -> Array:
+        """(k, R) float32, about the Hessian's diagonal; its inverse preconditions."""
+
+    def exact_step(self, gradient: Array, curvature: Array, row: int) -> Array:
+        """(R,) Newton step of one problem, found by factorising its Hessian."""
+
+    def __len__(self) -> int: ...
+
+
+def solve(problems: Problems, start: Array) -> Array:
+    """Optimal weights (K, R) of all problems, found from `start` (K, R).
+
+    Raises ProbeNotConvergedError rather than return one that is not at its optimum.
+    """
+    search = _NewtonSolver(problems)
+    return search.refined(problems.turned_back(search.rough(problems.turned(start))))
+
+
+@dataclass(frozen=True)
+class _NewtonSolver:
+    problems: Problems
+
+    def rough(self, start: Array) -> Array:
+        """Turned `start` brought near the optimum in float32. The last step is not looked back at."""
+        solved, rows, weights = start + 0.0, np.arange(len(start)), start
+        point = self._at(weights, rows, exact=False)
+        for _ in range(MAX_ROUGH_STEPS):
+            moving = to_numpy(point.relative > TOLERANCE)
+            rows, weights, point = rows[moving], weights[moving], point.only(moving)
+            if not rows.size:
+                return solved
+            step = self._newton_step(point, rows)
+            near = to_numpy(point.relative <= NEAR)
+            solved[rows[near]] = weights[near] + step[near]
+            if near.all():
+                return solved
+            rows, weights, point, step = rows[~near], weights[~near], point.only(~near), step[~near]
+            slope = (point.gradient * step).sum(axis=1)
+            weights, point = self._moved(weights, point, rows, step, slope, exact=False)
+            solved[rows] = weights
+        return solved
+
+    def refined(self, start: Array) -> Array:
+        """`start` brought to the optimum, certified by float64 gradients."""
+        solved, rows, weights = array_namespace(start).empty_like(start), np.arange(len(start)), start
+        point = self._at(weights, rows, exact=True)
+        for _ in range(MAX_NEWTON_STEPS):
+            # Negated, so that NaN stays open and ends in an error.
+            open_ = to_numpy(~((point.relative <= TOLERANCE) | (point.size <= self.problems.rounding(rows))))
+            solved[rows[~open_]] = weights[~open_]
+            if not open_.any():
+                return solved
+            rows, weights, point = rows[open_], weights[open_], point.only(open_)
+            step = self._newton_step(point, rows)
+            slope = (point.gradient * step).sum(axis=1)
+            weights, point = self._moved(weights, point, rows, self.problems.turned_back(step), slope, exact=True)
+        strength = self.problems.strength[rows]
+        raise ProbeNotConvergedError(
+            f"{len(rows)} of {len(self.problems)} logistic problems (C from {strength.min():g} to "
+            f"{strength.max():g}) are not at their optimum after {MAX_NEWTON_STEPS} Newton steps: worst relative "
+            f"gradient {float(point.relative.max()):.1e}, expected at most {TOLERANCE:.0e}. Look for extreme "
+            "feature values."
+        )
+
+    def _at(self, weights: Array, rows: Rows, *, exact: bool) -> NewtonState:
+        return self.problems.point(weights, rows, exact=exact)
+
+    def _moved(
+        self, weights: Array, point: NewtonState, rows: Rows, step: Array, slope: Array, *, exact: bool
+    ) -> tuple[Array, NewtonState]:
+        """One step on, halved per problem until the objective falls enough. slope: (k,) of it along the step."""
+        length = array_namespace(step).ones_like(slope)
+        noise = (1e-11 if exact else 1e-6) * abs(point.value)
+        moved = weights + step
+        state = self._at(moved, rows, exact=exact)
+        for _ in range(MAX_HALVINGS):
+            too_far = to_numpy(state.value > point.value + 1e-4 * length * slope + noise)
+            if not too_far.any():
+                break
+            length[too_far] /= 2
+            moved[too_far] = weights[too_far] + length[too_far, None] * step[too_far]
+            state.replace(too_far, self._at(moved[too_far], rows[too_far], exact=exact))
+        return moved, state
+
+    def _newton_step(self, point: NewtonState, rows: Rows) -> Array:
+        """(k, R) float64: Hessian · step = −gradient, as precisely as the point is worth.
+
+        What conjugate gradients do not settle in time is solved by factorising.
+        """
+        xp = array_namespace(point.gradient)
+        size = xp.amax(abs(point.gradient), axis=1)[:, None].clip(TINY)
+        residual = xp.asarray(-point.gradient / size, dtype=xp.float32)
+        step, live, curvature = xp.zeros_like(point.gradient), np.arange(len(residual)), point.curvature
+        inverse = 1 / self.problems.diagonal(curvature, rows)
+        direction = inverse * residual
+        slope = (residual * direction).sum(axis=1)
+        goal = xp.asarray(_precision(point) ** 2, dtype=xp.float32) * slope
+        for _ in range(MAX_CG_STEPS):
+            product = self.problems.curved(direction, curvature, rows[live])
+            length = (slope / (direction * product).sum(axis=1))[:, None]
+            step[live] += length * direction
+            residual = residual - length * product
+            scaled = inverse * residual
+            previous, slope = slope, (residual * scaled).sum(axis=1)
+            keep = to_numpy(slope > goal)
+            if not keep.any():
+                return step * size
+            direction = scaled + (slope / previous)[:, None] * direction
+            if not keep.all():
+                live = live[keep]
+                slope, goal, residual, direction, inverse, curvature = (
+                    part[keep] for part in (slope, goal, residual, direction, inverse, curvature)
+                )
+        step = step * size
+        for position in live:
+            gradient, weight = point.gradient[position], point.curvature[position]
+            step[position] = self.problems.exact_step(gradient, weight, int(rows[position]))
+        return step
+
+
+def _precision(point: NewtonState) -> Array:
+    """(k,) the share of the gradient that a step may leave: a more precise step would be wasted."""
+    relative = point.relative
+    return array_namespace(relative).maximum(relative.clip(1e-4, 0.1), 0.5 * TOLERANCE / relative)
+
 
 Inside = Callable[[Array, Block, NDArray[np.intp]], Array]
 """What stands between a product with the samples and one with their transpose: from (k, B) decisions, their block,

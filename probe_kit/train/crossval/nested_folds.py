@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from probe_kit.statistics.folds import INNER_FOLDS, OUTER_FOLDS, Fold, grouped_folds
-from probe_kit.train.solver.backend import Array, to_numpy
-from probe_kit.train.solver.projection import Projection
+from probe_kit.train.solver.arrays import Array, to_numpy
+from probe_kit.train.solver.design_matrix import Projection
 
 Matrix = NDArray[np.float64]
 

@@ -9,9 +9,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.statistics.estimates.shares import Accuracy
+from probe_kit.statistics.bootstrap import explained_interval
 from probe_kit.statistics.folds import SHARED_TRAINING, Fold
-from probe_kit.statistics.student import explained_interval
+from probe_kit.statistics.intervals import Accuracy
 from probe_kit.train.choices import Task
 
 Matrix = NDArray[np.float64]

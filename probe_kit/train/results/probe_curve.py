@@ -8,12 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.hooks.contract.sites import Site, part_of
-from probe_kit.statistics.estimates.balanced import CHANCE, GroupSums, balanced_sums
-from probe_kit.statistics.estimates.crossfit import Stream
-from probe_kit.statistics.estimates.shares import Accuracy
+from probe_kit.statistics.crossfit import CHANCE, GroupSums, Stream, balanced_sums
 from probe_kit.statistics.folds import Fold, fold_of_groups, split_by_fold, sums_by_group
+from probe_kit.statistics.intervals import Accuracy
 from probe_kit.statistics.label_permutations import max_statistic_p, smallest_p
-from probe_kit.statistics.paired_bootstrap import SHARED_PROBE
+from probe_kit.statistics.paired_tests import SHARED_PROBE
 from probe_kit.train.choices import Task
 from probe_kit.train.crossval.task_scores import class_weights, correctness, score_interval, squared_deviations
 

@@ -1,26 +1,339 @@
-"""Probe results: a table of scores, and the held-out decisions behind it."""
+"""Probe results: settings, directions, the table of scores with its best sites, and the decisions behind it."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from functools import cached_property
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO
 
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit._system.bounded_files import open_arrays
+from probe_kit._tables.numbers import p_text
+from probe_kit._terminal.notebook import rows_html
 from probe_kit.errors import UnknownSiteError
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.contract.sites import Site
+from probe_kit.runs.direction_files import about_direction, write_directions
 from probe_kit.runs.reader import RunReader
-from probe_kit.statistics.label_permutations import permutations_for, shortage
-from probe_kit.train.data.samples import is_token_view
-from probe_kit.train.results.best_sites import results_html
-from probe_kit.train.results.control_scores import Controls
-from probe_kit.train.results.probe_curve import ProbeCurve
-from probe_kit.train.results.probe_directions import Direction, Place
-from probe_kit.train.results.score_rows import score_rows
-from probe_kit.train.settings import ProbeSettings
+from probe_kit.runs.results import Bundle
+from probe_kit.statistics.folds import FoldUnit
+from probe_kit.statistics.intervals import effective_groups, group_shares, wilson_interval
+from probe_kit.statistics.label_permutations import permutations_for, pointwise_p, shortage
+from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.train.choices import SIDES, Incomplete, Task
+from probe_kit.train.crossval.task_scores import METRICS, fold_auc, fold_spearman, log_loss
+from probe_kit.train.results.control_scores import Controls, Exceeds, has_signal
+from probe_kit.train.results.probe_curve import Matrix, ProbeCurve
+from probe_kit.train.samples import is_token_view
 
 if TYPE_CHECKING:
     import pandas as pd
+
+
+FORMAT = 8  # raise when settings have other fields or would give other numbers
+
+
+@dataclass(frozen=True)
+class ProbeSettings:
+    """Everything that decides the numbers; its hash is the results' key.
+
+    seed_text: of the run, see `RunReader`; scores on equal groups of one are paired. episodes: sha256 of the ids
+    of the run's episodes, so that a run that grew is probed again. label: sha256 of the labels of the target.
+    token_permutations: 0 where no token view is probed. call: captured inference that a label of a whole episode
+    is decoded from. window: inferences per episode. group_by: column of the groups. exchange_within: column of the
+    strata, empty for exchanges everywhere. grouping: sha256 of groups and strata, empty for a side. align_to:
+    column of the event where windows begin, `#` and a part of its hash; empty for the first inference.
+    """
+
+    model: str
+    random_weights: bool
+    weights: str | None
+    suite: str
+    seed_text: str
+    run_settings: str
+    episodes: str
+    categories: tuple[str, ...]
+    views: tuple[str, ...]
+    target: str
+    permutations: int
+    seed: int
+    token_permutations: int = 0
+    folds: FoldUnit = "groups"
+    incomplete: Incomplete = "keep"
+    call: int = 0
+    task: Task = "binary"
+    label: str = ""
+    group_by: str = "group_id"
+    exchange_within: str = ""
+    grouping: str = ""
+    window: int = 1
+    align_to: str = ""
+    format: int = FORMAT
+
+    @property
+    def key(self) -> str:
+        """First 12 hex digits of the settings' sha256: the name of the results' folder."""
+        return sha256_json(asdict(self))[:12]
+
+    @property
+    def is_side(self) -> bool:
+        """Whether the target is the side of a picture."""
+        return self.target in SIDES
+
+
+Place = tuple[str, str, Site]
+"""A category, a view and a site."""
+
+
+@dataclass(frozen=True)
+class Direction:
+    """The probes of one place in raw features: w · x + b > 0 reads `left`, one probe per outer fold (F).
+
+    weights: (F, D) float32. intercepts: (F,). Each fold's probe never saw the episodes that fold tests
+    (`Curve.fold_of`): to steer an episode without having trained on it, take its fold's row.
+    spreads: (F,) deviation of the training samples along weights / ‖weights‖, the σ of a steering strength.
+    """
+
+    weights: NDArray[np.float32]
+    intercepts: NDArray[np.float64]
+    spreads: NDArray[np.float64]
+
+    @property
+    def unit(self) -> NDArray[np.float64]:
+        """(D,) mean of the folds' unit weights, of length 1; zero where no probe has any weight."""
+        lengths = np.linalg.norm(self.weights, axis=1, keepdims=True)
+        mean = np.divide(self.weights, lengths, where=lengths > 0, out=np.zeros(self.weights.shape)).mean(axis=0)
+        length = np.linalg.norm(mean)
+        return np.asarray(mean / length if length else mean)
+
+    @property
+    def spread(self) -> float:
+        """Mean of `spreads`."""
+        return float(self.spreads.mean())
+
+
+def save_directions(directions: Mapping[Place, Direction], file: BinaryIO) -> None:
+    """Write to an uncompressed `.npz`, members `category/view/site/part`; views and sites hold no slash."""
+    arrays = {
+        f"{category}/{view}/{site}/{part}": array
+        for (category, view, site), direction in directions.items()
+        for part, array in vars(direction).items()
+    }
+    np.savez(file, allow_pickle=False, **arrays)
+
+
+class StoredDirections(Mapping[Place, Direction]):
+    """Directions in a file of stored results, each read when it is asked for.
+
+    All of the file is checked once, before the first. Raises RunDamagedError then.
+    """
+
+    def __init__(self, bundle: Bundle, name: str) -> None:
+        self._bundle, self._name = bundle, name
+        self._checked = False
+
+    def _open(self) -> BinaryIO:
+        if not self._checked:
+            self._bundle.check(self._name)
+            self._checked = True
+        return self._bundle.open(self._name)
+
+    def __getitem__(self, key: Place) -> Direction:
+        return self.read([key])[key]
+
+    def read(self, places: Iterable[Place]) -> dict[Place, Direction]:
+        """Several directions in one opening of the file. Raises KeyError for a place that was not probed."""
+        directions = {}
+        with self._open() as file, open_arrays(file) as arrays:
+            for key in places:
+                name = "/".join(map(str, key))
+                if f"{name}/weights" not in arrays:
+                    raise KeyError(key)
+                directions[key] = Direction(
+                    **{part: arrays[f"{name}/{part}"] for part in Direction.__annotations__}
+                )
+        return directions
+
+    def __iter__(self) -> Iterator[Place]:
+        with self._open() as file, open_arrays(file) as arrays:
+            for name in dict.fromkeys(member.rpartition("/")[0] for member in arrays):
+                category, view, site = name.rsplit("/", 2)
+                yield category, view, Site.parse(site)
+
+    def __len__(self) -> int:
+        return sum(1 for _ in self)
+
+
+def read_directions(directions: Mapping[Place, Direction], places: Iterable[Place]) -> dict[Place, Direction]:
+    """The directions of `places`, stored ones in one opening of their file. Raises KeyError for unknown places."""
+    if isinstance(directions, StoredDirections):
+        return directions.read(places)
+    return {key: directions[key] for key in places}
+
+
+def write_direction_file(directions: Mapping[Place, Direction], file: Path, weights: str | None) -> int:
+    """Write the probes' directions for `intervene --direction FILE#NAME`, and return how many.
+
+    A vector is the mean of the folds' unit weights, times the deviation of the samples along it: a coefficient
+    counts deviations, toward `left`. weights: hash of the network's. Probes without any weight are left out.
+    """
+    vectors, about = {}, {}
+    for (category, view, site), direction in read_directions(directions, directions).items():
+        if direction.unit.any():
+            name, about_name = about_direction(category, view, site, weights)
+            vectors[name] = direction.unit * direction.spread
+            about[name] = about_name
+    write_directions(file, vectors, about)
+    return len(vectors)
+
+
+def score_rows(
+    settings: ProbeSettings, controls: Controls, key: tuple[str, str], curve: ProbeCurve
+) -> Iterator[dict[str, Any]]:
+    """Yield the row of every site of a curve. key: its category and view. See `ProbeResults.scores`."""
+    category, view = key
+    score, low, high = _estimates(curve)
+    p, p_fwe, chance = pointwise_p(curve.metric, curve.null), curve.p_fwe(), curve.chance
+    for row, (site, part) in enumerate(zip(curve.sites, curve.parts, strict=True)):
+        exceeds = _exceeds(controls, key, site, float(p_fwe[row]), curve.is_side)
+        yield {
+            "model": settings.model,
+            "random_weights": settings.random_weights,
+            "target": settings.target,
+            "task": curve.task,
+            "category": category,
+            "view": view,
+            "site": str(site),
+            "stream": site.stream,
+            "part": part,
+            "layer": site.layer,
+            "depth": curve.depth(site),
+            "iteration": site.iteration,
+            "metric": METRICS[curve.task],
+            "score": score[row],
+            "ci_low": low[row],
+            "ci_high": high[row],
+            "chance": chance[row],
+            "p": p[row],
+            "p_fwe": p_fwe[row],
+            "smallest_p": curve.least_p,
+            **{exceeds_column(name): better for name, better in exceeds.items() if name != "chance"},
+            "signal": has_signal(exceeds),
+            **(_of_side(curve, row, score[row]) if curve.is_side else _of_label(controls, key, curve, row)),
+            "n": curve.labels.size,
+            "episodes": np.unique(curve.episodes).size,
+            "items": np.unique(curve.items).size,
+            "groups": curve.n_groups,
+            "settings": settings.key,
+        }
+
+
+def exceeds_column(control: str) -> str:
+    """Return the name of the column that says whether a site exceeds a control."""
+    return f"exceeds_{control.replace('-', '_')}"
+
+
+def _estimates(curve: ProbeCurve) -> tuple[Matrix, Matrix, Matrix]:
+    """(S,) scores with the ends of their intervals."""
+    if curve.is_side:
+        sums = curve.sums
+        shares, variances = group_shares(sums.sums, sums.sizes)
+        count = effective_groups(sums.sizes)
+        low, high = wilson_interval(shares, variances, count, sums.n_episodes, max(count - 1, 1.0))
+        return shares, low, high
+    limits = np.array([curve.estimate(np.array([row]))[1] for row in range(len(curve.sites))])
+    return curve.metric, limits[:, 0], limits[:, 1]
+
+
+def _exceeds(controls: Controls, key: tuple[str, str], site: Site, p_fwe: float, is_side: bool) -> Exceeds:
+    exceeds = controls.exceeds(*key, site, p_fwe)
+    return {name: better for name, better in exceeds.items() if is_side or name == "chance" or better is not None}
+
+
+def _of_side(curve: ProbeCurve, row: int, accuracy: float) -> dict[str, Any]:
+    correct, control = curve.correct[row], curve.control_accuracy[row]
+    return {
+        "accuracy": accuracy,
+        "auc": fold_auc(curve.decisions[row], curve.labels, curve.folds()),
+        "log_loss": float(log_loss(curve.decisions[row], curve.labels)),
+        "control_accuracy": control,
+        "selectivity": curve.metric[row] - control,
+        "C": " ".join(f"{strength:g}" for strength in curve.strengths[row]),
+        "fold_accuracy": " ".join(f"{correct[fold.test].mean():.4f}" for fold in curve.folds()),
+    }
+
+
+def _of_label(controls: Controls, key: tuple[str, str], curve: ProbeCurve, row: int) -> dict[str, Any]:
+    quantity = curve.task == "continuous"
+    return {
+        "spearman": fold_spearman(curve.decisions[row], curve.labels, curve.folds()) if quantity else float("nan"),
+        "best_control": controls.reference(*key, curve.sites[row]),
+        "penalties": " ".join(f"{penalty:g}" for penalty in curve.penalties[row]),
+    }
+
+
+def best_sites(scores: "pd.DataFrame", is_side: bool) -> "list[pd.Series]":
+    """Return the best site of every category, view and stream: a row of `ProbeResults.scores`, by category.
+
+    That of a side has the largest accuracy, others the largest excess over their own chance; the first on ties.
+    Besides the columns of `scores`: `ties`, how many other sites are as good, and `first`, the best score at the
+    stream's first iteration, NaN where it runs once.
+    """
+    names = ["category", "view", "stream"]
+    worth = scores["score"] if is_side else scores["score"] - scores["chance"].fillna(0.0)
+    by_stream = worth.groupby([scores[name] for name in names], sort=False)
+    iterations = scores["iteration"].groupby([scores[name] for name in names], sort=False)
+    begins = scores["iteration"].eq(iterations.transform("min")).fillna(False).astype(bool)
+    marked = scores.assign(ties=worth == by_stream.transform("max"), first=scores["score"].where(begins))
+    grouped = marked.groupby(names, sort=False)
+    marked = marked.assign(ties=grouped["ties"].transform("sum") - 1, first=grouped["first"].transform("max"))
+    best = marked.loc[by_stream.idxmax()].sort_values("category", kind="stable")
+    return [row for _, row in best.iterrows()]
+
+
+def site_cells(row: "pd.Series", is_side: bool) -> tuple[str, str, str, str]:
+    """Return a row of `best_sites` as text: the site with its ties, score, chance and p; a dash for none."""
+    site = f"{row['site']} +{row['ties']}" if row["ties"] else str(row["site"])
+    limits = (row["score"], row["ci_low"], row["ci_high"])
+    score, low, high = (score_text(value, is_side) for value in limits)
+    return site, f"{score} [{low}, {high}]", score_text(row["chance"], is_side), p_text(row["p_fwe"])
+
+
+def score_text(value: float | None, is_side: bool) -> str:
+    """Return the accuracy of a side in percent, other scores as they are; a dash for none."""
+    if value is None or value != value:
+        return "–"
+    return f"{100 * value:.1f}" if is_side else f"{value:.3f}"
+
+
+def results_html(settings: ProbeSettings, label: str, scores: "pd.DataFrame") -> str:
+    """Return the best site of every category, view and stream as HTML."""
+    random = " (RANDOM WEIGHTS)" if settings.random_weights else ""
+    title = (
+        f"Probes of {label}{random}, target {settings.target}, call {settings.call}: the best site of "
+        "each stream, + as many others that tie"
+    )
+    score = "accuracy % [95 %]" if settings.is_side else f"{METRICS[settings.task]} [95 %]"
+    columns = ("category", "view", "stream", "best site", score, "chance", "family-wise p", "first iteration", "n")
+    rows = [
+        (
+            row["category"],
+            row["view"],
+            row["stream"],
+            *site_cells(row, settings.is_side),
+            score_text(row["first"], settings.is_side),
+            str(row["n"]),
+        )
+        for row in best_sites(scores, settings.is_side)
+    ]
+    note = (
+        f"{settings.permutations} label permutations, key {settings.key}; only p < {SIGNIFICANCE} is evidence. "
+        "results.scores has every site"
+    )
+    return rows_html(title, columns, rows, note)
 
 
 @dataclass(frozen=True, repr=False)

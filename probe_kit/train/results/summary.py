@@ -10,9 +10,8 @@ from probe_kit.hooks.contract.sites import label_of
 from probe_kit.suite.categories import category_of
 from probe_kit.train.choices import EVERYWHERE
 from probe_kit.train.crossval.task_scores import METRICS
-from probe_kit.train.results.best_sites import best_sites, score_text, site_cells
 from probe_kit.train.results.control_scores import ControlScore
-from probe_kit.train.results.probe_results import ProbeResults
+from probe_kit.train.results.probe_results import ProbeResults, best_sites, score_text, site_cells
 
 if TYPE_CHECKING:
     import pandas as pd

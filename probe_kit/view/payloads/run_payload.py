@@ -19,7 +19,7 @@ from probe_kit.retention.columns.columns import (
 from probe_kit.retention.estimators import Limits
 from probe_kit.retention.rows.row import StreamPart
 from probe_kit.runs.growth import flat_settings
-from probe_kit.statistics.estimates.balanced import CHANCE
+from probe_kit.statistics.crossfit import CHANCE
 from probe_kit.suite.categories import category_of
 from probe_kit.view.payloads.coding import rounded
 from probe_kit.view.viewed_run import ViewedRun

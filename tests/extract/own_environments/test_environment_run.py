@@ -14,7 +14,7 @@ from probe_kit.retention import retention_table
 from probe_kit.runs import Run, open_run, verify_run
 from probe_kit.runs.store import locate
 from probe_kit.train import Target, train_probes
-from probe_kit.train.columns.builtin import label_frame
+from probe_kit.train.builtin_columns import label_frame
 from tests.support.made_once import made_once
 
 HOME = "reach_env:"

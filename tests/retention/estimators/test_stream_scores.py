@@ -11,10 +11,8 @@ from scipy import stats
 
 from probe_kit.retention.behaviour import success_share
 from probe_kit.retention.estimators import PooledScores, Rate, StreamScores, curve_scores, limits, score_streams
-from probe_kit.statistics.estimates.retention import retention, retention_difference
-from probe_kit.statistics.estimates.scores import Scores
-from probe_kit.statistics.estimates.shares import Share
-from probe_kit.statistics.intervals import Interval
+from probe_kit.statistics.intervals import Interval, Share
+from probe_kit.statistics.retention import Scores, retention, retention_difference
 from probe_kit.train import ProbeCurve
 from tests.support.inner_qualities import inner_of
 

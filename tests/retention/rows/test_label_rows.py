@@ -22,7 +22,7 @@ from probe_kit.retention.columns.sentences import label_finding
 from probe_kit.retention.rows.probe_parts import with_corrected_p, with_probes
 from probe_kit.retention.rows.row import RetentionRow, RunInfo
 from probe_kit.runs import Run, open_run
-from probe_kit.statistics.estimates.retention import OTHER_TRAINING
+from probe_kit.statistics.retention import OTHER_TRAINING
 from probe_kit.train import (
     ControlComparison,
     Controls,

@@ -1,1 +1,0 @@
-"""Estimates with intervals: shares, scores of best sites, retention, and their verdicts."""

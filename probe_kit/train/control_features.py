@@ -1,0 +1,248 @@
+"""Features of controls: layout, step, state, action, words and pictures of the samples, without a model.
+
+The control `random-features` is an untrained conjunction of picture and word features. Concepts recur in other
+groups of pictures, so a probe can itself learn which pixels answer which word, as soon as its features hold
+products of both. Any random nonlinear layer does. The control is such a layer, as wide as the site it is compared
+with, on the pictures and the words alone; a model that knows more than that must be better.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import UsageError
+from probe_kit.runs.reader import RunReader
+from probe_kit.train.builtin_columns import frames_of_inferences, why_no_sim
+from probe_kit.train.results.control_scores import RANDOM_FEATURES
+from probe_kit.train.target_samples import TargetSamples
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from probe_kit.runs.inputs import StoredInputs
+    from probe_kit.suite import Suite
+
+
+PICTURED = frozenset({"pixels", RANDOM_FEATURES})
+"""Controls that need pictures."""
+THUMBNAIL, SIDE = 32, 12
+"""Pixels along a picture: of `pixels`, and of `random-features`, enough for colours and shapes."""
+LAYERS = 5
+"""Random layers, whose mean is the reference: one alone is lucky or not, and the best of them is lucky."""
+MOST_BINS = 50
+"""Columns that the step has at most: neighbouring inferences of long windows share one."""
+
+Features = NDArray[np.float32]
+
+
+class ControlInputs:
+    """The features of controls for n samples of a run. suite: None where no control needs its pictures."""
+
+    def __init__(self, run: RunReader, samples: TargetSamples, is_side: bool, suite: "Suite | None") -> None:
+        self.run, self.samples, self.is_side, self.suite = run, samples, is_side, suite
+
+    def features(self, name: str) -> Features:
+        """(n, D) features of a control but `random-features`."""
+        if name in (array_features := self.run.control_features):
+            return array_features[name][self.samples.rows].astype(np.float32)
+        if name == "instruction":
+            return self._words()
+        makers: dict[str, Callable[[], Features]] = {
+            "position": self._layout,
+            "step": lambda: step_features(self.samples, self._frames()),
+            "state": self._state,
+            "action": lambda: self._recorded("action")[:, 0].astype(np.float32),
+            "pixels": lambda: self._pixels(THUMBNAIL),
+        }
+        return makers[name]()
+
+    def layer(self, positions: NDArray[np.intp], width: int, seed: int) -> Features:
+        """(E, width) outputs of a random tanh layer for the samples at some positions."""
+        return random_layer([part[positions] for part in self._layer_inputs], width, seed)
+
+    @cached_property
+    def _layer_inputs(self) -> list[Features]:
+        """Pictures, words and, for targets but a side, the state where there is one; read once for all layers."""
+        parts = [self._pixels(SIDE), word_counts(self.run)[self.samples.rows]]
+        if not self.is_side and why_no_state(self.run) is None:
+            parts.append(self._state())
+        return parts
+
+    def _layout(self) -> Features:
+        """(n, 1): +1 in the original layout, −1 in the swapped one."""
+        original = (self.run.episodes["layout"] == "original").to_numpy()[self.samples.rows]
+        return np.where(original, np.float32(1), np.float32(-1))[:, None]
+
+    def _words(self) -> Features:
+        """(n, W) word counts; of a side (n, 2 W), with the same times the layout's sign.
+
+        The second half shows a word whose picture always lies on one side.
+        """
+        counts = word_counts(self.run)[self.samples.rows]
+        return np.hstack([counts, counts * self._layout()]) if self.is_side else counts
+
+    def _state(self) -> Features:
+        if self.recorded is not None:
+            return self._recorded("state").astype(np.float32)
+        return state_features(self.run, self.samples)
+
+    @cached_property
+    def recorded(self) -> "StoredInputs | None":
+        """The stored inputs of recordings and of a user's own environment."""
+        inputs: StoredInputs | None = self.run.inputs
+        return inputs
+
+    def _recorded(self, kind: str) -> NDArray[Any]:
+        """(n, …) stored inputs of the samples."""
+        assert self.recorded is not None
+        values: NDArray[Any] = self.recorded.read(kind)[self.samples.rows, self.samples.inferences]
+        return values
+
+    def _frames(self) -> NDArray[np.intp] | None:
+        """(n,) place of every recorded frame in the order of frames; None for scenes, and from an event on."""
+        if self.recorded is None or self.samples.aligned is not None:
+            return None
+        steps = self.run.control_steps[self.samples.rows, self.samples.inferences]
+        return np.asarray(np.unique(steps, return_inverse=True)[1], np.intp)
+
+    def _pixels(self, side: int) -> Features:
+        if self.recorded is not None:
+            return small_pictures(self._recorded("pixels"), side)
+        assert self.suite is not None, "a control that needs pictures is given the suite"
+        rows, row_number = np.unique(self.samples.rows, return_inverse=True)
+        return tile_pixels(self.run.episodes.iloc[rows], self.suite, side)[row_number]
+
+
+def why_impossible(run: RunReader, samples: TargetSamples) -> dict[str, str]:
+    """Return why the run or the target does not allow a control, by name."""
+    reasons = {}
+    inputs = run.inputs
+    if "layout" not in run.episodes:
+        reasons["position"] = "the episodes have no layouts"
+    if samples.window == 1:
+        reasons["step"] = "every episode has one inference with a label"
+    if (reason := why_no_state(run)) is not None:
+        reasons["state"] = reason
+    if inputs is None or "action" not in inputs.kinds:
+        reasons["action"] = "no actions were recorded"
+    if inputs is not None and "pixels" not in inputs.kinds:
+        reasons |= dict.fromkeys(PICTURED, "the run was extracted with --no-pixels")
+    if "instruction" not in run.episodes:
+        reasons |= dict.fromkeys(("instruction", RANDOM_FEATURES), "the episodes have no column 'instruction'")
+    return reasons
+
+
+def why_no_state(run: RunReader) -> str | None:
+    """Return why a run has no control `state`; None if it has one."""
+    inputs = run.inputs
+    if inputs is None:
+        return why_no_sim(run)
+    return None if "state" in inputs.kinds else "the data set has no state"
+
+
+def word_counts(run: RunReader) -> Features:
+    """(E, W): how often each word occurs in the instruction. Raises UsageError without instructions."""
+    if "instruction" not in run.episodes:
+        raise UsageError(f"the episodes of {run.location} have no column 'instruction'; leave that control out")
+    words = [str(text).lower().split() for text in run.episodes["instruction"]]
+    vocabulary = {word: number for number, word in enumerate(sorted({word for text in words for word in text}))}
+    counts = np.zeros((len(words), len(vocabulary)), np.float32)
+    for row, text in enumerate(words):
+        for word in text:
+            counts[row, vocabulary[word]] += 1
+    return counts
+
+
+def tile_pixels(episodes: "pd.DataFrame", suite: "Suite", side: int) -> Features:
+    """(E, 6 side²): the left and the right picture of every episode, RGB from 0 to 1, `side` pixels wide."""
+    from probe_kit.suite import Episode
+
+    items = {item.item_id: item for item in suite.items}
+    thumbnails: dict[Path, Features] = {}
+    rows = []
+    for item_id, layout in zip(episodes["item_id"], episodes["layout"], strict=True):
+        episode = Episode(items[item_id], layout)
+        pictures = [episode.picture("left"), episode.picture("right")]
+        thumbnails |= {path: _thumbnail(path, side) for path in pictures if path not in thumbnails}
+        rows.append(np.concatenate([thumbnails[path] for path in pictures]))
+    return np.stack(rows)
+
+
+def _thumbnail(path: Path, side: int) -> Features:
+    from PIL import Image
+
+    from probe_kit.suite import load_picture
+
+    small = load_picture(path).resize((side, side), Image.Resampling.BOX)
+    return np.asarray(small, np.float32).ravel() / np.float32(255)
+
+
+def small_pictures(pixels: NDArray[np.uint8], side: int) -> Features:
+    """(n, cameras · side² · 3) of (n, cameras, 32, 32, 3): RGB from 0 to 1, each pixel the mean of its part."""
+    from PIL import Image
+
+    box = Image.Resampling.BOX
+    rows = [
+        np.concatenate(
+            [np.asarray(Image.fromarray(picture).resize((side, side), box)).ravel() for picture in cameras]
+        )
+        for cameras in pixels
+    ]
+    return np.stack(rows).astype(np.float32) / np.float32(255)
+
+
+def step_features(samples: TargetSamples, places: NDArray[np.intp] | None = None) -> Features:
+    """(n, at most 50): which part of the window an inference is in, one-hot.
+
+    places: (n,) of recorded frames in the order of their numbers, which take the place of inferences.
+    """
+    steps, count = samples.steps, samples.window
+    if places is not None:
+        steps, count = places, int(places.max()) + 1
+    bins = min(count, MOST_BINS)
+    features: Features = np.eye(bins, dtype=np.float32)[steps * bins // count]
+    return features
+
+
+def state_features(run: RunReader, samples: TargetSamples) -> Features:
+    """(n, 7): position and angles of the hand and the opening of the gripper at the step of every inference.
+
+    Raises UsageError for a run without trajectories or control steps.
+    """
+    of_row: dict[int, list[int]] = {}
+    for position, row in enumerate(samples.rows.tolist()):
+        of_row.setdefault(row, []).append(position)
+    features = np.empty((samples.rows.size, 7), np.float32)
+    for trajectory, row, frames in frames_of_inferences(run):
+        for position in of_row.get(row, ()):
+            frame = frames[samples.inferences[position]]
+            features[position] = [*trajectory.tool[frame], trajectory.opening[frame]]
+    return features
+
+
+def random_layer(parts: Sequence[Features], width: int, seed: int) -> Features:
+    """(N, width) outputs of a random tanh layer, to which every part (N, D) gives an equal share.
+
+    A part that is the same for all samples, such as the state at the first frame, gives nothing.
+    """
+    generator = np.random.default_rng(seed)
+    varying = [_standardised(part) for part in parts]
+    mixed = [
+        # Divided by the root of its width, so that a thousand pixels do not drown ten words.
+        part @ generator.standard_normal((part.shape[1], width)) / max(1, part.shape[1]) ** 0.5
+        for part in varying
+    ]
+    outputs: Features = np.tanh(sum(mixed)).astype(np.float32)
+    return outputs
+
+
+def _standardised(columns: Features) -> NDArray[np.float64]:
+    """Columns that vary, with mean 0 and deviation 1."""
+    values = columns.astype(np.float64)
+    spread = values.std(axis=0)
+    centred: NDArray[np.float64] = (values - values.mean(axis=0))[:, spread > 0] / spread[spread > 0]
+    return centred

@@ -1,0 +1,396 @@
+"""Controls that probes must exceed: features that never saw the model, and an untrained network."""
+
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import SuiteNotFoundError, UsageError
+from probe_kit.hashing import derive_seed
+from probe_kit.hooks.contract.sites import Site
+from probe_kit.runs.layout import DATASET
+from probe_kit.runs.reader import RunReader, full_name
+from probe_kit.statistics.intervals import Accuracy
+from probe_kit.statistics.label_permutations import pointwise_p
+from probe_kit.statistics.paired_tests import better_than_best, better_than_reference
+from probe_kit.train.choices import CONTROLS, EVERYWHERE
+from probe_kit.train.control_features import LAYERS, PICTURED, ControlInputs, why_impossible
+from probe_kit.train.crossval.site_probe import SiteProbe
+from probe_kit.train.problem import Problem
+from probe_kit.train.results.control_scores import (
+    RANDOM_FEATURES,
+    UNTRAINED,
+    ControlComparison,
+    Controls,
+    ControlScore,
+    UntrainedScore,
+)
+from probe_kit.train.results.probe_curve import ProbeCurve
+from probe_kit.train.results.probe_results import ProbeResults, ProbeSettings
+from probe_kit.train.run_suite import suite_of
+from probe_kit.train.samples import Samples
+from probe_kit.train.target_samples import TargetSamples
+
+SIDE_DEFAULT = (RANDOM_FEATURES, "pixels")
+"""Controls of a side that are run where the suite's pictures are, unless others, or none, are requested."""
+NOT_BY_DEFAULT = frozenset({"action", "position"})
+"""Controls of other targets that must be asked for.
+
+A policy's own action is no leak: whether a site exceeds it is another question. The layout is in no instruction.
+"""
+_SIDE_SEEDS = {RANDOM_FEATURES: "binding", UNTRAINED: "twin"}
+"""Words in the seeds of the controls that sites of a side are compared with."""
+
+
+@dataclass(frozen=True)
+class PreparedControls:
+    """Controls that are still to be run. left_out: why a default one cannot be, by name."""
+
+    names: tuple[str, ...]
+    inputs: ControlInputs
+    left_out: Mapping[str, str]
+
+
+def prepare_controls(
+    run: RunReader,
+    samples: TargetSamples,
+    is_side: bool,
+    names: Sequence[str] | None,
+    folder: Path | None,
+    stored: Controls,
+    categories: Sequence[str],
+) -> PreparedControls:
+    """Return the controls `names` that `stored` does not have yet, before anything is probed.
+
+    names: None for those that are run by default; of them what is not possible is left out, with a warning where
+    pictures are missing. folder: of the run's suite, see `suite_of`. Raises UsageError for a control that was
+    asked for and is unknown or not possible, and what `suite_of` raises.
+    """
+    array_features = run.control_features
+    available = (*array_features, *(name for name in CONTROLS if name not in array_features))
+    if unknown := [name for name in names or () if name not in available]:
+        raise UsageError(f"unknown control {unknown[0]!r}; expected some of {', '.join(available)}")
+    default = SIDE_DEFAULT if is_side else tuple(name for name in available if name not in NOT_BY_DEFAULT)
+    ordered = [name for name in available if name in (default if names is None else names)]
+    reasons = {name: why for name, why in why_impossible(run, samples).items() if name not in array_features}
+    if names is not None and (wrong := [name for name in ordered if name in reasons]):
+        raise UsageError(f"the control {wrong[0]!r} is not possible: {reasons[wrong[0]]}. Leave it out")
+    left_out = {name: reasons[name] for name in ordered if name in reasons}
+    missing = [name for name in ordered if name not in reasons and not stored.has(name, categories)]
+    suite = None
+    if PICTURED.intersection(missing).difference(array_features) and run.inputs is None:
+        try:
+            suite = suite_of(run, folder)
+        except SuiteNotFoundError as error:
+            if names is not None:
+                raise
+            lost = [name for name in missing if name in PICTURED]
+            _warn_of_no_control(lost, error, is_side)
+            left_out |= dict.fromkeys(lost, "the pictures of the suite were not found")
+            missing = [name for name in missing if name not in PICTURED]
+    return PreparedControls(tuple(missing), ControlInputs(run, samples, is_side, suite), left_out)
+
+
+def _warn_of_no_control(lost: Sequence[str], reason: SuiteNotFoundError, is_side: bool) -> None:
+    names = f"control {lost[0]} is" if len(lost) == 1 else f"controls {' and '.join(lost)} are"
+    judged = ", so that a signal is judged against chance only" if is_side and RANDOM_FEATURES in lost else ""
+    warnings.warn(
+        f"the {names} on by default and NOT run{judged}: {reason}; or say that you want none (--controls none, "
+        "controls=())",
+        stacklevel=4,
+    )
+
+
+def add_controls(
+    results: ProbeResults, problems: Mapping[str, Problem], widths: Mapping[str, int], prepared: PreparedControls
+) -> ProbeResults:
+    """Return `results` with these controls for every category. widths: of every stream, for `random-features`.
+
+    Every site is compared with `random-features`, and of targets but a side with every control.
+    """
+    before = results.controls
+    missing = {**before.left_out, **prepared.left_out}
+    controls = replace(before, left_out={name: why for name, why in missing.items() if name not in before.names})
+    seed = results.settings.seed
+    for name in prepared.names:
+        # Random layers are made per stream, as wide as it: a wider layer decodes more, whatever it holds.
+        features = None if name == RANDOM_FEATURES else Samples.pooled(prepared.inputs.features(name))
+        for category, problem in problems.items():
+            if features is None:
+                references = {
+                    stream: problem.curve(_by_site(_layer_probes(prepared.inputs, problem, width, seed)))
+                    for stream, width in widths.items()
+                }
+                scores = _layer_scores(category, references, problem.is_side)
+            else:
+                reference = problem.curve(_by_site([problem.probe(features)]))
+                references = dict.fromkeys(widths, reference)
+                scores = [control_score(name, category, reference)]
+            compared = name == RANDOM_FEATURES or not problem.is_side
+            comparisons = list(_compared(results, name, category, references)) if compared else []
+            controls = controls.with_scores(scores, comparisons)
+    return replace(results, controls=controls)
+
+
+def _by_site(probes: Sequence[SiteProbe]) -> dict[Site, SiteProbe]:
+    """Probes of controls by sites that stand for none."""
+    return {Site("control", number): probe for number, probe in enumerate(probes)}
+
+
+def _layer_probes(inputs: ControlInputs, problem: Problem, width: int, seed: int) -> list[SiteProbe]:
+    """Probes of the random layers, without label permutations."""
+    # Words of seeds, which numbers depend on: another word would draw other layers.
+    kind = "binding" if problem.is_side else "label random features"
+    layers = (inputs.layer(problem.positions, width, derive_seed(kind, seed, number)) for number in range(LAYERS))
+    return [problem.fit(Samples.pooled(layer)) for layer in layers]
+
+
+def _layer_scores(category: str, references: Mapping[str, ProbeCurve], is_side: bool) -> list[ControlScore]:
+    """One score as wide as the backbone for a side, else one for every stream."""
+    if is_side:
+        widest = references.get("backbone", next(iter(references.values())))
+        return [control_score(RANDOM_FEATURES, category, widest)]
+    return [control_score(RANDOM_FEATURES, category, curve, stream) for stream, curve in references.items()]
+
+
+def control_score(name: str, category: str, curve: ProbeCurve, stream: str = "", view: str = "") -> ControlScore:
+    """Return the mean score of the probes of a control, with p where a single one has label permutations."""
+    score, limits = curve.estimate(np.arange(len(curve.sites)))
+    p = float(pointwise_p(curve.metric.mean(keepdims=True), curve.null.mean(axis=0)[None, :])[0])
+    chance = float(curve.chance.mean())
+    by_step = (
+        np.mean([curve.by_step(scores) for scores in curve.scores], axis=0) if not curve.is_side else np.empty(0)
+    )
+    return ControlScore(
+        name=name,
+        category=category,
+        score=score,
+        ci=limits,
+        p=None if np.isnan(p) else p,
+        chance=None if np.isnan(chance) else chance,
+        n=curve.labels.size,
+        stream=stream,
+        view=view,
+        by_step=tuple(by_step.tolist()),
+    )
+
+
+def _compared(
+    results: ProbeResults, name: str, category: str, references: Mapping[str, ProbeCurve]
+) -> Iterator[ControlComparison]:
+    for (curve_category, view), curve in results.curves.items():
+        for stream in curve.streams if curve_category == category else ():
+            rows, reference = curve.stream(stream), references[stream].scores.mean(axis=0)
+            seed = comparison_seed(results.settings, name, category, view, stream)
+            p = better_than_reference(curve.scores[rows], reference, curve.groups, seed, curve.widening)
+            yield from comparisons(name, category, view, curve, rows, float(reference.mean()), p)
+
+
+def comparison_seed(settings: ProbeSettings, name: str, category: str, view: str, stream: str) -> int:
+    """Return the seed of the resamples that compare a stream in a category and view with a control."""
+    if settings.is_side:
+        return derive_seed(_SIDE_SEEDS[name], settings.seed, category, view, stream)
+    parts = (view, stream) if settings.categories == (EVERYWHERE,) else (category, view, stream)
+    return derive_seed("label control", settings.seed, name, *parts)
+
+
+def comparisons(
+    name: str,
+    category: str,
+    view: str,
+    curve: ProbeCurve,
+    rows: NDArray[np.intp],
+    reference: float,
+    p: NDArray[np.float64],
+) -> Iterator[ControlComparison]:
+    """Yield the comparison of every site at `rows` with a control, from (len(rows),) p."""
+    for row, of_site in zip(rows, p, strict=True):
+        yield ControlComparison(name, category, view, str(curve.sites[row]), reference, float(of_site))
+
+
+_SHOWN = (DATASET, "suite", "scene", "seed")
+"""Settings that decide which frames a network is shown."""
+
+
+def check_same_source(run: RunReader, untrained: RunReader, samples: TargetSamples, is_side: bool) -> None:
+    """Raise UsageError for the run itself; of a target that is no side also for other frames or missing episodes.
+
+    samples: of the run.
+    """
+    if run.location.address == untrained.location.address:
+        raise UsageError(
+            f"{run.location} cannot be its own untrained control; give another run of the same episodes"
+        )
+    if is_side:
+        return
+    _check_settings(run, untrained)
+    names = run.episodes["episode_id"].to_numpy(str)[samples.rows]
+    missing = names[~np.isin(names, untrained.episodes["episode_id"].to_numpy(str))]
+    if missing.size:
+        raise UsageError(
+            f"the untrained control {untrained.location} has no episode {str(missing[0])!r}; expected all that "
+            f"{run.location} has with a label. Finish it, or extract it again by the same command"
+        )
+
+
+def check_untrained(
+    run: RunReader,
+    untrained: RunReader,
+    samples: TargetSamples,
+    untrained_samples: TargetSamples,
+    is_side: bool,
+    call: int,
+) -> None:
+    """Raise UsageError unless `untrained` is another run of the same episodes, instructions, frames and labels.
+
+    samples, untrained_samples: of the two runs. Of a target that is no side also for inferences after the first of
+    a network that acted: the frames it was shown then follow from its own actions.
+    """
+    identities, untrained_identities = (
+        _identities(*pair) for pair in ((run, samples), (untrained, untrained_samples))
+    )
+    if identities != untrained_identities:
+        advice = "Extract both by the same command, one with --random-weights"
+        if call > 0:
+            advice = (
+                f"Not the same episodes got as far as captured inference {call}: leave --call or --untrained out"
+            )
+        pairs = zip(identities, untrained_identities, strict=False)
+        differing = next((f"; the first is {first!r}" for first, second in pairs if first != second), "")
+        raise UsageError(
+            f"the untrained control {untrained.model!r} has {len(untrained_identities)} samples to probe, "
+            f"{run.model!r} has {len(identities)}, and they are not the same in episode, instruction and "
+            f"label{differing}. {advice}."
+        )
+    if run.settings_sha256 == untrained.settings_sha256:
+        raise UsageError(
+            f"{untrained.location} is a copy of {run.location}, which cannot be its own untrained control; "
+            "give a run of other weights"
+        )
+    if not is_side:
+        _check_frames(run, untrained, samples, untrained_samples)
+
+
+def _identities(run: RunReader, samples: TargetSamples) -> list[tuple[str, str, int, float]]:
+    """Id, instruction, inference and label of every sample: what two runs must have in common."""
+    names = run.episodes["episode_id"].to_numpy(str)[samples.rows].tolist()
+    texts = [""] * len(names)
+    if "instruction" in run.episodes:
+        texts = run.episodes["instruction"].to_numpy(str)[samples.rows].tolist()
+    return list(zip(names, texts, samples.inferences.tolist(), samples.values.tolist(), strict=True))
+
+
+def _check_settings(run: RunReader, untrained: RunReader) -> None:
+    if differing := [name for name in _SHOWN if _identity(run, name) != _identity(untrained, name)]:
+        raise UsageError(
+            f"the untrained control {untrained.location} has another {differing[0]} than {run.location}; expected "
+            "the same frames. Extract both by the same command, one with --random-weights"
+        )
+
+
+def _identity(run: RunReader, name: str) -> Any:
+    value = run.settings.get(name)
+    return value.get("identity", value) if isinstance(value, dict) else value
+
+
+def _check_frames(
+    run: RunReader, untrained: RunReader, samples: TargetSamples, untrained_samples: TargetSamples
+) -> None:
+    if run.recorded:
+        frames, other_frames = (
+            reader.control_steps[reader_samples.rows, reader_samples.inferences]
+            for reader, reader_samples in ((run, samples), (untrained, untrained_samples))
+        )
+        if (frames != other_frames).any():
+            raise UsageError(
+                f"the untrained control {untrained.location} shows other frames than {run.location}. Extract both "
+                "with the same --select"
+            )
+    elif samples.inferences.any():
+        raise UsageError(
+            f"an untrained control of labels after the first inference: the network of {untrained.location} acted "
+            "otherwise, so it saw other frames. Expected labels of whole episodes at --call 0, --window 1, or "
+            "recordings"
+        )
+
+
+def add_untrained(results: ProbeResults, untrained: ProbeResults) -> ProbeResults:
+    """Return `results` compared with the same probes of an untrained network, in place of any other one.
+
+    Raises UsageError for other episodes, and for a stream that the untrained network lacks.
+    """
+    gains: list[UntrainedScore] = []
+    scores: list[ControlScore] = []
+    compared: list[ControlComparison] = []
+    for key, curve in results.curves.items():
+        other = untrained.curves[key]
+        _check_samples(key[0], curve, other, untrained.label)
+        if curve.is_side:
+            gains += _gains(key, curve, other, untrained)
+        for stream in curve.streams:
+            if not (other_rows := other.stream(stream)).size:
+                raise UsageError(
+                    f"the untrained control {untrained.label!r} has no {key[1]!r} of the stream {stream}; "
+                    "expected all streams of the run. Extract both by the same command"
+                )
+            if not curve.is_side:
+                best = replace(other, **_only(other, other.best(stream)))
+                scores.append(replace(control_score(UNTRAINED, key[0], best, stream, key[1]), chance=None, p=None))
+            compared += _compared_with_best(results, key, stream, other.scores[other_rows])
+    controls = results.controls.with_untrained(gains).with_scores(scores, compared)
+    return replace(results, controls=controls)
+
+
+def _only(curve: ProbeCurve, row: int) -> dict[str, Any]:
+    """The members of a curve with a single one of its sites."""
+    members = ("decisions", "strengths", "null", "inner", "sample_scores")
+    arrays = {name: getattr(curve, name)[[row]] for name in members if getattr(curve, name) is not None}
+    return {"sites": (curve.sites[row],), "parts": (curve.parts[row],), **arrays}
+
+
+def _check_samples(category: str, curve: ProbeCurve, other: ProbeCurve, name: str) -> None:
+    if other.episodes.tolist() != curve.episodes.tolist() or (other.labels != curve.labels).any():
+        raise UsageError(
+            f"category {category!r}: the untrained control {name!r} has {other.labels.size} "
+            f"episodes, this run {curve.labels.size}, and they are not the same. Extract both from the same suite."
+        )
+
+
+def _compared_with_best(
+    results: ProbeResults, key: tuple[str, str], stream: str, other_scores: NDArray[np.float64]
+) -> Iterator[ControlComparison]:
+    """Yield every site of a stream against the best of the untrained network's."""
+    curve = results.curves[key]
+    rows, seed = curve.stream(stream), comparison_seed(results.settings, UNTRAINED, *key, stream)
+    p = better_than_best(curve.scores[rows], other_scores, curve.groups, seed, curve.widening)
+    yield from comparisons(UNTRAINED, *key, curve, rows, float(other_scores.mean(axis=1).max()), p)
+
+
+def _gains(
+    key: tuple[str, str], curve: ProbeCurve, other: ProbeCurve, untrained: ProbeResults
+) -> Iterator[UntrainedScore]:
+    """Yield the gain of every site, and of the best one of every stream."""
+    pairs = [(row, other.sites.index(site), False) for row, site in enumerate(curve.sites) if site in other.sites]
+    streams = [name for name in curve.streams if other.stream(name).size]
+    pairs += [(curve.best(stream), other.best(stream), True) for stream in streams]
+    correct, untrained_correct = (
+        c.correct[[pair[side] for pair in pairs]].T.astype(float) for side, c in enumerate((curve, other))
+    )
+    for column, (row, untrained_row, peak) in enumerate(pairs):
+        hits, untrained_hits = correct[:, column], untrained_correct[:, column]
+        gap = Accuracy.of(hits, curve.groups).difference(Accuracy.of(untrained_hits, curve.groups))
+        yield UntrainedScore(
+            *key,
+            site=str(curve.sites[row]),
+            untrained_site=str(other.sites[untrained_row]),
+            peak=peak,
+            accuracy=float(hits.mean()),
+            untrained_accuracy=float(untrained_hits.mean()),
+            difference=float((correct - untrained_correct)[:, column].mean()),
+            ci=(gap.low, gap.high),
+            untrained=full_name(untrained.label, untrained.settings.random_weights),
+        )

@@ -1,1 +1,0 @@
-"""Controls: accuracies that probes must exceed."""

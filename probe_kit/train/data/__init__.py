@@ -1,1 +1,0 @@
-"""Inputs of probes: samples and labels of a run."""

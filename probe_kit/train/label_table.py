@@ -1,0 +1,258 @@
+"""Tables of labels: CSV, Parquet or a DataFrame, with the line of every cell; values of a column under a task."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import date, time
+from decimal import Decimal
+from math import isnan
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+from uuid import UUID
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit._system.bounded_files import check_regular
+from probe_kit._system.escaping import UNSAFE, terminal_safe
+from probe_kit._system.imports import require
+from probe_kit._system.parquet_files import open_parquet, read_parquet
+from probe_kit._system.table_cells import Cell
+from probe_kit._system.text_tables import MOST_BYTES, cell_of, open_table
+from probe_kit._tables.label_table import LabelTable
+from probe_kit.errors import UsageError
+from probe_kit.train.choices import TASKS, Task
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+EPISODE, INFERENCE = "episode_id", "inference"
+"""Key columns of a table: one label per episode, or with both one per captured inference."""
+SOURCE, FRAME = "source_episode", "frame"
+"""The same of recordings, by the numbers of the data set; read where a table has no `episode_id`."""
+
+
+def read_table(table: "Path | str | pd.DataFrame", requested: Sequence[str]) -> LabelTable:
+    """The key columns and the columns `requested` of a table. requested: those that it lacks are left out.
+
+    table: a CSV file (see `open_table`), a Parquet file (`.parquet`), or a DataFrame. Raises UsageError for a file
+    that is no such table, or has no column `episode_id`; MissingExtraError for Parquet without pyarrow.
+    """
+    if not isinstance(table, str | Path):
+        return _of_frame(table, "DataFrame", requested)
+    path = Path(table)
+    if path.suffix.lower() in (".parquet", ".pq"):
+        _check_file(path)
+        return _of_parquet(path, requested)
+    return _of_csv(path, requested)
+
+
+def _check_file(path: Path) -> None:
+    try:
+        check_regular(path, MOST_BYTES)
+    except OSError as error:
+        raise UsageError(f"{path} cannot be read: {error.strerror}. Give a CSV or Parquet file") from error
+
+
+def _of_csv(path: Path, requested: Sequence[str]) -> LabelTable:
+    opened = open_table(path, (EPISODE, SOURCE))
+    read = list(_places(opened.names, requested, str(path), opened.line))
+    return LabelTable.of_lines(opened, opened.rows(read), read)
+
+
+def _places(names: Sequence[str], requested: Sequence[str], source: str, line: int = 1) -> dict[str, int]:
+    """Position of every column to read. Raises UsageError without the key, and for a name used twice."""
+    if EPISODE not in names and SOURCE not in names:
+        listed = ", ".join(terminal_safe(name) for name in names[:12]) or "no column"
+        raise UsageError(
+            f"{source}, line {line} lacks the key column {EPISODE!r}; it has {listed}. "
+            f"{_other_delimiter(names)}`probe-kit labels RUN` writes a table with the keys of a run"
+        )
+    keys = (EPISODE, INFERENCE) if EPISODE in names else (SOURCE, FRAME)
+    read = [name for name in dict.fromkeys((*keys, *requested)) if name in names]
+    if unsafe := [character for name in read if (character := UNSAFE.search(name))]:
+        raise UsageError(
+            f"{source}, line {line}: the name of a column holds the control or direction character "
+            f"U+{ord(unsafe[0][0]):04X}; expected plain text. Rename the column"
+        )
+    if twice := [name for name in read if names.count(name) > 1]:
+        raise UsageError(
+            f"{source}, line {line} has the column {terminal_safe(twice[0])!r} twice. Rename one of them"
+        )
+    return {name: names.index(name) for name in read}
+
+
+def _other_delimiter(names: Sequence[str]) -> str:
+    """Return advice for a heading that holds the key and another delimiter than a comma; empty for others."""
+    for delimiter, name in (("|", "bars"), (":", "colons")):
+        fields = {field.strip().strip('"') for heading in names for field in heading.split(delimiter)}
+        if len(fields) > len(names) and fields & {EPISODE, SOURCE}:
+            return f"Its fields are separated by {name}; save it with commas, semicolons or tabs. "
+    return ""
+
+
+def _of_parquet(path: Path, requested: Sequence[str]) -> LabelTable:
+    """Cells by arrow, because pandas rounds large integers beside empty cells."""
+    require("pyarrow.parquet", "export")
+    try:
+        with open_parquet(path, "export") as file:
+            names = file.schema_arrow.names
+            position_of = _places(names, requested, str(path))
+            read = read_parquet(file, list(position_of))
+    except UsageError:
+        raise
+    except OSError as error:
+        reason = str(error.strerror or error).rstrip(".")
+        raise UsageError(f"{path} cannot be read: {reason}. Give a CSV or Parquet file") from error
+    except Exception as error:  # pyarrow raises many kinds for files that are no Parquet
+        reason = str(error).rstrip(".")
+        raise UsageError(f"{path} is no Parquet file: {reason}. Write it again, or give a CSV file") from error
+    cells = {name: read.column(name).to_pylist() for name in position_of}
+    return _of_cells(cells, tuple(names), len(read), str(path))
+
+
+def _of_frame(frame: "pd.DataFrame", source: str, requested: Sequence[str]) -> LabelTable:
+    if any(name is not None for name in frame.index.names):
+        frame = frame.reset_index()
+    names = [str(name) for name in frame.columns]
+    position_of = _places(names, requested, source)
+    cells = {name: frame.iloc[:, number].tolist() for name, number in position_of.items()}
+    return _of_cells(cells, tuple(names), len(frame), source)
+
+
+def _of_cells(cells: dict[str, list[Any]], names: tuple[str, ...], count: int, source: str) -> LabelTable:
+    table = LabelTable(source, "row", names, {}, list(range(1, count + 1)))
+    for name, column in cells.items():
+        table.columns[name] = [_plain(cell, table, row, name) for row, cell in enumerate(column)]
+    return table
+
+
+def _plain(cell: Any, table: LabelTable, row: int, column: str) -> Cell:
+    """A cell of a frame or Parquet file as a Python type; whatever means "missing" is None. Dates are texts.
+
+    Raises UsageError for other objects, such as lists.
+    """
+    import pandas as pd
+
+    if isinstance(cell, np.generic):
+        cell = cell.item()
+    if cell is None or cell is pd.NA or cell is pd.NaT:
+        return None
+    if isinstance(cell, Decimal):
+        cell = float(cell)
+    if isinstance(cell, float):
+        return None if isnan(cell) else cell
+    if isinstance(cell, bool | int):
+        return cell
+    if isinstance(cell, str):
+        return cell_of(cell)
+    if isinstance(cell, date | time | UUID):
+        return str(cell)
+    raise UsageError(
+        f"{table.where(row, column)} is of type {type(cell).__name__}; expected text, a number, or true or false. "
+        "Write one such value per row, a duration as a number of seconds"
+    )
+
+
+MOST_DOUBTFUL = 20
+"""Integers of 3 to so many values can be classes or quantities; only the user knows."""
+LARGEST = 1e100
+"""Quantities are squared and summed in float64, which ends at 1e308."""
+
+
+@dataclass(frozen=True)
+class LabelValues:
+    """A column of labels, coded for its task.
+
+    classes: names of the classes in order, empty for a continuous label. values: (n,) float64, the number of the
+    class or the quantity; NaN where the cell is empty.
+    """
+
+    task: Task
+    classes: tuple[str, ...]
+    values: NDArray[np.float64]
+
+    def of(self, at: Sequence[int]) -> "LabelValues":
+        """Return the values at some places, with the classes that occur there."""
+        return self.of_values(self.values[list(at)])
+
+    def of_values(self, values: NDArray[np.float64]) -> "LabelValues":
+        """Return some of the coded values, with the classes that occur among them, coded anew."""
+        if not self.classes:
+            return LabelValues(self.task, (), values)
+        present = np.unique(values[np.isfinite(values)])
+        codes = np.where(np.isfinite(values), np.searchsorted(present, values), np.nan)
+        return LabelValues(self.task, tuple(self.classes[int(code)] for code in present), codes)
+
+
+def code_labels(cells: Sequence[Cell], task: Task | None, target: str) -> LabelValues:
+    """Code the cells of one kind of the column `target` for `task`, or for the only task that fits.
+
+    Booleans and two values are binary, other texts classes, other numbers continuous. Raises UsageError if the
+    column is empty or constant, cannot have this task, or could have two.
+    """
+    if task is not None and task not in TASKS:
+        raise UsageError(f"task {task!r}; expected one of {', '.join(TASKS)}")
+    present = [_integer_if_whole(cell) for cell in cells if cell is not None]
+    distinct = sorted(set(present))  # type: ignore[type-var]  # of one kind, so that they can be ordered
+    if len(distinct) < 2:
+        contents = f"one value, {distinct[0]!r}" if distinct else "no value"
+        raise UsageError(f"column {target!r} has {contents}; expected two or more. There is nothing to decode")
+    fitting_task = task or _only_task(distinct, target)
+    _check_task(fitting_task, distinct, target)
+    if fitting_task == "continuous":
+        numbers = np.array([np.nan if cell is None else float(cell) for cell in cells], np.float64)
+        _check_squares(numbers, target)
+        return LabelValues(fitting_task, (), numbers)
+    code = {value: number for number, value in enumerate(distinct)}
+    codes = [np.nan if cell is None else code[_integer_if_whole(cell)] for cell in cells]
+    return LabelValues(fitting_task, tuple(map(str, distinct)), np.array(codes, np.float64))
+
+
+def _integer_if_whole(cell: Cell) -> Cell:
+    """A number without decimals as an integer: tables with empty cells store integers as decimals."""
+    return int(cell) if isinstance(cell, float) and cell.is_integer() else cell
+
+
+def _only_task(distinct: Sequence[Cell], target: str) -> Task:
+    if len(distinct) == 2:
+        return "binary"
+    if isinstance(distinct[0], str):
+        return "classes"
+    if all(isinstance(value, int) for value in distinct) and len(distinct) <= MOST_DOUBTFUL:
+        raise UsageError(
+            f"column {target!r} has {len(distinct)} integers, from {distinct[0]} to {distinct[-1]}, which can be "
+            "classes or quantities. Say which with --task classes or --task continuous (task=…)"
+        )
+    return "continuous"
+
+
+def _check_squares(numbers: NDArray[np.float64], target: str) -> None:
+    """Raise UsageError for quantities whose sums of squares leave the range of float64."""
+    largest, spread = float(np.nanmax(np.abs(numbers))), float(np.nanmax(numbers) - np.nanmin(numbers))
+    if largest > LARGEST or spread < 1 / LARGEST:
+        raise UsageError(
+            f"column {target!r} has values up to {largest:g}, and they differ by {spread:g}; expected at most "
+            f"{LARGEST:g}, and differences of at least {1 / LARGEST:g}. Correct the cell, or give another unit"
+        )
+
+
+def _check_task(task: Task, distinct: Sequence[Cell], target: str) -> None:
+    if task == "continuous" and isinstance(distinct[0], str | bool):
+        kind = "true and false" if isinstance(distinct[0], bool) else f"texts such as {distinct[0]!r}"
+        raise UsageError(
+            f"column {target!r} has {kind}; a continuous label needs numbers. Use --task "
+            f"{'binary' if len(distinct) == 2 else 'classes'}"
+        )
+    if task == "binary" and len(distinct) != 2:
+        listed = ", ".join(repr(value) for value in distinct[:4])
+        raise UsageError(
+            f"column {target!r} has {len(distinct)} values ({listed}, …); a binary label needs two. "
+            "Use --task classes or --task continuous"
+        )
+    if task == "classes" and not all(isinstance(value, str | int) for value in distinct):
+        decimal = next(value for value in distinct if not isinstance(value, str | int))
+        raise UsageError(
+            f"column {target!r} has decimals such as {cast(float, decimal)!r}; classes need texts or integers. "
+            "Use --task continuous, or write the classes as words"
+        )

@@ -1,0 +1,476 @@
+"""Probes fitted on all of one run and scored on another: `transfer_probes`, its results, table and sentences."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit._system.counting import counted
+from probe_kit._tables.numbers import p_text
+from probe_kit._tables.table import Table
+from probe_kit._terminal.notebook import notebook_progress
+from probe_kit.errors import SettingsMismatchError, TooFewGroupsError, UsageError
+from probe_kit.hooks.contract.sites import Site, label_of
+from probe_kit.runs.reader import RunReader
+from probe_kit.statistics.folds import OUTER_FOLDS, Fold
+from probe_kit.statistics.label_permutations import pointwise_p
+from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.train.choices import EVERYWHERE, Task
+from probe_kit.train.crossval.nested_folds import NestedFold
+from probe_kit.train.crossval.site_probe import predict_once, probe_labels
+from probe_kit.train.crossval.task_scores import METRICS, balanced_scores, score_interval
+from probe_kit.train.probe_sweep import (
+    TOKEN_PERMUTATIONS,
+    ExecutionSettings,
+    Progress,
+    Sweep,
+    check_options,
+    check_run,
+)
+from probe_kit.train.problem import Problem, make_problem, smallest_p_of_labels
+from probe_kit.train.results.probe_curve import ProbeCurve
+from probe_kit.train.results.probe_results import score_text
+from probe_kit.train.samples import Samples, read_samples, sites_of
+from probe_kit.train.solver.arrays import RowSubset
+from probe_kit.train.target import Target
+from probe_kit.train.target_samples import TargetSamples
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+Matrix = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class TransferCurve:
+    """All S sites of one view on the m samples of the other run.
+
+    fitted: probes as they were fitted. recentred: the same probes after the other run's features were moved to the
+    mean of the first. refitted: (S, m) held-out scores of probes of the other run itself.
+    """
+
+    fitted: ProbeCurve
+    recentred: ProbeCurve
+    refitted: Matrix
+
+
+@dataclass(frozen=True, repr=False)
+class TransferResults:
+    """Probes of one label, fitted on one run (`model`) and scored on another (`other_model`).
+
+    definition: hash of the label's definition, equal in both. classes: of the other run's labels. labels: (m,)
+    coded. episodes, groups: (m,) names. inferences: (m,). curves: by view. smallest_p: no p can be lower.
+    trained_on: number of samples and groups of the first run. left_out: of the other run, by reason.
+    """
+
+    model: str
+    other_model: str
+    same_weights: bool
+    target: str
+    task: Task
+    definition: str
+    classes: tuple[str, ...]
+    labels: Matrix
+    episodes: NDArray[np.str_]
+    inferences: NDArray[np.int64]
+    groups: NDArray[np.str_]
+    curves: Mapping[str, TransferCurve]
+    smallest_p: float
+    trained_on: Mapping[str, int]
+    left_out: Mapping[str, int]
+
+    def __repr__(self) -> str:
+        return (
+            f"<TransferResults {self.target} ({self.task}), {self.model} to {self.other_model}; views "
+            f"{', '.join(self.curves)}; {self.labels.size} samples, {np.unique(self.groups).size} groups>"
+        )
+
+    @cached_property
+    def scores(self) -> "pd.DataFrame":
+        """One row per view and site.
+
+        `score`, `ci_low`, `ci_high`, `chance`, `p`, `p_fwe`: as in `ProbeResults.scores`, on the other run.
+        `recentred`, `recentred_chance`, `recentred_p_fwe`: the same on features moved to the first run's mean.
+        `refitted`, `refitted_ci_low`, `refitted_ci_high`: cross-validated score of the other run itself.
+        `penalty`: λ, or 1 / C.
+        """
+        import pandas as pd
+
+        return pd.DataFrame([row for view, curve in self.curves.items() for row in self._rows(view, curve)])
+
+    def _rows(self, view: str, curve: TransferCurve) -> list[dict[str, Any]]:
+        fitted, moved = curve.fitted, curve.recentred
+        p, p_fwe, moved_p = pointwise_p(fitted.metric, fitted.null), fitted.p_fwe(), moved.p_fwe()
+        rows = []
+        for row, (site, part) in enumerate(zip(fitted.sites, fitted.parts, strict=True)):
+            low, high = score_interval(fitted.scores[row], self.labels, self.groups, self.task)
+            low_refitted, high_refitted = score_interval(
+                curve.refitted[row], self.labels, self.groups, self.task, (self.labels - self.labels.mean()) ** 2
+            )
+            rows.append(
+                {
+                    "model": self.model,
+                    "other_model": self.other_model,
+                    "target": self.target,
+                    "task": self.task,
+                    "view": view,
+                    "site": str(site),
+                    "stream": site.stream,
+                    "part": part,
+                    "layer": site.layer,
+                    "iteration": site.iteration,
+                    "metric": METRICS[self.task],
+                    "score": fitted.metric[row],
+                    "ci_low": low,
+                    "ci_high": high,
+                    "chance": fitted.chance[row],
+                    "p": p[row],
+                    "p_fwe": p_fwe[row],
+                    "recentred": moved.metric[row],
+                    "recentred_chance": moved.chance[row],
+                    "recentred_p_fwe": moved_p[row],
+                    "refitted": float(curve.refitted[row].mean()),
+                    "refitted_ci_low": low_refitted,
+                    "refitted_ci_high": high_refitted,
+                    "penalty": float(fitted.penalties[row, 0]),
+                    "n": self.labels.size,
+                    "groups": np.unique(self.groups).size,
+                }
+            )
+        return rows
+
+
+_DIGITS = 12
+"""Of a suite's hash, in its identity."""
+
+
+def transfer_probes(
+    run: RunReader,
+    other: RunReader,
+    target: Target | str,
+    other_target: Target | str | None = None,
+    categories: Sequence[str] | None = None,
+    views: Sequence[str] = ("mean",),
+    *,
+    window: int | None = None,
+    permutations: int = 200,
+    token_permutations: int = TOKEN_PERMUTATIONS,
+    call: int = 0,
+    seed: int = 0,
+    across_weights: bool = False,
+    progress: Progress | None = None,
+) -> TransferResults:
+    """Fit every site's probe on all of `run`, and score it on `other`; nothing is stored.
+
+    C or λ is chosen by five folds of the groups of `run`; no label of `other` takes part in a fit. Groups of
+    `other` that `run` has too are left out, see `shared_groups`. The null permutes the labels of `other`. Besides:
+    the same probe after the features of `other` are moved to the mean of `run`, and the cross-validated score of
+    `other` itself on the same samples.
+    target, other_target: of either run, of one `Target.definition`; other_target: by default the same side or
+    built-in column. categories: pooled, by default all. across_weights: allow two networks; sites and widths must
+    still be equal. Others: as in `train_probes`, for both runs.
+    Raises SettingsMismatchError for other weights, sites or definitions, TooFewGroupsError where too few
+    groups are not shared, and what `train_probes` raises.
+    """
+    check_options(views, permutations, token_permutations)
+    options: dict[str, Any] = {"views": views, "seed": seed, "call": call}
+    pooled = categories or (EVERYWHERE,)
+    of_other = target if other_target is None else other_target
+    for reader in (run, other):
+        check_run(reader, categories)
+    side = Sweep.of(run, target, pooled, ExecutionSettings(), None, window=window, permutations=0, **options)
+    run_window = side.samples.window if side.target.per_step else None
+    options |= {"permutations": permutations, "token_permutations": token_permutations, "window": run_window}
+    other_side = Sweep.of(other, of_other, pooled, ExecutionSettings(), None, **options)
+    _check_alike(run, other, views, across_weights)
+    train = make_problem(run, side.target, side.samples, EVERYWHERE, side.settings)
+    if side.target.definition != other_side.target.definition:
+        raise SettingsMismatchError(
+            f"the label of {run.location} is {side.target.described}, that of {other.location} is "
+            f"{other_side.target.described}; expected one definition. Give both the same column and task"
+        )
+    samples, shared = _unshared(run, train.samples, other, other_side.samples, side.target.group_by)
+    test = make_problem(other, other_side.target, samples, EVERYWHERE, other_side.settings)
+    code = _codes(train.classes, test.classes)
+    keys = [(view, site) for view in views for site in sites_of(other, view)]
+    progress = progress or notebook_progress("sites")
+    transferred: dict[tuple[str, Site], _Transferred] = {}
+    for view, site in keys:
+        run_samples, other_samples = (
+            read_samples(source, view, site, rows.rows, rows.inferences)
+            for source, rows in ((run, train.samples), (other, samples))
+        )
+        transferred[view, site] = _transfer(train, run_samples, test, other_samples, code)
+        if progress is not None:
+            progress(len(transferred), len(keys), f"{site} {view}")
+    return TransferResults(
+        model=run.label,
+        other_model=other.label,
+        same_weights=_same_weights(run, other),
+        target=side.target.name,
+        task=side.target.task,
+        definition=side.target.definition,
+        classes=test.classes,
+        labels=samples.values,
+        episodes=test.episodes,
+        inferences=samples.inferences.astype(np.int64),
+        groups=samples.groups,
+        curves={view: _curve(other, test, view, transferred) for view in views},
+        smallest_p=smallest_p_of_labels(test.labels, test.permuted_labels),
+        trained_on={"samples": train.samples.rows.size, "groups": np.unique(train.samples.groups).size},
+        left_out={**samples.left_out, **({"groups that both runs have": shared} if shared else {})},
+    )
+
+
+def shared_groups(
+    run: RunReader, samples: TargetSamples, other: RunReader, other_samples: TargetSamples, group_by: str | None
+) -> NDArray[np.str_]:
+    """Return the names of the groups of `other_samples` that `samples` has too.
+
+    By name, where names mean the same: with `group_by`, or if both runs are of one suite, data set or environment,
+    or of selections of one suite. Also those with an item whose id and content are in both.
+    """
+    names = np.unique(other_samples.groups)
+    in_both = np.zeros(names.size, bool)
+    if group_by is not None or _sources(run) & _sources(other):
+        in_both |= np.isin(names, samples.groups)
+    contents, other_contents = _contents(run, samples), _contents(other, other_samples)
+    both = set(contents.values()) & set(other_contents.values())
+    group_of = dict(zip(other_samples.rows.tolist(), other_samples.groups.tolist(), strict=True))
+    in_both |= np.isin(names, [group_of[row] for row, content in other_contents.items() if content in both])
+    shared: NDArray[np.str_] = names[in_both]
+    return shared
+
+
+def _sources(run: RunReader) -> set[str]:
+    """Names under which what a run shows is known."""
+    digest = run.suite.partition("#")[2]
+    parent = run.suite_parent
+    return {name for name in (run.suite, digest[:_DIGITS], (parent or "")[:_DIGITS]) if name}
+
+
+def _contents(run: RunReader, samples: TargetSamples) -> dict[int, tuple[str, str]]:
+    """Item id and content hash by row of the episodes; empty where the run has no items."""
+    items = run.items
+    if items is None or "item_id" not in run.episodes or "content_sha256" not in items:
+        return {}
+    content = dict(zip(items["item_id"].astype(str), items["content_sha256"], strict=True))
+    ids = run.episodes["item_id"].astype(str).to_numpy()
+    return {
+        int(row): (ids[row], str(content[ids[row]])) for row in np.unique(samples.rows) if content.get(ids[row])
+    }
+
+
+def _check_alike(run: RunReader, other: RunReader, views: Sequence[str], across_weights: bool) -> None:
+    """Raise SettingsMismatchError for two networks, unless that is allowed, and for other sites or widths."""
+    if not (across_weights or _same_weights(run, other)):
+        ours, theirs = ((reader.weights_sha256 or "unknown")[:12] for reader in (run, other))
+        raise SettingsMismatchError(
+            f"{run.location} has the weights {ours}, {other.location} {theirs}; expected one network, because a "
+            "direction means nothing in another. Accept that with --across-weights (across_weights=True)"
+        )
+    for view in views:
+        sites, other_sites = (
+            [(str(site), run_of.streams[site.stream].width) for site in sites_of(run_of, view)]
+            for run_of in (run, other)
+        )
+        if sites != other_sites:
+            site, width = next(iter(set(sites) ^ set(other_sites)))
+            raise SettingsMismatchError(
+                f"view {view!r}: {run.location} has {len(sites)} sites, {other.location} {len(other_sites)}, and "
+                f"not both have {site} of width {width}; expected the same sites and widths"
+            )
+
+
+def _same_weights(run: RunReader, other: RunReader) -> bool:
+    """Whether both are known to be of one network."""
+    return run.weights_sha256 is not None and run.weights_sha256 == other.weights_sha256
+
+
+def _unshared(
+    run: RunReader, samples: TargetSamples, other: RunReader, other_samples: TargetSamples, group_by: str | None
+) -> tuple[TargetSamples, int]:
+    """The samples in groups that `run` does not have, and how many groups are left out."""
+    shared = shared_groups(run, samples, other, other_samples, group_by)
+    unshared = ~np.isin(other_samples.groups, shared)
+    remaining = np.unique(other_samples.groups[unshared]).size
+    if remaining < OUTER_FOLDS:
+        raise TooFewGroupsError(
+            f"{shared.size} of the {np.unique(other_samples.groups).size} groups of {other.location} are in "
+            f"{run.location} too, which leaves {remaining}; expected at least {OUTER_FOLDS} to score "
+            "on. Give a run of other items or episodes"
+        )
+    return other_samples.of(unshared), int(shared.size)
+
+
+def _codes(classes: Sequence[str], other_classes: Sequence[str]) -> Matrix | None:
+    """(K,) code in the other run of every class; -1 where it has none, None for quantities."""
+    if not classes:
+        return None
+    if unknown := [name for name in other_classes if name not in classes]:
+        raise UsageError(
+            f"the other run has the class {unknown[0]!r}, which no probe was fitted to; expected some of "
+            f"{', '.join(classes)}. Leave its cells empty, or fit on a run that has it"
+        )
+    return np.array([other_classes.index(name) if name in other_classes else -1 for name in classes], np.float64)
+
+
+@dataclass(frozen=True)
+class _Transferred:
+    """One site. plain, moved: (m,) predictions as fitted, and on recentred features. refitted: (m,) scores of
+    a probe of the other run itself."""
+
+    plain: Matrix
+    moved: Matrix
+    scores: tuple[Matrix, Matrix]
+    null: tuple[Matrix, Matrix]
+    refitted: Matrix
+    strength: float
+
+
+def _transfer(
+    train: Problem, run_samples: Samples, test: Problem, other_samples: Samples, code: Matrix | None
+) -> _Transferred:
+    count, other_count = run_samples.counts.size, other_samples.counts.size
+    samples = Samples.joined([run_samples, other_samples, _recentred(other_samples, run_samples)])
+    fold = NestedFold(
+        Fold(np.arange(count), np.arange(count, count + 2 * other_count)), [fold.outer for fold in train.folds]
+    )
+    blank = np.zeros(count + 2 * other_count)  # in place of the other run's labels, which no fit may see
+    blank[:count] = train.labels
+    predicted, strength = predict_once(samples, blank, train.task, fold)
+    if code is not None:
+        predicted = code[predicted.astype(np.intp)]
+    plain, moved = predicted[:other_count], predicted[other_count:]
+    truth = np.column_stack([test.labels, test.permuted_for(other_samples)]).astype(np.float64)
+    of_plain, of_moved = (_scores(predictions, truth, test.task) for predictions in (plain, moved))
+    scores = probe_labels(other_samples, truth[:, :1], test.task, test.folds).scores
+    return _Transferred(
+        plain, moved, (of_plain[0], of_moved[0]), (of_plain[1], of_moved[1]), scores, strength
+    )  # fmt: skip
+
+
+def _recentred(samples_to_move: Samples, run_samples: Samples) -> Samples:
+    """Return the samples of the other run, moved to the mean of the first run's."""
+    means, run_means = (np.asarray(samples.means) for samples in (samples_to_move, run_samples))
+    shift = run_means.mean(axis=0, dtype=np.float64) - means.mean(axis=0, dtype=np.float64)
+    features = samples_to_move.read()
+    moved = (features + shift).astype(features.dtype)
+    if samples_to_move.pools:
+        return Samples.pooled(moved)
+    return Samples(RowSubset.all(moved), samples_to_move.counts, means + shift)
+
+
+def _scores(predicted: Matrix, truth: Matrix, task: Task) -> tuple[Matrix, Matrix]:
+    """(m,) scores of the real labels, and (P,) the metric of every permutation, from (m, 1 + P) labels.
+
+    R² compares with the mean of the other run's labels, as scikit-learn's `r2_score` does.
+    """
+    if task == "continuous":
+        scores = 1 - (truth - predicted[:, None]) ** 2 / truth.var(axis=0)
+    else:
+        scores = balanced_scores(np.repeat(predicted[:, None], truth.shape[1], axis=1), truth)
+    return scores[:, 0], scores.mean(axis=0)[1:]
+
+
+def _curve(
+    run: RunReader, test: Problem, view: str, transferred: dict[tuple[str, Site], _Transferred]
+) -> TransferCurve:
+    of_view = {site: result for (name, site), result in transferred.items() if name == view}
+    transferred_sites = list(of_view.values())
+    plain, moved = (
+        ProbeCurve(
+            sites=tuple(of_view),
+            labels=test.labels,
+            episodes=test.episodes,
+            items=test.items,
+            groups=test.groups,
+            fold_of=test.fold_of,
+            decisions=np.stack([(result.plain, result.moved)[at] for result in transferred_sites]),
+            strengths=np.array([[result.strength] for result in transferred_sites]),
+            null=np.stack([result.null[at] for result in transferred_sites]),
+            inner=np.zeros((len(transferred_sites), 0, 0), np.float32),
+            parts=tuple(str(run.streams[site.stream].part) for site in of_view),
+            task=test.task,
+            is_side=False,
+            classes=test.classes,
+            sample_scores=np.stack([result.scores[at] for result in transferred_sites]),
+        )
+        for at in (0, 1)
+    )
+    return TransferCurve(plain, moved, np.stack([result.refitted for result in transferred_sites]))
+
+
+_LEGEND = (
+    "Fitted on one run, scored on the other. The score of a chosen site is too high. Chance: mean score with "
+    "labels of the other run exchanged. Recentred: features of the other run moved to the mean of the first. "
+    "Refitted: cross-validated probe of the other run itself"
+)
+
+
+def transfer_table(results: TransferResults, splits: bool = True) -> Table:
+    """A row per stream and view for its best site."""
+    several, metric = len(results.curves) > 1, METRICS[results.task]
+    best = _best(results)
+    rows = [(" · ".join([label_of(row["stream"]), *[row["view"]] * several]), *_cells(row)) for row in best]
+    title = [f"{results.target}: {metric}", f"{results.model} to {results.other_model}"]
+    title += ["OTHER WEIGHTS"] * (not results.same_weights)
+    headings = (
+        "stream",
+        "best site",
+        f"{metric} [95 %]",
+        "chance",
+        "family-wise p",
+        "recentred",
+        "refitted [95 %]",
+    )
+    overflow = "split" if splits else "leave out"
+    return Table.of(", ".join(title), headings, rows, notes=[_LEGEND], overflow=overflow)
+
+
+def transfer_sentences(results: TransferResults) -> list[str]:
+    """Return a sentence per reason for leaving samples out, then one per view: where the label transfers."""
+    sentences = [f"left out: {count} {reason}" for reason, count in results.left_out.items()]
+    groups, samples = results.trained_on["groups"], results.trained_on["samples"]
+    on = f"fitted on {counted(groups, 'group')}, {counted(samples, 'sample')}"
+    for view in results.curves:
+        rows = [row for row in _best(results) if row["view"] == view]
+        of = f"{on}; scored on {counted(rows[0]['groups'], 'group')}, {counted(rows[0]['n'], 'sample')}"
+        of += f", view {view}" if len(results.curves) > 1 else ""
+        sentences.append(f"{results.target} ({of}) {'; '.join(map(_verdict, rows))}.")
+    return sentences
+
+
+def _best(results: TransferResults) -> "list[pd.Series]":
+    """The row of `scores` of the best site of every view and stream: the largest excess over chance."""
+    scores = results.scores
+    excess = scores["score"] - scores["chance"].fillna(0.0)
+    best = excess.groupby([scores["view"], scores["stream"]], sort=False).idxmax()
+    return [scores.loc[number] for number in best]
+
+
+def _cells(row: "pd.Series") -> tuple[str, ...]:
+    return (
+        str(row["site"]),
+        f"{row['score']:.3f} [{row['ci_low']:.3f}, {row['ci_high']:.3f}]",
+        score_text(row["chance"], is_side=False),
+        p_text(row["p_fwe"]),
+        score_text(row["recentred"], is_side=False),
+        f"{row['refitted']:.3f} [{row['refitted_ci_low']:.3f}, {row['refitted_ci_high']:.3f}]",
+    )
+
+
+def _verdict(row: "pd.Series") -> str:
+    where, numbers = (
+        f"in the {label_of(row['stream'])}",
+        f"({row['metric']} {row['score']:.2f}, refitted {row['refitted']:.2f})",
+    )
+    if row["p_fwe"] != row["p_fwe"]:
+        return f"was not tested {where} {numbers}"
+    if row["p_fwe"] < SIGNIFICANCE:
+        return f"transfers {where} at {row['site']} {numbers}"
+    return f"is not shown to transfer {where} {numbers}"
