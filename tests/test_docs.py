@@ -100,6 +100,19 @@ def test_the_page_of_errors_names_no_error_that_is_none() -> None:
     assert set(re.findall(r"^\| `(\w+Error)`", page, re.MULTILINE)) == {error.__name__ for error in ERRORS}
 
 
+def test_every_family_that_acts_has_a_row_on_the_page_of_families() -> None:
+    from probe_kit.hooks.registry import own_families
+
+    page = (DOCS / "families.md").read_text(encoding="utf-8")
+    named = {
+        name
+        for line in re.findall(r"^\| (`[^|]*) \|", page, re.MULTILINE)
+        for name in re.findall(r"`([^`]+)`", line)
+    }
+    acting = {name for name, family in own_families().items() if family.acts}
+    assert acting - {"pi0-tiny-early", "pi0-tiny-state"} - named == set()
+
+
 def test_every_public_name_is_described_in_the_reference() -> None:
     import probe_kit
 

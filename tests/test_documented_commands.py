@@ -224,14 +224,12 @@ def _called(function: ast.expr, known: dict[str, Any]) -> Any:
 
 RUNS = {
     "docs/causal.md": ("RUN",),
-    "docs/magma.md": ("RUN_MAGMA", "RUN_PI0"),
-    "docs/openvla.md": ("RUN_OPENVLA", "RUN_PI0"),
-    "docs/protocols.md": ("runs/pi0",),
+    "docs/families.md": ("runs/pi0",),
     "docs/qwen-vla.md": ("RUN_XIAOMI", "RUN_INTERNVLA", "RUN_PI0"),
     "docs/report.md": ("runs/a", "runs/b"),
-    "docs/spatialvla.md": ("RUN_SPATIALVLA", "RUN_OPENVLA", "RUN_PI0"),
     "docs/storage.md": ("runs/pi0",),
     "docs/success-rate.md": ("RUN",),
+    "docs/token-policies.md": ("RUN_OPENVLA", "RUN_PI0"),
     "docs/view.md": ("runs/mine",),
 }
 """Runs that a page takes for granted, made of the embedded policy; all of a page are different runs."""
@@ -252,7 +250,7 @@ STAND_INS = {
         r"--model pi0-tiny": "--model pi0-tiny --max-steps 12",
         r"train runs/pi0-tiny": "train runs/pi0-tiny --permutations 20",
     },
-    "docs/protocols.md": {
+    "docs/families.md": {
         r"--model pi0 --checkpoint lerobot/pi0_base": "--model pi0-tiny --categories color --items 12",
         r"train runs/pi0-base": "train runs/pi0-base --permutations 20",
     },

@@ -1,7 +1,7 @@
 """Defaults of a diagnosis, and how many groups it draws; without imports."""
 
 FRAMES = 24
-"""With so many, words that decide were seen to in nine of ten draws or more; see `docs/diagnose.md`."""
+"""With so many, words that decide were seen to in nine of ten draws or more; see `docs/notes/causal.md`."""
 LEAST_GROUPS = 6
 """Fewer groups cannot show at p < 0.05 that anything matters, by sign flips of whole groups: 2⁻⁵ is 0.03."""
 

@@ -90,7 +90,7 @@ def test_no_page_repeats_the_demos_numbers_outside_its_tables() -> None:
 
 
 def test_the_overview_of_performance_points_to_figures_and_holds_none() -> None:
-    text = (DOCS / "performance.md").read_text(encoding="utf-8").partition("\n## ")[0]
+    text = (DOCS / "notes" / "performance.md").read_text(encoding="utf-8").partition("\n## ")[0]
     assert [found[0] for found in FIGURE.finditer(text)] == []
     assert text.count("](") >= 6
 

@@ -19,12 +19,11 @@ NOT_COMMANDS = {
     ("docs/capture.md", "passed   Every stream declares"): "output of check-adapter",
     ("docs/diagnose.md", "Inputs of pi0-tiny"): "output of diagnose",
     ("docs/storage.md", "RUN/"): "a tree of files",
-    ("docs/storage.md", "run.json ── zarr.json"): "a diagram",
     (
         "docs/suite.md",
         "instruction,correct,wrong",
     ): "a table, written to questions.csv before the page's commands run",
-    ("docs/scale.md", "seconds per episode"): "formulas",
+    ("docs/notes/performance.md", "seconds per episode"): "formulas",
 }
 """Blocks without a language that hold no commands, by their page and how they begin, and what they are."""
 

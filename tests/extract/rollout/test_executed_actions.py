@@ -38,7 +38,7 @@ def test_no_turn_stays_no_turn_and_one_axis_stays_its_angle() -> None:
 
 
 def test_the_released_conversion_moves_the_turn_by_a_few_percent() -> None:
-    """Read by the controller of the scene act2answer; what docs/protocols.md says of the size."""
+    """Read by the controller of the scene act2answer; what docs/paper.md says of the size."""
     angles = np.random.default_rng(0).uniform(LOW, HIGH, (500, 3))
     actions = np.zeros((500, 7), np.float32)
     actions[:, 3:6] = angles

@@ -88,7 +88,7 @@ def test_without_a_tokenizer_the_missing_files_are_named(folder: Path, observati
 
 
 def test_picture_positions_cannot_know_the_instruction(fused: OpenVLA, observation: Observation) -> None:
-    """Attention is causal and the picture comes first; docs/openvla.md says what that means for probes."""
+    """Attention is causal and the picture comes first; docs/token-policies.md says what that means for probes."""
     kept = []
     for text in ("Put the cube on the star", "Take it away"):
         with capture(fused, fused.sites()) as tape:

@@ -83,7 +83,7 @@ def test_the_first_step_of_a_chunk_is_the_same_whether_the_rest_is_captured(
 
 
 def test_picture_positions_know_the_instruction(plain: SpatialVLA, seen: list[Observation]) -> None:
-    """Attention goes both ways over the prompt; docs/spatialvla.md says what that means for probes."""
+    """Attention goes both ways over the prompt; docs/token-policies.md says what that means for probes."""
     kept = []
     for text in ("put the cube on the star", "take it away"):
         with capture(plain, plain.sites()) as tape:
