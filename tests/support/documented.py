@@ -23,7 +23,6 @@ NOT_COMMANDS = {
         "docs/suite.md",
         "instruction,correct,wrong",
     ): "a table, written to questions.csv before the page's commands run",
-    ("docs/notes/performance.md", "seconds per episode"): "formulas",
 }
 """Blocks without a language that hold no commands, by their page and how they begin, and what they are."""
 
