@@ -32,10 +32,9 @@ from probe_kit.extract.sources.player import Row
 from probe_kit.extract.sources.scene import SceneSettings
 from probe_kit.extract.sources.scene_source import SceneSource, scene_row
 from probe_kit.runs import open_run, seal, verify_run
-from probe_kit.runs.commits import Commit, commit_key, write_commit
+from probe_kit.runs.commits import NOT_MEASURED, Commit, commit_key, write_commit, write_seconds
 from probe_kit.runs.layout import DATA, StoredStream
 from probe_kit.runs.records import HASH
-from probe_kit.runs.seconds import NOT_MEASURED, write_seconds
 from probe_kit.runs.store import locate
 from probe_kit.runs.writer import EpisodeRecord, RunWriter
 from probe_kit.suite import Suite, build_suite

@@ -2,7 +2,7 @@
 
     python benchmarks/intervention_acceptance.py FOLDER [--seed 0] [--items 24] [--steps N] [--loop 4]
 
-Draws a suite of its own seed, has every organism of `probe_kit.demo.organisms` act on it, fits probes, intervenes.
+Draws a suite of its own seed, has every organism of `probe_kit.demo.pipeline` act on it, fits probes, intervenes.
 What is true of each is taken from there; places and layers from what is found. --steps plays shorter episodes:
 enough for all that is read off first actions, and the closed loop then repeats those. --loop: items per category
 that are played again. Finished work in FOLDER is reused. An undecided verdict is neither true nor false. Exits
@@ -14,7 +14,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from probe_kit.demo.organisms import (
+from probe_kit.demo.pipeline import (
+    FULL,
     ORGANISMS,
     TRAINED,
     UNTRAINED_NETWORK,
@@ -23,7 +24,6 @@ from probe_kit.demo.organisms import (
     findings,
     probed,
 )
-from probe_kit.demo.pipeline import FULL
 from probe_kit.errors import CaptureChangedActionError
 from probe_kit.intervene import (
     ClosedLoop,

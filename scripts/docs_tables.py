@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from probe_kit.demo.organisms import count_agreements
+from probe_kit.demo.pipeline import count_agreements
 
 ROOT = Path(__file__).parents[1]
 DATA = ROOT / "docs" / "demo.json"

@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from probe_kit._terminal.console import counter, progress
-from probe_kit.demo.organisms import TRAINED, VLM
+from probe_kit.demo.pipeline import TRAINED, VLM
 from probe_kit.env import SceneSpec
 from probe_kit.extract import AskSettings, ExtractSettings, ask_run, extract_run
 from probe_kit.extract.prompts import TEMPLATES

@@ -18,8 +18,17 @@ from docs_tables import DATA, PAGES, README, ROOT, filled
 from readme_picture import draw_picture
 
 from probe_kit._terminal.console import counter, progress
-from probe_kit.demo.organisms import TRAINED, Finding, NamedProgress
-from probe_kit.demo.pipeline import FULL, QUICK, Demo, Size, compare_organisms, run_demo
+from probe_kit.demo.pipeline import (
+    FULL,
+    QUICK,
+    TRAINED,
+    Demo,
+    Finding,
+    NamedProgress,
+    Size,
+    compare_organisms,
+    run_demo,
+)
 from probe_kit.retention.columns.sentences import verdict
 from probe_kit.retention.report import write_report
 

@@ -27,7 +27,7 @@ from probe_kit.hooks.family import Dtype
 from probe_kit.intervene.kinds import kind_names
 from probe_kit.retention.behaviour import SCORES
 from probe_kit.retention.choices import AnswerScore, Family, Section
-from probe_kit.runs.export.export import FORMATS
+from probe_kit.runs.export import FORMATS
 from probe_kit.runs.layout import (
     AskTokens,
     Codec,

@@ -9,7 +9,7 @@ from contextlib import ExitStack, contextmanager
 from queue import SimpleQueue
 from typing import Any, Self
 
-from probe_kit._execution.worker import Lost, Work, serve
+from probe_kit._execution.executor import Lost, Work, serve
 from probe_kit._system.imports import require
 from probe_kit.errors import UsageError
 

@@ -3,17 +3,25 @@
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
+from itertools import product
+from pathlib import Path
 from typing import Any
 
+from PIL import Image, ImageDraw
+
+from probe_kit._system.escaping import csv_of_rows
 from probe_kit.errors import UsageError
+from probe_kit.extract import AskSettings, ExtractSettings, ask_run, extract_run
 from probe_kit.hooks.conformance.check import Outcome, package_of, require, tried
 from probe_kit.hooks.conformance.subject import INSTRUCTIONS, Subject
 from probe_kit.hooks.contract.declared import read_pairs
 from probe_kit.hooks.contract.model import Policy
 from probe_kit.hooks.registry import entry_module, find_family
 from probe_kit.hooks.testing import CONTRACTS
+from probe_kit.runs import Run
+from probe_kit.suite import Terms, suite_from_csv
 
 _HEAVY = 3
 _LISTED = f"import sys, {{module}}; sys.exit({_HEAVY} if 'torch' in sys.modules else 0)"
@@ -88,8 +96,6 @@ def outcomes(subjects: Sequence[Subject]) -> Iterator[Outcome]:
 
 
 def _run(subject: Subject, mismatch: bool) -> None:
-    from probe_kit.check_adapter.smoke_run import act_twice, answer_twice
-
     settings: dict[str, Any] = {
         "checkpoint": subject.given_checkpoint, "options": subject.options, "device": subject.device,
         "dtype": subject.dtype,
@@ -112,3 +118,60 @@ def _require_light(module: str) -> None:
         last = (process.stderr.strip().splitlines() or [f"exit code {process.returncode}"])[-1]
         raise UsageError(f"`import {module}` fails in a new process: {last}")
     require(process.returncode == 0, f"`import {module}` imports torch", "a module that imports none")
+
+
+STEPS = 8
+"""Control steps of an episode at most."""
+_SIDE = 224
+_COLOURS = ("red", "blue")
+
+
+def act_twice(
+    model: str, load_options: Mapping[str, Any], instruction: str, capture_only: bool, folder: Path
+) -> None:
+    """Extract two episodes, and load every site again.
+
+    load_options: checkpoint, options, device and dtype. capture_only: do not act, for actions that do not fit
+    the arm. Raises what `extract_run` raises, and CheckFailedError for a run that is not whole.
+    """
+    settings = ExtractSettings(
+        model,
+        suite=_one_item(instruction, folder),
+        frames="none",
+        env_workers=0,
+        capture_only=capture_only,
+        accept_units=True,  # a tiny checkpoint may have any statistics
+        accept_ignored_inputs=True,  # and untrained bins that no input moves
+        max_steps=STEPS,
+        **load_options,
+    )
+    _read_back(extract_run(settings, folder / "run"))
+
+
+def answer_twice(model: str, load_options: Mapping[str, Any], instruction: str, folder: Path) -> None:
+    """Ask about two episodes, activations included, and load every site again. Raises as `act_twice` does."""
+    settings = AskSettings(
+        model, suite=_one_item(instruction, folder), frames="none", env_workers=0, tokens="pooled", **load_options
+    )
+    _read_back(ask_run(settings, folder / "run"))
+
+
+def _one_item(instruction: str, folder: Path) -> Path:
+    """A suite of one item over two discs; played in both layouts it is two episodes."""
+    for colour in _COLOURS:
+        picture = Image.new("RGB", (_SIDE, _SIDE), "white")
+        ImageDraw.Draw(picture).ellipse((32, 32, 192, 192), fill=colour)
+        picture.save(folder / f"{colour}.png")
+    correct, wrong = (f"{colour}.png" for colour in _COLOURS)
+    row = {"instruction": instruction, "correct": correct, "wrong": wrong, "object": instruction.split()[-1]}
+    (folder / "discs.csv").write_text(csv_of_rows(list(row), [row]), encoding="utf-8")
+    terms = Terms("CC0-1.0", "drawn by probe-kit check-adapter")
+    return suite_from_csv(folder / "discs.csv", folder / "suite", terms=terms).folder
+
+
+def _read_back(run: Run) -> None:
+    require(len(run.episodes) == 2, f"{len(run.episodes)} episodes", "2, the item in both layouts")
+    for stream in run.streams:
+        for site, view in product(run.sites(stream), run.views(stream)):
+            rows = len(run.column(site, view))
+            require(rows == 2, f"{site} has {rows} rows of {view}", "2, one per episode")

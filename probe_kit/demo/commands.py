@@ -35,7 +35,7 @@ def demo(
     from probe_kit.demo.pipeline import FULL, QUICK, compare_organisms, run_demo
 
     if compare:
-        from probe_kit.demo.organisms import organism_table
+        from probe_kit.demo.pipeline import organism_table
 
         with progress() as bar:
             findings = compare_organisms(out_folder, lambda stage: counter(bar, stage))

@@ -1,22 +1,264 @@
-"""The whole pipeline on the embedded policy: what `probe-kit demo` runs."""
+"""Model organisms, which validate the pipeline, and what `probe-kit demo` runs.
+
+`vlm-tiny` answers and does not act: it was trained on questions of Color, Shape, State and Traffic (*known*),
+and of nothing else. `pi0-tiny` is made of its backbone: it was trained to act on Color and Shape (*used*), while
+the actions of State questions went to a random side (*not used*). `pi0-tiny-state` differs in that they
+followed the answer (*used*). The early checkpoint has the VLM's backbone and an action expert of random weights
+(*does not decide*); untrained networks know nothing (*absent*).
+"""
 
 import shlex
 import shutil
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal, get_args
 
 from rich.text import Text
 
 from probe_kit._system.drafts import write_whole
+from probe_kit._tables.numbers import number, percent
+from probe_kit._tables.table import Cell, Table, grouped
 from probe_kit._terminal.console import marked
-from probe_kit.demo.organisms import TRAINED, VLM, Finding, NamedProgress, answered, compare, probed
-from probe_kit.retention import RetentionTable, retention_table
+from probe_kit.extract import AskSettings, ExtractSettings, ask_run, extract_run
+from probe_kit.extract.prompts import TEMPLATES
+from probe_kit.intervene import ImageSwap, ReplaySource, run_intervention
+from probe_kit.retention import RetentionRow, RetentionTable, retention_table
+from probe_kit.retention.columns.columns import FOLLOWS, MARGIN
+from probe_kit.retention.columns.sentences import readable, verdict
+from probe_kit.retention.columns.text import exceeds_text, retention_value
 from probe_kit.retention.displays import layer_curve
 from probe_kit.retention.report import write_report
 from probe_kit.runs import Run
 from probe_kit.runs.layout import VIDEOS
 from probe_kit.suite import Suite, build_suite
+from probe_kit.train import ProbeResults, train_probes
+
+NamedProgress = Callable[[str], Callable[..., None]]
+Truth = str
+"""A behaviour of `UseVerdict`, or `does not decide`, `absent`, `known` or `not shown`."""
+Agreement = Literal["true", "undecided", "wrong"]
+"""Of a verdict with the truth. An undecided verdict claims no behaviour: it is neither true nor wrong."""
+DOES_NOT_DECIDE: Truth = "does not decide"
+"""What is true of an action expert of random weights: nothing was trained to choose a side by the answer.
+
+Nothing was trained to ignore the answer either, and random weights pass some of it on. How much is not known.
+"""
+COMPATIBLE: Mapping[Truth, tuple[str, ...]] = {
+    DOES_NOT_DECIDE: (
+        "not used", "moves with it, does not decide", "against: moves with it, does not decide",
+    ),
+}  # fmt: skip
+"""By truth, every verdict that is true with it; of all others the truth's own words alone."""
+
+
+@dataclass(frozen=True)
+class Organism:
+    """A model by its name, and the verdict that is true of it per category; `absent` or `not shown` if not named.
+
+    folder: what its run is called. answers: it answers questions and does not act. max_steps: actions per
+    episode; None for as many as its scene has. view: the tokens whose mean is probed.
+    """
+
+    name: str
+    folder: str
+    model: str
+    random_weights: bool = False
+    weights_seed: int = 0
+    truth: tuple[tuple[str, Truth], ...] = ()
+    answers: bool = False
+    max_steps: int | None = None
+    view: str = "mean"
+
+    def expected(self, category: str) -> Truth:
+        """Return what is true of a category by construction."""
+        return dict(self.truth).get(category, "not shown" if self.answers else "absent")
+
+
+TRAINED = Organism(
+    "trained", "run", "pi0-tiny", truth=(("color", "used"), ("shape", "used"), ("state", "not used"))
+)
+STATE_USED = Organism(
+    "State used",
+    "run-state-used",
+    "pi0-tiny-state",
+    truth=(("color", "used"), ("shape", "used"), ("state", "used")),
+)
+SHORT = 8
+"""Actions of organisms that were not trained to act: two inferences; their verdict needs only the first."""
+EARLY = Organism(
+    "early",
+    "run-early",
+    "pi0-tiny-early",
+    truth=(("color", DOES_NOT_DECIDE), ("shape", DOES_NOT_DECIDE), ("state", DOES_NOT_DECIDE)),
+    max_steps=SHORT,
+    view="mean:language",  # where a VLM answers; nothing was trained that would take it from there
+)
+UNTRAINED_NETWORK = Organism(
+    "untrained network", "run-untrained", "pi0-tiny", random_weights=True, max_steps=SHORT
+)
+OTHER_TWINS = tuple(
+    replace(UNTRAINED_NETWORK, name=f"untrained network {seed}", folder=f"run-untrained-{seed}", weights_seed=seed)
+    for seed in (1, 2)
+)
+ORGANISMS = (TRAINED, STATE_USED, EARLY, UNTRAINED_NETWORK, *OTHER_TWINS)
+VLM = Organism(
+    "vlm",
+    "run-vlm",
+    "vlm-tiny",
+    truth=(("color", "known"), ("shape", "known"), ("state", "known"), ("traffic", "known")),
+    answers=True,
+)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """The verdict of the instrument on one organism and category, and the truth."""
+
+    organism: str
+    category: str
+    expected: Truth
+    measured: Truth
+    row: RetentionRow
+
+    @property
+    def agreement(self) -> Agreement:
+        """The verdict compared with the truth: true, undecided or wrong."""
+        if self.measured in COMPATIBLE.get(self.expected, (self.expected,)):
+            return "true"
+        return "undecided" if self.measured == "undecided" else "wrong"
+
+
+def settings_of(organism: Organism, suite: Suite) -> ExtractSettings:
+    """Return the settings with which an organism that acts plays `suite`."""
+    return ExtractSettings(
+        organism.model,
+        suite=suite.folder,
+        random_weights=organism.random_weights,
+        weights_seed=organism.weights_seed,
+        max_steps=organism.max_steps,
+        video="first",
+    )
+
+
+def source_of(organism: Organism, suite: Suite) -> ReplaySource:
+    """Return where interventions find the organism and its pictures; of an untrained network its own seed."""
+    return ReplaySource(suite.folder, weights_seed=organism.weights_seed)
+
+
+def probed(
+    organism: Organism,
+    suite: Suite,
+    folder: Path,
+    permutations: int,
+    stage: NamedProgress,
+    untrained: Run | None = None,
+) -> tuple[Run, ProbeResults]:
+    """The organism's run on `suite`, in `folder`, and its probes, compared with random-features.
+
+    What exchanged pictures do is stored too, and finished work is reused. stage: gives a progress callback (done,
+    total, …) for a stage of this name. untrained: run of an untrained network, as a control.
+    """
+    run = extract_run(
+        settings_of(organism, suite), folder / organism.folder, progress=stage(f"episodes, {organism.name}")
+    )
+    progress = stage(f"probing sites, {organism.name}")
+    results = train_probes(
+        run,
+        views=(organism.view,),
+        permutations=permutations,
+        controls=("random-features",),
+        suite=suite.folder,
+        untrained=untrained,
+        progress=progress,
+    )
+    progress = stage(f"exchanging pictures, {organism.name}")
+    run_intervention(run, ImageSwap(), source_of(organism, suite), progress=progress)
+    return run, results
+
+
+def answered(organism: Organism, suite: Suite, folder: Path, stage: NamedProgress) -> Run:
+    """Return the run of a VLM on `suite`, in the prompt nearest to an instruction; finished work is reused."""
+    settings = AskSettings(organism.model, suite=suite.folder, prompt=TEMPLATES["p2"])
+    return ask_run(settings, folder / organism.folder, progress=stage(f"questions, {organism.name}"))
+
+
+def compare(suite: Suite, folder: Path, permutations: int, stage: NamedProgress) -> list[Finding]:
+    """Judge the VLM and every organism on `suite`; the first untrained network is a control of all others.
+
+    Arguments as of `probed`.
+    """
+    control, _ = probed(UNTRAINED_NETWORK, suite, folder, permutations, stage)
+    runs = [(VLM, answered(VLM, suite, folder, stage))]
+    runs += [
+        (
+            organism,
+            control
+            if organism == UNTRAINED_NETWORK
+            else probed(organism, suite, folder, permutations, stage, control)[0],
+        )
+        for organism in ORGANISMS
+    ]
+    return findings(runs)
+
+
+def findings(runs: Sequence[tuple[Organism, Run]]) -> list[Finding]:
+    """Return the verdicts on every organism's run, and the truth, one for each category."""
+    rows = [(organism, row) for organism, run in runs for row in retention_table([run]).rows]
+    trained_acts = any(verdict(row) == "used" for organism, row in rows if organism == TRAINED)
+    return [
+        Finding(organism.name, row.category, organism.expected(row.category), measured(row, trained_acts), row)
+        for organism, row in rows
+    ]
+
+
+def measured(row: RetentionRow, another_acts: bool) -> Truth:
+    """The row's verdict. Where only a category that follows is wanting, another organism's counts as one.
+
+    another_acts: whether the trained one acts on some category. It has the same scene, questions and network, so
+    that following would be seen in every other; a policy that was not trained to act follows nowhere by itself.
+    """
+    use, reading = row.image_swap.use, readable(row)
+    if use is None or (use.is_bounded and reading in ("absent", "not shown")):
+        return "absent" if reading == "not shown" else reading  # so few items cannot show that it is absent
+    if use.lacks_control and another_acts:
+        return "not used"
+    return f"{'against: ' * use.reversed}{use.behaviour}"
+
+
+def organism_table(findings: Sequence[Finding]) -> Table:
+    """One line per organism and category: the truth, the verdict, and the numbers behind it."""
+    notes = [count_agreements([finding.agreement for finding in findings])]
+    notes.append("accuracies in %, retention with its interval")
+    if any(finding.expected == DOES_NOT_DECIDE for finding in findings):
+        either = " and ".join(f"*{verdict}*" for verdict in COMPATIBLE[DOES_NOT_DECIDE][:2])
+        notes.append(f"*{DOES_NOT_DECIDE}*: the action expert was not trained; {either} are both true of it")
+    numbers = ("SR %", "± Δ", "follow / reversal %", "backbone", "p", "exceeds", "action", "retention [95 %]")
+    headings = grouped(
+        ("", ("policy",)),
+        ("Verdicts", ("category", "expected", "measured", "agreement")),
+        ("What they rest on", numbers),
+    )
+    return Table.of("Model organisms", headings, list(map(_cells, findings)), notes=notes)
+
+
+def count_agreements(agreements: Sequence[Agreement]) -> str:
+    """`20 of 24 verdicts are true, 4 undecided, none is wrong`."""
+    true, left_open, wrong = (agreements.count(agreement) for agreement in get_args(Agreement))
+    return (
+        f"{true} of {len(agreements)} verdicts are true, {left_open} undecided, "
+        f"{wrong or 'none'} {'are' if wrong > 1 else 'is'} wrong"
+    )
+
+
+def _cells(finding: Finding) -> tuple[Cell | str, ...]:
+    row = finding.row
+    return (
+        finding.organism, finding.category, finding.expected, finding.measured,
+        Cell(finding.agreement, alarm=finding.agreement == "wrong"),
+        percent(row.success.sr), MARGIN.text(row), FOLLOWS.text(row), percent(row.backbone.score),
+        number(row.backbone.p_fwe, 3), exceeds_text(row.backbone), percent(row.action.score), retention_value(row),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -69,7 +311,7 @@ class Demo:
 
 
 def compare_organisms(folder: Path, stage: NamedProgress) -> list[Finding]:
-    """Put the questions of `FULL` to policies of which the truth is known; see `probe_kit.demo.organisms`."""
+    """Put the questions of `FULL` to policies of which the truth is known; see `probe_kit.demo.pipeline`."""
     return compare(_questions(folder, FULL, stage), folder, FULL.permutations, stage)
 
 

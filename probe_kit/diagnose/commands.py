@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from probe_kit.intervene import ReplaySource
     from probe_kit.intervene.settings import PairRow
     from probe_kit.runs import Run
-    from probe_kit.runs.location import Location
+    from probe_kit.runs.store import Location
 
 _ACTING = frozenset(
     {"model", "execute", "rotation", "no_act", "captured_calls", "later_views", "tokens", "frames", "video"}

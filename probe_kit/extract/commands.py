@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from probe_kit.extract import Extraction
     from probe_kit.extract.settings import Settings
     from probe_kit.runs import Run
-    from probe_kit.runs.location import Location
+    from probe_kit.runs.store import Location
 
 
 class Sizes(tuple[tuple[int, int], ...]):
@@ -154,8 +154,8 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
     from rich.table import Table
 
     from probe_kit.extract.plan import space_needed
-    from probe_kit.runs.disk import in_units
-    from probe_kit.runs.growth import growth_at
+    from probe_kit.runs.run_folders import in_units
+    from probe_kit.runs.writer import growth_at
 
     plan, identity, free = extraction.plan, extraction.identity(), location.free_bytes()
     growth = growth_at(location, plan.to_json()["episodes"])
@@ -214,7 +214,7 @@ def check_size(extraction: "Extraction", location: "Location", agreed: bool) -> 
     """Raise DiskSpaceError for more than 64 GB, unless that was agreed to."""
     from probe_kit.errors import DiskSpaceError
     from probe_kit.extract.plan import space_needed
-    from probe_kit.runs.disk import in_units
+    from probe_kit.runs.run_folders import in_units
 
     needed = sum(space_needed(extraction.further_plan(location), extraction.settings).values())
     if needed > LARGE and not agreed:
@@ -292,7 +292,7 @@ def _next_command(run: "Run") -> str:
 
 def print_input_notes(run: "Run") -> None:
     """Say which inputs did not change the first output, in yellow."""
-    from probe_kit.runs.certificates import input_notes
+    from probe_kit.runs.provenance import input_notes
 
     for note in input_notes(run.certificate):
         say(marked("[yellow]{}; [bold]probe-kit diagnose {}[/] says where it is lost[/]", note, run.location))

@@ -19,8 +19,7 @@ from probe_kit.extract.settings import Settings
 from probe_kit.extract.sources.kinds import SOURCES, kind_of, kinds_typed
 from probe_kit.hooks.contract.declared import read_pairs
 from probe_kit.runs.layout import RUN_FILE
-from probe_kit.runs.origin import is_here, option_files
-from probe_kit.runs.reader import origin_of
+from probe_kit.runs.reader import is_here, option_files, origin_of
 
 if TYPE_CHECKING:
     from probe_kit.extract.sources.source import SourceSettings

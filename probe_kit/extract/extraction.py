@@ -31,17 +31,14 @@ from probe_kit.extract.sources.source import Source, raise_together
 from probe_kit.hashing import canonical_json, sha256_json
 from probe_kit.hooks.registry import find_family, get_family
 from probe_kit.runs.commits import failure_key
-from probe_kit.runs.disk import check_if_full
-from probe_kit.runs.growth import check_other_settings, further_rows
-from probe_kit.runs.label import label_run
 from probe_kit.runs.layout import RUN_FILE, StoredStream
-from probe_kit.runs.location import Location
 from probe_kit.runs.provenance import provenance_here
-from probe_kit.runs.root import read_root
+from probe_kit.runs.root import label_run, read_root
 from probe_kit.runs.run import Run, open_run
-from probe_kit.runs.sealing import seal
-from probe_kit.runs.store import locate
-from probe_kit.runs.writer import RunWriter
+from probe_kit.runs.run_folders import check_if_full
+from probe_kit.runs.store import Location, locate
+from probe_kit.runs.verify import seal
+from probe_kit.runs.writer import RunWriter, check_other_settings, further_rows
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Model

@@ -201,7 +201,7 @@ def weights_needed(
     parameters, whose stored precision is not known.
     """
     from probe_kit.hooks.registry import get_family
-    from probe_kit.runs.disk import in_units
+    from probe_kit.runs.run_folders import in_units
 
     family = get_family(model)
     if family is None or family.weights_bytes(options) is None:

@@ -66,7 +66,7 @@ def _fields_of(part: str, values: Any) -> dict[str, Any]:
 def _checked_label(label: str | None) -> str | None:
     """The label. Raises UsageError for one that tables cannot show."""
     if label is not None:
-        from probe_kit.runs.label import check_label
+        from probe_kit.runs.root import check_label
 
         check_label(label)
     return label

@@ -22,7 +22,6 @@ from probe_kit._system.bounded_files import open_arrays
 from probe_kit.errors import NoInterventionsError
 from probe_kit.intervene.settings import FORMAT, key_of
 from probe_kit.runs.layout import INTERVENTIONS
-from probe_kit.runs.location import Location
 from probe_kit.runs.reader import RunReader
 from probe_kit.runs.records import as_json
 from probe_kit.runs.results import (
@@ -33,6 +32,7 @@ from probe_kit.runs.results import (
     tidy_bundle,
     write_bundle,
 )
+from probe_kit.runs.store import Location
 
 CLEAN, IMAGE_SWAP, INSTRUCTION_SWAP, NOISE = "clean", "image_swap", "instruction_swap", "noise"
 """Conditions: as in the run, the two pictures swapped, the counterpart's instruction, the noise drawn anew."""

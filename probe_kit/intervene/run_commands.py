@@ -108,8 +108,8 @@ def show(
     """
     from probe_kit.intervene.results.inventory import listed_interventions
     from probe_kit.runs import label_run, open_run
-    from probe_kit.runs.certificates import input_notes
     from probe_kit.runs.layout import INTERVENTIONS
+    from probe_kit.runs.provenance import input_notes
     from probe_kit.runs.results import unfinished_bundles
     from probe_kit.train.commands import facts_table
     from probe_kit.train.results.inventory import inventory

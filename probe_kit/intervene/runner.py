@@ -22,8 +22,7 @@ from probe_kit.intervene.sessions.session import LoadPolicy, Progress, ReplaySes
 from probe_kit.intervene.settings import PER_STEP, check_run_fits, has_sides, key_of, settings_of
 from probe_kit.intervene.spread import displacements_toward, sizes
 from probe_kit.runs.layout import INTERVENTIONS
-from probe_kit.runs.results import tidy_bundle
-from probe_kit.runs.resume_pieces import Pieces
+from probe_kit.runs.results import Pieces, tidy_bundle
 from probe_kit.runs.run import Run
 from probe_kit.statistics.sufficiency import groups_for_not_used
 

@@ -479,7 +479,7 @@ def save_all(exhibits: "Sequence[ReportFigure]", folder: Path, details: bool = F
 
 def say_report(written: Path) -> None:
     """Say where a report is, and how large."""
-    from probe_kit.runs.disk import in_units
+    from probe_kit.runs.run_folders import in_units
 
     say(f"report: {written} ({in_units(written.stat().st_size)})")
 

@@ -38,8 +38,8 @@ from probe_kit.retention.rows.build import RowSettings, RowWithEstimates, mean_r
 from probe_kit.retention.rows.outcome_rules import can_be_judged, check_epsilons, under_rule
 from probe_kit.retention.rows.probe_parts import label_notes, label_rows, read_labels
 from probe_kit.retention.rows.row import RetentionRow
-from probe_kit.runs.location import Location
 from probe_kit.runs.reader import RunReader, check_sides
+from probe_kit.runs.store import Location
 from probe_kit.statistics.sufficiency import ABSENT_BELOW
 from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.train.results.store import is_current, load_side_results

@@ -9,13 +9,12 @@ from probe_kit._system.imports import lazy_names
 
 if TYPE_CHECKING:
     from probe_kit.runs.action_errors import ActionErrors, compare_actions
-    from probe_kit.runs.copying import copy_run
-    from probe_kit.runs.export.export import export_run
-    from probe_kit.runs.label import label_run
+    from probe_kit.runs.contents import copy_run
+    from probe_kit.runs.export import export_run
+    from probe_kit.runs.root import label_run
     from probe_kit.runs.run import Run, open_run
-    from probe_kit.runs.sealing import seal
     from probe_kit.runs.store import Location, locate
-    from probe_kit.runs.verify import Audit, verify_run
+    from probe_kit.runs.verify import Audit, seal, verify_run
 
 __all__ = [
     "ActionErrors",
@@ -40,12 +39,12 @@ __getattr__, __dir__ = lazy_names(
         "Location": "store",
         "Run": "run",
         "compare_actions": "action_errors",
-        "copy_run": "copying",
-        "export_run": "export.export",
-        "label_run": "label",
+        "copy_run": "contents",
+        "export_run": "export",
+        "label_run": "root",
         "locate": "store",
         "open_run": "run",
-        "seal": "sealing",
+        "seal": "verify",
         "verify_run": "verify",
     },
 )

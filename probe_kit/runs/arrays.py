@@ -1,11 +1,21 @@
-"""The arrays of a run: shapes, chunks, codec, and where the inner chunks of a shard lie.
+"""The arrays of a run: shapes, chunks, codec, where the inner chunks of a shard lie, and the reading of rows.
 
 Arrays of tokens and of later inferences hold the bits of bfloat16 as uint16, because Zarr v3 has no bfloat16.
+Inputs of recorded frames lie beside the streams, one chunk per row of the plan:
+
+    data.zarr/inputs/state        float32 (episode, call, number), as recorded
+    data.zarr/inputs/action       float32 (episode, call, step, number): the recorded actions from the frame on
+    data.zarr/inputs/prediction   float32 (episode, call, step, number), in the checkpoint's own units
+    data.zarr/inputs/columns      float64 (episode, call, column): timestamp, reward … as the data set has them
+    data.zarr/inputs/pixels       uint8 (episode, call, camera, y, x, colour): 32 × 32
+
+Rows behind the last frame of a stretch are not numbers; of pixels they are zero.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from threading import Lock
 from typing import Any
 
@@ -15,14 +25,17 @@ from numpy.typing import NDArray
 from zarr.abc.codec import BytesBytesCodec
 from zarr.abc.store import Store
 from zarr.codecs import BloscCodec, BytesCodec, Crc32cCodec, ShardingCodec
-from zarr.core.array_spec import ArraySpec
+from zarr.core.array_spec import ArrayConfigLike, ArraySpec
 from zarr.core.buffer import Buffer
 from zarr.core.metadata import ArrayV3Metadata
+from zarr.errors import ChunkNotFoundError
 from zarr.registry import register_codec
 
+from probe_kit._system.table_cells import Cell
 from probe_kit.errors import RunDamagedError
-from probe_kit.runs.layout import LATER, MEAN_VIEW, LaterViews, StoredStream
-from probe_kit.runs.location import MOST_OBJECT_BYTES
+from probe_kit.hooks.contract.sites import PADDING, plays
+from probe_kit.runs.folder import MOST_OBJECT_BYTES
+from probe_kit.runs.layout import CLASSES, INPUTS, LATER, MEAN_VIEW, TRUTHS, LaterViews, StoredStream
 
 ENTRY, CHECKSUM = 16, 4
 """Bytes: offset and length of a chunk as two uint64, and the crc32c after all entries, in the
@@ -197,3 +210,183 @@ def inner_chunks(shard: bytes, count: int) -> list[slice]:
     """Return the bytes of the `count` inner chunks of a whole shard, then those of its index."""
     index = slice(len(shard) - index_bytes(count), len(shard))
     return [*chunk_slices(shard[index]), index]
+
+
+Spans = Sequence[tuple[str, int, int]]
+_BLOCK_BYTES = 1 << 24
+"""Rows that are read in order come this many bytes at a time: beginning a request takes longer than reading."""
+_DAMAGE = (ChunkNotFoundError, ValueError, RuntimeError)
+"""What Zarr and its codecs raise for missing and for changed bytes."""
+
+
+@dataclass(frozen=True)
+class Rows:
+    """An array with one row per planned episode, seen through the committed ones.
+
+    numbers: the plan's number of every committed episode, in order.
+    """
+
+    array: "zarr.Array[Any]"
+    numbers: Sequence[int]
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def __getitem__(self, position: int) -> NDArray[Any]:
+        """All of one episode."""
+        return self.read(position, ())
+
+    def __iter__(self) -> Iterator[NDArray[Any]]:
+        """All of every episode, in order, as `between`."""
+        return self.between(0, len(self))
+
+    def between(self, start: int, stop: int) -> Iterator[NDArray[Any]]:
+        """All of the episodes from `start` up to `stop`, in order; several are read at a time.
+
+        Raises RunDamagedError at a damaged one.
+        """
+        per_row = math.prod(self.array.shape[1:]) * self.array.dtype.itemsize
+        size = max(1, _BLOCK_BYTES // max(1, per_row))
+        for first in range(start, stop, size):
+            yield from self._block(range(first, min(first + size, stop)))
+
+    def _block(self, positions: range) -> Iterator[NDArray[Any]]:
+        try:
+            numbers = [self.numbers[position] for position in positions]
+            # Of an array with much room, a slice is quick; other indexing makes a table of all its chunks.
+            consecutive = numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+            block = np.asarray(
+                self.array[numbers[0] : numbers[-1] + 1] if consecutive else self.array.oindex[np.array(numbers)]
+            )
+        except (*_DAMAGE, RunDamagedError):
+            yield from (self[position] for position in positions)  # up to the damaged one, which is then named
+        else:
+            yield from block
+
+    def read(self, position: int, index: tuple[Any, ...]) -> NDArray[Any]:
+        """Part of one episode. Raises RunDamagedError if bytes are missing or fail their checksum."""
+        number = self.numbers[position]
+        try:
+            return np.asarray(self.array[(number, *index)])
+        except _DAMAGE as error:
+            raise RunDamagedError(
+                f"{self.array.path or self.array.name} of episode {number} cannot be read: {error}. Delete "
+                f"commits/{number:08d}.json and run the same `probe-kit extract` again to redo the episode"
+            ) from error
+
+
+@dataclass(frozen=True)
+class TokenBlock:
+    """Tokens `start` up to `start + T` of one site: values (E, T, D) float32 and mask (E, T) bool.
+
+    Values outside the mask are zero.
+    """
+
+    start: int
+    values: NDArray[np.float32]
+    mask: NDArray[np.bool_]
+
+
+def role_mask(spans: Sequence[Spans], tokens: int, role: str | None) -> NDArray[np.bool_]:
+    """(E, tokens) bool: positions of `role`, or of all but padding, from one sequence of spans per episode."""
+    mask = np.zeros((len(spans), tokens), bool)
+    for row, episode in enumerate(spans):
+        for name, start, stop in episode:
+            mask[row, start:stop] = name != PADDING if role is None else plays(name, role)
+    return mask
+
+
+def token_blocks(rows: Rows, at: tuple[int, ...], mask: NDArray[np.bool_], block: int) -> Iterator[TokenBlock]:
+    """Blocks of `block` tokens at `at` (call, [iteration,] layer); a block that `mask` never touches is left out.
+
+    Reads only the inner chunks it needs, one block of all episodes at a time.
+    """
+    for start in range(0, mask.shape[1], block):
+        block_mask = mask[:, start : start + block]
+        if not block_mask.any():
+            continue
+        values = np.zeros((*block_mask.shape, rows.array.shape[-1]), np.float32)
+        for position in np.flatnonzero(block_mask.any(axis=1)):
+            bits = rows.read(position, (*at, slice(start, start + block)))
+            # Not a product: padding may hold NaN or infinity, and NaN times 0 is NaN.
+            values[position] = np.where(block_mask[position, :, None], decode_bfloat16(bits), 0)
+        yield TokenBlock(start, values, block_mask)
+
+
+_TYPES = {"columns": "float64", "pixels": "uint8"}
+"""All others are float32. Columns hold timestamps and indices, of which float32 has too few digits."""
+
+
+def create_inputs(store: Store, calls: int, shapes: Mapping[str, list[int]], codec: str) -> None:
+    """Create the arrays. shapes: by kind, of one inference."""
+    root = zarr.open_group(store, mode="a", zarr_format=3)
+    group = root.create_group(INPUTS)
+    for name, shape in shapes.items():
+        dtype = np.dtype(_TYPES.get(name, "float32"))
+        group.create_array(
+            name,
+            shape=(ROOM, calls, *shape),
+            chunks=(1, calls, *shape),
+            dtype=dtype,
+            fill_value=0 if dtype.kind == "u" else np.nan,
+            compressors=codecs(codec, typesize=dtype.itemsize),
+            config={"write_empty_chunks": True},
+        )
+
+
+def write_inputs(store: Store, number: int, inputs: Mapping[str, NDArray[Any]], config: ArrayConfigLike) -> None:
+    """Store the inputs (n, …) by kind of the row `number`, n at most its calls."""
+    for name, values in inputs.items():
+        array: zarr.Array[Any] = zarr.open_array(
+            store, path=f"{INPUTS}/{name}", mode="r+", zarr_format=3, config=config
+        )
+        row = np.full(array.shape[1:], array.fill_value, array.dtype)
+        row[: len(values)] = values
+        array[number] = row
+
+
+class StoredInputs:
+    """The inputs of the committed rows of a run, in their order.
+
+    kinds: that are stored. columns: names of the numbers of `columns`. names: of those of `state` and `action`.
+    truths: columns that are truth values, stored as 0 and 1. classes: by column of texts, the texts of which it
+    stores the position.
+    """
+
+    def __init__(self, store: Store, numbers: list[int], dataset: Mapping[str, Any]) -> None:
+        self._store, self._numbers = store, numbers
+        self.kinds: tuple[str, ...] = tuple(dataset["inputs"])
+        self.columns: tuple[str, ...] = tuple(dataset["columns"])
+        self.names: dict[str, tuple[str, ...]] = {name: tuple(names) for name, names in dataset["names"].items()}
+        self.truths: tuple[str, ...] = self.names.pop(TRUTHS, ())
+        self.classes: dict[str, tuple[str, ...]] = {
+            name: self.names.pop(CLASSES + name) for name in self.columns if CLASSES + name in self.names
+        }
+
+    def read(self, kind: str) -> NDArray[Any]:
+        """(E, C, …) of one kind. Raises KeyError for one that is not stored, RunDamagedError."""
+        if kind not in self.kinds:
+            raise KeyError(kind)
+        rows = Rows(open_array(self._store, f"{INPUTS}/{kind}"), self._numbers)
+        return np.stack(list(rows))
+
+    def row(self, kind: str, position: int) -> NDArray[Any]:
+        """Return (C, …) of one kind of the row at a position. Raises KeyError as `read` does, RunDamagedError."""
+        if kind not in self.kinds:
+            raise KeyError(kind)
+        return Rows(open_array(self._store, f"{INPUTS}/{kind}"), self._numbers)[position]
+
+    def column(self, name: str) -> NDArray[np.float64]:
+        """(E, C) one column of the data set. Raises KeyError."""
+        if name not in self.columns:
+            raise KeyError(name)
+        values: NDArray[np.float64] = self.read("columns")[..., self.columns.index(name)]
+        return values
+
+    def cell(self, name: str, value: float) -> Cell:
+        """Return a number of a column as its source had it: a number, truth value or text; None if not finite."""
+        if not np.isfinite(value):
+            return None
+        if texts := self.classes.get(name):
+            return texts[int(value)]
+        return bool(value) if name in self.truths and value in (0, 1) else value

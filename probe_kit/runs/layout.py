@@ -2,11 +2,11 @@
 
 RUN/
   run.json           the root: settings, streams, hashes of all metadata, and its own, see `root`
-  label.json         what tables call the run; may be changed, see `label`
+  label.json         what tables call the run; may be changed, see `root`
   left-out.json      only in a copy without activations: what it left out, see `root`
   plan/<n>.json      the episodes in order, each with its item's content hash; a further record when the run grows
   commits/<n>.json   one per finished episode, written last: hashes of its objects, and its own
-  times/<n>.json     seconds that an episode took, which no other hash covers, see `seconds`
+  times/<n>.json     seconds that an episode took, which no other hash covers, see `commits`
   failed/<n>.json    why an episode was given up; removed when it is tried again
   certificate.json   what was really loaded, and what was checked
   data.zarr/         <stream>/pooled; with --tokens all <stream>/tokens; with --later-views mean <stream>/later

@@ -1,23 +1,139 @@
-"""The protocol of a run: what probes, tables and interventions read of it, in memory or stored; and its checks."""
+"""The protocol of a run, in memory or stored: what probes, tables and interventions read of it; and its checks."""
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit._system.counting import counted
+from probe_kit._terminal.notebook import facts_html
 from probe_kit.errors import UsageError
+from probe_kit.hooks.contract.card import EMBEDDED, streams_text
 from probe_kit.hooks.contract.sites import Site, Stream
-from probe_kit.runs.layout import DATASET, ENVIRONMENT
-from probe_kit.runs.origin import Origin
+from probe_kit.runs.layout import CAPTURE_ONLY, DATASET, ENVIRONMENT
+from probe_kit.suite.categories import check_categories
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from probe_kit.runs.inputs import StoredInputs
+    from probe_kit.runs.arrays import StoredInputs
     from probe_kit.runs.store import Location
+
+
+ORIGIN = "origin"
+"""Entry of a certificate."""
+SUITE = "suite"
+OF_SCENE = "scene."
+"""Beginning of the name of a file that a field of the scene gives."""
+
+
+class LoadedModel(Protocol):
+    """The model of a run's settings; see `ModelSettings`."""
+
+    @property
+    def family(self) -> str:
+        """Its name."""
+
+    @property
+    def options(self) -> Mapping[str, Any]:
+        """Options of the family."""
+
+    @property
+    def random_weights(self) -> bool:
+        """Whether random weights were requested."""
+
+    @property
+    def weights_seed(self) -> int:
+        """Seed of requested random weights."""
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Files and choices of one process that played episodes of a run; none is part of the run's identity.
+
+    files: absolute, by field of the source's settings, such as `suite`, `folder` or `scene.background`.
+    checkpoint: absolute folder, hub id, or a word of the family; empty if unknown. options: of the family, as they
+    were passed, files and folders absolute. random_weights: whether random weights were requested, which a file
+    that calls its weights random is not. weights_seed: of requested random weights. repositories: commits of
+    further repositories of the hub, by name, which a repetition reads again.
+    """
+
+    files: Mapping[str, str] = field(default_factory=dict)
+    checkpoint: str = ""
+    options: Mapping[str, Any] = field(default_factory=dict)
+    random_weights: bool = False
+    weights_seed: int = 0
+    repositories: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls,
+        model: LoadedModel,
+        files: Mapping[str, Path],
+        checkpoint: str,
+        repositories: Mapping[str, str] = MappingProxyType({}),
+    ) -> Self:
+        """Return the origin of a process. files: of its source. checkpoint, repositories: of the model's card."""
+        return cls(
+            files={name: _absolute(path) for name, path in files.items()},
+            checkpoint=_absolute(checkpoint) if is_here(checkpoint) else checkpoint,
+            options={**model.options, **{name: _absolute(path) for name, path in option_files(model).items()}},
+            random_weights=model.random_weights,
+            weights_seed=model.weights_seed,
+            repositories=dict(repositories),
+        )
+
+    @classmethod
+    def of_record(cls, record: Mapping[str, Any]) -> Self:
+        """Return the origin in the record of a process; an empty one where it has none."""
+        return cls(**record.get(ORIGIN, {}))
+
+    @property
+    def suite(self) -> str | None:
+        """The suite's folder; None for the embedded suite and for runs without one."""
+        return self.files.get(SUITE)
+
+    @property
+    def scene_files(self) -> dict[str, Path]:
+        """The files of the scene by its fields."""
+        return {
+            name.removeprefix(OF_SCENE): Path(path)
+            for name, path in self.files.items()
+            if name.startswith(OF_SCENE)
+        }
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values."""
+        return asdict(self)
+
+
+def option_files(model: LoadedModel) -> dict[str, Path]:
+    """Files and folders of this machine that options of a model name."""
+    from probe_kit.hooks.registry import get_family
+
+    family = get_family(model.family)
+    names = [option.name for option in (() if family is None else family.options) if option.is_path]
+    # The same text may be a word of the family, such as a data set's name.
+    return {name: Path(str(model.options[name])) for name in names if is_here(model.options.get(name))}
+
+
+def is_here(text: str | None) -> bool:
+    """Whether a setting, such as a checkpoint, is a folder or file of this machine."""
+    if text in (None, "", EMBEDDED):
+        return False
+    try:
+        return Path(str(text)).expanduser().exists()
+    except (OSError, RuntimeError):  # no path at all, or ~name of an unknown user
+        return False
+
+
+def _absolute(path: Path | str) -> str:
+    return str(Path(path).expanduser().absolute())
+
 
 SIDE = "side_correct"
 """The column of episodes whose question has a correct picture on one side."""
@@ -282,3 +398,72 @@ def reached_calls(run: RunReader) -> NDArray[np.bool_]:
     if not hasattr(run, "reached"):  # `ArrayRun` has one inference per row and no such method
         return np.ones((len(run.episodes), 1), bool)
     return np.stack([run.reached(call) for call in range(run.captured_calls)], axis=1)
+
+
+def select_items(
+    items: "pd.DataFrame", categories: Sequence[str] | None, per_category: int | None, where: str
+) -> list[str]:
+    """Ids of the first items of some categories, in the order of the plan.
+
+    items: as `Run.items`. categories: slugs, all by default. where: the run, for messages.
+    Raises UnknownCategoryError and UsageError, see `Run.only`.
+    """
+    categories_of_run = list(dict.fromkeys(items["category"].astype(str)))
+    selected = categories_of_run if categories is None else check_categories(categories, categories_of_run)
+    if not selected:
+        raise UsageError("no category selected. Name at least one, or leave `categories` out for all.")
+    item_ids: list[str] = []
+    for category in selected:
+        planned = items[items["category"] == category]
+        count = len(planned) if per_category is None else per_category
+        if not 0 < count <= len(planned):
+            raise UsageError(
+                f"items is {count}, but {where} plans {len(planned)} items of {category!r}; give a number from 1 "
+                f"to {len(planned)}, or play more with `probe-kit extract`"
+            )
+        _check_twins(planned, count, category)
+        item_ids += planned["item_id"].iloc[:count].tolist()
+    return item_ids
+
+
+def _check_twins(items: "pd.DataFrame", count: int, category: str) -> None:
+    """Raise UsageError if the first items hold one of two role-exchanged twins, and the others the other one."""
+    pairs = items["pair_id"]
+    separated = set(pairs.iloc[:count].dropna()) & set(pairs.iloc[count:].dropna())
+    if separated:
+        raise UsageError(
+            f"items is {count}, which would keep one of the role-exchanged twins {min(separated)!r} of "
+            f"{category!r} and drop the other. Give an even number."
+        )
+
+
+def run_text(run: RunReader) -> str:
+    """One line: model, suite, how much is there, where."""
+    random = ", RANDOM WEIGHTS" if run.random_weights else ""
+    random += ", CAPTURE ONLY (it did not act)" if CAPTURE_ONLY in _outcomes(run) else ""
+    return f"<Run {run.label}{random} on {run.suite}: {_episodes(run)}, at {run.location}>"
+
+
+def run_html(run: RunReader) -> str:
+    """Describe the run, how it went, and its folder."""
+    weights = "scripted, no weights" if run.weights_sha256 is None else f"sha256 {run.weights_sha256[:12]}"
+    facts = {
+        "suite": run.suite,
+        "weights": f"RANDOM ({weights})" if run.random_weights else weights,
+        "episodes": _episodes(run),
+        "outcomes": ", ".join(f"{name} {count}" for name, count in _outcomes(run).items()),
+        "streams": streams_text(run.streams.values()),
+        "at": run.location.name if Path(str(run.location)).is_absolute() else str(run.location),
+    }
+    return facts_html(f"Run of {run.label}", facts, "run.episodes is the table, run.column(site) one site of it")
+
+
+def _episodes(run: RunReader) -> str:
+    committed = len(run.episodes)
+    return f"{committed} episodes" if committed == run.planned else f"{committed} of {run.planned} episodes"
+
+
+def _outcomes(run: RunReader) -> dict[str, int]:
+    if run.episodes.empty:
+        return {}
+    return {str(name): int(count) for name, count in run.episodes["outcome"].value_counts().items()}

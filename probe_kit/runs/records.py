@@ -21,7 +21,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, PlainSerializer, Pr
 from probe_kit._system.bounded_files import parse_strict_json
 from probe_kit._system.complaints import in_words
 from probe_kit.errors import RunDamagedError
-from probe_kit.runs.location import Location
+from probe_kit.runs.store import Location
 
 HASH = "blake2b"
 """The part of a record that holds its hash, named as the hash is computed."""

@@ -1,28 +1,36 @@
-"""The root of a run: `run.json`, and the parts that belong to every run.
+"""The root of a run: `run.json`, the plan of its episodes, and its label.
 
-It holds settings and streams, the hash of every array's metadata, and its own hash, which is the run's identity:
-plans and commits name it, so that none counts in another run. Nothing in it grows: the selection of episodes is in
-`plans`.
+    run.json              settings, streams, hashes of all arrays' metadata, and its own: the run's identity
+    plan/00000000.json    the first selection of a suite: its episodes, their order, their whole suite
+    plan/<n>.json         the n-th growth: the episodes it adds, and the order of all of them
+    label.json            the name of the run in tables, which may be changed at any time
+
+Plans and commits name the identity, so that none counts in another run. `run.json` knows of no selection, so two
+runs of other items have one identity. A run grows by a further plan record; none is ever changed. Commits name the
+hash of the record that planned their episode. An episode keeps its number for ever; `order` is that of the same
+selection planned at once.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+import re
+from bisect import bisect_right
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import count
+from pathlib import Path
 from typing import Any, ClassVar, NoReturn
 
-from probe_kit.errors import (
-    ActivationsLeftOutError,
-    RunDamagedError,
-    RunNotFoundError,
-)
+from probe_kit.errors import ActivationsLeftOutError, RunDamagedError, RunNotFoundError, UsageError
 from probe_kit.hashing import sha256_json
 from probe_kit.runs.layout import (
     DATA,
     DATASET,
     ENVIRONMENT,
     INPUTS,
+    LABEL_FILE,
     LEFT_OUT_FILE,
     MEAN_VIEW,
+    PLANS,
     RUN_FILE,
     SCHEMA_VERSION,
     TRAJECTORY,
@@ -31,10 +39,152 @@ from probe_kit.runs.layout import (
     VectorKind,
     stored_inputs_of,
 )
-from probe_kit.runs.location import Location
-from probe_kit.runs.plans import Row, StoredPlan, plan_key, read_plans
 from probe_kit.runs.records import RESTORE, Record, Sum, Sums, expect, read_plain
 from probe_kit.runs.run_folders import what_to_open
+from probe_kit.runs.store import Location, locate
+
+Row = dict[str, Any]
+_NUMBERED = re.compile(rf"{PLANS}/[0-9]{{8}}\.json")
+_SELECTION = {"suite": dict, "categories": list, "items": int}
+
+
+class PlanRecord(Record):
+    """One selection. tokens: T by stream, where pooled views alone are stored. order: of all episodes so far."""
+
+    kind: ClassVar[str] = "plan"
+    run: str
+    record: int
+    selection: dict[str, Any]
+    suite_parent: str | None
+    tokens: dict[str, int]
+    episodes: list[Row]
+    order: list[int]
+
+
+@dataclass(frozen=True)
+class StoredPlan:
+    """All plan records of a run together.
+
+    rows: the episodes in order. selection, suite_parent, tokens: of the newest record, see `PlanRecord`. extents:
+    planned episodes after each record. hashes: of the records, which the commits of their episodes name.
+    """
+
+    rows: Sequence[Row] = ()
+    selection: Mapping[str, Any] = field(default_factory=dict)
+    suite_parent: str | None = None
+    tokens: Mapping[str, int] = field(default_factory=dict)
+    extents: tuple[int, ...] = ()
+    hashes: tuple[str, ...] = ()
+
+    def hash_of(self, number: int) -> str:
+        """Hash of the record that added the episode of this number."""
+        return self.hashes[bisect_right(self.extents, number)]
+
+
+def plan_key(record: int) -> str:
+    """The key of the plan record of this number; 0 is the first selection."""
+    return f"{PLANS}/{record:08d}.json"
+
+
+def count_plans(location: Location) -> int:
+    """Return the number of plan records of a run. A run that begins right now may have none."""
+    return next(record for record in count() if not location.exists(plan_key(record)))
+
+
+def grown_record(
+    run: str,
+    before: StoredPlan,
+    rows: Sequence[Row],
+    selection: Mapping[str, Any],
+    suite_parent: str | None,
+    tokens: Mapping[str, int],
+) -> PlanRecord:
+    """The record that adds to a plan those of `rows` that it lacks; `rows` hold all that it has.
+
+    run: identity. rows: of all episodes in their order; numbers of new ones are given here.
+    """
+    numbers = {row["episode_id"]: row["episode"] for row in before.rows}
+    added = [row for row in rows if row["episode_id"] not in numbers]
+    numbers |= {row["episode_id"]: len(before.rows) + position for position, row in enumerate(added)}
+    return PlanRecord(
+        run=run,
+        record=len(before.extents),
+        selection=dict(selection),
+        suite_parent=suite_parent,
+        # A later selection may have shorter instructions only; the arrays of before keep their length.
+        tokens={name: max(length, before.tokens.get(name, 0)) for name, length in tokens.items()},
+        episodes=[{**row, "episode": numbers[row["episode_id"]]} for row in added],
+        order=[numbers[row["episode_id"]] for row in rows],
+    )
+
+
+def read_plans(location: Location, run: str, check_row: Callable[[Row, str], None]) -> StoredPlan:
+    """All plan records together; without any rows for a run that has none yet.
+
+    run: its identity. check_row: raises for a row that is none, given its file's name.
+    Raises RunDamagedError if a record is missing, was changed, or belongs elsewhere.
+    """
+    plan, by_number = StoredPlan(), dict[int, Row]()
+    for number in count():
+        name = f"{location}/{plan_key(number)}"
+        try:
+            raw = location.read(plan_key(number))
+        except FileNotFoundError:
+            break
+        record = PlanRecord.parse(raw, name, RESTORE, run=run, record=number)
+        _check_selection(record.selection, name)
+        for row in record.episodes:
+            check_row(row, name)
+            by_number[row["episode"]] = row
+        _check_order(record, len(plan.rows), by_number, name)
+        rows = [by_number[episode] for episode in record.order]
+        plan = StoredPlan(
+            rows, record.selection, record.suite_parent, record.tokens,
+            (*plan.extents, len(rows)), (*plan.hashes, record.hash),
+        )  # fmt: skip
+    missing = plan_key(len(plan.extents))
+    if later := [key for key in location.keys(PLANS) if _NUMBERED.fullmatch(key) and key > missing]:
+        raise RunDamagedError(f"{location}/{missing} is missing, though {later[0]} is there. {RESTORE}")
+    return plan
+
+
+def _check_selection(selection: Mapping[str, Any], name: str) -> None:
+    """Raise RunDamagedError unless it is a selection of a suite, of recordings, or of an environment."""
+    where = f"{name}: the selection"
+    for source in ("recording", "played"):
+        if source in selection:
+            expect(selection, {source: dict}, where, RESTORE)
+            expect(selection[source], {"name": str, "episodes": list}, where, RESTORE)
+            return
+    expect(selection, _SELECTION, where, RESTORE)
+    expect(selection["suite"], {"identity": str, "content_sha256": str, "seed_text": str}, where, RESTORE)
+    if "wordings" in selection:
+        expect(selection, {"wordings": dict}, where, RESTORE)
+        expect(selection["wordings"], {"names": list}, where, RESTORE)
+
+
+def _check_order(record: PlanRecord, before: int, by_number: Mapping[int, Row], name: str) -> None:
+    """Raise RunDamagedError unless new episodes are numbered on from `before`, and all of them have a place."""
+    numbers = [row["episode"] for row in record.episodes]
+    ids = {row["episode_id"] for row in by_number.values()}
+    expected = list(range(before + len(numbers)))
+    if numbers != expected[before:] or sorted(record.order) != expected or len(ids) != len(expected):
+        raise RunDamagedError(f"{name} numbers or orders its episodes in another way than plans do. {RESTORE}")
+
+
+def while_growing[Result](location: Location, read: Callable[[], Result]) -> Result:
+    """The result of `read`, called again if the run grew meanwhile: parts of two states do not fit together.
+
+    Raises what `read` raises.
+    """
+    while True:
+        before = count_plans(location)
+        try:
+            return read()
+        except RunDamagedError:
+            if count_plans(location) == before:
+                raise
+
 
 _SETTINGS = {"model": str, "captured_calls": int, "tokens": str, "codec": str}
 """The settings of every run, and their types."""
@@ -312,3 +462,37 @@ def _read_streams(stored: list[Any], name: str) -> dict[str, StoredStream]:
     if len({stream.name for stream in streams}) < len(streams):
         raise RunDamagedError(f"{name} describes two streams of one name. {RESTORE}")
     return {stream.name: stream for stream in streams}
+
+
+LONGEST_LABEL = 200
+
+
+class Label(Record):
+    """`label.json`: the label, and the identity of the run that it belongs to."""
+
+    kind: ClassVar[str] = "label"
+    run: str
+    label: str
+
+
+def label_run(path: Path | str | Location, label: str) -> None:
+    """Give the run at `path` another label; nothing else of it changes.
+
+    label: 1 to 200 printable characters. Raises UsageError for another label, RunNotFoundError if there is no run,
+    RunDamagedError if `run.json` was changed.
+    """
+    root = read_root(locate(path))
+    check_label(label)
+    root.location.write(LABEL_FILE, Label(run=root.identity, label=label).to_bytes())
+
+
+def check_label(label: str) -> None:
+    """Raise UsageError unless tables can call a run so."""
+    if not (label.isprintable() and 0 < len(label) <= LONGEST_LABEL):
+        raise UsageError(f"label is {label[:LONGEST_LABEL]!r}; expected 1 to {LONGEST_LABEL} printable characters")
+
+
+def read_label(root: Root) -> str:
+    """The label of a run. Raises RunDamagedError if its record is missing, was changed, or is of another run."""
+    advice = f"Write it anew: `probe-kit run show {root.location} --label LABEL`"
+    return Label.read(root.location, LABEL_FILE, advice, run=root.identity).label

@@ -21,20 +21,27 @@ from probe_kit.errors import (
     UsageError,
 )
 from probe_kit.hooks.contract.sites import Site, Stream, resolve_view
-from probe_kit.runs.arrays import decode_bfloat16, open_array
-from probe_kit.runs.certificates import read_certificate
+from probe_kit.runs.arrays import (
+    Rows,
+    StoredInputs,
+    TokenBlock,
+    decode_bfloat16,
+    open_array,
+    role_mask,
+    token_blocks,
+)
 from probe_kit.runs.checking import CheckedStore
 from probe_kit.runs.columns import Columns, find_columns
 from probe_kit.runs.commits import (
     Commit,
+    Seconds,
     committed_sums,
     read_commits,
     read_failures,
+    read_seconds,
     redo,
     stamp_of,
 )
-from probe_kit.runs.inputs import StoredInputs
-from probe_kit.runs.label import read_label
 from probe_kit.runs.layout import (
     DATA,
     DATASET,
@@ -47,19 +54,18 @@ from probe_kit.runs.layout import (
     VectorKind,
     stored_inputs_of,
 )
-from probe_kit.runs.origin import Origin
-from probe_kit.runs.outcomes_by_rule import Watched, judged, watch, with_outcomes
-from probe_kit.runs.plans import while_growing
-from probe_kit.runs.provenance import Provenance, check_provenances, differences, read_provenances
-from probe_kit.runs.reader import RunSource
+from probe_kit.runs.provenance import (
+    Provenance,
+    check_provenances,
+    differences,
+    read_certificate,
+    read_provenances,
+)
+from probe_kit.runs.reader import Origin, RunSource, run_html, run_text, select_items
 from probe_kit.runs.records import RESTORE, Sum
-from probe_kit.runs.root import read_root
-from probe_kit.runs.rows import Rows, TokenBlock, role_mask, token_blocks
-from probe_kit.runs.seconds import Seconds, read_seconds
-from probe_kit.runs.selection import select_items
+from probe_kit.runs.root import read_label, read_root, while_growing
 from probe_kit.runs.store import Location, locate
-from probe_kit.runs.summary import run_html, run_text
-from probe_kit.runs.trajectories import Trajectories, names_trajectory
+from probe_kit.runs.trajectories import Trajectories, Watched, judged, names_trajectory, watch, with_outcomes
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -498,7 +504,7 @@ class Run:
     def judged(self, rule: str, last_steps: int = 1) -> pd.DataFrame:
         """A row per episode with the fields of `Judgement`: what an outcome rule says of it.
 
-        rule: a name of `probe_kit.env.scoring.RULES`. last_steps: control steps at the end that count; the
+        rule: a name of `probe_kit.env.scoring.rules.RULES`. last_steps: control steps at the end that count; the
         released evaluation averages over 11. Raises UsageError for an unknown rule, NoTrajectoryError.
         """
         if last_steps == 1:
@@ -516,7 +522,7 @@ class Run:
 
     @cached_property
     def behaviour(self) -> pd.DataFrame:
-        """A row per episode: its id, then what hand and cube did, see `probe_kit.env.scoring`.
+        """A row per episode: its id, then what hand and cube did, see `probe_kit.env.scoring.behaviour`.
 
         Raises NoTrajectoryError if the run keeps no trajectories.
         """

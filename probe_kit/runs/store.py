@@ -1,13 +1,401 @@
-"""The location of a run, from the path or URL that the user gave."""
+"""The location at a path or URL: a folder, or a prefix in an object store through obstore (extra `remote`).
 
+Single objects appear complete or not at all, and `If-None-Match: *` creates them exclusively: that is all the
+commit protocol needs. Folders have locks and renaming besides, which are replaced as follows.
+
+* No process can know that it is alone, so nothing that others may be writing is ever removed. There is little to
+  remove: half an upload is no object, and objects without a commit are written again under the same key.
+* A run begins with its objects created one by one, `run.json` last. Two processes that begin at once create the
+  same bytes, or one of them is refused.
+
+A store may be busy or away for a while: from its first answer on, every request is repeated for `PATIENCE`. Before
+it has answered once, the address is more likely wrong, and it is given up within seconds.
+"""
+
+import asyncio
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from datetime import timedelta
+from functools import cached_property
+from io import SEEK_SET, BufferedReader, RawIOBase
 from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO, Literal
+from urllib.parse import urlsplit
 
-from probe_kit.errors import UsageError
-from probe_kit.runs.bucket import Bucket
-from probe_kit.runs.folder import Folder
-from probe_kit.runs.location import Location
+from zarr.abc.store import ByteRequest, Store
+from zarr.core.buffer import Buffer, BufferPrototype
+from zarr.storage import WrapperStore
 
-__all__ = ["SCHEMES", "Location", "locate"]
+from probe_kit._system.imports import require
+from probe_kit.errors import SettingsMismatchError, StoreError, UsageError
+from probe_kit.runs.folder import Folder, Location, check_size
+
+if TYPE_CHECKING:
+    from obstore import ReadableFile
+    from obstore.store import ObjectStore
+
+
+__all__ = [
+    "SCHEMES",
+    "Location",
+    "locate",
+]
+
+
+READERS = 32
+"""Small objects that are read side by side, because each of them takes a round trip. A choice, not measured."""
+PATIENCE = timedelta(seconds=60)
+"""The time for repeating a request; the last try may then take its own time, 30 s unless AWS_TIMEOUT says so."""
+LONGEST_PAUSE = 5.0
+"""Seconds between two requests of the same thing."""
+_QUICK = timedelta(seconds=5)
+"""`PATIENCE` with a store that never answered."""
+_NO_BUCKET = "NoSuchBucket"
+_METADATA_SERVICES = ("169.254.169.254", "169.254.170.2", "metadata.google.internal")
+"""Services of cloud machines, where a client looks last for credentials."""
+
+
+class Bucket(Location):
+    """A prefix of a bucket. Endpoint and credentials come from the environment, such as AWS_ACCESS_KEY_ID.
+
+    Raises MissingExtraError without obstore, UsageError for a URL without bucket or name, StoreError if the store
+    cannot be reached or refuses.
+    """
+
+    def __init__(self, url: str) -> None:
+        require("obstore", "remote")
+        self._url = url.rstrip("/")
+        self._answered = False
+        parts = urlsplit(self._url)
+        if not (parts.netloc and parts.path.strip("/")):
+            raise UsageError(f"{url} names no run; expected {parts.scheme}://BUCKET/PREFIX/RUN")
+
+    def __str__(self) -> str:
+        return self._url
+
+    @property
+    def name(self) -> str:
+        """After the last slash."""
+        return self._url.rpartition("/")[2]
+
+    @property
+    def path(self) -> Path:
+        """Raises UsageError."""
+        raise UsageError(f"{self} lies in an object store and has no folder; read it through `open_run`")
+
+    @property
+    def address(self) -> str:
+        """The URL."""
+        return self._url
+
+    def path_of_export(self, name: str) -> Path:
+        """Return a path in the working directory."""
+        return Path(name)
+
+    def free_bytes(self) -> None:
+        """No bound."""
+
+    # -- requests --------------------------------------------------------------------------------------
+
+    @cached_property
+    def _patient(self) -> "ObjectStore":
+        return self._below("")
+
+    @cached_property
+    def _quick(self) -> "ObjectStore":
+        return self._below("", quick=True)
+
+    def _below(self, folder: str, quick: bool = False) -> "ObjectStore":
+        from obstore.store import from_url
+
+        with self.in_words():
+            store: ObjectStore = from_url(
+                f"{self._url}/{folder}".rstrip("/"),
+                retry_config={
+                    "retry_timeout": _QUICK if quick else PATIENCE,
+                    "max_retries": 10 if quick else 10_000,  # the timeout is to end it, not the count
+                    "backoff": {"max_backoff": timedelta(seconds=LONGEST_PAUSE)},
+                },
+            )
+        return store
+
+    def _answer[T](self, request: Callable[["ObjectStore"], T]) -> T:
+        """Return the answer to a request, in our words.
+
+        obstore repeats requests that change nothing. Repeated here are a listing that breaks off, and a
+        conditional put or a deletion without an answer. All of them may be done twice.
+        """
+        from obstore.exceptions import GenericError
+
+        pauses = pauses_for(PATIENCE)
+        with self.in_words():
+            while True:
+                try:
+                    answer = request(self._patient if self._answered else self._quick)
+                except FileNotFoundError:  # an answer too: the store is there, the object is not
+                    self._answered = True
+                    raise
+                except GenericError:
+                    pause = next(pauses, None)
+                    if not self._answered or pause is None:
+                        raise
+                else:
+                    self._answered = True
+                    return answer
+                time.sleep(pause)
+
+    @contextmanager
+    def in_words(self) -> Iterator[None]:
+        """Whatever obstore says."""
+        from obstore.exceptions import BaseError
+
+        try:
+            yield
+        except FileNotFoundError as error:
+            if _NO_BUCKET in str(error):
+                raise self._refused(error) from error
+            raise
+        except BaseError as error:
+            raise self._refused(error) from error
+
+    def _refused(self, error: Exception) -> StoreError:
+        """The error of the store, with the remedy."""
+        why = str(error).split("\n\nDebug source", maxsplit=1)[0]
+        advice = (
+            "Check the bucket, the network, and what the environment says of endpoint and credentials "
+            "(AWS_ENDPOINT_URL, AWS_ACCESS_KEY_ID …)"
+        )
+        if _NO_BUCKET in str(error):
+            bucket = urlsplit(self._url).netloc
+            why, advice = f"there is no bucket {bucket!r}", "Create it, or correct its name or AWS_ENDPOINT_URL"
+        elif any(service in why for service in _METADATA_SERVICES):
+            why = "the environment holds no credentials, and this machine has none of its own"
+            advice = (
+                "Set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_SKIP_SIGNATURE=true for a public bucket"
+            )
+        return StoreError(f"{self} cannot be used: {why}. {advice}; the same command continues")
+
+    # -- objects ---------------------------------------------------------------------------------------
+
+    def exists(self, key: str) -> bool:
+        """One request for the head of the object."""
+        import obstore
+
+        try:
+            self._answer(lambda objects: obstore.head(objects, key))
+        except FileNotFoundError:
+            return False
+        return True
+
+    def read(self, key: str) -> bytes:
+        """One request."""
+        import obstore
+
+        def content(objects: Any) -> bytes:
+            answer = obstore.get(objects, key)
+            check_size(key, answer.meta["size"], self)
+            return bytes(answer.bytes())
+
+        return self._answer(content)
+
+    def open(self, key: str) -> BinaryIO:
+        """Reads ranges when they are asked for."""
+        import obstore
+
+        return BufferedReader(_Ranges(self._answer(lambda objects: obstore.open_reader(objects, key)), self))
+
+    def read_all(self, folder: str, suffix: str) -> dict[str, bytes]:
+        """A listing, then many requests side by side. An object that is gone by then is left out."""
+        names = [key.removeprefix(f"{folder}/") for key in self.keys(folder)]
+        names = [name for name in names if name.endswith(suffix) and "/" not in name]
+        with ThreadPoolExecutor(READERS) as readers:
+            contents = readers.map(lambda name: self._read_if_there(f"{folder}/{name}"), names)
+            return {name: raw for name, raw in zip(names, contents, strict=True) if raw is not None}
+
+    def _read_if_there(self, key: str) -> bytes | None:
+        """None for what was removed since it was listed: seals and failures come and go."""
+        try:
+            return self.read(key)
+        except FileNotFoundError:
+            return None
+
+    def keys(self, folder: str) -> list[str]:
+        """Read a listing."""
+        return sorted(self._listing(folder))
+
+    def sizes(self, folder: str, keys: Iterable[str]) -> dict[str, int]:
+        """Read a listing."""
+        listing = self._listing(folder)
+        return {key: listing[f"{folder}/{key}"] for key in keys if f"{folder}/{key}" in listing}
+
+    def _listing(self, folder: str) -> dict[str, int]:
+        import obstore
+
+        return self._answer(
+            lambda objects: {meta["path"]: meta["size"] for page in obstore.list(objects, folder) for meta in page}
+        )
+
+    def flush(self, keys: Iterable[str]) -> None:
+        """A put that was answered is durable."""
+
+    def create(self, key: str, content: bytes) -> bool:
+        """A conditional put."""
+        return self._put(key, content, "create")
+
+    def write(self, key: str, content: bytes, durable: bool = True) -> None:  # noqa: ARG002 - always
+        """A put."""
+        self._put(key, content, "overwrite")
+
+    def _put(self, key: str, content: bytes, mode: Literal["create", "overwrite"]) -> bool:
+        import obstore
+
+        def put(objects: Any) -> bool:
+            try:
+                obstore.put(objects, key, content, mode=mode)
+            except obstore.exceptions.AlreadyExistsError:
+                return False
+            except FileNotFoundError as error:  # no object can be missing here, only the bucket
+                raise obstore.exceptions.BaseError(str(error)) from error
+            return True
+
+        return self._answer(put)
+
+    def delete(self, key: str) -> None:
+        """One request."""
+        self._delete([key])
+
+    def remove(self, folder: str) -> None:
+        """A listing, then bulk deletions."""
+        self._delete(self.keys(folder))
+
+    def _delete(self, keys: list[str]) -> None:
+        import obstore
+
+        if keys:
+            self._answer(lambda objects: obstore.delete(objects, keys))
+
+    def store(self, folder: str, read_only: bool = False) -> Store:
+        """Zarr's own, over obstore; its errors in our words."""
+        from zarr.storage import ObjectStore
+
+        return _PatientStore(ObjectStore(self._below(folder), read_only=read_only), self)
+
+    # -- runs ------------------------------------------------------------------------------------------
+
+    def begin(self, objects: Mapping[str, bytes], last: str) -> None:
+        """One after another, none over another's."""
+        strange = sorted(set(self.keys("")) - set(objects))
+        if strange and not self.exists(last):
+            raise SettingsMismatchError(f"{self} holds {strange[0]} but no run; choose another --out")
+        for key, content in objects.items():
+            if key != last and not self.create(key, content) and self.read(key) != content:
+                raise SettingsMismatchError(
+                    f"{self} holds the beginning of a run with another {key}: one of other settings, killed early "
+                    "or beginning now in another process. Choose another --out, or remove it"
+                )
+        # Tried on a real key, before the run exists: a store that cannot keep writers apart is refused at once.
+        self.check_exclusive(next(key for key in objects if key != last))
+        self.create(last, objects[last])
+
+    @contextmanager
+    def locked(self, clear: Callable[[], None]) -> Iterator[None]:
+        """Nothing is locked."""
+        clear()
+        yield
+
+    @contextmanager
+    def tended(self, folder: str) -> Iterator[None]:  # noqa: ARG002 - an object store holds no drafts
+        """No lock: files of other content have other names, and the last head counts."""
+        yield
+
+
+def pauses_for(time_to_repeat: timedelta) -> Iterator[float]:
+    """Seconds to wait before every further try, doubling up to `LONGEST_PAUSE`, until the time is over."""
+    pause, end = 0.1, time.monotonic() + time_to_repeat.total_seconds()
+    while time.monotonic() + pause <= end:
+        yield pause
+        pause = min(2 * pause, LONGEST_PAUSE)
+
+
+class _PatientStore(WrapperStore[Store]):
+    """A store of Zarr whose errors are those of its bucket, and that waits for them to pass.
+
+    obstore repeats most requests, but not an answer that breaks off. Of Zarr's operations it covers those that
+    `CheckedStore`, `RecordingStore` and `BlankStore` pass on.
+    """
+
+    def __init__(self, store: Store, bucket: Bucket) -> None:
+        super().__init__(store)
+        self._bucket = bucket
+
+    def _with_store(self, store: Store) -> "_PatientStore":
+        return _PatientStore(store, self._bucket)
+
+    async def _answer[T](self, request: Callable[[], Awaitable[T]]) -> T:
+        from obstore.exceptions import GenericError
+
+        pauses = pauses_for(PATIENCE)
+        with self._bucket.in_words():
+            while True:
+                try:
+                    return await request()
+                except GenericError:
+                    pause = next(pauses, None)
+                    if pause is None:
+                        raise
+                await asyncio.sleep(pause)
+
+    async def get(
+        self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None
+    ) -> Buffer | None:
+        """One object or a part of it."""
+        return await self._answer(lambda: self._store.get(key, prototype, byte_range))
+
+    async def get_ranges(
+        self, key: str, byte_ranges: Sequence[ByteRequest | None], *, prototype: BufferPrototype, **how: Any
+    ) -> AsyncIterator[Sequence[tuple[int, Buffer | None]]]:
+        """Parts of one."""
+        # Not repeated: parts that were handed on already would come twice.
+        with self._bucket.in_words():
+            async for group in super().get_ranges(key, byte_ranges, prototype=prototype, **how):
+                yield group
+
+    async def exists(self, key: str) -> bool:
+        """Whether it exists."""
+        return await self._answer(lambda: self._store.exists(key))
+
+    async def set(self, key: str, value: Buffer) -> None:
+        """Write one."""
+        await self._answer(lambda: self._store.set(key, value))
+
+    async def delete(self, key: str) -> None:
+        """Remove one."""
+        await self._answer(lambda: self._store.delete(key))
+
+
+class _Ranges(RawIOBase):
+    """An object of obstore as Python's own file type, read by ranges."""
+
+    def __init__(self, file: "ReadableFile", bucket: Bucket) -> None:
+        self._file, self._bucket = file, bucket
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def seek(self, offset: int, whence: int = SEEK_SET) -> int:
+        return self._file.seek(offset, whence)
+
+    def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
+        with self._bucket.in_words():
+            content = self._file.read(len(buffer))
+        buffer[: len(content)] = bytes(content)
+        return len(content)
+
 
 SCHEMES = ("s3", "gs", "az")
 

@@ -16,9 +16,9 @@ from probe_kit.errors import ProbeKitError, RunIncompleteError, RunNotFoundError
 from probe_kit.extract.plan import planned_sizes, space_of
 from probe_kit.hooks.registry import family_names
 from probe_kit.runs import verify_run
-from probe_kit.runs.disk import in_units
 from probe_kit.runs.layout import RUN_FILE, StoredStream
 from probe_kit.runs.root import read_root
+from probe_kit.runs.run_folders import in_units
 from probe_kit.runs.store import locate
 from probe_kit.study.cells import KEY_DIGITS, NOT_TRIED_AGAIN, Cell, Failure, Failures, Selection
 from probe_kit.study.expansion import control_of

@@ -16,8 +16,8 @@ from probe_kit.errors import ProbeKitError, RunIncompleteError, RunNotFoundError
 from probe_kit.hashing import canonical_json
 from probe_kit.hooks.checkpoints.checkpoint import COMMIT_DIGITS, is_on_hub, without_revision
 from probe_kit.runs import open_run
-from probe_kit.runs.growth import flat_settings
 from probe_kit.runs.store import locate
+from probe_kit.runs.writer import flat_settings
 from probe_kit.study.cells import Cell, Failures, Selection, checkpoint_stamp
 from probe_kit.study.reading import LoadedStudy, load_study, shipped_studies
 from probe_kit.study.schema import ProbesTable

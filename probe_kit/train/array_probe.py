@@ -15,8 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from probe_kit.errors import UnknownSiteError, UsageError
 from probe_kit.hashing import derive_seed, sha256_json
 from probe_kit.hooks.contract.sites import Site, Stream
-from probe_kit.runs.origin import Origin
-from probe_kit.runs.reader import RunSource
+from probe_kit.runs.reader import Origin, RunSource
 from probe_kit.runs.store import Location, locate
 from probe_kit.train.choices import EVERYWHERE, Task
 from probe_kit.train.probe_sweep import train_probes
@@ -27,8 +26,7 @@ from probe_kit.train.target import Target
 if TYPE_CHECKING:
     import pandas as pd
 
-    from probe_kit.runs.inputs import StoredInputs
-    from probe_kit.runs.rows import TokenBlock
+    from probe_kit.runs.arrays import StoredInputs, TokenBlock
 
 
 class NotPlayed:
@@ -170,7 +168,7 @@ class ArrayRun(NotPlayed):
 
     def iter_token_blocks(self, site: Site, role: str | None = None) -> Iterator["TokenBlock"]:
         """All tokens of one site, as one block: they are in memory. Raises UnknownSiteError."""
-        from probe_kit.runs.rows import TokenBlock
+        from probe_kit.runs.arrays import TokenBlock
 
         yield TokenBlock(0, *self.tokens(site, role))
 

@@ -23,7 +23,7 @@ from probe_kit.train.target_samples import TargetSamples
 if TYPE_CHECKING:
     import pandas as pd
 
-    from probe_kit.runs.inputs import StoredInputs
+    from probe_kit.runs.arrays import StoredInputs
     from probe_kit.suite import Suite
 
 

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import NonFiniteActivationError, UnknownSiteError
 from probe_kit.hooks.contract.sites import Site, resolve_view
+from probe_kit.runs.arrays import TokenBlock
 from probe_kit.runs.reader import RunReader, Tokens
-from probe_kit.runs.rows import TokenBlock
 from probe_kit.train.solver.arrays import Array, Features, RowSubset, to_device, to_numpy
 
 TOKENS = "tokens"

@@ -10,12 +10,16 @@ from probe_kit.retention.columns.text import VIEWER_WORDS
 from probe_kit.runs import Run
 from probe_kit.runs.layout import COMMITS, FAILED
 from probe_kit.runs.thumbnails import episode_frames
-from probe_kit.view.payloads.coding import failure_script, payload_script
-from probe_kit.view.payloads.episode_payload import episode_payload
-from probe_kit.view.payloads.episodes_payload import episodes_payload
-from probe_kit.view.payloads.results_payload import results_payload, stored_keys
-from probe_kit.view.payloads.run_payload import run_payload
-from probe_kit.view.payloads.site_map_payload import site_map_payload, target_map_payload
+from probe_kit.view.episode_payloads import episode_payload, episodes_payload
+from probe_kit.view.run_payloads import (
+    failure_script,
+    payload_script,
+    results_payload,
+    run_payload,
+    site_map_payload,
+    stored_keys,
+    target_map_payload,
+)
 from probe_kit.view.viewed_run import view_runs
 
 SCHEMA = 2

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from probe_kit._execution.executor import GivenUp, TaskQueue, WorkerLostWarning, work_off
-from probe_kit._execution.worker import Idle, Lost
+from probe_kit._execution.executor import GivenUp, Idle, Lost, TaskQueue, WorkerLostWarning, work_off
 from probe_kit.errors import UsageError, WorkerDiedError
 
 

@@ -13,8 +13,8 @@ from typing import Any
 
 import pytest
 
+from probe_kit._execution.executor import Idle, Lost, Work
 from probe_kit._execution.process_pool import ProcessPool, share_of_machine
-from probe_kit._execution.worker import Idle, Lost, Work
 from probe_kit._system.machine import CORES, cores_here
 from probe_kit.errors import UsageError
 from tests.support.echo_work import BREAK, DIE, FAIL

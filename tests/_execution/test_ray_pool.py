@@ -12,9 +12,8 @@ from typing import Any
 import pytest
 
 from probe_kit._execution import ray_pool
-from probe_kit._execution.executor import GivenUp, TaskQueue, WorkerLostWarning, work_off
+from probe_kit._execution.executor import GivenUp, Idle, TaskQueue, WorkerLostWarning, work_off
 from probe_kit._execution.ray_pool import ClusterFullWarning, RayPool
-from probe_kit._execution.worker import Idle
 from probe_kit.errors import UnknownModelError, WorkerDiedError
 
 TASKS = 40

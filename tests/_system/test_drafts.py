@@ -10,7 +10,7 @@ import pytest
 
 from probe_kit._system.drafts import draft_of, write_whole
 from probe_kit.runs import open_run
-from probe_kit.runs.export.export import export_run
+from probe_kit.runs.export import export_run
 from probe_kit.runs.store import locate
 from probe_kit.suite import build_suite
 

@@ -7,7 +7,7 @@ from typing import get_args
 import pytest
 
 from probe_kit._terminal.console import out
-from probe_kit.demo.organisms import (
+from probe_kit.demo.pipeline import (
     COMPATIBLE,
     DOES_NOT_DECIDE,
     EARLY,

@@ -17,7 +17,7 @@ from probe_kit.extract.plan import Plan, weights_needed
 from probe_kit.hooks import load_model
 from probe_kit.hooks.contract.sites import PADDING
 from probe_kit.hooks.registry import own_families
-from probe_kit.runs.disk import in_units
+from probe_kit.runs.run_folders import in_units
 from probe_kit.suite import Suite, build_suite, default_suite, load_suite
 from probe_kit.suite.sufficiency import sufficiencies
 from tests.support.every_checkpoint import WRITERS, families

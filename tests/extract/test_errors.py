@@ -29,8 +29,7 @@ from probe_kit.extract.sources.scene_source import ScenePlayer
 from probe_kit.hooks import Observation
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.runs import open_run
-from probe_kit.runs.certificates import write_certificate
-from probe_kit.runs.provenance import provenance_here
+from probe_kit.runs.provenance import provenance_here, write_certificate
 from probe_kit.runs.store import locate
 from probe_kit.suite import Suite, build_suite
 

@@ -17,7 +17,7 @@ from probe_kit.extract.sources.inputs import PICTURE, same_input
 from probe_kit.hooks import Edit, Observation, Policy, Site, Tap
 from probe_kit.hooks.families.pi0.adapter import load_pi0_tiny
 from probe_kit.runs import Run
-from probe_kit.runs.certificates import input_notes
+from probe_kit.runs.provenance import input_notes
 from tests.support.lerobot_recordings import CAMERA, write_recording
 from tests.support.organisms import Edit as WeightEdit
 from tests.support.organisms import make_blind, make_deaf

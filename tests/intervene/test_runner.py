@@ -37,7 +37,7 @@ from probe_kit.intervene.sessions.opening import open_session
 from probe_kit.intervene.sessions.session import ReplaySession, load_policy_of
 from probe_kit.retention import retention_table
 from probe_kit.runs import Run, open_run, verify_run
-from probe_kit.runs.origin import Origin
+from probe_kit.runs.reader import Origin
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy

@@ -17,8 +17,7 @@ from zarr.storage import LocalStore
 
 from probe_kit.extract.plan import Plan
 from probe_kit.extract.rollout.capturing import EpisodeBuffers
-from probe_kit.extract.rollout.worker import Rollout
-from probe_kit.runs import sealing, writer
+from probe_kit.runs import verify, writer
 from probe_kit.runs.commits import Commit
 from probe_kit.runs.layout import StoredStream
 from probe_kit.runs.store import Location, locate
@@ -53,7 +52,7 @@ def extract(run: str, plan: Plan) -> None:
     with writing.owned(), writing.location.in_words():
         for number in writing.remaining():
             writing.write(rollout(plan, number).record)
-        sealing.seal(run)
+        verify.seal(run)
 
 
 def die_at(point: str) -> None:

@@ -17,7 +17,7 @@ from probe_kit.cli import app
 from probe_kit.errors import ProbeKitError, StoreError
 from probe_kit.hooks import Site
 from probe_kit.runs import Run, open_run, seal, verify_run
-from probe_kit.runs import bucket as buckets
+from probe_kit.runs import store as buckets
 from probe_kit.runs.run import NotSealedWarning
 from probe_kit.runs.store import locate
 from probe_kit.suite import Suite

@@ -19,11 +19,10 @@ from probe_kit.extract.plan import Plan
 from probe_kit.extract.prompts import QUERIES, phrases
 from probe_kit.runs import Run, open_run, seal, verify_run
 from probe_kit.runs.folder import Folder
-from probe_kit.runs.growth import growth_at
-from probe_kit.runs.plans import plan_key
+from probe_kit.runs.root import plan_key
 from probe_kit.runs.store import locate
 from probe_kit.runs.thumbnails import as_thumbnail, thumbnail_key
-from probe_kit.runs.writer import RunWriter
+from probe_kit.runs.writer import RunWriter, growth_at
 from probe_kit.suite import Suite
 from probe_kit.suite.items import Wording
 from probe_kit.train import load_results, train_probes

@@ -5,7 +5,7 @@ import pytest
 import zarr
 from numpy.typing import NDArray
 
-from probe_kit.runs.rows import Rows, role_mask, token_blocks
+from probe_kit.runs.arrays import Rows, role_mask, token_blocks
 
 TOKENS, WIDTH = 7, 3
 SPANS = [

@@ -66,7 +66,7 @@ def test_what_a_killed_seal_left_is_cleared_by_the_next_one(copy: Path, finished
 def test_a_slab_smaller_than_the_run_changes_nothing(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = hashes(copy)
     shutil.rmtree(copy / "columns.zarr")
-    monkeypatch.setattr("probe_kit.runs.sealing.SLAB_BYTES", 3 * 48 * 96 * 4)
+    monkeypatch.setattr("probe_kit.runs.verify.SLAB_BYTES", 3 * 48 * 96 * 4)
     seal(copy)
     assert hashes(copy) == before
 

@@ -9,7 +9,7 @@ import zarr
 
 from probe_kit.errors import RunDamagedError, UsageError
 from probe_kit.hooks.families.pi0.adapter import Pi0
-from probe_kit.runs import Run, open_run, rows, verify_run
+from probe_kit.runs import Run, arrays, open_run, verify_run
 from tests.support.rehashing import rehash
 
 
@@ -68,7 +68,7 @@ def test_trajectories_that_are_read_together_are_those_that_are_read_alone(
     recorded_run: Run, copy: Path, monkeypatch: pytest.MonkeyPatch, together: int
 ) -> None:
     array = zarr.open_array(str(copy / "data.zarr"), path="trajectory", mode="r")
-    monkeypatch.setattr(rows, "_BLOCK_BYTES", together * array[0].nbytes)
+    monkeypatch.setattr(arrays, "_BLOCK_BYTES", together * array[0].nbytes)
     assert len(list(recorded_run.trajectories)) == 48
     for position, trajectory in enumerate(recorded_run.trajectories):
         np.testing.assert_array_equal(trajectory.frames, recorded_run.trajectories[position].frames)

@@ -16,7 +16,7 @@ from probe_kit.extract.plan import Plan
 from probe_kit.runs import open_run, verify_run
 from probe_kit.runs import writer as writers
 from probe_kit.runs.commits import commit_key
-from probe_kit.runs.resume_pieces import Pieces
+from probe_kit.runs.results import Pieces
 from probe_kit.runs.store import locate
 from probe_kit.runs.writer import EpisodeRecord
 from probe_kit.suite import Suite

@@ -94,5 +94,5 @@ def test_processes_that_die_before_they_begin_end_the_study(
 
 def _players() -> Iterator[psutil.Process]:
     for child in psutil.Process().children(recursive=True):
-        if "probe_kit._execution.worker:serve" in " ".join(child.cmdline()):
+        if "probe_kit._execution.executor:serve" in " ".join(child.cmdline()):
             yield child

@@ -10,7 +10,7 @@ import pytest
 
 from probe_kit.errors import NonFiniteActivationError, UnknownSiteError
 from probe_kit.hooks import Site
-from probe_kit.runs.rows import TokenBlock
+from probe_kit.runs.arrays import TokenBlock
 from probe_kit.train import ArrayRun
 from probe_kit.train.samples import Samples, read_samples, role_of, sites_of
 from probe_kit.train.target import side_labels

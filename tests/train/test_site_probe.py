@@ -16,7 +16,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
 from probe_kit.errors import NonFiniteActivationError, TooFewGroupsError
-from probe_kit.runs.rows import TokenBlock
+from probe_kit.runs.arrays import TokenBlock
 from probe_kit.statistics.folds import INNER_FOLDS, OUTER_FOLDS, Fold, assign_folds
 from probe_kit.statistics.intervals import Share
 from probe_kit.statistics.label_permutations import flip_items

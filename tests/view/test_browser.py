@@ -24,7 +24,7 @@ from probe_kit.train import load_results
 from probe_kit.train.results.store import load_results_by_call
 from probe_kit.view import write_viewer
 from probe_kit.view.catalogue import Catalogue
-from probe_kit.view.payloads.coding import code_words, pack_log_odds, payload_script
+from probe_kit.view.run_payloads import code_words, pack_log_odds, payload_script
 from tests.support.browser import CHROMIUM, WHY_SKIPPED, Browser, Page
 from tests.support.little_run import episode, little_plan, little_writer
 from tests.view.conftest import (

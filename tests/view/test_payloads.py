@@ -25,7 +25,7 @@ from probe_kit.train import load_results
 from probe_kit.train.results.probe_results import read_directions
 from probe_kit.train.results.store import load_results_by_call
 from probe_kit.view.catalogue import Catalogue
-from probe_kit.view.payloads.coding import pack_floats, pack_log_odds, payload_script
+from probe_kit.view.run_payloads import pack_floats, pack_log_odds, payload_script
 from tests.retention.asked_runs import ASK
 from tests.support.little_run import certify, episode, little_plan, little_settings, little_writer
 from tests.view.payload_reader import floats, log_odds, read_payload, words

@@ -28,8 +28,8 @@ from probe_kit.hashing import derive_seed
 from probe_kit.hooks.checkpoints.third_party import begin_randomness, copied, while_acting
 from probe_kit.hooks.contract.declared import PLAIN, Rotation
 from probe_kit.hooks.contract.observation import Observation
-from probe_kit.runs.certificates import INPUT_CHECK
 from probe_kit.runs.layout import StoredStream
+from probe_kit.runs.provenance import INPUT_CHECK
 
 if TYPE_CHECKING:
     from torch import Tensor

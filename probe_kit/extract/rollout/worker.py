@@ -35,9 +35,9 @@ from probe_kit.extract.sources.player import (
 )
 from probe_kit.extract.sources.source import Played, Source
 from probe_kit.hooks.contract.observation import Observation
+from probe_kit.runs.commits import Seconds
 from probe_kit.runs.layout import LATER, VIDEOS
-from probe_kit.runs.origin import ORIGIN, Origin
-from probe_kit.runs.seconds import Seconds
+from probe_kit.runs.reader import ORIGIN, Origin
 from probe_kit.runs.small_frames import SmallFrames
 from probe_kit.runs.thumbnails import as_thumbnail, thumbnail_key
 from probe_kit.runs.writer import EpisodeRecord, RunWriter

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from probe_kit._execution.child_process import Child
+from probe_kit._execution.process_pool import Child
 from probe_kit.errors import (
     ActionError,
     EmptyRoleError,

@@ -17,8 +17,7 @@ from probe_kit.hooks.contract.observation import Observation
 from probe_kit.intervene.pairs import Chunk, Pair
 from probe_kit.intervene.sessions.session import ReplaySession, ReplaySource
 from probe_kit.runs.layout import FIRST_FRAME
-from probe_kit.runs.origin import OF_SCENE
-from probe_kit.runs.reader import origin_of
+from probe_kit.runs.reader import OF_SCENE, origin_of
 from probe_kit.runs.run import Run
 from probe_kit.suite.items import Episode, Item, Layout, check_wordings, counterparts_of, in_words
 from probe_kit.train.run_suite import suite_of

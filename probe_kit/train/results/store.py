@@ -24,6 +24,7 @@ from probe_kit.runs.reader import RunReader
 from probe_kit.runs.results import (
     HEAD,
     Bundle,
+    Pieces,
     bundle_keys,
     complete_key,
     read_bundle,
@@ -31,7 +32,6 @@ from probe_kit.runs.results import (
     tidy_bundle,
     write_bundle,
 )
-from probe_kit.runs.resume_pieces import Pieces
 from probe_kit.runs.store import Location, locate
 from probe_kit.statistics.sufficiency import GROUPS_FOR_PROBES, probe_command
 from probe_kit.train.choices import CORRECT, EVERYWHERE, SIDES

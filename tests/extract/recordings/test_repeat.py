@@ -16,7 +16,7 @@ from probe_kit.cli import app
 from probe_kit.errors import UsageError
 from probe_kit.extract import ExtractSettings
 from probe_kit.extract.config_files import read_config
-from probe_kit.runs.origin import Origin
+from probe_kit.runs.reader import Origin
 from probe_kit.suite import Suite
 
 RED = "Put the cube on the red shape"

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from probe_kit.check_adapter.smoke_run import _one_item
+from probe_kit.check_adapter.checking import _one_item
 from probe_kit.hooks import Family, Option, registry
 from probe_kit.hooks.conformance import subject
 from probe_kit.hooks.conformance.check import SkipTest

@@ -1,0 +1,375 @@
+"""Export of a run for tools that read another format: a file, or a folder.
+
+Everything is written row by row, so that a run larger than memory can be exported; every row passes its checksum
+on the way. The sha256 of a file is written beside it, and those of a folder into it, in the form that
+`sha256sum --check` reads.
+"""
+
+import hashlib
+import io
+import json
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit._system.drafts import draft_of, full_disk_in_words, write_whole
+from probe_kit._system.imports import require
+from probe_kit._system.machine import same_scheduling
+from probe_kit.env.scoring import MOTION, STATE
+from probe_kit.errors import UsageError
+from probe_kit.runs.arrays import Rows
+from probe_kit.runs.direction_files import about_direction, check_direction_file, write_directions
+from probe_kit.runs.export_vectors import StreamChoice, choose, is_tokens, write_parquet, write_sae
+from probe_kit.runs.layout import MEAN_VIEW, ArrayKind, ExportFormat, SaeDtype
+from probe_kit.runs.reader import SIDE, check_sides
+from probe_kit.runs.run import Run, open_run
+from probe_kit.runs.small_frames import SmallFrames
+from probe_kit.runs.store import Location
+from probe_kit.runs.thumbnails import decode_frames, read_sheet
+from probe_kit.version import __version__
+
+SUMS = "SHA256SUMS"
+"""The hashes of all other files of a folder."""
+
+
+def export_run(
+    path: Path | str | Location,
+    style: ExportFormat,
+    out: Path,
+    allow_partial: bool = False,
+    *,
+    sites: Sequence[str] | None = None,
+    view: str | None = None,
+    dtype: SaeDtype = "bfloat16",
+    seed: int = 0,
+) -> Path:
+    """Write the run at `path` to `out`, whole or not at all, with sha256 of every file; returns `out`.
+
+    h5: `<stream>/pooled`, `<stream>/later`, `<stream>/tokens`, and a dataset per column under `episodes`.
+    safetensors: the same with a dot, the last two true bfloat16; episodes in the metadata.
+    Axes of both are (episode, call, [iteration,] layer, view or token, feature).
+    lerobot: a LeRobotDataset, of a run with `--frames all`.
+
+    Three formats hold the vectors that `sites` and `view` choose, see `choose`.
+    parquet: a row per vector with episode, group, inference, frame, site, view, role and token.
+    directions: a vector per category, view and site, see `write_class_means`; a .safetensors or .npz.
+    sae: a folder with a memory map (N, D) per site in a drawn order, an index, and the scale of every site.
+    Default are all sites, and all pooled views in Parquet, `mean` in matrices. dtype, seed: of `sae` alone.
+
+    Raises UsageError for another format, an option that a format does not have, or a file that exists;
+    UnknownSiteError, MissingExtraError, RunDamagedError, DiskSpaceError.
+    """
+    check_format(style)
+    if style not in OF_VECTORS and (sites is not None or view is not None):
+        raise UsageError(
+            f"--sites or --view with --format {style}, which holds all that was stored; leave them out, or "
+            f"use one of {', '.join(OF_VECTORS)}"
+        )
+    if style != SAE and (dtype != "bfloat16" or seed):
+        raise UsageError(f"--dtype or --seed with --format {style}; leave them out, or use --format sae")
+    if style == DIRECTIONS:
+        check_direction_file(out)
+    if out.exists():
+        raise UsageError(f"{out} exists; choose another --out or remove it")
+    run = open_run(path, allow_partial)
+    if not run.streams and style != LEROBOT:
+        raise UsageError(f"{path} has no activations to export; its episodes are in `open_run(...).episodes`")
+    with full_disk_in_words(out), draft_of(out) as draft:
+        if style in OF_VECTORS:
+            choices = choose(run, sites, view or (MEAN_VIEW if style == SAE else None))
+            if style == DIRECTIONS:
+                write_class_means(run, choices, draft)
+            elif style == SAE:
+                write_sae(run, choices, draft, _about(run, choices), dtype, seed)
+            else:
+                write_parquet(run, choices, draft, _about(run, choices))
+        else:
+            WHOLE[style](run, draft)
+        if draft.is_dir():
+            _write_sums(draft)
+        else:
+            write_whole(out.with_name(f"{out.name}.sha256"), f"{_digest(draft)}  {out.name}\n")
+        return draft.rename(out)  # last: the file never lies there without its hash
+
+
+def check_format(style: str) -> None:
+    """Raise UsageError for a format that is not offered."""
+    if style not in FORMATS:
+        raise UsageError(f"unknown format {style!r}; expected one of {', '.join(FORMATS)}")
+
+
+def _about(run: Run, choices: Sequence[StreamChoice]) -> str:
+    """JSON of what vectors were made of: sites and views, the run's settings, and what it was made with."""
+    return json.dumps(
+        {
+            "probe_kit": __version__,
+            "run": run.label,
+            "settings": run.settings,
+            "settings_sha256": run.settings_sha256,
+            "commits": run.stamp,
+            "provenances": run.provenances,
+            "sites": [str(site) for choice in choices for site in choice.sites],
+            "views": {choice.name: choice.views for choice in choices},
+        }
+    )
+
+
+def _write_sums(folder: Path) -> None:
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    lines = [f"{_digest(path)}  {path.relative_to(folder).as_posix()}\n" for path in files]
+    (folder / SUMS).write_text("".join(lines), encoding="utf-8", newline="\n")
+
+
+def _digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _arrays(run: Run) -> Iterator[tuple[str, str, Rows]]:
+    """Stream, kind and rows of every array of the run."""
+    tokens: tuple[ArrayKind, ...] = ("tokens",) if run.settings["tokens"] == "all" else ()
+    for stream in run.streams:
+        for kind in (*run.root.vector_kinds, *tokens):
+            yield stream, kind, run.rows(stream, kind)
+
+
+def _episodes(run: Run) -> dict[str, list[Any]]:
+    table = run.episodes
+    columns: dict[str, list[Any]] = json.loads(table.to_json(orient="split"))
+    return {name: [row[i] for row in columns["data"]] for i, name in enumerate(columns["columns"])}
+
+
+def write_h5(run: Run, out: Path) -> None:
+    """A dataset per array, and one per column of the episodes."""
+    import h5py  # loads its C library, which only this format needs
+
+    with out.open("w+b", buffering=0) as raw:
+        safe = _SafeFile(raw)
+        with h5py.File(safe, "w") as file:
+            _fill(file, run, safe)
+        safe.check()
+
+
+def _fill(file: Any, run: Run, safe: "_SafeFile") -> None:
+    file.attrs["settings"] = json.dumps(run.settings)
+    for stream, kind, rows in _arrays(run):
+        shape = rows.array.shape[1:]
+        dataset = file.create_dataset(
+            f"{stream}/{kind}", (len(rows), *shape), rows.array.dtype, chunks=(1, *shape), fletcher32=True
+        )
+        dataset.attrs["views"] = list(run.views(stream))
+        dataset.attrs["dtype"] = "float32" if kind == "pooled" else "bfloat16 bits"
+        for position, row in enumerate(rows):
+            dataset[position] = row
+            if safe.error is not None:  # the library does not know of it and would go through all episodes
+                return
+    for name, values in _episodes(run).items():
+        # HDF5 has no column of mixed types, and no null among numbers: such a column becomes text.
+        numeric = all(isinstance(value, bool | int | float) for value in values)
+        file[f"episodes/{name}"] = values if numeric else ["" if v is None else str(v) for v in values]
+
+
+class _SafeFile(io.RawIOBase):
+    """A file that tells the HDF5 library of no failed write and keeps the error.
+
+    The library crashes the process when it closes a file that it could not write, as on a full disk.
+    """
+
+    def __init__(self, raw: io.FileIO) -> None:
+        self._raw = raw
+        self.error: OSError | None = None
+
+    def check(self) -> None:
+        """Raise the first error of the file."""
+        if self.error is not None:
+            raise self.error
+
+    def write(self, content: Any) -> int:
+        """Write all of it; after an error nothing is written."""
+        unwritten = memoryview(content).cast("B")
+        length = len(unwritten)
+        try:
+            while unwritten and self.error is None:
+                unwritten = unwritten[self._raw.write(unwritten) or 0 :]
+        except OSError as error:
+            self.error = error
+        return length
+
+    def readinto(self, buffer: Any) -> int:
+        """Read as far as the file goes."""
+        return self._raw.readinto(buffer) or 0
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        """Go to a place of the file."""
+        return self._raw.seek(offset, whence)
+
+    def tell(self) -> int:
+        """Return the place in the file."""
+        return self._raw.tell()
+
+    def truncate(self, size: int | None = None) -> int:
+        """Change the length of the file."""
+        try:
+            return self._raw.truncate(size)
+        except OSError as error:
+            self.error = self.error or error
+            return size or 0
+
+    def flush(self) -> None:
+        """Do nothing: the file has no buffer."""
+
+
+def write_safetensors(run: Run, out: Path) -> None:
+    """A tensor per array; settings, episodes and names of views in the metadata."""
+    header: dict[str, Any] = {
+        "__metadata__": {
+            "settings": json.dumps(run.settings),
+            "episodes": json.dumps(_episodes(run)),
+            **{f"{stream}.views": json.dumps(run.views(stream)) for stream in run.streams},
+        }
+    }
+    end = 0
+    for stream, kind, rows in _arrays(run):
+        shape = [len(rows), *rows.array.shape[1:]]
+        start, end = end, end + int(np.prod(shape)) * rows.array.dtype.itemsize
+        dtype = "F32" if kind == "pooled" else "BF16"
+        header[f"{stream}.{kind}"] = {"dtype": dtype, "shape": shape, "data_offsets": [start, end]}
+    with out.open("wb") as file:
+        _write_header(file, header)
+        for _, _, rows in _arrays(run):
+            for row in rows:
+                file.write(np.ascontiguousarray(row).tobytes())
+
+
+def _write_header(file: BinaryIO, header: dict[str, Any]) -> None:
+    """Length, then JSON padded to eight bytes, as the format wants it."""
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 8)
+    file.write(len(text).to_bytes(8, "little") + text)
+
+
+CAMERA = "observation.images.scene"
+EPISODES = "probe_kit_episodes.csv"
+"""In `meta`: a row per episode of the data set with all that the run says of it; lerobot does not read it."""
+_STATE = [*STATE["tool"], "opening"]
+
+
+@same_scheduling()
+def write_lerobot(run: Run, folder: Path) -> None:
+    """The data set in `folder`: an episode of T steps has T rows, each with what the policy did next.
+
+    `observation.state` is the measured tool, x, y, z, roll, pitch, yaw in metres and radians, and the opening of
+    the gripper; `action` is the commanded action. The frame behind the last action is left out.
+    Raises UsageError for a run without all frames, NoTrajectoryError, MissingExtraError, and RunDamagedError.
+    """
+    for needed in ("datasets", "av"):
+        require(needed, "datasets")
+    datasets = require("lerobot.datasets.lerobot_dataset", "datasets")
+    require("datasets", "datasets").disable_progress_bars()
+    trajectories, data = run.trajectories, None
+    for position, (row, frames) in enumerate(_filmed_episodes(run)):
+        trajectory = trajectories[position]
+        if data is None:
+            data = datasets.LeRobotDataset.create(
+                f"probe_kit/{run.location.name}", round(_control_rate(run)), _features(frames[0].shape),
+                root=folder, robot_type=str(run.settings["scene"]["arm"]),
+            )  # fmt: skip
+        for step in range(trajectory.steps):
+            state = np.append(trajectory.tool[step], trajectory.opening[step]).astype(np.float32)
+            data.add_frame(
+                {
+                    CAMERA: frames[step],
+                    "observation.state": state,
+                    "action": trajectory.commanded[step].astype(np.float32),
+                    "task": str(row["instruction"]),
+                }
+            )
+        data.save_episode()
+    if data is not None:
+        data.finalize()
+    table = run.episodes.rename_axis("episode_index")
+    table.to_csv(folder / "meta" / EPISODES)
+
+
+def _features(shape: tuple[int, ...]) -> dict[str, Any]:
+    return {
+        CAMERA: {"dtype": "video", "shape": shape, "names": ["height", "width", "channels"]},
+        "observation.state": {"dtype": "float32", "shape": (len(_STATE),), "names": _STATE},
+        "action": {"dtype": "float32", "shape": (len(MOTION),), "names": list(MOTION)},
+    }
+
+
+def _filmed_episodes(run: Run) -> Iterator[tuple[dict[str, Any], SmallFrames]]:
+    """The row and the frames of every episode: one before the first action, one behind each.
+
+    Raises UsageError before the first if an episode was played without `--frames all`, or its frames were deleted.
+    """
+    rows = run.episodes.to_dict("records")
+    for commit in run.commits():
+        if commit.frames is None:
+            raise UsageError(
+                f"{run.location} does not keep every frame of episode {commit.episode_id}. Extract it again to "
+                "another --out, with --frames all"
+            )
+    for row in rows:
+        sheet = read_sheet(run.location, int(row["episode"]))
+        if sheet is None or sheet.count is None:
+            raise UsageError(f"{run.location} has lost its frames; its folder of pictures was deleted")
+        yield {str(name): value for name, value in row.items()}, decode_frames(sheet.content, sheet.count)
+
+
+def _control_rate(run: Run) -> float:
+    """Actions per second of the run's scene. Raises UsageError for a run without a scene."""
+    scene = run.settings.get("scene")
+    if scene is None:
+        raise UsageError(f"{run.location} was not played in a scene")
+    return float(scene["physics"]["rate"] / scene["physics"]["substeps"])
+
+
+def write_class_means(run: Run, choices: Sequence[StreamChoice], file: Path) -> None:
+    """Write half the difference of the means of left and right, per category, view and site, of all episodes.
+
+    In raw features, so that a coefficient of 2 goes from one mean to the other. Equal means are left out. Raises
+    UsageError for a run without sides, for views of tokens, and where no means differ.
+    """
+    check_sides(run, "an export of directions")
+    episodes = run.episodes
+    is_left = (episodes[SIDE] == "left").to_numpy()
+    vectors: dict[str, NDArray[np.float32]] = {}
+    about = {}
+    for choice in choices:
+        for view in choice.views:
+            if is_tokens(view):
+                raise UsageError(f"--view {view} with --format directions; take a pooled view, such as mean:image")
+            for site in choice.sites:
+                features = run.column(site, view).astype(np.float64)
+                for category in dict.fromkeys(episodes["category"].astype(str)):
+                    rows = (episodes["category"] == category).to_numpy()
+                    left_rows, right_rows = features[rows & is_left], features[rows & ~is_left]
+                    if not len(left_rows) or not len(right_rows):
+                        continue
+                    difference = left_rows.mean(axis=0) - right_rows.mean(axis=0)
+                    if difference.any():
+                        name, about[name] = about_direction(category, view, site, run.weights_sha256)
+                        vectors[name] = (difference / 2).astype(np.float32)
+    if not vectors:
+        raise UsageError(f"{run.location}: the means of left and right are equal at all of these sites")
+    write_directions(file, vectors, about)
+
+
+LEROBOT: ExportFormat = "lerobot"
+"""The format that holds frames and actions, and no activations."""
+WHOLE: dict[ExportFormat, Callable[[Run, Path], None]] = {
+    "h5": write_h5,
+    "safetensors": write_safetensors,
+    LEROBOT: write_lerobot,
+}
+"""Formats that hold all that was stored."""
+SAE: ExportFormat = "sae"
+DIRECTIONS: ExportFormat = "directions"
+OF_VECTORS: tuple[ExportFormat, ...] = ("parquet", SAE, DIRECTIONS)
+"""Formats that hold chosen vectors."""
+FORMATS: tuple[ExportFormat, ...] = (*WHOLE, *OF_VECTORS)

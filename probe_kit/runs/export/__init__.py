@@ -1,1 +1,0 @@
-"""Runs written for other tools: whole arrays, tables, matrices, a LeRobotDataset; see `export`."""
