@@ -92,7 +92,7 @@ def pytest_cmdline_main(config: pytest.Config) -> None:
         config.option.numprocesses = len(os.sched_getaffinity(0))
         if config.option.dist == "no":
             config.option.dist = "loadfile"
-        config.option.loadscopereorder = False  # xdist would start with the files of most tests, whatever they take
+        config.option.loadscopereorder = False  # xdist would begin with the files of most tests
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:

@@ -17,6 +17,7 @@ from zarr.storage import LocalStore
 
 from probe_kit.extract.plan import Plan
 from probe_kit.extract.rollout.capturing import EpisodeBuffers
+from probe_kit.extract.rollout.worker import Rollout
 from probe_kit.runs import verify, writer
 from probe_kit.runs.commits import Commit
 from probe_kit.runs.layout import StoredStream
