@@ -1,27 +1,29 @@
 """Playing of studies: resumed, each model loaded once, and a model that fails alone."""
 
 import json
+import re
+from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner
 
+from probe_kit._execution.executor import GivenUp, TaskQueue
 from probe_kit._terminal.console import out
 from probe_kit.cli import app
-from probe_kit.errors import RunIncompleteError, UsageError
+from probe_kit.errors import RunDamagedError, RunIncompleteError, UsageError
+from probe_kit.extract import ExtractSettings
 from probe_kit.hooks import load_policy
 from probe_kit.runs import open_run
-from probe_kit.study import (
-    Failure,
-    conduct_study,
-    fit_probes,
-    load_study,
-    make_table,
-    plan_study,
-)
+from probe_kit.study import Failure, conduct_study, fit_probes, load_study, make_table, plan_study, playing
+from probe_kit.study.cells import Cell, Failures
+from probe_kit.study.playing import Made, ModelTask, Moved, RunTask
 from probe_kit.study.stored import open_cell
 from probe_kit.suite import Suite
-from tests.study.small_study import LIGHT, small_study
+from tests.study.broken_files import BASE
+from tests.study.small_study import LIGHT, SCRIPTED, small_study
 
 BROKEN = '[models.broken]\nfamily = "pi0-tiny"\ncheckpoint = "{out}/nowhere"\n\n[models.idle]'
 SHORT = LIGHT.replace("[models.idle]", BROKEN).replace('["expert", "idle"]', '["expert", "broken", "idle"]')
@@ -288,3 +290,189 @@ def test_probes_are_compared_again_where_the_file_names_another_untrained_networ
     assert words() == "whole; probed"
     file.write_text(text, encoding="utf-8")
     assert words() == "whole; probes main: compared with another untrained network"
+
+
+SETTINGS = ExtractSettings("expert")
+
+
+def task(model: str, size: float, gpus: int = 0) -> ModelTask:
+    runs = tuple(RunTask(f"{model}/{way}", SETTINGS, way, 0) for way in ("plain", "dark"))
+    return ModelTask(model, runs, gpus, size)
+
+
+def conducted(monkeypatch: pytest.MonkeyPatch, tasks: list[ModelTask], story: Any, **where: Any) -> list[Any]:
+    """The events that are reported while `story` plays the queue in place of workers."""
+    reports: list[Any] = []
+    monkeypatch.setattr(playing, "work_off", lambda _pool, queue: story(queue))
+    playing.play_models(tasks, reports.append, **where)
+    return reports
+
+
+def test_the_longest_model_goes_first_and_one_with_a_gpu_only_where_there_is_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(
+        __import__("sys").modules, "torch", SimpleNamespace(cuda=SimpleNamespace(device_count=lambda: 1))
+    )
+
+    def story(queue: TaskQueue[ModelTask]) -> Iterator[tuple[int, Any]]:
+        assert [queue.take(slot) for slot in (1, 0, 2, 0)] == [
+            task("middle", 2), task("long", 3, gpus=1), task("short", 1), None,
+        ]  # fmt: skip
+        for slot, played in ((1, "middle"), (0, "long"), (2, "short")):
+            assert not queue.finished
+            yield slot, task(played, 0)
+        assert queue.finished
+
+    assert (
+        conducted(monkeypatch, [task("short", 1), task("long", 3, gpus=1), task("middle", 2)], story, slots=3)
+        == []
+    )
+
+
+def test_a_lost_model_comes_back_without_the_runs_that_are_made_or_given_up(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made = Made("base", "base/plain")
+    failed = Failure(stage="episodes", model="base", run="base/dark", reason="two of them")
+
+    def story(queue: TaskQueue[ModelTask]) -> Iterator[tuple[int, Any]]:
+        queue.take(0)
+        for slot, event, left in ((0, made, ["base/dark"]), (1, failed, [])):
+            yield slot, event
+            queue.retry(slot, "base", counts=False)
+            again = queue.take(slot + 1)
+            assert again is not None
+            assert [run.run for run in again.runs] == left
+
+    assert conducted(monkeypatch, [task("base", 1)], story, slots=1) == [made, failed]
+
+
+def test_a_model_is_given_up_after_three_losses_without_an_episode_in_between(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    moved = Moved("base", "base/plain", 1, 4, "correct")
+
+    def story(queue: TaskQueue[ModelTask]) -> Iterator[tuple[int, Any]]:
+        def lose() -> tuple[ModelTask, bool]:
+            held = queue.take(0)
+            assert held is not None
+            return held, queue.retry(0, "base")
+
+        assert all(lose()[1] for _ in range(2))
+        queue.take(0)
+        yield 0, moved
+        assert queue.retry(0, "base")
+        assert lose()[1]
+        held, again = lose()
+        assert not again
+        yield 0, GivenUp(held, "worker 0 ended with code -11")
+        assert queue.finished
+
+    reports = conducted(monkeypatch, [task("base", 1)], story, slots=1)
+    assert reports[0] == moved
+    failure = reports[1]
+    assert (failure.stage, failure.run, failure.error) == ("playing", "base/plain", "WorkerDiedError")
+    assert failure.reason.startswith("worker 0 ended with code -11, 3 times without an episode in between")
+
+
+FAILURE = Failure(stage="playing", model="base", run="base/dark", reason="no memory", when="noon")
+
+
+@pytest.fixture
+def study_file(tmp_path: Path) -> Path:
+    file = tmp_path / "study.toml"
+    file.write_text(BASE.replace("runs/small", str(tmp_path / "out")), encoding="utf-8")
+    return file
+
+
+@pytest.fixture
+def cell(study_file: Path) -> Cell:
+    return next(cell for cell in load_study(study_file).cells if cell.name == "base/dark")
+
+
+@pytest.fixture
+def failures(tmp_path: Path) -> Failures:
+    return Failures(str(tmp_path / "out"))
+
+
+def test_a_failure_is_stored_once_and_cleared(cell: Cell, failures: Failures, tmp_path: Path) -> None:
+    assert failures.of(cell) is None
+    failures.note(cell, FAILURE)
+    (file,) = (tmp_path / "out" / "failures").iterdir()
+    assert file.name == f"base+dark-{cell.key}.json"
+    before = file.stat()
+    failures.note(cell, FAILURE.model_copy(update={"when": "later"}))
+    assert (file.stat().st_ino, file.stat().st_mtime_ns) == (before.st_ino, before.st_mtime_ns)
+    failures.note(cell, FAILURE.model_copy(update={"stage": "probes"}), "main")
+    assert FAILURE.same(failures.of(cell))
+    failures.clear(cell)
+    assert failures.of(cell) is None
+    assert failures.of(cell, "main") is not None
+
+
+def test_what_a_killed_process_left_aside_is_removed(cell: Cell, failures: Failures, tmp_path: Path) -> None:
+    failures.note(cell, FAILURE)
+    draft = tmp_path / "out" / "failures" / "left.tmp"
+    draft.touch()
+    failures.check_place()
+    assert not draft.exists()
+
+
+@pytest.mark.parametrize("content", ["", "[]", '{"run": 1}', '{"run": "base/dark"}'])
+def test_a_record_that_is_none_is_named(cell: Cell, failures: Failures, tmp_path: Path, content: str) -> None:
+    failures.note(cell, FAILURE)
+    (file,) = (tmp_path / "out" / "failures").iterdir()
+    file.write_text(content, encoding="utf-8")
+    with pytest.raises(RunDamagedError, match=rf"{re.escape(file.name)} .*Delete it; no number"):
+        failures.of(cell)
+
+
+def test_a_failure_has_its_traceback_and_equals_the_same_one_later() -> None:
+    def failed() -> Failure:
+        try:
+            raise ValueError("no such layer")
+        except ValueError as error:
+            return Failure.of("playing", "base", "base/dark", error)
+
+    failure, again = failed(), failed()
+    assert str(failure) == "base failed at base/dark: no such layer"
+    assert "in failed\n" in failure.traceback
+    assert failure.error == "ValueError"
+    assert failure.same(again.model_copy(update={"when": "later", "traceback": ""}))
+    assert not failure.same(again.model_copy(update={"reason": "another layer"}))
+    assert not failure.same(None)
+
+
+def test_a_plan_names_failures_and_what_waits_for_them(study_file: Path, cell: Cell, failures: Failures) -> None:
+    failures.note(cell, FAILURE)
+    states = {
+        planned.cell.name: (planned.state, planned.why) for planned in plan_study(load_study(study_file)).cells
+    }
+    assert states["base/dark"] == ("failed", "failed (noon): no memory")
+    assert states["base/plain"] == ("waiting", "new; waits, because base/dark failed")
+    assert states["state/plain"] == ("new", "new")
+    failures.note(cell, FAILURE.model_copy(update={"stage": "episodes"}))
+    assert whys(study_file)["base/plain"] == "new"
+
+
+def test_a_failure_of_former_settings_is_none(study_file: Path, cell: Cell, failures: Failures) -> None:
+    failures.note(cell, FAILURE)
+    text = study_file.read_text(encoding="utf-8")
+    study_file.write_text(text.replace("light_level = 0.7", "light_level = 0.6"), encoding="utf-8")
+    assert whys(study_file)["base/dark"] == "new"
+
+
+def whys(file: Path) -> dict[str, str]:
+    return {planned.cell.name: planned.why for planned in plan_study(load_study(file)).cells}
+
+
+@pytest.mark.slow
+def test_a_plan_says_what_changed_since_a_run_of_the_same_name(small_suite: Suite, tmp_path: Path) -> None:
+    file = small_study(tmp_path, small_suite, SCRIPTED, items=6)
+    assert conduct_study(plan_study(load_study(file)), env_workers=0) == []
+    assert set(whys(file).values()) == {"whole"}
+    text = file.read_text(encoding="utf-8")
+    file.write_text(text.replace("light_level = 0.7", "light_level = 0.6"), encoding="utf-8")
+    expected = {"plain": "whole", "dark": "new: light_level 0.7 → 0.6"}
+    assert whys(file) == {f"{model}/{way}": why for model in ("expert", "idle") for way, why in expected.items()}

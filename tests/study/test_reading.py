@@ -1,14 +1,28 @@
 """Study files: mistakes with their paths, all at once, and what a correct one expands to."""
 
+import os
+import resource
+import subprocess
+import sys
+import time
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from probe_kit.errors import UsageError
 from probe_kit.extract import ExtractSettings
-from probe_kit.study import LoadedStudy, StudyFileError, load_study, plan_study
+from probe_kit.extract.plan import EPISODE, THUMBNAILS
+from probe_kit.hooks.contract.sites import Site
+from probe_kit.runs.layout import StoredStream
+from probe_kit.study import LoadedStudy, StudyFileError, StudyPlan, load_study, make_table, plan_study
+from probe_kit.study.cells import Cell
 from probe_kit.study.expansion import control_of
+from probe_kit.study.plan import PlannedCell, State, is_of_network
 from probe_kit.suite import Suite
+from probe_kit.train.results.control_scores import UntrainedScore
+from probe_kit.train.results.probe_curve import ProbeCurve
 from tests.study.broken_files import BASE, ELSEWHERE, MISTAKES
 
 
@@ -279,3 +293,129 @@ def test_paths_are_relative_to_the_working_directory_also_in_studies_of_the_pack
     study = load_study(written(tmp_path / "files", text))
     assert study.suite.identity == f"{small_suite.name}@{small_suite.version}"  # a suite that grows keeps its runs
     assert study.cells[0].settings_to_play.source.suite == Path("suites/paper")
+
+
+def command(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-X", "importtime", "-m", "probe_kit", "study", *arguments],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        capture_output=True,
+        encoding="utf-8",
+        check=False,
+    )
+
+
+def stored(folder: Path) -> dict[Path, tuple[int, int]]:
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return {path: (path.stat().st_ino, path.stat().st_mtime_ns) for path in files}
+
+
+@pytest.mark.slow
+def test_the_embedded_study_runs_to_all_tables_and_again_without_a_model(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    began, before = time.monotonic(), resource.getrusage(resource.RUSAGE_CHILDREN)
+    played = command(tmp_path, "run", "embedded", "--slots", "2")
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    assert played.returncode == 0, played.stderr[-3000:]
+    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    print(f"{time.monotonic() - began:.0f} s, {cpu:.0f} CPU seconds, load {os.getloadavg()[0]:.1f}")
+    files = stored(tmp_path)
+    again = command(tmp_path, "run", "embedded")
+    assert again.returncode == 0, again.stderr[-3000:]
+    assert "missing: 0 episodes" in again.stdout
+    assert not [line for line in again.stderr.splitlines() if line.split("|")[-1].strip() == "torch"]
+    assert stored(tmp_path) == files
+    assert command(tmp_path, "run", "embedded", "--dry-run", "--exit-code").returncode == 0
+    monkeypatch.chdir(tmp_path)
+    study = load_study("embedded")
+    for name in study.study.tables:
+        assert make_table(study, name).numbers, name
+
+
+LAYERS = 3
+
+
+def curve(layers: int = LAYERS) -> ProbeCurve:
+    """Decisions about 8 episodes, of which layer n has n + 1 right."""
+    labels, names = np.tile([True, False], 4), np.arange(8).astype(str)
+    right = np.arange(8) <= np.arange(layers)[:, None]
+    return ProbeCurve(
+        sites=tuple(Site("backbone", layer) for layer in range(layers)), labels=labels, episodes=names,
+        items=names, groups=names, fold_of=np.arange(8) % 4, decisions=np.where(right == labels, 1.0, -1.0),
+        strengths=np.ones((layers, 4)), null=np.full((layers, 9), 0.5), inner=np.zeros((layers, 4, 8), np.float32),
+    )  # fmt: skip
+
+
+def test_a_network_without_the_site_or_category_of_a_comparison_is_another_one() -> None:
+    site = str(curve().sites[LAYERS - 1])
+    score = UntrainedScore(
+        "color", "mean", site, site, False, 1.0, LAYERS / 8, 1 - LAYERS / 8, (0.5, 0.7), "tiny (random weights)"
+    )
+    assert is_of_network(score, {("color", "mean"): curve()})
+    assert not is_of_network(replace(score, untrained_accuracy=0.5), {("color", "mean"): curve()})
+    assert not is_of_network(score, {("color", "mean"): curve(LAYERS - 1)})
+    assert not is_of_network(score, {("shape", "mean"): curve()})
+
+
+STREAMS = (StoredStream("backbone", 4, 64, None, 150, ("mean", "last")),)
+
+
+@pytest.fixture
+def study(tmp_path: Path) -> LoadedStudy:
+    file = tmp_path / "study.toml"
+    file.write_text(BASE, encoding="utf-8")
+    return load_study(file)
+
+
+@pytest.fixture
+def cells(study: LoadedStudy) -> dict[str, Cell]:
+    return {cell.name: cell for cell in study.cells}
+
+
+def planned(
+    cell: Cell, missing: int, seconds: float | None = None, streams: tuple[StoredStream, ...] | None = None
+) -> PlannedCell:
+    """A cell of which these episodes are missing."""
+    stored = cell.episodes - missing
+    state: State = "whole" if not missing else "partial" if stored else "new"
+    return PlannedCell(cell, "", state, stored, "", seconds=seconds, streams=streams)
+
+
+def test_hours_come_from_stored_episodes_of_the_model_by_inferences(
+    study: LoadedStudy, cells: dict[str, Cell]
+) -> None:
+    plain, dark = cells["base/plain"], cells["base/dark"]
+    short = replace(
+        plain, way="short", settings=plain.settings.changed(scene=replace(plain.settings.scene, max_steps=20))
+    )
+    assert (plain.units, short.units) == (40, 20)
+    reader = planned(cells["reader/p1"], 40)
+    plan = StudyPlan(study, (planned(plain, 90, 8.0), planned(short, short.episodes), planned(dark, 0), reader))
+    assert plan.seconds == pytest.approx({"base/plain": 90 * 8.0, "base/short": short.episodes * 4.0})
+    assert plan.hours() == {"base": pytest.approx((720 + 4 * short.episodes) / 3600), "reader": None}
+    assert "hours unknown before a first episode is stored: reader" in plan.lines()
+
+
+def test_bytes_come_from_stored_streams_of_the_model(study: LoadedStudy, cells: dict[str, Cell]) -> None:
+    plain, dark = cells["base/plain"], cells["base/dark"]
+    activations = 2 * 4 * 64 * 2 * 4  # rows and columns, of layers, features, views and float32
+    expected = activations + 4 * 16 + EPISODE + THUMBNAILS
+    stored, new = planned(plain, 3, 1.0, STREAMS), planned(dark, 2)
+    assert StudyPlan(study, (stored, new)).bytes() == {"base": 5 * expected}
+    assert StudyPlan(study, (new,)).bytes() == {"base": None}
+
+
+def test_every_inference_takes_bytes_at_most(study: LoadedStudy, cells: dict[str, Cell]) -> None:
+    plain = cells["base/plain"]
+    most, fixed = plain.settings.scene.max_steps, 4 * 16 + EPISODE + THUMBNAILS
+    for later, bytes_of_later in (("all", 2 * 4 * 64 * 2 * 4), ("mean", 2 * 4 * 64 * 2)):
+        every = replace(plain, settings=plain.settings.changed(captured_calls="all", later_views=later))
+        expected = 2 * 4 * 64 * 2 * 4 + (most - 1) * bytes_of_later + fixed
+        assert StudyPlan(study, (planned(every, 1, 1.0, STREAMS),)).bytes() == {"base": expected}
+
+
+def test_nothing_missing_takes_nothing(study: LoadedStudy, cells: dict[str, Cell]) -> None:
+    plan = StudyPlan(study, (planned(cells["base/plain"], 0, 1.0, STREAMS),))
+    assert (plan.hours(), plan.bytes(), plan.seconds) == ({}, {}, {})

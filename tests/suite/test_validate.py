@@ -1,5 +1,12 @@
+"""What items are enough for, and how many would be, is known before any work."""
+
 import json
+import re
+import struct
+import zlib
 from collections.abc import Callable
+from dataclasses import replace
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -9,11 +16,21 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from probe_kit.cli import app
-from probe_kit.errors import UsageError
+from probe_kit.errors import SuiteError, UsageError
 from probe_kit.statistics.significance import detectable
+from probe_kit.statistics.sufficiency import (
+    GROUPS_FOR_PROBES,
+    groups_for_absence,
+    groups_for_interventions,
+    groups_for_not_used,
+    groups_for_signal,
+)
 from probe_kit.suite import Suite, load_suite, validate_suite
-from probe_kit.suite.pictures import encode_png
+from probe_kit.suite.pictures import decode_picture, encode_png
+from probe_kit.suite.rules import Finding, listing
+from probe_kit.suite.sufficiency import Smallest, Sufficiency, sufficiencies
 from probe_kit.suite.suite import count_by_category
+from tests.support.changed_suites import save_changed
 
 Record = dict[str, Any]
 EditRecords = Callable[[Callable[[list[Record]], None]], Path]
@@ -154,3 +171,252 @@ def test_validate_says_how_strong_a_leak_must_be_to_be_found(small_suite: Suite)
     assert power == {name: pytest.approx(detectable(count)) for name, count in counts.items()}
     text = CliRunner().invoke(app, ["suite", "validate", str(small_suite.folder), "--power"]).stdout
     assert "a leak is found in 4 of 5 suites" in text
+
+
+def set_field(name: str, value: Any) -> Callable[[list[Record]], None]:
+    """Gives the first record another value."""
+
+    def change(records: list[Record]) -> None:
+        records[0][name] = value
+
+    return change
+
+
+def say(phrase: str) -> Callable[[list[Record]], None]:
+    """Asks the first record for something else."""
+
+    def change(records: list[Record]) -> None:
+        records[0] |= {"object_phrase": phrase, "instruction": f"Put the cube on the {phrase}"}
+
+    return change
+
+
+def drop_field(records: list[Record]) -> None:
+    del records[0]["pair_id"]
+
+
+def repeat_id(records: list[Record]) -> None:
+    records[1]["item_id"] = records[0]["item_id"]
+
+
+def show_one_picture_twice(records: list[Record]) -> None:
+    records[0]["right_pixels_sha256"] = records[0]["left_pixels_sha256"]
+
+
+def ask_for_both(records: list[Record]) -> None:
+    records[0]["distractor_concept"] = records[0]["target_concept"]
+
+
+@pytest.mark.parametrize(
+    ("change", "finding"),
+    [
+        (drop_field, r"E02 metadata.jsonl:1: field 'pair_id' is missing"),
+        (set_field("gen", "none"), r"E02 metadata.jsonl:1: field 'gen' is 'none'; expected a dict"),
+        (set_field("correct_side", "centre"), r"E02 .*'correct_side' is 'centre'; expected one of left, right"),
+        (set_field("category", "My colours"), r"E02 .*'category' is 'My colours'; expected one like 'ripe-fruit'"),
+        (set_field("schema_version", "2.0"), r"E03 metadata.jsonl:1: uses schema 2.0; this tool reads 1.x"),
+        (repeat_id, r"E04 item a2a-embedded-color-\w+: the id appears in lines 1 and 2"),
+        (set_field("left_file_name", "images/no.png"), r"E05 item .*: picture 'images/no.png' not found"),
+        (set_field("left_file_name", "../x.png"), r"E05 item .*: the path '../x.png' leaves the suite folder"),
+        (set_field("left_file_name", "/x.png"), r"E05 item .*: the path '/x.png' leaves the suite folder"),
+        (set_field("left_sha256", "ab" * 32), r"E06 .*left picture changed.*expected abababababab, found"),
+        (show_one_picture_twice, r"E08 item .*: both sides are the same picture"),
+        (ask_for_both, r"E11 item .*: target and distractor concept are both '\w+'"),
+        (set_field("instruction", "Put the cube on me"), r"E09 item .*does not contain the object phrase"),
+        (set_field("object_phrase", ""), r"E09 item .*does not contain the object phrase ''"),
+        (say("red shape."), r"E09 item .*ends with a period"),
+        (say("red\nshape"), r"E09 item .*more than one line"),
+        (say("very " * 12 + "red shape"), r"E09 item .*has 19 words \(limit 12\)"),
+        (say("x" * 80), r"E09 item .*has 100 characters \(limit 80\)"),
+        (say("left shape"), r"E10 item .*names a side \('left'\)"),
+        (set_field("license", " "), r"E14 item .*: licence missing"),
+        (set_field("license", "LicenseRef-x"), r"E14 item .*marked redistributable"),
+        (set_field("contains_real_face", True), r"E15 item .*suite.json says there are none"),
+        (set_field("group_id", "g-other"), r"E12 items .* share picture \w+ but have groups g-other, g-"),
+        (list.pop, r"E13 suite.json: count per category differs: .*'shape': 12.*'shape': 11"),
+        (set_field("instruction", "Put the cube on me"), r"E13 suite.json: content hash differs"),
+    ],
+)
+def test_each_rule_finds_its_violation(edit_records: EditRecords, change: Any, finding: str) -> None:
+    folder = edit_records(change)
+    with pytest.raises(SuiteError, match=finding):
+        load_suite(folder)
+
+
+def test_an_untouched_copy_passes_all_rules(edit_records: EditRecords) -> None:
+    folder = edit_records(lambda _: None)
+    assert len(load_suite(folder).items) == 24
+
+
+def test_fields_of_a_later_minor_schema_are_left_out(small_suite: Suite, tmp_path: Path) -> None:
+    first, *others = small_suite.items
+    later = replace(small_suite, items=(replace(first, schema_version="1.7"), *others))
+    folder = save_changed(later, tmp_path / "later").folder
+    lines = (folder / "items" / "metadata.jsonl").read_text(encoding="utf-8").splitlines()
+    lines[0] = json.dumps(json.loads(lines[0]) | {"mood": "sunny"})
+    (folder / "items" / "metadata.jsonl").write_text("\n".join(lines), encoding="utf-8")
+    assert load_suite(folder).items[0].schema_version == "1.7"
+
+
+@pytest.mark.parametrize("field", ["schema_version", "pair_id"])
+def test_what_stands_in_the_hash_cannot_be_changed_unseen(field: str, edit_records: EditRecords) -> None:
+    with pytest.raises(SuiteError, match=r"E13 suite\.json: content hash differs"):
+        load_suite(edit_records(set_field(field, "1.7")))
+
+
+@pytest.mark.parametrize(("field", "value"), [("name", "mine"), ("version", "9.9.9"), ("schema_version", "1.7")])
+def test_what_the_card_names_cannot_be_changed_unseen(field: str, value: str, edit_records: EditRecords) -> None:
+    folder = edit_records(lambda _: None)
+    card = json.loads((folder / "suite.json").read_text(encoding="utf-8"))
+    (folder / "suite.json").write_text(json.dumps(card | {field: value}), encoding="utf-8")
+    with pytest.raises(SuiteError, match=r"E13 suite\.json: content hash differs"):
+        load_suite(folder)
+
+
+def test_all_findings_are_reported_at_once(edit_records: EditRecords) -> None:
+    def change(records: list[Record]) -> None:
+        ask_for_both(records)
+        records[3]["left_file_name"] = "images/no.png"
+
+    with pytest.raises(SuiteError) as caught:
+        load_suite(edit_records(change))
+    assert all(rule in str(caught.value) for rule in ("E05", "E11", "E13"))
+
+
+def test_a_report_holds_at_most_twenty_findings_of_a_rule() -> None:
+    findings = [Finding("E06", "error", f"item {n}", "changed") for n in range(23)]
+    findings.append(Finding("E05", "error", "item x", "not found"))
+    lines = listing(findings).splitlines()
+    assert lines[0] == "E05 item x: not found"
+    assert len(lines) == 1 + 20 + 1
+    assert lines[-1] == "E06: and 3 more"
+
+
+def test_a_picture_may_not_be_a_link_that_leaves_the_suite(edit_records: EditRecords, tmp_path: Path) -> None:
+    folder = edit_records(lambda _: None)
+    picture = next(folder.glob("items/images/*/*.png"))
+    picture.rename(tmp_path / "elsewhere.png")
+    picture.symlink_to(tmp_path / "elsewhere.png")
+    with pytest.raises(SuiteError, match=r"E05 item .* is a link that leaves the suite folder"):
+        load_suite(folder)
+
+
+@pytest.mark.parametrize(
+    ("change", "finding"),
+    [
+        (
+            set_field("item_id", "a\x1b[31m"),
+            r"E02 .*'item_id' holds characters that cannot be printed \('a␛\[31m'\)",
+        ),
+        (set_field("item_id", "two\nlines"), r"E02 .*'item_id' holds characters"),
+        (set_field("attribution", "user\u202egnp"), r"E02 .*'attribution' holds characters"),
+        (set_field("attribution", "x" * 5000), r"E02 .*'attribution' has 5000 characters; expected at most 4096"),
+        (set_field("left_file_name", "images/" + "a" * 5000), r"E02 .*'left_file_name' has 5007 characters"),
+        (set_field("instruction", "half \ud800"), r"E01 .*half a surrogate pair"),
+    ],
+)
+def test_text_that_no_terminal_or_file_system_should_meet_is_refused(
+    edit_records: EditRecords, change: Any, finding: str
+) -> None:
+    with pytest.raises(SuiteError, match=finding):
+        load_suite(edit_records(change))
+
+
+@pytest.mark.parametrize("name", ["suite.json", "items/metadata.jsonl"])
+@pytest.mark.parametrize(
+    "content", [b"[" * 100_000, b'{"a":' * 100_000, b"\xed\xa0\x80", b"9" * 5000, b"\xff\xfe"]
+)
+def test_json_that_is_none_is_a_finding(edit_records: EditRecords, name: str, content: bytes) -> None:
+    folder = edit_records(lambda _: None)
+    (folder / name).write_bytes(content)
+    with pytest.raises(SuiteError, match="E01"):
+        load_suite(folder)
+
+
+def test_a_picture_that_fills_all_memory_once_decoded_is_refused(edit_records: EditRecords) -> None:
+    bomb = png_bomb(12_000)
+    folder = edit_records(set_field("left_sha256", sha256(bomb).hexdigest()))
+    record = json.loads((folder / "items/metadata.jsonl").read_text(encoding="utf-8").splitlines()[0])
+    (folder / "items" / record["left_file_name"]).write_bytes(bomb)
+    with pytest.raises(SuiteError, match=r"E07 item .*left picture is 12000×12000; at most 8192 are read"):
+        load_suite(folder)
+    with pytest.raises(SuiteError, match="claims to be 12000×12000"):
+        decode_picture(folder / "items" / record["left_file_name"])
+
+
+def png_bomb(side: int) -> bytes:
+    """A PNG of a few bytes that claims a size."""
+    parts = [(b"IHDR", struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0)), (b"IDAT", zlib.compress(b""))]
+    chunks = [
+        struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+        for kind, body in parts
+    ]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
+
+
+def by_name(suite: Suite, scored: bool = True, probed: bool = True) -> dict[str, Sufficiency]:
+    return {one.name: one for one in sufficiencies(suite, scored, probed)}
+
+
+@pytest.mark.parametrize("items", [2, 6, 8, 10, 12])
+def test_every_use_is_enough_exactly_from_its_number_of_groups(items: int, small_suite: Suite) -> None:
+    suite = small_suite.select(None, items)
+    groups = min(len({one.group_id for one in suite.items if one.category == name}) for name in suite.categories)
+    said = by_name(suite)
+    assert list(said) == [
+        "success rate", "probes", "retention", "shown", "absent", "interventions", "not used",
+    ]  # fmt: skip
+    assert said["probes"].enough == said["retention"].enough == (groups >= GROUPS_FOR_PROBES)
+    assert said["shown"].enough == (groups >= groups_for_signal())
+    assert said["interventions"].enough == (groups >= groups_for_interventions())
+    assert said["not used"].enough == (groups >= groups_for_not_used())
+    assert said["absent"].enough == (groups >= groups_for_absence(round(2 * items / groups)))
+    assert said["success rate"].enough is (False if items < 4 else None)
+    for one in said.values():
+        if one.enough is False and one.name != "success rate":
+            assert one.words.startswith(f"no, {groups} groups of ")
+            assert re.search(r"; (take \d+ (items|or more)|the suite has \d+)$", one.words)
+            assert len(one.words) < 64  # a line of a terminal of 80 columns
+
+
+@pytest.mark.parametrize("category", ["color", "shape"])
+def test_the_number_of_items_that_would_do_is_the_smallest_that_can_be_selected(
+    category: str, small_suite: Suite
+) -> None:
+    smallest = Smallest.of(small_suite.select([category], 2))
+    for groups in range(1, 7):
+        items = smallest.items_for(groups)
+        if items is None:
+            assert Smallest.of(small_suite.select([category])).groups < groups
+            continue
+        assert Smallest.of(small_suite.select([category], items)).groups >= groups
+        if items > 2:
+            assert Smallest.of(small_suite.select([category], items - 2)).groups < groups
+
+
+def test_the_category_with_the_fewest_groups_decides_and_is_named(small_suite: Suite) -> None:
+    few = small_suite.select(["shape"], 4).items
+    suite = Suite(
+        small_suite.name, small_suite.version,
+        tuple(item for item in small_suite.items if item.category == "color" or item in few),
+        small_suite.folder, small_suite.card,
+    )  # fmt: skip
+    assert Smallest.of(suite).words.startswith("shape: 4 items in ")
+
+
+def test_a_use_that_a_run_cannot_have_is_not_mentioned(small_suite: Suite) -> None:
+    suite = small_suite.select(None, 4)
+    assert list(by_name(suite, probed=False)) == ["success rate"]
+    assert next(iter(by_name(suite, scored=False))) == "probes"
+
+
+def test_the_command_says_it_before_any_work_in_few_lines(small_suite: Suite, tmp_path: Path) -> None:
+    command = ["extract", "--model", "idle", "--suite", str(small_suite.folder), "--items", "4", "--dry-run"]
+    answer = CliRunner().invoke(app, [*command, "--out", str(tmp_path / "run")])
+    assert answer.exit_code == 0, answer.output
+    lines = answer.output.splitlines()
+    at = next(number for number, line in enumerate(lines) if "enough for" in line)
+    assert "4 items in" in lines[at]
+    assert "Δ = ± 49.0 points; ± 10 takes 97 items" in lines[at + 1]
+    assert len(lines) - at <= 8
+    assert not (tmp_path / "run").exists()

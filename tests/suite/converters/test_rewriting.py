@@ -1,9 +1,19 @@
 """The unit table: questions as benchmarks ask them, the rule that matches, the phrase, and its opposite."""
 
-import pytest
+import json
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
 
-from probe_kit.suite.converters import rewrite
-from probe_kit.suite.converters.rewriting import base_of, clean, opposite_of
+import numpy as np
+import pytest
+from PIL import Image
+
+from probe_kit.errors import SuiteError, UsageError
+from probe_kit.suite.converters import ConvertOptions, convert, rewrite
+from probe_kit.suite.converters.rewriting import base_of, clean, opposite_of, picture_problem, text_problem
+from probe_kit.suite.pictures import look_of
 
 SYMMETRIC, ASYMMETRIC = "picture with a line of symmetry", "picture without a line of symmetry"
 TABLE = [
@@ -146,3 +156,140 @@ def test_opposites_are_reviewed_words_or_less() -> None:
 @pytest.mark.parametrize("base", ["clean", "green", "calm", "tough", "quiet", "new", "young", "smart", "black"])
 def test_a_comparative_that_only_added_er_loses_only_that(base: str) -> None:
     assert base_of(f"{base}er") == base
+
+
+OPTIONS = ConvertOptions()
+
+
+def noise(width: int, height: int) -> Image.Image:
+    pixels = np.random.default_rng(0).integers(0, 256, (height // 20 + 1, width // 20 + 1, 3), dtype=np.uint8)
+    return Image.fromarray(pixels).resize((width, height), Image.Resampling.BICUBIC)
+
+
+@pytest.mark.parametrize(
+    ("image", "problem"),
+    [
+        (noise(120, 100), None),
+        (noise(120, 99), "picture too small"),
+        (noise(251, 100), "picture too long"),
+        (Image.new("RGB", (120, 120), "red"), "picture nearly blank"),
+    ],
+)
+def test_pictures_are_judged_by_size_shape_and_contrast(image: Image.Image, problem: str | None) -> None:
+    assert picture_problem(image, OPTIONS) == problem
+
+
+def test_a_source_of_small_pictures_may_have_its_own_limit() -> None:
+    assert picture_problem(noise(48, 48), OPTIONS, least_side=48) is None
+
+
+def test_fine_detail_is_lost_on_a_tile_and_coarse_detail_is_not() -> None:
+    options = ConvertOptions(legible_at=40)
+    fine = Image.fromarray(np.random.default_rng(0).integers(0, 256, (400, 400, 3), dtype=np.uint8))
+    assert picture_problem(fine, options) == "picture not legible on a tile"
+    assert picture_problem(noise(100, 100), options) is None
+
+
+def test_a_re_encoded_picture_looks_the_same_and_another_colour_does_not() -> None:
+    picture = noise(200, 200)
+    smaller = picture.resize((150, 150))
+    red, green, blue = picture.split()
+    assert look_of(picture).same_as(look_of(smaller))
+    assert not look_of(picture).same_as(look_of(Image.merge("RGB", (blue, green, red))))
+
+
+@pytest.mark.parametrize(
+    ("instruction", "problem"),
+    [
+        ("Put the cube on the red shape", None),
+        ("Put the cube on the " + "very " * 8 + "red shape", "instruction has too many words"),
+        ("Put the cube on the " + "x" * 61, "instruction too long"),
+        ("Put the cube. Then stop", "instruction is more than one sentence"),
+        ("Put the cube on the red shape.", "instruction ends with a period"),
+        ("Put the cube on the café", "instruction is not plain ASCII"),
+        ("Put the cube on the left shape", "instruction names a side"),
+    ],
+)
+def test_instructions_are_short_plain_single_sentences(instruction: str, problem: str | None) -> None:
+    assert text_problem(instruction, "red shape", OPTIONS) == problem
+
+
+def test_other_alphabets_are_allowed_on_request() -> None:
+    assert text_problem("Put the cube on the café", "café", ConvertOptions(allow_unicode=True)) is None
+
+
+GOOD = {"instruction": "Put the cube on the calmer sky", "object": "calmer sky", "polarity": "none", "keep": True}
+
+
+class Service:
+    """Answers every request with `reply` and remembers them."""
+
+    def __init__(self) -> None:
+        self.reply: object = GOOD
+        self.requests: list[dict[str, object]] = []
+        outer = self
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_POST(self) -> None:
+                body = self.rfile.read(int(self.headers["Content-Length"]))
+                outer.requests.append({"path": self.path, **json.loads(body)})
+                content = {"choices": [{"message": {"content": json.dumps(outer.reply)}}]}
+                self.send_response(200)
+                self.end_headers()
+                self.wfile.write(json.dumps(content).encode())
+
+            def log_message(self, *_: object) -> None:
+                pass
+
+        self.server = HTTPServer(("127.0.0.1", 0), Handler)
+        self.base = f"http://127.0.0.1:{self.server.server_port}/v1"
+
+
+@pytest.fixture
+def service() -> Iterator[Service]:
+    running = Service()
+    threading.Thread(target=running.server.serve_forever, daemon=True).start()
+    yield running
+    running.server.shutdown()
+    running.server.server_close()
+
+
+def test_a_proposal_waits_for_a_person_unless_models_are_trusted(
+    service: Service, compbench_root: Path, tmp_path: Path
+) -> None:
+    llm = {"llm_base": service.base, "llm_model": "tiny", "llm_cache": str(tmp_path / "cache")}
+    source = ("mllm-compbench", compbench_root)
+    waiting = convert(*source, tmp_path / "waiting", categories=["attribute"], **llm)
+    assert "calmer sky" not in {item.object_phrase for item in waiting.items}
+    trusted = convert(*source, tmp_path / "trusted", categories=["attribute"], trust_llm=True, **llm)
+    (item,) = [item for item in trusted.items if item.object_phrase == "calmer sky"]
+    assert (item.rule_id, item.curation_status) == ("llm", "llm-trusted")
+    assert trusted.card["curation"] == ["llm-trusted", "rules-only"]
+    assert len(service.requests) == 1, "the second run is answered by the cache"
+    assert service.requests[0]["path"] == "/v1/chat/completions"
+    assert service.requests[0]["temperature"] == 0
+
+
+@pytest.mark.parametrize(
+    "reply",
+    ["no object", {**GOOD, "keep": False}, {**GOOD, "instruction": "Take the calmer sky"}, {**GOOD, "object": ""}],
+)
+def test_an_unusable_reply_leaves_the_question_unworded(
+    service: Service, compbench_root: Path, tmp_path: Path, reply: object
+) -> None:
+    service.reply = reply
+    llm = {"llm_base": service.base, "llm_model": "tiny", "llm_cache": str(tmp_path / "cache"), "trust_llm": True}
+    suite = convert("mllm-compbench", compbench_root, tmp_path / "suite", categories=["attribute"], **llm)
+    assert {item.rule_id for item in suite.items} == {"R2"}
+
+
+def test_a_service_that_does_not_answer_is_an_error(compbench_root: Path, tmp_path: Path) -> None:
+    llm = {"llm_base": "http://127.0.0.1:9", "llm_model": "tiny", "llm_cache": str(tmp_path / "cache")}
+    with pytest.raises(SuiteError, match="gave no usable reply"):
+        convert("mllm-compbench", compbench_root, tmp_path / "suite", categories=["attribute"], **llm)
+    assert not (tmp_path / "suite").exists()
+
+
+def test_half_of_the_settings_are_refused(compbench_root: Path, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="llm_base needs llm_model and llm_cache"):
+        convert("mllm-compbench", compbench_root, tmp_path / "suite", llm_base="http://127.0.0.1:9")

@@ -1,8 +1,9 @@
 """What every embedded category promises, and the rules of each."""
 
 import hashlib
-from collections import Counter
-from collections.abc import Sequence
+from collections import Counter, defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import fields
 from itertools import combinations, islice
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from probe_kit.suite import CATEGORIES
+from probe_kit.hashing import sha256_json
+from probe_kit.suite import CATEGORIES, Item, Side, Suite, build_suite
+from probe_kit.suite.build import draw_twins
 from probe_kit.suite.generators import GENERATORS, Concept, vocabulary
 from probe_kit.suite.generators.attribute import GRADABLES
 from probe_kit.suite.generators.counting import GLYPHS
@@ -433,3 +436,117 @@ def test_backgrounds_are_pale_whatever_the_ink() -> None:
         backgrounds = np.array([background_for(ink, rng) for _ in range(100)])
         assert backgrounds.min() >= 150 - 12
         assert np.ptp(backgrounds, axis=1).max() <= 2 * 12
+
+
+SIDES: tuple[Side, Side] = ("left", "right")
+
+
+def twins_of(suite: Suite) -> list[tuple[Item, Item]]:
+    pairs: dict[str, list[Item]] = defaultdict(list)
+    for item in suite.items:
+        pairs[item.pair_id].append(item)
+    return [(first, second) for first, second in pairs.values()]
+
+
+@pytest.mark.slow
+def test_twins_show_the_same_pictures_in_the_same_places_and_ask_both_ways(embedded: Suite) -> None:
+    for first, second in twins_of(embedded):
+        assert [first.picture(side) for side in SIDES] == [second.picture(side) for side in SIDES]
+        assert first.target_concept == second.distractor_concept
+        assert first.distractor_concept == second.target_concept
+        assert {first.correct_side, second.correct_side} == {"left", "right"}
+        assert first.group_id == second.group_id
+
+
+def test_every_concept_is_target_as_often_as_distractor(embedded: Suite) -> None:
+    targets = Counter((item.category, item.target_concept) for item in embedded.items)
+    assert targets == Counter((item.category, item.distractor_concept) for item in embedded.items)
+
+
+@pytest.mark.parametrize("category", list(GENERATORS))
+def test_each_original_layout_has_as_many_answers_left_as_right(embedded: Suite, category: str) -> None:
+    sides = Counter(item.correct_side for item in embedded.items if item.category == category)
+    assert sides["left"] == sides["right"] == 20
+
+
+def test_no_phrase_leans_to_a_side_in_the_original_layout(embedded: Suite) -> None:
+    lean: Counter[str] = Counter()
+    for item in embedded.items:
+        lean[item.object_phrase] += 1 if item.correct_side == "left" else -1
+    assert max(map(abs, lean.values())) <= 2
+
+
+def test_which_twin_comes_first_says_nothing_about_its_side(embedded: Suite) -> None:
+    left_first = np.mean([first.correct_side == "left" for first, _ in twins_of(embedded)])
+    assert abs(left_first - 0.5) < 3 * np.sqrt(0.25 / len(twins_of(embedded)))
+
+
+def test_instructions_name_no_side_and_follow_one_form(embedded: Suite) -> None:
+    for item in embedded.items:
+        assert item.instruction == f"Put the cube on the {item.object_phrase}"
+        assert not {"left", "right", "first", "second", "centre", "middle"} & set(item.instruction.lower().split())
+
+
+def test_an_item_says_where_its_pictures_come_from_and_how_they_were_drawn(embedded: Suite) -> None:
+    item = embedded.select(["color"], 2).items[0]
+    assert item.source["benchmark"] == "a2a-embedded"
+    assert (item.transfer_type, item.license, item.attribution) == ("procedural", "Apache-2.0", "probe_kit")
+    assert item.gen["generator"] == item.category
+    assert set(item.gen["left"]) == set(item.gen["right"])
+
+
+def test_every_field_has_one_type_so_that_tables_can_be_inferred(embedded: Suite) -> None:
+    for field in fields(Item):
+        assert len({type(getattr(item, field.name)) for item in embedded.items}) == 1
+        assert all(getattr(item, field.name) is not None for item in embedded.items)
+
+
+COLOURFUL = ("attribute", "color", "shape", "traffic")
+DRAWN_FROM = "091f29c53352e411b1b0b3458a1487bd2be7256957eef7daecb189dc284b8872"
+"""sha256 of what the first three couples of every category are drawn from and asked, and of their sides."""
+
+
+def tiles_of(category: str, count: int = 60) -> list[Any]:
+    couples = islice(draw_couples(GENERATORS[category], seed=0), count)
+    return [tile for couple in couples for tile in (couple.left_tile, couple.right_tile)]
+
+
+def test_the_items_are_those_of_this_suite_version() -> None:
+    """Parameters instead of pixels, which other versions of Pillow may shade otherwise."""
+    twins = [pair for name in GENERATORS for pair in draw_twins(name, 3, 0)]
+    drawn = [[item.gen, item.instruction, item.correct_side] for pair in twins for item in pair.items]
+    assert sha256_json(drawn) == DRAWN_FROM
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("category", COLOURFUL)
+def test_pictures_stay_on_their_tile_and_stand_out(category: str) -> None:
+    for tile in tiles_of(category):
+        pixels = np.asarray(tile.draw())
+        border = np.concatenate([pixels[0], pixels[-1], pixels[:, 0], pixels[:, -1]])
+        assert (border == tile.background).all()
+        assert abs(lightness(tile.ink) - lightness(tile.background)) >= INK_CONTRAST
+
+
+@pytest.mark.parametrize("category", COLOURFUL)
+def test_backgrounds_are_far_more_colourful_than_pale_ones(category: str) -> None:
+    def chroma(background: Callable[[Any], tuple[int, int, int]]) -> float:
+        return float(np.mean([max(color) - min(color) for color in map(background, tiles_of(category, 40))]))
+
+    rng = np.random.default_rng(0)
+    assert chroma(lambda tile: tile.background) > 4 * chroma(lambda tile: background_for(tile.ink, rng))
+
+
+def test_no_background_has_a_colour_that_is_asked_for() -> None:
+    def nearest(color: tuple[int, int, int]) -> str:
+        return min(COLORS, key=lambda name: float(np.abs(np.subtract(COLORS[name], color)).sum()))
+
+    for couple in islice(draw_couples(GENERATORS["color"], seed=0), 60):
+        met = {couple.left.name, couple.right.name}
+        assert not {nearest(couple.left_tile.background), nearest(couple.right_tile.background)} & met
+
+
+def test_a_suite_is_built_again_equal_and_names_its_version(tmp_path: Path) -> None:
+    first, again = (build_suite(tmp_path / name, ["color", "counting"], 4) for name in ("first", "again"))
+    assert first.identity == again.identity
+    assert first.identity.startswith("a2a-embedded@2.0.0#")
