@@ -4,7 +4,7 @@ Stored probes are used on the activations of another run of the same episodes. N
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -28,7 +28,6 @@ from probe_kit.statistics.label_permutations import flip_groups, max_statistic_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.suite.categories import category_of
 from probe_kit.train.crossval.task_scores import correctness
-from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import Direction, ProbeResults
 from probe_kit.train.results.store import load_results
 
@@ -40,72 +39,56 @@ _CONSTANT = 1e-9
 """Share of the largest deviation below which a feature does not vary."""
 
 
-@dataclass(frozen=True)
-class ProbedRun:
-    """A run of one wording, with its probes."""
-
-    run: RunReader
-    results: ProbeResults
-
-    def features(self, site: Site, view: str, episodes: NDArray[np.str_]) -> Features:
-        """(E, D) of these episodes, in this order."""
-        at = {name: row for row, name in enumerate(self.run.episodes["episode_id"].astype(str))}
-        return np.asarray(self.run.column(site, view)[[at[name] for name in episodes]], np.float64)
+Side = tuple[RunReader, ProbeResults]
+"""A run of one wording, with its probes."""
 
 
-@dataclass(frozen=True)
-class Transfer:
-    """The accuracy of the probes of one run on the activations of another, at S sites, as shares.
+def _features(side: Side, site: Site, view: str, episodes: NDArray[np.str_]) -> Features:
+    """Return (E, D) of these episodes, in this order."""
+    at = {name: row for row, name in enumerate(side[0].episodes["episode_id"].astype(str))}
+    return np.asarray(side[0].column(site, view)[[at[name] for name in episodes]], np.float64)
 
-    raw: decisions as they are. recentred: features are first centred and scaled as in the other run's own
-    training folds, without labels. p_fwe: of `recentred`, against the best site under label permutations of whole
-    groups.
+
+def _transfer(
+    probed: Side, other: Side, category: str, view: str, sites: Sequence[Site], common: NDArray[np.str_]
+) -> Features:
+    """Return (3, S): accuracies of the probes of one run on the activations of another, as shares, and p.
+
+    The first ones are of decisions as they are. For the second ones features are centred and scaled as in the
+    other run's own training folds, without labels. p is of these, against the best site under label permutations
+    of whole groups. Each of the `common` episodes is judged by the probe that was trained without its fold. Raises
+    UnknownSiteError for a site without a stored direction.
     """
-
-    raw: Features
-    recentred: Features
-    p_fwe: Features
-
-
-def transfer(
-    probed: ProbedRun, other: ProbedRun, category: str, view: str, sites: Sequence[Site], common: NDArray[np.str_]
-) -> Transfer:
-    """Decisions of `probed`'s probes on `other`'s activations of the `common` episodes.
-
-    Each episode is judged by the probe that was trained without its fold. Raises UnknownSiteError for a site
-    without a stored direction.
-    """
-    curve = probed.results.curves[category, view]
+    curve = probed[1].curves[category, view]
     rows = np.flatnonzero(np.isin(curve.episodes, common))
-    episodes, labels = curve.episodes[rows], curve.labels[rows]
+    episodes, labels, fold_of = curve.episodes[rows], curve.labels[rows], curve.fold_of[rows]
+    folds = np.unique(curve.fold_of)
     raw, recentred = np.empty((2, len(sites), rows.size))
     for at, site in enumerate(sites):
-        direction = probed.results.direction(category, view, site)
-        of_probed, of_other = (run.features(site, view, episodes) for run in (probed, other))
-        raw[at] = _decisions(direction, of_other, of_other, of_other, curve.fold_of[rows], curve)
-        recentred[at] = _decisions(direction, of_other, of_probed, of_other, curve.fold_of[rows], curve)
+        direction = probed[1].direction(category, view, site)
+        of_probed, of_other = (_features(side, site, view, episodes) for side in (probed, other))
+        raw[at] = _decisions(direction, of_other, None, fold_of, folds)
+        recentred[at] = _decisions(direction, of_other, of_probed, fold_of, folds)
     null = flip_groups(labels, curve.groups[rows], PERMUTATIONS, derive_seed("transfer", category, view))
     right = np.array([correctness(run[:, None], null).mean(axis=0) for run in recentred])
-    accuracies = (correctness(run, labels[None, :]).mean(axis=1) for run in (raw, recentred))
-    accuracy, aligned = accuracies
-    return Transfer(accuracy, aligned, max_statistic_p(aligned, right))
+    accuracy, aligned = (correctness(run, labels[None, :]).mean(axis=1) for run in (raw, recentred))
+    return np.stack([accuracy, aligned, max_statistic_p(aligned, right)])
 
 
 def _decisions(
     direction: Direction,
     features: Features,
-    like: Features,
-    origin: Features,
+    like: Features | None,
     fold_of: NDArray[np.int64],
-    curve: ProbeCurve,
+    folds: NDArray[np.int64],
 ) -> Features:
-    """Return (E,) decisions on features (E, D), moved and scaled from `origin`'s training folds to `like`'s."""
+    """Return (E,) decisions on features (E, D), moved and scaled from their own training folds to `like`'s."""
     decisions = np.empty(len(features))
-    for position, fold in enumerate(np.unique(curve.fold_of)):
+    for position, fold in enumerate(folds):
         tested = fold_of == fold
         moved = features[tested]
-        if like is not origin:
-            moved = _moved(moved, origin[~tested], like[~tested])
+        if like is not None:
+            moved = _moved(moved, features[~tested], like[~tested])
         decisions[tested] = moved @ direction.weights[position].astype(np.float64) + direction.intercepts[position]
     return decisions
 
@@ -118,34 +101,22 @@ def _moved(features: Features, origin: Features, like: Features) -> Features:
     return moved
 
 
-@dataclass(frozen=True)
-class Agreement:
-    """Cosines of the directions of two runs at a site.
+def _cosines(first: Direction, second: Direction, features: Features) -> tuple[float, float, float]:
+    """Return three cosines of the directions of two runs. features: (E, D) of the second run.
 
-    raw: of their unit vectors. weighted: by the covariance of the second run's activations, which is the
-    correlation of the two decisions. ceiling: mean raw cosine between the folds of the first run.
+    Of their unit vectors; weighted by the covariance of the features, which is the correlation of the two
+    decisions; and the ceiling: the mean between the folds of the first run.
     """
-
-    raw: float
-    weighted: float
-    ceiling: float
-
-
-def agreement(first: Direction, second: Direction, features: Features) -> Agreement:
-    """Return the cosines of the directions of two runs. features: (E, D) of the second run."""
     before, after = first.unit, second.unit
     varied = features - features.mean(axis=0)
+    of_first, of_second = varied @ before, varied @ after
+    length = float(np.linalg.norm(of_first) * np.linalg.norm(of_second))
     # Weights of zero, such as of constant features, have no direction and stay zero.
     units = first.weights / np.linalg.norm(first.weights, axis=1, keepdims=True).clip(min=1e-30)
     between = units @ units.T
     folds = len(units)
     ceiling = (between.sum() - np.trace(between)) / (folds * (folds - 1))
-    return Agreement(float(before @ after), _cosine(varied @ before, varied @ after), float(ceiling))
-
-
-def _cosine(first: Features, second: Features) -> float:
-    length = float(np.linalg.norm(first) * np.linalg.norm(second))
-    return float(first @ second) / length if length else float("nan")
+    return float(before @ after), float(of_first @ of_second) / length if length else float("nan"), float(ceiling)
 
 
 Verdict = Literal["kept", "transfer not shown", "forgotten", "learned", "not shown in either", "not clear"]
@@ -164,6 +135,7 @@ VERDICTS: Mapping[Verdict, str] = {
 class SiteDrift:
     """One site of one category: accuracies of transferred probes, there and back, and likeness.
 
+    cosine, weighted, ceiling: of the probes' directions, see `_cosines`; None where a side has no signal.
     lens: accuracy of the logit lens at this layer, before and after; None unless both runs answer by letter.
     """
 
@@ -175,7 +147,9 @@ class SiteDrift:
     recentred_back: float
     p_fwe_back: float
     cka: float
-    agreement: Agreement | None
+    cosine: float | None = None
+    weighted: float | None = None
+    ceiling: float | None = None
     lens: tuple[float, float] | None = None
 
 
@@ -232,14 +206,14 @@ def measure_drift(
     Raises NoProbesError, UnknownSiteError for a view that was not probed, and UsageError where the backbones have
     no site of one name and width in common.
     """
-    sides = [
-        ProbedRun(run, load_results(run) if results is None else results)
+    first, second = (
+        (run, load_results(run) if results is None else results)
         for run, results in zip((before, after), probes, strict=True)
-    ]
+    )
     locations = str(before.location), str(after.location)
     # A run beside itself, with two sets of probes, has no difference; of a pair it is the first minus the second.
     runs, pairs = ([before, after], [locations[::-1]]) if locations[0] != locations[1] else ([before], [])
-    keys = [side.results.key for side in sides[: len(runs)]]
+    keys = [results.key for _, results in (first, second)[: len(runs)]]
     table = retention_table(runs, [view], labels=labels, pairs=pairs, keys=keys)
     rows = {(row.run.location, row.category): row for row in table.rows if row.view == view}
     gaps = {row.category: row for row in table.differences if row.view == view}
@@ -247,12 +221,7 @@ def measure_drift(
     why = why_alone(before, after, view)
     return [
         _category(
-            name,
-            (sides[0], sides[1]),
-            view,
-            (rows[locations[0], name], rows[locations[1], name]),
-            gaps.get(name),
-            why,
+            name, (first, second), view, (rows[locations[0], name], rows[locations[1], name]), gaps.get(name), why
         )
         for name in names
         if all((location, name) in rows for location in locations)
@@ -267,9 +236,13 @@ def why_alone(before: RunReader, after: RunReader, view: str = "mean") -> str:
     """
     if wording_of(before) != wording_of(after):
         return "other words"
-    if ask_of(before) != ask_of(after):
-        return _why_alone_beside_vlm(before, after, view)
-    return _why_other_frames(before, after)
+    if ask_of(before) != ask_of(after) and (why := _why_alone_beside_vlm(before, after, view)):
+        return why
+    tables = [run.episodes for run in (before, after)]
+    if not all(FIRST_FRAME in table for table in tables):
+        return "frames unknown"
+    both = tables[0][["episode_id", FIRST_FRAME]].merge(tables[1][["episode_id", FIRST_FRAME]], on="episode_id")
+    return "" if len(both) and (both[f"{FIRST_FRAME}_x"] == both[f"{FIRST_FRAME}_y"]).all() else "other frames"
 
 
 def _why_alone_beside_vlm(before: RunReader, after: RunReader, view: str) -> str:
@@ -280,9 +253,8 @@ def _why_alone_beside_vlm(before: RunReader, after: RunReader, view: str) -> str
     if ask["picture"] != "frame" or _picture_size(vlm) != _picture_size(policy):
         return "other pictures"
     of_vlm, of_policy = _delivered(vlm, view), _delivered(policy, view)
-    if any(None in of_vlm[name] or of_vlm[name] != of_policy[name] for name in of_vlm.keys() & of_policy.keys()):
-        return "other tokens"
-    return _why_other_frames(before, after)
+    both = of_vlm.keys() & of_policy.keys()
+    return "other tokens" if any(None in of_vlm[name] or of_vlm[name] != of_policy[name] for name in both) else ""
 
 
 def _picture_size(run: Any) -> list[int]:
@@ -303,24 +275,16 @@ def _delivered(run: Any, view: str) -> dict[str, tuple[Any, list[int]]]:
     return delivered
 
 
-def _why_other_frames(before: RunReader, after: RunReader) -> str:
-    tables = [run.episodes for run in (before, after)]
-    if not all(FIRST_FRAME in table for table in tables):
-        return "frames unknown"
-    both = tables[0][["episode_id", FIRST_FRAME]].merge(tables[1][["episode_id", FIRST_FRAME]], on="episode_id")
-    return "" if len(both) and (both[f"{FIRST_FRAME}_x"] == both[f"{FIRST_FRAME}_y"]).all() else "other frames"
-
-
 def _category(
     name: str,
-    sides: tuple[ProbedRun, ProbedRun],
+    sides: tuple[Side, Side],
     view: str,
     rows: tuple[RetentionRow, RetentionRow],
     difference: Difference | None,
     why: str,
 ) -> CategoryDrift:
-    curves = [side.results.curves[name, view] for side in sides]
-    items = common_items([side.run for side in sides]).get(name)
+    curves = [results.curves[name, view] for _, results in sides]
+    items = common_items([run for run, _ in sides]).get(name)
     episodes = np.intersect1d(curves[0].episodes, curves[1].episodes)
     if items is None or not items.n_items or not episodes.size:
         return CategoryDrift(name, *rows, difference, (), 0, 0, why or "no item in common")
@@ -328,15 +292,21 @@ def _category(
         return CategoryDrift(name, *rows, difference, (), 0, episodes.size, why)
     sites = _common_sites(sides, name, view)
     forth, back = (
-        transfer(probed, second, name, view, sites, episodes) for probed, second in (sides, (sides[1], sides[0]))
+        _transfer(probed, other, name, view, sites, episodes) for probed, other in (sides, (sides[1], sides[0]))
     )
-    lenses = [lens_accuracy(side.run, episodes) for side in sides]
-    site_drifts = tuple(
-        replace(_site(at, site, sides, name, view, episodes, (forth, back)), lens=_at_layer(lenses, site.layer))
-        for at, site in enumerate(sites)
-    )
-    accuracies = [curves[0].correct[curves[0].sites.index(site)].mean() for site in sites]
-    return CategoryDrift(name, *rows, difference, site_drifts, int(np.argmax(accuracies)), episodes.size)
+    lenses = [lens_accuracy(run, episodes) for run, _ in sides]
+    drifts = []
+    for at, site in enumerate(sites):
+        before, after = (_features(side, site, view, episodes) for side in sides)
+        cosines: tuple[float | None, float | None, float | None] = (None, None, None)
+        if all(_has_signal(results, name, view, site) for _, results in sides):
+            first, second = (results.direction(name, view, site) for _, results in sides)
+            cosines = _cosines(first, second, after)
+        accuracies = map(float, (*forth[:, at], *back[:, at]))
+        lens = _at_layer(lenses, site.layer)
+        drifts.append(SiteDrift(site, *accuracies, unbiased_cka(before, after), *cosines, lens))
+    own = [curves[0].correct[curves[0].sites.index(site)].mean() for site in sites]
+    return CategoryDrift(name, *rows, difference, tuple(drifts), int(np.argmax(own)), episodes.size)
 
 
 def lens_accuracy(run: RunReader, episodes: NDArray[np.str_]) -> NDArray[np.float64] | None:
@@ -362,51 +332,24 @@ def _at_layer(lenses: list[NDArray[np.float64] | None], layer: int) -> tuple[flo
     return None if before is None or after is None else (before, after)
 
 
-def _common_sites(sides: tuple[ProbedRun, ProbedRun], category: str, view: str) -> list[Site]:
+def _common_sites(sides: tuple[Side, Side], category: str, view: str) -> list[Site]:
     """Sites of both backbones, by name, where these are equally wide."""
     widths = []
-    for side in sides:
-        curve = side.results.curves[category, view]
-        width = {name: stream.width for name, stream in side.run.streams.items()}
+    for run, results in sides:
+        curve = results.curves[category, view]
+        width = {name: stream.width for name, stream in run.streams.items()}
         widths.append({site: width[site.stream] for site in curve.sites if site.stream == curve.backbone_stream})
     shared = [site for site in widths[0] if widths[0][site] == widths[1].get(site)]
     if not shared:
         raise UsageError(
-            f"{sides[0].run.location} and {sides[1].run.location} have no site of the backbone with one name and "
+            f"{sides[0][0].location} and {sides[1][0].location} have no site of the backbone with one name and "
             "width in common: probes of one cannot be used on the other"
         )
     return shared
 
 
-def _site(
-    at: int,
-    site: Site,
-    sides: tuple[ProbedRun, ProbedRun],
-    category: str,
-    view: str,
-    episodes: NDArray[np.str_],
-    transfers: tuple[Transfer, Transfer],
-) -> SiteDrift:
-    before, after = (side.features(site, view, episodes) for side in sides)
-    signal = all(_has_signal(side, category, view, site) for side in sides)
-    directions = [side.results.direction(category, view, site) for side in sides]
-    to, back = transfers
-    directions_agree = agreement(directions[0], directions[1], after) if signal else None
-    return SiteDrift(
-        site=site,
-        raw=float(to.raw[at]),
-        recentred=float(to.recentred[at]),
-        p_fwe=float(to.p_fwe[at]),
-        raw_back=float(back.raw[at]),
-        recentred_back=float(back.recentred[at]),
-        p_fwe_back=float(back.p_fwe[at]),
-        cka=unbiased_cka(before, after),
-        agreement=directions_agree,
-    )
-
-
-def _has_signal(side: ProbedRun, category: str, view: str, site: Site) -> bool:
-    scores = side.results.scores
+def _has_signal(results: ProbeResults, category: str, view: str, site: Site) -> bool:
+    scores = results.scores
     of_site = scores[(scores["category"] == category) & (scores["view"] == view) & (scores["site"] == str(site))]
     return bool(of_site["signal"].iloc[0])
 
@@ -439,14 +382,8 @@ def drift_table(pairs: Mapping[tuple[str, str], Sequence[CategoryDrift]], title:
     drifts = [(names, drift) for names, of_pair in pairs.items() for drift in of_pair]
     has_lens = any(site.lens for _, drift in drifts for site in drift.sites)
     cells = tuple(
-        (
-            f"{before} → {after}",
-            category_of(drift.category).title,
-            drift.verdict,
-            *_cells(drift),
-            *_lens(drift)[: 2 * has_lens],
-        )
-        for (before, after), drift in drifts
+        (f"{names[0]} → {names[1]}", category_of(drift.category).title, drift.verdict, *_cells(drift, has_lens))
+        for names, drift in drifts
     )
     verdicts = dict.fromkeys(drift.verdict for _, drift in drifts)
     note = [f"view {view}", *_NOTE, *[_LENS_NOTE][:has_lens], *(f"{name}: {VERDICTS[name]}" for name in verdicts)]
@@ -458,16 +395,16 @@ def drift_table(pairs: Mapping[tuple[str, str], Sequence[CategoryDrift]], title:
     return Table.of(heading, grouped(*groups), cells, names=2, notes=note, numbers=numbers)
 
 
-def _cells(drift: CategoryDrift) -> tuple[str, ...]:
+def _cells(drift: CategoryDrift, has_lens: bool) -> tuple[str, ...]:
     gap = drift.difference
     accuracies = (
-        _row_key(drift.before),
-        _row_key(drift.after),
+        *(with_limits(row.backbone.score, row.backbone.ci, percent) for row in (drift.before, drift.after)),
         "–" if gap is None else with_limits(gap.backbone, gap.backbone_ci, points),
     )
     if not drift.sites:
-        return (*accuracies, *["–"] * 8)
+        return (*accuracies, *["–"] * (8 + 2 * has_lens))
     site = drift.sites[drift.best]
+    lens = ("–", "–") if site.lens is None else tuple(map(percent, site.lens))
     return (
         *accuracies,
         str(site.site.layer),
@@ -476,22 +413,10 @@ def _cells(drift: CategoryDrift) -> tuple[str, ...]:
         p_text(drift.p_transfer),
         percent(site.raw_back),
         percent(site.recentred_back),
-        _cosine_text(site),
+        "–" if site.cosine is None else f"{number(site.cosine)} ({number(site.ceiling)})",
         number(site.cka),
+        *(lens if has_lens else ()),
     )
-
-
-def _lens(drift: CategoryDrift) -> tuple[str, str]:
-    lens = drift.sites[drift.best].lens if drift.sites else None
-    return ("–", "–") if lens is None else (percent(lens[0]), percent(lens[1]))
-
-
-def _row_key(row: RetentionRow) -> str:
-    return with_limits(row.backbone.score, row.backbone.ci, percent)
-
-
-def _cosine_text(site: SiteDrift) -> str:
-    return "–" if site.agreement is None else f"{number(site.agreement.raw)} ({number(site.agreement.ceiling)})"
 
 
 def _numbers(names: tuple[str, str], drift: CategoryDrift, view: str) -> list[Number]:
@@ -511,24 +436,24 @@ def _numbers(names: tuple[str, str], drift: CategoryDrift, view: str) -> list[Nu
         "difference_ci": None if gap is None else gap.backbone_ci,
         "p": drift.p_transfer if drift.sites else None,
     }
-    return [of_category, *({**names_of_row, **_of_site(site)} for site in drift.sites)]
-
-
-def _of_site(site: SiteDrift) -> Number:
-    directions = site.agreement
-    return {
-        "site": str(site.site),
-        "layer": site.site.layer,
-        "transfer": site.raw,
-        "recentred": site.recentred,
-        "p_fwe": site.p_fwe,
-        "transfer_back": site.raw_back,
-        "recentred_back": site.recentred_back,
-        "p_fwe_back": site.p_fwe_back,
-        "cka": site.cka,
-        "cosine": None if directions is None else directions.raw,
-        "cosine_weighted": None if directions is None else directions.weighted,
-        "cosine_ceiling": None if directions is None else directions.ceiling,
-        "lens_before": None if site.lens is None else site.lens[0],
-        "lens_after": None if site.lens is None else site.lens[1],
-    }
+    of_sites: list[Number] = [
+        {
+            **names_of_row,
+            "site": str(site.site),
+            "layer": site.site.layer,
+            "transfer": site.raw,
+            "recentred": site.recentred,
+            "p_fwe": site.p_fwe,
+            "transfer_back": site.raw_back,
+            "recentred_back": site.recentred_back,
+            "p_fwe_back": site.p_fwe_back,
+            "cka": site.cka,
+            "cosine": site.cosine,
+            "cosine_weighted": site.weighted,
+            "cosine_ceiling": site.ceiling,
+            "lens_before": None if site.lens is None else site.lens[0],
+            "lens_after": None if site.lens is None else site.lens[1],
+        }
+        for site in drift.sites
+    ]
+    return [of_category, *of_sites]

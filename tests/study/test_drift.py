@@ -97,9 +97,9 @@ def test_a_run_against_itself_transfers_as_it_decodes(pair: tuple[ArrayRun, Arra
         assert curve.raw == curve.raw_back == curve.recentred
         assert curve.cka == pytest.approx(1)
         assert one.verdict in ("kept", "not shown in either")
-        if curve.agreement is not None:
-            assert curve.agreement.raw == pytest.approx(1)
-            assert curve.agreement.weighted == pytest.approx(1)
+        if curve.cosine is not None:
+            assert curve.cosine == pytest.approx(1)
+            assert curve.weighted == pytest.approx(1)
 
 
 def test_transferred_decisions_are_those_of_the_probe_that_never_saw_the_episode(
@@ -120,13 +120,10 @@ def test_transferred_decisions_are_those_of_the_probe_that_never_saw_the_episode
 
 def test_directions_are_compared_only_where_both_sides_have_signal(found: dict[str, CategoryDrift]) -> None:
     for name in ("forgotten", "learned", "never"):
-        assert all(site.agreement is None for site in found[name].sites)
-    kept = found["kept"].sites[0].agreement
-    assert kept is not None
-    assert 0.7 < kept.raw <= 1
-    turned = found["turned"].sites[0].agreement
-    assert turned is not None
-    assert abs(turned.raw) < 0.5 < turned.ceiling
+        assert all(site.cosine is None for site in found[name].sites)
+    assert 0.7 < found["kept"].sites[0].cosine <= 1
+    turned = found["turned"].sites[0]
+    assert abs(turned.cosine) < 0.5 < turned.ceiling
 
 
 def test_the_table_leads_with_transfer_and_says_what_each_verdict_means(found: dict[str, CategoryDrift]) -> None:
