@@ -302,9 +302,10 @@ def _category(
         if all(_has_signal(results, name, view, site) for _, results in sides):
             first, second = (results.direction(name, view, site) for _, results in sides)
             cosines = _cosines(first, second, after)
-        accuracies = map(float, (*forth[:, at], *back[:, at]))
-        lens = _at_layer(lenses, site.layer)
-        drifts.append(SiteDrift(site, *accuracies, unbiased_cka(before, after), *cosines, lens))
+        raw, recentred, p_fwe = forth[:, at].tolist()
+        raw_back, recentred_back, p_fwe_back = back[:, at].tolist()
+        likeness = (unbiased_cka(before, after), *cosines, _at_layer(lenses, site.layer))
+        drifts.append(SiteDrift(site, raw, recentred, p_fwe, raw_back, recentred_back, p_fwe_back, *likeness))
     own = [curves[0].correct[curves[0].sites.index(site)].mean() for site in sites]
     return CategoryDrift(name, *rows, difference, tuple(drifts), int(np.argmax(own)), episodes.size)
 

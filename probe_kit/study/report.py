@@ -1,6 +1,5 @@
 """The figures of a study, and its report: one HTML file with its state, tables, figures, and settings of runs."""
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,10 +17,10 @@ from probe_kit.retention.displays.heat_table import SideTableDisplay
 from probe_kit.retention.report.parts import Picture, citation, data_uri, provenance, render, words_of
 from probe_kit.retention.table import RetentionTable, retention_table
 from probe_kit.study.cells import slugs
-from probe_kit.study.plan import StudyPlan, plan_study
+from probe_kit.study.plan import plan_study
 from probe_kit.study.rates import domain_scores, episodes_per_category
 from probe_kit.study.reading import LoadedStudy
-from probe_kit.study.schema import FigureKind, FigureTable, unknown
+from probe_kit.study.schema import unknown
 from probe_kit.study.stored import StoredRuns, stored_runs, study_probes
 from probe_kit.study.tables import make_each, make_table
 from probe_kit.version import __version__
@@ -43,98 +42,59 @@ def make_figures(study: LoadedStudy, name: str, partial_runs: bool = False) -> l
     categories = None if figure.categories is None else slugs(figure.categories)
     subject = f"the figure {name!r}"
     runs = stored_runs(study, lambda cell: cell.selected(figure.runs), subject, partial_runs, categories)
-    return _MAKERS[figure.kind](_Source(study, name, figure, runs, categories, runs.labels(study), partial_runs))
+    if figure.kind == "curves":
+        return [_curves(study, name, runs, categories, partial_runs)]
+    if figure.kind == "dose":
+        return _doses(name, runs)
+    opened = [stored.run for stored in runs.runs]
+    table = retention_table(opened, labels=runs.labels, pairs=(), keys=[""] * len(opened))
+    if figure.kind == "sides":
+        display = SideTableDisplay.from_table(table)
+        return [ReportFigure(name, display.title, "behaviour", display.note, None, partial(figure_of, display))]
+    reading = "Normalised score of the mean over the categories of a domain: 0 for guessing, 100 for perfection."
+    return [ReportFigure(name, "Score by domain", "behaviour", reading, None, partial(draw_overview, table))]
 
 
-@dataclass(frozen=True)
-class _Source:
-    """The parts of a figure. categories: slugs, None for all. labels: of the runs by location.
-
-    partial: whether runs that are missing are accepted.
-    """
-
-    study: LoadedStudy
-    name: str
-    figure: FigureTable
-    runs: StoredRuns
-    categories: tuple[str, ...] | None
-    labels: Mapping[str, str]
-    partial: bool
-
-    @property
-    def table(self) -> RetentionTable:
-        """The table of all runs, nothing compared."""
-        runs = [stored.run for stored in self.runs.runs]
-        return retention_table(runs, labels=self.labels, pairs=(), keys=[""] * len(runs))
-
-
-def _curves(source: _Source) -> list[ReportFigure]:
+def _curves(
+    study: LoadedStudy, name: str, runs: StoredRuns, categories: tuple[str, ...] | None, partial_runs: bool
+) -> ReportFigure:
     """A panel per category and part of the model, a line per system; of one system a line per iteration."""
-    probes = {
-        source.labels[stored.location]: study_probes(
-            source.study, stored, stored.probed.in_wording(), source.partial
-        )
-        for stored in source.runs.runs
+    stored_probes = {
+        runs.labels[stored.location]: study_probes(study, stored, stored.probed.in_wording(), partial_runs)
+        for stored in runs.runs
     }
-    with_probes = [
-        (label, results_of_run) for label, results_of_run in probes.items() if results_of_run is not None
-    ]
-    if not with_probes:
+    probes = {label: of_run for label, of_run in stored_probes.items() if of_run is not None}
+    if not probes:
         raise UsageError(
-            f"no run of the figure {source.name!r} has the probes of the file; `probe-kit study run "
-            f"{source.study.typed}` fits them"
+            f"no run of the figure {name!r} has the probes of the file; `probe-kit study run {study.typed}` fits "
+            "them"
         )
-    names, results = [label for label, _ in with_probes], [results_of_run for _, results_of_run in with_probes]
-    view = source.figure.view or results[0].settings.views[0]
-    if len(results) == 1 and source.categories is None:
+    names, results = list(probes), list(probes.values())
+    view = study.study.figures[name].view or results[0].settings.views[0]
+    if len(results) == 1 and categories is None:
         draw = partial(layer_curve, results[0], view)
     else:
-        draw = partial(curves_side_by_side, results, names, view, categories=source.categories)
+        draw = partial(curves_side_by_side, results, names, view, categories=categories)
     reading = f"How often a linear probe names the side of the correct picture, layer by layer. {ONLY_FILLED}."
-    return [ReportFigure(source.name, "Layer curves", "probes", reading, None, draw)]
+    return ReportFigure(name, "Layer curves", "probes", reading, None, draw)
 
 
-def _sides(source: _Source) -> list[ReportFigure]:
-    display = SideTableDisplay.from_table(source.table)
-    return [ReportFigure(source.name, display.title, "behaviour", display.note, None, partial(figure_of, display))]
-
-
-def _dose(source: _Source) -> list[ReportFigure]:
+def _doses(name: str, runs: StoredRuns) -> list[ReportFigure]:
     """A figure per run that was steered."""
-    steered = [stored for stored in source.runs.runs if stored_steering(stored.run)]
+    steered = [stored for stored in runs.runs if stored_steering(stored.run)]
     if not steered:
         raise UsageError(
-            f"no run of the figure {source.name!r} was steered. Steer one with `probe-kit intervene "
-            f"{source.runs.runs[0].location} --kind steer --sites backbone.NN --roles image`"
+            f"no run of the figure {name!r} was steered. Steer one with `probe-kit intervene "
+            f"{runs.runs[0].location} --kind steer --sites backbone.NN --roles image`"
         )
     reading = "Episodes that turn to the side they are pushed to, minus those that turn from it, by coefficient."
     figures = []
     for at, stored in enumerate(steered):
-        stem = "-".join(
-            [
-                source.name,
-                stored.cell.model,
-                stored.cell.way,
-                *([str(stored.cell.seed)] if stored.cell.seed else []),
-            ]
-        )
-        title = f"Dose and response: {source.labels[stored.location]}"
+        cell = stored.cell
+        stem = "-".join([name, cell.model, cell.way, *([str(cell.seed)] if cell.seed else [])])
+        title = f"Dose and response: {runs.labels[stored.location]}"
         figures.append(ReportFigure(stem, title, "interventions", reading, at, partial(dose_response, stored.run)))
     return figures
-
-
-def _overview(source: _Source) -> list[ReportFigure]:
-    reading = "Normalised score of the mean over the categories of a domain: 0 for guessing, 100 for perfection."
-    draw = partial(draw_overview, source.table)
-    return [ReportFigure(source.name, "Score by domain", "behaviour", reading, None, draw)]
-
-
-_MAKERS: Mapping[FigureKind, Callable[[_Source], list[ReportFigure]]] = {
-    "curves": _curves,
-    "sides": _sides,
-    "dose": _dose,
-    "overview": _overview,
-}
 
 
 def draw_overview(table: RetentionTable) -> "Figure":
@@ -190,10 +150,17 @@ def study_report(study: LoadedStudy, partial: bool = False) -> StudyReport:
     missing = {f"table {name}": why for name, why in no_table.items()}
     missing |= {f"figure {name}": why for name, why in no_figure.items()}
     runs = stored_runs(study, lambda cell: cell.selection, str(study.file), partial=True)
-    labels, plan = runs.labels(study), plan_study(study)
+    plan = plan_study(study)
     places = tuple(name for stored in runs.runs for name in (stored.run.location.address, stored.location))
-    state = _state(plan)
-    drawn = {name: [_picture(stored, places) for stored in of_name] for name, of_name in figures.items()}
+    rows = [
+        (run.cell.model, run.run_text, ", ".join(run.cell.selections), str(run.cell.episodes), run.words)
+        for run in plan.cells
+    ]
+    state = Table.of("Runs", ("model", "run", "blocks", "episodes", "state"), rows, names=2)
+    drawn = {
+        name: [Picture(each.title, "", each.reading, *data_uri(each, places), extra=False) for each in of_name]
+        for name, of_name in figures.items()
+    }
     sentence, bibtex = citation([stored.run for stored in runs.runs])
     html = render(
         "study.html.jinja",
@@ -209,29 +176,10 @@ def study_report(study: LoadedStudy, partial: bool = False) -> StudyReport:
         tables=tables,
         figures=drawn,
         file=read_regular(study.file).decode("utf-8-sig"),
-        provenance=[provenance(labels[stored.location], stored.run, []) for stored in runs.runs],
+        provenance=[provenance(runs.labels[stored.location], stored.run, []) for stored in runs.runs],
         words=words_of([state, *tables.values()]),
         sentence=sentence,
         bibtex=bibtex,
     )
     partly = bool(missing) or bool(runs.unfinished) or any(of_name.is_partial for of_name in tables.values())
     return StudyReport(html, missing, partly)
-
-
-def _state(plan: StudyPlan) -> Table:
-    """A row per run: what is stored of it."""
-    cells = [
-        (
-            planned.cell.model,
-            planned.run_text,
-            ", ".join(planned.cell.selections),
-            str(planned.cell.episodes),
-            planned.words,
-        )
-        for planned in plan.cells
-    ]
-    return Table.of("Runs", ("model", "run", "blocks", "episodes", "state"), cells, names=2)
-
-
-def _picture(figure: ReportFigure, places: tuple[str, ...]) -> Picture:
-    return Picture(figure.title, "", figure.reading, *data_uri(figure, places), extra=False)

@@ -5,7 +5,7 @@ weights, wordings and suite.
 """
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -36,27 +36,26 @@ Change = tuple[str, Any, Any]
 """Path of a setting, its stored value, and the value that the cell has."""
 
 
-def check_run_of_cell(
-    run: "Run", cell: Cell, cells: Sequence[Cell], settings_sha256: str | None, file: object
-) -> None:
-    """Raise SettingsMismatchError unless `run` is the run of `cell`.
+def _weights(run: "Run", cell: Cell) -> Iterator[Change]:
+    """Yield the seed of random weights, or the checkpoint, as the process that loaded them recorded it.
 
-    cells: of the study, to name the one that the run belongs to. settings_sha256: hash of the run's settings by
-    the record of an archive, which holds the weights' hash; None without one. file: of the study, for the message.
+    A card has the commit of a hub id. A file may name a branch or nothing: then repository and folder count. The
+    folder of a local checkpoint may have been moved since. If it is still at its old path, and is another one than
+    the file's by name, size and time of its files, the run is another checkpoint's.
     """
-    problems = list(differences(run, cell))
-    if not problems and settings_sha256 not in (None, run.settings_sha256):
-        problems = [f"settings and weights hash {run.settings_sha256[:12]}, noted {str(settings_sha256)[:12]}"]
-    if not problems:
+    if not run.commits():
         return
-    other = next((each for each in cells if each.name != cell.name and not any(differences(run, each))), None)
-    owner = "" if other is None else f" It is a run of {other.name}."
-    more = f" and {len(problems) - _MOST_PRINTED} more" if len(problems) > _MOST_PRINTED else ""
-    raise SettingsMismatchError(
-        f"{run.location} should hold the run of {cell.name}, and holds another one: "
-        f"{'; '.join(problems[:_MOST_PRINTED])}{more}.{owner} Move each folder back to its own name, or remove "
-        f"this one and run `probe-kit study run {file}`"
-    )
+    card: Mapping[str, Any] = run.certificate.get("policy") or {}
+    if cell.settings.model.random_weights and "weights_seed" in card:
+        yield "weights_seed", card["weights_seed"], cell.settings.model.weights_seed
+    stored, expected = str(card.get("checkpoint")), str(cell.settings.model.checkpoint)
+    if is_on_hub(stored) and is_on_hub(expected):
+        has_commit = len(expected.partition("@")[2]) == COMMIT_DIGITS
+        names = [name if has_commit else without_revision(name) for name in (stored, expected)]
+        yield "checkpoint", names[0], names[1]
+    stamps = [checkpoint_stamp(stored), checkpoint_stamp(expected)]
+    if all(isinstance(stamp, list) for stamp in stamps) and stamps[0] != stamps[1]:
+        yield "checkpoint", stored, expected
 
 
 def check_same_items(runs: Sequence["Run"]) -> None:
@@ -90,11 +89,20 @@ def check_same_weights(runs: Sequence[tuple[Cell, "Run"]]) -> None:
 
 def differences(run: "Run", cell: Cell) -> Iterator[str]:
     """Yield the settings in which a run is not one of `cell`, in words, stored value first."""
-    for change in changed_settings(run.root.own_settings, cell):
-        yield _in_words(*change)
-    yield from _different("wordings", list(run.wordings), list(cell.settings.wordings or ()))
-    yield from _other_weights(run, cell)
-    yield from _other_items(run, cell.suite.contents)
+    changes = [
+        *changed_settings(run.root.own_settings, cell),
+        ("wordings", list(run.wordings), list(cell.settings.wordings or ())),
+        *_weights(run, cell),
+    ]
+    for name, stored, expected in changes:
+        if stored != expected:
+            yield f"{name}: stored {_short(stored)}, expected {_short(expected)}"
+    contents = cell.suite.contents  # empty where they are not known
+    hashes = dict(zip(run.items["item_id"], run.items["content_sha256"], strict=True))
+    changed = [name for name, content in hashes.items() if contents and contents.get(name) != content]
+    if changed:
+        state = "changed" if changed[0] in contents else "is not in the suite"
+        yield f"item {changed[0]!r} {state} since it was played ({len(changed)} of {len(hashes)} items)"
 
 
 def changed_settings(own_settings: Mapping[str, Any], cell: Cell) -> Iterator[Change]:
@@ -123,51 +131,9 @@ def _expected(cell: Cell) -> dict[str, Any]:
     return plain
 
 
-def _different(name: str, stored: Any, expected: Any) -> Iterator[str]:
-    if stored != expected:
-        yield _in_words(name, stored, expected)
-
-
-def _in_words(name: str, stored: Any, expected: Any) -> str:
-    return f"{name}: stored {_short(stored)}, expected {_short(expected)}"
-
-
 def _short(value: Any) -> str:
     text = repr(value)
     return text if len(text) <= 60 else f"{text[:57]}…"
-
-
-def _other_weights(run: "Run", cell: Cell) -> Iterator[str]:
-    """Yield the seed of random weights, or the checkpoint, as the process that loaded them recorded it.
-
-    A card has the commit of a hub id. A file may name a branch or nothing: then repository and folder count. The
-    folder of a local checkpoint may have been moved since. If it is still at its old path, and is another one than
-    the file's by name, size and time of its files, the run is another checkpoint's.
-    """
-    if not run.commits():
-        return
-    card: Mapping[str, Any] = run.certificate.get("policy") or {}
-    if cell.settings.model.random_weights and "weights_seed" in card:
-        yield from _different("weights_seed", card["weights_seed"], cell.settings.model.weights_seed)
-    stored, expected = str(card.get("checkpoint")), str(cell.settings.model.checkpoint)
-    if is_on_hub(stored) and is_on_hub(expected):
-        has_commit = len(expected.partition("@")[2]) == COMMIT_DIGITS
-        names = (name if has_commit else without_revision(name) for name in (stored, expected))
-        yield from _different("checkpoint", *names)
-    stamps = [checkpoint_stamp(stored), checkpoint_stamp(expected)]
-    if all(isinstance(stamp, list) for stamp in stamps) and stamps[0] != stamps[1]:
-        yield _in_words("checkpoint", stored, expected)
-
-
-def _other_items(run: "Run", contents: Mapping[str, str]) -> Iterator[str]:
-    """Yield the items that the suite has with other content, or lacks. contents: hash by id; empty if unknown."""
-    if not contents:
-        return
-    hashes = dict(zip(run.items["item_id"], run.items["content_sha256"], strict=True))
-    changed = [name for name, content in hashes.items() if contents.get(name) != content]
-    if changed:
-        state = "changed" if changed[0] in contents else "is not in the suite"
-        yield f"item {changed[0]!r} {state} since it was played ({len(changed)} of {len(hashes)} items)"
 
 
 @dataclass(frozen=True)
@@ -192,20 +158,14 @@ class StoredRuns:
     """The runs that a table is made of, in the order of the file.
 
     missing: of the others, why they are not in the table. unfinished: episodes that `study run` would still play
-    of both, in words; only of partial tables. models: of every run, stored or not.
+    of both, in words; only of partial tables. labels: by location the model's label, with condition or ask and
+    seed where a model has several runs, stored or not.
     """
 
     runs: tuple[StoredRun, ...]
     missing: tuple[str, ...]
     unfinished: tuple[str, ...]
-    models: tuple[str, ...]
-
-    def labels(self, study: LoadedStudy) -> dict[str, str]:
-        """Return by location the model's label, with condition or ask and seed where a model has several runs."""
-        return {
-            stored.location: _label(study, stored.cell, self.models.count(stored.cell.model) > 1)
-            for stored in self.runs
-        }
+    labels: Mapping[str, str]
 
 
 def stored_runs(
@@ -251,7 +211,8 @@ def stored_runs(
         raise UsageError(f"no run of {subject} is stored. Play it with `probe-kit study run {study.typed}`")
     check_same_items([stored.run for stored in runs])
     check_same_weights([(stored.cell, stored.run) for stored in runs])
-    return StoredRuns(tuple(runs), tuple(missing), tuple(unfinished), tuple(models))
+    labels = {run.location: _label(study, run.cell, models.count(run.cell.model) > 1) for run in runs}
+    return StoredRuns(tuple(runs), tuple(missing), tuple(unfinished), labels)
 
 
 def _why_missing(study: LoadedStudy, cell: Cell, error: ProbeKitError) -> str:
@@ -270,12 +231,24 @@ def _first_sentence(error: ProbeKitError) -> str:
 def open_matching(study: LoadedStudy, cell: Cell, partial: bool) -> "Run":
     """Open the run of a cell, checked to be of its settings, weights and suite.
 
-    Raises what `open_run` raises, and SettingsMismatchError for the run of another cell.
+    Raises what `open_run` raises, and SettingsMismatchError for the run of another cell, which it names.
     """
-    packed = None if study.pack is None else study.pack.runs.get(cell.name)
     run = open_run(locate(cell.location(study.study.folder)), allow_partial=partial)
-    check_run_of_cell(run, cell, study.cells, None if packed is None else packed.settings_sha256, study.file)
-    return run
+    problems = list(differences(run, cell))
+    packed = None if study.pack is None else study.pack.runs.get(cell.name)
+    if not problems and packed is not None and packed.settings_sha256 != run.settings_sha256:
+        hashes = f"{run.settings_sha256[:12]}, noted {packed.settings_sha256[:12]}"
+        problems = [f"settings and weights hash {hashes}"]
+    if not problems:
+        return run
+    others = (other for other in study.cells if other.name != cell.name)
+    owner = next((f" It is a run of {other.name}." for other in others if not any(differences(run, other))), "")
+    more = f" and {len(problems) - _MOST_PRINTED} more" if len(problems) > _MOST_PRINTED else ""
+    raise SettingsMismatchError(
+        f"{run.location} should hold the run of {cell.name}, and holds another one: "
+        f"{'; '.join(problems[:_MOST_PRINTED])}{more}.{owner} Move each folder back to its own name, or remove "
+        f"this one and run `probe-kit study run {study.file}`"
+    )
 
 
 def open_stored(study: LoadedStudy, cell: Cell, partial: bool = False) -> "Run":
@@ -321,23 +294,13 @@ def part_of(run: "Run", cell: Cell, selection: Selection, categories: Sequence[s
 # -- probes ------------------------------------------------------------------------------------------------------
 
 
-def probe_keys(study: LoadedStudy, runs: Sequence[tuple[StoredRun, "Run"]], partial: bool) -> list[str]:
-    """Return of each run the key of the probes that the file's tables fit to it; empty for none.
+def probe_key(study: LoadedStudy, stored: StoredRun, run: "Run", partial: bool) -> str:
+    """Return the key of the probes that the file's tables fit to a run; empty for none.
 
-    runs: what is stored of a cell, and the part of it that is printed. Probes that were fitted otherwise, by hand
-    or for a former state of the file, give no number.
+    run: the part of what is stored that is printed. Probes that were fitted otherwise, by hand or for a former
+    state of the file, give no number.
     Raises RunIncompleteError for a run without the probes of the file, unless `partial`.
     """
-    return [_probe_key(study, stored, run, partial) for stored, run in runs]
-
-
-def study_probes(study: LoadedStudy, stored: StoredRun, run: "Run", partial: bool) -> ProbeResults | None:
-    """Return the probes of the file that are stored of a run, None without any. Raises as `probe_keys`."""
-    key = _probe_key(study, stored, run, partial)
-    return load_results(run, key) if key else None
-
-
-def _probe_key(study: LoadedStudy, stored: StoredRun, run: "Run", partial: bool) -> str:
     tables = {
         name: table
         for name, table in study.study.shown_probes.items()
@@ -345,9 +308,14 @@ def _probe_key(study: LoadedStudy, stored: StoredRun, run: "Run", partial: bool)
     }
     if not tables or not run.streams:
         return ""
-    if keys := _stored_keys(tables.values(), run):
-        return keys[-1]  # of several, which share the run through two blocks, the last of the file
-    if partial or _stored_keys(tables.values(), stored.probed.in_wording()):  # they are fitted to other items
+
+    def keys(of_run: "Run") -> list[str]:
+        named = (probe_key_of(table, of_run) for table in tables.values())
+        return [key for key in named if is_stored(of_run.location, key)]
+
+    if stored_keys := keys(run):
+        return stored_keys[-1]  # of several, which share the run through two blocks, the last of the file
+    if partial or keys(stored.probed.in_wording()):  # they are fitted to other items
         return ""
     other_keys = [key for key, bundle in read_probes(run.location).items() if settings_of(bundle).is_side]
     also = f" It has those of other settings: {', '.join(other_keys)}." if other_keys else ""
@@ -358,9 +326,10 @@ def _probe_key(study: LoadedStudy, stored: StoredRun, run: "Run", partial: bool)
     )
 
 
-def _stored_keys(tables: Iterable[ProbesTable], run: "Run") -> list[str]:
-    """Return the keys of those probes of the tables that are stored of a run."""
-    return [key for table in tables if is_stored(run.location, key := probe_key_of(table, run))]
+def study_probes(study: LoadedStudy, stored: StoredRun, run: "Run", partial: bool) -> ProbeResults | None:
+    """Return the probes of the file that are stored of a run, None without any. Raises as `probe_key`."""
+    key = probe_key(study, stored, run, partial)
+    return load_results(run, key) if key else None
 
 
 def probe_key_of(table: ProbesTable, run: "Run") -> str:

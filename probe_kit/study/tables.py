@@ -35,7 +35,7 @@ from probe_kit.study.expansion import of_side
 from probe_kit.study.rates import caption, probing_table, score_table, sides_table, success_table, vlm_table
 from probe_kit.study.reading import LoadedStudy
 from probe_kit.study.schema import ComparisonTable, DriftTable, TableTable, unknown
-from probe_kit.study.stored import StoredRun, StoredRuns, probe_keys, stored_runs, study_probes
+from probe_kit.study.stored import StoredRun, StoredRuns, probe_key, stored_runs, study_probes
 from probe_kit.suite.categories import category_of
 
 _TEST = (
@@ -53,7 +53,7 @@ def difference_table(table: RetentionTable, title: str) -> Table:
     cells = [
         (
             f"{row.group} − {row.minus}",
-            _category(row.category),
+            _title(row.category),
             with_limits(row.sr, row.sr_ci, points),
             difference_test(row),
             _items(row.n_items, row.of_items),
@@ -61,20 +61,9 @@ def difference_table(table: RetentionTable, title: str) -> Table:
         for row in rows
     ]
     columns = ("systems", "category", "difference, points [95 %]", "p (Holm)", "items")
-    numbers = tuple(map(_number, rows))
-    printed = _of_pairs(title, columns, cells, caption(table, [_TEST]), numbers)
-    return printed.with_notes([*_remarks(rows), *(sentence.removesuffix(".") for sentence in table.unpaired)])
-
-
-def _of_pairs(
-    title: str,
-    columns: Sequence[str],
-    cells: Sequence[Sequence[str]],
-    note: str,
-    numbers: tuple[Number, ...],
-    mean: str = MEAN,
-) -> Table:
-    return Table.of(title, columns, cells, names=2, mean=mean, notes=[note], numbers=numbers)
+    notes = [caption(table, [_TEST]), *_remarks(rows), *(text.removesuffix(".") for text in table.unpaired)]
+    numbers = tuple(map(_difference_numbers, rows))
+    return Table.of(title, columns, cells, names=2, mean=MEAN, notes=notes, numbers=numbers)
 
 
 def _tested(rows: Sequence[Difference]) -> list[Difference]:
@@ -105,7 +94,7 @@ def group_table(table: RetentionTable, title: str) -> Table:
     cells = [
         (
             f"{row.group} − {row.minus}",
-            _category(row.category),
+            _title(row.category),
             models_test(row.sr_models, points),
             with_limits(row.sr, row.sr_ci, points),
         )
@@ -117,8 +106,8 @@ def group_table(table: RetentionTable, title: str) -> Table:
     )
     columns = ("groups", "category", "p over models (least)", "these models, points [95 %]")
     # The p over items is about these models alone, and the table about others like them.
-    numbers = tuple({**_number(row), "p": None, "p_holm": None} for row in rows)
-    return _of_pairs(title, columns, cells, caption(table, [note]), numbers)
+    numbers = tuple({**_difference_numbers(row), "p": None, "p_holm": None} for row in rows)
+    return Table.of(title, columns, cells, names=2, mean=MEAN, notes=[caption(table, [note])], numbers=numbers)
 
 
 def vlm_vla_table(differences: Sequence[Difference]) -> Table:
@@ -127,7 +116,7 @@ def vlm_vla_table(differences: Sequence[Difference]) -> Table:
     cells = [
         (
             f"{row.group} − {row.minus}",
-            _category(row.category),
+            _title(row.category),
             percent(row.sr_group),
             percent(row.sr_minus),
             with_limits(row.sr, row.sr_ci, percent),
@@ -156,9 +145,9 @@ def vlm_vla_table(differences: Sequence[Difference]) -> Table:
         for row in rows
     ]
     other = "; some pairs began with OTHER first frames" if any(row.same_frames is False for row in rows) else ""
-    note = f"{_TEST.replace('this comparison', 'the table')}{other}"
+    notes = [f"{_TEST.replace('this comparison', 'the table')}{other}", *_remarks(rows)]
     columns = ("systems", "category", "VLM %", "VLA %", "VLM − VLA [95 %]", "p (Holm)", "items")
-    return _of_pairs("VLM − VLA", columns, cells, note, tuple(numbers)).with_notes(_remarks(rows))
+    return Table.of("VLM − VLA", columns, cells, names=2, mean=MEAN, notes=notes, numbers=tuple(numbers))
 
 
 def stages_table(joins: Sequence[KnownUsedTable]) -> Table:
@@ -167,15 +156,19 @@ def stages_table(joins: Sequence[KnownUsedTable]) -> Table:
     Items with the probe right are counted where the answer is shown.
     """
     pairs = [(join, row) for join in joins for row in join.rows]
+
+    def count(number: int | None) -> str:
+        return "–" if number is None else str(number)
+
     cells = [
         (
             f"{join.asked} · {join.acted}",
             row.category if row.category == OVERALL else category_of(row.category).title,
             str(row.n_items),
-            _count(row.answered_correctly),
-            "not shown" if row.has_signal is False else _count(_encoded(join, row)),
-            _count(row.acted_correctly),
-            _count(row.answered_and_encoded),
+            count(row.answered_correctly),
+            "not shown" if row.has_signal is False else count(_encoded(join, row)),
+            count(row.acted_correctly),
+            count(row.answered_and_encoded),
             with_limits(row.share_not_acted_on, row.share_not_acted_on_ci or (None, None), percent),
         )
         for join, row in pairs
@@ -197,7 +190,6 @@ def stages_table(joins: Sequence[KnownUsedTable]) -> Table:
         }
         for join, row in pairs
     ]
-    note = "items right in both layouts, which guessing manages in 25 %; lost: share of answered and encoded ones"
     columns = (
         "systems",
         "category",
@@ -208,11 +200,14 @@ def stages_table(joins: Sequence[KnownUsedTable]) -> Table:
         "answer and probe right",
         "of these without success %",
     )
-    printed = _of_pairs("Stages", columns, cells, note, tuple(numbers), mean=OVERALL)
-    notes = [text for join in joins for text in join.notes if text not in without_signal(join.rows)]
-    dull = any(row.has_signal is False for _, row in pairs)
-    remark = ["not shown: probes are not shown to exceed chance and every control"] if dull else []
-    return printed.with_notes([*remark, *dict.fromkeys(text.removesuffix(".") for text in notes)])
+    notes = [
+        "items right in both layouts, which guessing manages in 25 %; lost: share of answered and encoded ones"
+    ]
+    if any(row.has_signal is False for _, row in pairs):
+        notes.append("not shown: probes are not shown to exceed chance and every control")
+    texts = [text for join in joins for text in join.notes if text not in without_signal(join.rows)]
+    notes += dict.fromkeys(text.removesuffix(".") for text in texts)
+    return Table.of("Stages", columns, cells, names=2, mean=OVERALL, notes=notes, numbers=tuple(numbers))
 
 
 def _encoded(join: KnownUsedTable, row: CategoryCounts) -> int | None:
@@ -223,15 +218,22 @@ def _encoded(join: KnownUsedTable, row: CategoryCounts) -> int | None:
     return sum(part.encoded or 0 for part in inside if part.has_signal and part.category != OVERALL)
 
 
-def _count(number: int | None) -> str:
-    return "–" if number is None else str(number)
+_OF_RUNS: Mapping[str, Callable[[RetentionTable], Table]] = {
+    "success": success_table,
+    "vlms": vlm_table,
+    "sides": sides_table,
+}
+_OF_PROBED_RUNS: Mapping[str, Callable[[RetentionTable], Table]] = {
+    "probing": probing_table,
+    "as-paper": attrgetter("as_paper"),
+}
 
 
-def _category(name: str) -> str:
-    return name if name == MEAN else category_of(name).title
+def _title(category: str) -> str:
+    return category if category == MEAN else category_of(category).title
 
 
-def _number(row: Difference) -> Number:
+def _difference_numbers(row: Difference) -> Number:
     models = row.sr_models
     return {
         "system": row.group,
@@ -250,17 +252,6 @@ def _number(row: Difference) -> Number:
     }
 
 
-_OF_RUNS: Mapping[str, Callable[[RetentionTable], Table]] = {
-    "success": success_table,
-    "vlms": vlm_table,
-    "sides": sides_table,
-}
-_OF_PROBED_RUNS: Mapping[str, Callable[[RetentionTable], Table]] = {
-    "probing": probing_table,
-    "as-paper": attrgetter("as_paper"),
-}
-
-
 def make_table(study: LoadedStudy, name: str, partial: bool = False) -> Table:
     """Make a table of a study file from stored runs alone: no model and no simulator.
 
@@ -274,8 +265,11 @@ def make_table(study: LoadedStudy, name: str, partial: bool = False) -> Table:
         return _packed(study.file.parent, study.pack, name)
     subject = f"the table {name!r}"
     stored = stored_runs(study, _selection(study, table), subject, partial, _categories(table))
+    provenances = [provenance for run in stored.runs for provenance in run.run.provenances.values()]
+    different = ", ".join(differences(provenances))  # what changes numbers, such as the version of torch
+    versions = [f"runs were made with different {different}"] if different else []
     printed = _of_kind(study, table, stored, name, partial)
-    printed = printed.with_notes([*stored.missing, *stored.unfinished, *_versions(stored)])
+    printed = printed.with_notes([*stored.missing, *stored.unfinished, *versions])
     return replace(printed, is_partial=bool(stored.unfinished), numbers=_numbers(printed.numbers, stored))
 
 
@@ -331,15 +325,11 @@ def _packed(archive: Path, pack: Pack, name: str) -> Table:
         raise RunDamagedError(f"{file} is no record of a table ({error!r}). Fetch the archive again") from error
 
 
-def _versions(stored: StoredRuns) -> list[str]:
-    """Return a remark on what changes numbers and is not the same for all runs, such as the version of torch."""
-    provenances = [provenance for run in stored.runs for provenance in run.run.provenances.values()]
-    different = ", ".join(differences(provenances))
-    return [f"runs were made with different {different}"] if different else []
-
-
 def _of_kind(study: LoadedStudy, table: TableTable, stored: StoredRuns, name: str, partial: bool) -> Table:
-    labels, opened = stored.labels(study), [run.run for run in stored.runs]
+    def keys(runs: Sequence[StoredRun]) -> list[str]:
+        return [probe_key(study, run, run.run, partial) for run in runs]
+
+    labels, opened = stored.labels, [run.run for run in stored.runs]
     no_keys = [""] * len(opened)  # tables without probes read none
     if table.kind in _OF_RUNS:
         return _OF_RUNS[table.kind](retention_table(opened, labels=labels, pairs=(), keys=no_keys))
@@ -347,41 +337,45 @@ def _of_kind(study: LoadedStudy, table: TableTable, stored: StoredRuns, name: st
         scores, elsewhere = retention_table(opened, labels=labels, pairs=(), keys=no_keys), table.elsewhere
         if elsewhere is None:
             return score_table(scores)
-        models = {run.location: run.cell.model for run in stored.runs}
-        values = {
-            location: elsewhere.values[model] for location, model in models.items() if model in elsewhere.values
-        }
-        return score_table(scores, elsewhere.title, elsewhere.source, values)
+        values = elsewhere.values
+        by_location = {run.location: values[run.cell.model] for run in stored.runs if run.cell.model in values}
+        return score_table(scores, elsewhere.title, elsewhere.source, by_location)
     if table.kind == "vlm-vla":
         vlms = retention_table(opened, labels=labels, pairs=(), keys=no_keys, vlm_vla=_sources(study, stored.runs))
         return vlm_vla_table(vlms.vlm_vla)
     if table.kind in _OF_PROBED_RUNS:
-        probed = [(run, run.probed.in_wording()) for run in stored.runs]
-        keys, categories = probe_keys(study, probed, partial), _categories(table)
+        parts = [run.probed.in_wording() for run in stored.runs]
+        of_parts = [probe_key(study, run, part, partial) for run, part in zip(stored.runs, parts, strict=True)]
+        categories = _categories(table)
         return _OF_PROBED_RUNS[table.kind](
-            retention_table([run for _, run in probed], labels=labels, pairs=(), categories=categories, keys=keys)
+            retention_table(parts, labels=labels, pairs=(), categories=categories, keys=of_parts)
         )
     if table.kind == "drift":
-        return _drift(study, study.study.drift[table.drift or ""], stored, labels, name, partial)
+        return _drift(study, study.study.drift[table.drift or ""], stored, name, partial)
     if table.kind == "stages":
-        return stages_table(_joins(study, stored, labels, partial))
+        return stages_table(_joins(study, stored, partial))
     comparison = study.study.comparisons[table.comparison or ""]
     if comparison.groups is not None:
-        groups = _groups(study, comparison.groups, stored)
+        models = study.study.models
+        groups = {
+            group: [run for run in stored.runs if group in models[run.cell.model].groups]
+            for group in comparison.groups
+        }
         members = [run for of_group in groups.values() for run in of_group]
         return group_table(
             retention_table(
                 {group: [run.run for run in of_group] for group, of_group in groups.items()},
                 labels=labels,
-                keys=probe_keys(study, [(run, run.run) for run in members], partial),
-                origins={str(run.run.location): _origin(study, run.cell.model) for run in members},
+                keys=keys(members),
+                origins={run.location: _origin(study, run.cell.model) for run in members},
             ),
             f"Groups of models: {name}",
         )
     title = "Ablation" if comparison.chain is None else "Chain"
-    keys = probe_keys(study, [(run, run.run) for run in stored.runs], partial)
     pairs = _pairs(comparison, stored.runs)
-    return difference_table(retention_table(opened, labels=labels, pairs=pairs, keys=keys), f"{title}: {name}")
+    return difference_table(
+        retention_table(opened, labels=labels, pairs=pairs, keys=keys(stored.runs)), f"{title}: {name}"
+    )
 
 
 def _selection(study: LoadedStudy, table: TableTable) -> Callable[[Cell], Selection | None]:
@@ -450,16 +444,9 @@ def _sources(study: LoadedStudy, runs: Sequence[StoredRun]) -> list[tuple[str, s
     ]
 
 
-def _drift(
-    study: LoadedStudy,
-    table: DriftTable,
-    stored: StoredRuns,
-    labels: Mapping[str, str],
-    name: str,
-    partial: bool,
-) -> Table:
+def _drift(study: LoadedStudy, table: DriftTable, stored: StoredRuns, name: str, partial: bool) -> Table:
     """Make the table of every pair of the file whose runs are both stored."""
-    by_name = {run.cell.name: run for run in stored.runs}
+    by_name, labels = {run.cell.name: run for run in stored.runs}, stored.labels
     drifts: dict[tuple[str, str], list[CategoryDrift]] = {}
     for cells in ([of_side(study.cells, side) for side in pair] for pair in table.pairs):
         for pair in product(*cells):
@@ -481,17 +468,15 @@ def _drift(
     return drift_table(drifts, name, table.view)
 
 
-def _joins(
-    study: LoadedStudy, stored: StoredRuns, labels: Mapping[str, str], partial: bool
-) -> list[KnownUsedTable]:
+def _joins(study: LoadedStudy, stored: StoredRuns, partial: bool) -> list[KnownUsedTable]:
     """Join every policy run with the run of its VLM, with the probes of the policy where there are any."""
     runs = {run.location: run for run in stored.runs}
     probes = {location: study_probes(study, run, run.probed, partial) for location, run in runs.items()}
     joins = [
         replace(
             match_runs(scored(runs[vlm].run, "text"), runs[policy].run, probes[policy]),
-            asked=labels[vlm],
-            acted=labels[policy],
+            asked=stored.labels[vlm],
+            acted=stored.labels[policy],
         )
         for vlm, policy in _sources(study, stored.runs)
     ]
@@ -503,8 +488,3 @@ def _origin(study: LoadedStudy, model: str) -> str:
     while (earlier := study.study.models[model].finetuned_from) is not None:
         model = earlier
     return model
-
-
-def _groups(study: LoadedStudy, names: list[str], stored: StoredRuns) -> dict[str, list[StoredRun]]:
-    models = study.study.models
-    return {name: [run for run in stored.runs if name in models[run.cell.model].groups] for name in names}
