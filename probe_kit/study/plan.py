@@ -5,7 +5,7 @@ Everything is read from the runs themselves, and from the failures that are stor
 
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from math import isclose
 from pathlib import Path
@@ -37,15 +37,6 @@ _FITTED = ("views", "permutations", "seed")
 """The fields of a table that decide its probes, by which the plan says why they are fitted again."""
 
 
-@dataclass(frozen=True)
-class PlannedProbes:
-    """Probes of one run. name: of their table in the file. why: in words, unless they are stored."""
-
-    name: str
-    state: Literal["stored", "missing", "failed"]
-    why: str = ""
-
-
 def probes_of(study: LoadedStudy, cell: Cell) -> Iterator[tuple[str, ProbesTable, Selection]]:
     """Yield the tables of probes that a cell belongs to, by name, each with what of the run is probed."""
     for name, table in study.study.probes.items():
@@ -54,16 +45,14 @@ def probes_of(study: LoadedStudy, cell: Cell) -> Iterator[tuple[str, ProbesTable
             yield name, table, selection
 
 
-def planned_probes(study: LoadedStudy, cell: Cell, run: "Run") -> Iterator[PlannedProbes]:
-    """Yield the state of the probes of a whole run."""
-    failures = Failures(study.study.folder)
+def planned_probes(study: LoadedStudy, cell: Cell, run: "Run") -> dict[str, str]:
+    """Return by table why the probes of a whole run are to be fitted; empty for those that are stored."""
+    failures, reasons = Failures(study.study.folder), dict[str, str]()
     for name, table, selection in probes_of(study, cell):
         why = _why_missing(study, table, cell, run, selection)
         failure = failures.of(cell, name) if why else None
-        if failure is not None:
-            yield PlannedProbes(name, "failed", failure.reason)
-        else:
-            yield PlannedProbes(name, "missing" if why else "stored", why)
+        reasons[name] = why if failure is None else failure.reason
+    return reasons
 
 
 def _why_missing(study: LoadedStudy, table: ProbesTable, cell: Cell, run: "Run", selection: Selection) -> str:
@@ -137,9 +126,9 @@ _MOST_CHANGES = 3
 class PlannedCell:
     """A cell with what lies at its location. stored: episodes of its selection. why: the state in words.
 
-    failure: of the last time it was played. waits_for: failure of another run of its model. probes: those that the
-    file names of it. sealed: whether nothing is left to do after its last episode. seconds: mean of a stored
-    episode. streams: of what is stored.
+    failure: of the last time it was played. waits_for: failure of another run of its model. probes: by table of
+    the file, why they are to be fitted; empty for stored ones. sealed: whether nothing is left to do after its
+    last episode. seconds: mean of a stored episode. streams: of what is stored.
     """
 
     cell: Cell
@@ -149,7 +138,7 @@ class PlannedCell:
     why: str
     failure: Failure | None = None
     waits_for: Failure | None = None
-    probes: tuple[PlannedProbes, ...] = ()
+    probes: Mapping[str, str] = field(default_factory=dict)
     sealed: bool = True
     seconds: float | None = None
     streams: tuple[StoredStream, ...] | None = None
@@ -160,22 +149,22 @@ class PlannedCell:
         return 0 if self.state == "skipped" else self.cell.episodes - self.stored
 
     @property
-    def unprobed(self) -> tuple[PlannedProbes, ...]:
-        """Probes that are to be fitted."""
-        return tuple(probes for probes in self.probes if probes.state != "stored")
-
-    @property
-    def given_up(self) -> bool:
-        """Whether the run is tried again only on request."""
-        return any(failure and failure.stage in NOT_TRIED_AGAIN for failure in (self.failure, self.waits_for))
+    def unprobed(self) -> dict[str, str]:
+        """Probes that are to be fitted, each with the reason."""
+        return {name: why for name, why in self.probes.items() if why}
 
     @property
     def words(self) -> str:
         """The state of the run, and of its probes."""
         if not self.probes or self.state != "whole":
             return self.why
-        of_probes = [f"probes {probes.name}: {probes.why}" for probes in self.unprobed] or ["probed"]
+        of_probes = [f"probes {name}: {why}" for name, why in self.unprobed.items()] or ["probed"]
         return "; ".join([self.why, *of_probes])
+
+    @property
+    def given_up(self) -> bool:
+        """Whether the run is tried again only on request."""
+        return any(failure and failure.stage in NOT_TRIED_AGAIN for failure in (self.failure, self.waits_for))
 
     @property
     def run_text(self) -> str:
@@ -308,7 +297,7 @@ class StudyPlan:
                     "done": planned.stored,
                     "inferences": planned.cell.inferences,
                     "failure": None if planned.failure is None else planned.failure.content,
-                    "probes": {probes.name: probes.why or probes.state for probes in planned.probes},
+                    "probes": {name: why or "stored" for name, why in planned.probes.items()},
                 }
                 for planned in self.cells
             ],
@@ -353,7 +342,7 @@ def _planned(study: LoadedStudy, cell: Cell) -> PlannedCell:
         cell.episodes,
         "whole",
         # An archive has the probes of its runs, and nothing is fitted to it.
-        probes=() if study.archive is not None else tuple(planned_probes(study, cell, run)),
+        probes={} if study.archive is not None else planned_probes(study, cell, run),
         sealed=run.sealed or not run.streams or study.archive is not None,
         seconds=_mean_seconds(run),
         streams=streams,
@@ -361,13 +350,16 @@ def _planned(study: LoadedStudy, cell: Cell) -> PlannedCell:
 
 
 def _why_new(study: LoadedStudy, cell: Cell) -> str:
-    """Return what changed since the newest run of the same model, condition and seed, if there is one."""
-
-    former = sorted(_former_runs(study.study.folder, cell), key=lambda file: file.stat().st_mtime_ns)
-    if not former:
+    """Return what changed since the newest run of the same model, condition and seed on this machine, if any."""
+    out = study.study.folder
+    digits = "[0-9a-f]" * KEY_DIGITS
+    files = () if "://" in out else Path(out).glob(f"{cell.folder[:-KEY_DIGITS]}{digits}/{RUN_FILE}")
+    others = (file for file in files if file.parent != Path(cell.location(out)))
+    former = max(others, key=lambda file: file.stat().st_mtime_ns, default=None)
+    if former is None:
         return "new"
     try:
-        settings = read_root(locate(former[-1].parent)).own_settings
+        settings = read_root(locate(former.parent)).own_settings
     except ProbeKitError:
         return "new"
     changes = [
@@ -375,7 +367,7 @@ def _why_new(study: LoadedStudy, cell: Cell) -> str:
         for name, before, after in changed_settings(settings, cell)
     ]
     if not changes:  # a run does not store these by value
-        return f"new: another checkpoint, or other options, than {former[-1].parent.name}"
+        return f"new: another checkpoint, or other options, than {former.parent.name}"
     more = f" and {len(changes) - _MOST_CHANGES} more" if len(changes) > _MOST_CHANGES else ""
     return f"new: {', '.join(changes[:_MOST_CHANGES])}{more}"
 
@@ -383,15 +375,6 @@ def _why_new(study: LoadedStudy, cell: Cell) -> str:
 def _short(value: Any) -> str:
     text = "none" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
     return text if len(text) <= 40 else f"{text[:37]}…"
-
-
-def _former_runs(out: str, cell: Cell) -> Iterator[Path]:
-    """Yield the `run.json` of runs of other settings, in a folder of this machine."""
-    if "://" not in out:
-        digits = "[0-9a-f]" * KEY_DIGITS
-        for file in Path(out).glob(f"{cell.folder[:-KEY_DIGITS]}{digits}/{RUN_FILE}"):
-            if file.parent != Path(cell.location(out)):
-                yield file
 
 
 def _failed(study: LoadedStudy, planned: PlannedCell) -> PlannedCell:
@@ -435,14 +418,6 @@ def _mean_seconds(run: "Run") -> float | None:
         return None
     total = (episodes["seconds_inference"] + episodes["seconds_simulation"]).dropna()
     return None if total.empty else float(total.mean())
-
-
-def cells_by_model(cells: Sequence[PlannedCell]) -> Mapping[str, list[PlannedCell]]:
-    """Return the cells of each model, in order."""
-    by_model: dict[str, list[PlannedCell]] = {}
-    for planned in cells:
-        by_model.setdefault(planned.cell.model, []).append(planned)
-    return by_model
 
 
 def _by_model(amounts: Iterable[tuple[str, float | None]]) -> dict[str, float | None]:

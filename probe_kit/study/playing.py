@@ -7,6 +7,7 @@ model whose worker is lost, or whose study is started again, resumes after its l
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import groupby
 from typing import Any
 
 from probe_kit._execution.executor import GivenUp, Pool, TaskQueue, work_off
@@ -24,13 +25,13 @@ from probe_kit.errors import (
     WorkerDiedError,
 )
 from probe_kit.extract import prepare
-from probe_kit.extract.extraction import Extraction, open_checked
+from probe_kit.extract.extraction import open_checked
 from probe_kit.extract.rollout.tasks import task_of
 from probe_kit.extract.settings import Settings
 from probe_kit.runs import seal
 from probe_kit.runs.store import locate
 from probe_kit.study.cells import NOT_TRIED_AGAIN, Cell, Failure, Failures, Selection
-from probe_kit.study.plan import PlannedCell, StudyPlan, cells_by_model, probes_of, untrained_cell
+from probe_kit.study.plan import PlannedCell, StudyPlan, probes_of, untrained_cell
 from probe_kit.study.reading import LoadedStudy
 from probe_kit.study.schema import ProbesTable
 from probe_kit.study.stored import open_cell
@@ -144,7 +145,8 @@ def _checked_tasks(
 ) -> Iterator[ModelTask]:
     """Yield the tasks of all models whose runs pass the checks; the others fail at once."""
     rehearsed: list[SceneSpec] = []
-    for model, cells in cells_by_model(missing).items():
+    for model, of_model in groupby(missing, key=lambda planned: planned.cell.model):  # which are in this order
+        cells = list(of_model)
         failure = next(filter(None, (_problem(planned, rehearsed, ray) for planned in cells)), None)
         if failure is not None:
             note(failure)
@@ -192,7 +194,7 @@ def play_model(task: ModelTask, report: Report) -> None:
     Episodes that are given up end their run alone; anything else ends the model. Raises DiskSpaceError and
     StoreError, which concern all runs.
     """
-    loaded = _Loaded()
+    loaded: dict[bool, Any] = {}  # as policy and as VLM, on first use
     for run in task.runs:
         moved = list[int]()
 
@@ -201,8 +203,12 @@ def play_model(task: ModelTask, report: Report) -> None:
             moved.append(stored)
             report(Moved(task.model, run.run, stored, planned, outcome))
 
+        settings = run.settings
         try:
-            loaded.prepare(run.settings, run.location).run(run.location, progress=count)
+            if settings.asks not in loaded:
+                loaded[settings.asks] = task_of(settings).load(settings)
+            extraction = prepare(settings, run.location, loaded[settings.asks])
+            extraction.run(run.location, progress=count)
             report(Made(task.model, run.run))
         except STOPS_ALL:
             raise
@@ -214,19 +220,6 @@ def play_model(task: ModelTask, report: Report) -> None:
         except Exception as error:  # noqa: BLE001 - whatever a model raises must not end the others
             report(Failure.of("playing", task.model, run.run, error))
             return
-
-
-class _Loaded:
-    """The model as policy and as VLM, loaded on first use."""
-
-    def __init__(self) -> None:
-        self._by_task: dict[bool, Any] = {}
-
-    def prepare(self, settings: Settings, location: str) -> Extraction:
-        """Prepare an extraction with the loaded model."""
-        if settings.asks not in self._by_task:
-            self._by_task[settings.asks] = task_of(settings).load(settings)
-        return prepare(settings, location, self._by_task[settings.asks])
 
 
 # -- all models --------------------------------------------------------------------------------------------------
@@ -306,8 +299,9 @@ def fit_probes(plan: StudyPlan, progress: ProbeProgress | None = None, jobs: int
     `train_probes`.
     """
     stored, failures = Failures(plan.study.study.folder), list[Failure]()
-    fitted = {(planned.cell.name, probes.name) for planned in plan.cells for probes in planned.probes}
-    fitted -= {(planned.cell.name, probes.name) for planned in plan.cells for probes in planned.unprobed}
+    fitted = {
+        (planned.cell.name, name) for planned in plan.cells for name, why in planned.probes.items() if not why
+    }
     for cell in (planned.cell for planned in plan.cells):
         for name, table, selection in probes_of(plan.study, cell):
             if (cell.name, name) in fitted:
