@@ -306,8 +306,8 @@ def _category(
         raw_back, recentred_back, p_fwe_back = back[:, at].tolist()
         likeness = (unbiased_cka(before, after), *cosines, _at_layer(lenses, site.layer))
         drifts.append(SiteDrift(site, raw, recentred, p_fwe, raw_back, recentred_back, p_fwe_back, *likeness))
-    own = [curves[0].correct[curves[0].sites.index(site)].mean() for site in sites]
-    return CategoryDrift(name, *rows, difference, tuple(drifts), int(np.argmax(own)), episodes.size)
+    accuracies = [curves[0].correct[curves[0].sites.index(site)].mean() for site in sites]
+    return CategoryDrift(name, *rows, difference, tuple(drifts), int(np.argmax(accuracies)), episodes.size)
 
 
 def lens_accuracy(run: RunReader, episodes: NDArray[np.str_]) -> NDArray[np.float64] | None:

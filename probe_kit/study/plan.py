@@ -354,8 +354,8 @@ def _why_new(study: LoadedStudy, cell: Cell) -> str:
     out = study.study.folder
     digits = "[0-9a-f]" * KEY_DIGITS
     files = () if "://" in out else Path(out).glob(f"{cell.folder[:-KEY_DIGITS]}{digits}/{RUN_FILE}")
-    others = (file for file in files if file.parent != Path(cell.location(out)))
-    former = max(others, key=lambda file: file.stat().st_mtime_ns, default=None)
+    former_files = (file for file in files if file.parent != Path(cell.location(out)))
+    former = max(former_files, key=lambda file: file.stat().st_mtime_ns, default=None)
     if former is None:
         return "new"
     try:

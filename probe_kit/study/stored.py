@@ -241,8 +241,8 @@ def open_matching(study: LoadedStudy, cell: Cell, partial: bool) -> "Run":
         problems = [f"settings and weights hash {hashes}"]
     if not problems:
         return run
-    others = (other for other in study.cells if other.name != cell.name)
-    owner = next((f" It is a run of {other.name}." for other in others if not any(differences(run, other))), "")
+    cells = (other for other in study.cells if other.name != cell.name)
+    owner = next((f" It is a run of {other.name}." for other in cells if not any(differences(run, other))), "")
     more = f" and {len(problems) - _MOST_PRINTED} more" if len(problems) > _MOST_PRINTED else ""
     raise SettingsMismatchError(
         f"{run.location} should hold the run of {cell.name}, and holds another one: "
@@ -310,8 +310,8 @@ def probe_key(study: LoadedStudy, stored: StoredRun, run: "Run", partial: bool) 
         return ""
 
     def keys(of_run: "Run") -> list[str]:
-        named = (probe_key_of(table, of_run) for table in tables.values())
-        return [key for key in named if is_stored(of_run.location, key)]
+        candidates = (probe_key_of(table, of_run) for table in tables.values())
+        return [key for key in candidates if is_stored(of_run.location, key)]
 
     if stored_keys := keys(run):
         return stored_keys[-1]  # of several, which share the run through two blocks, the last of the file
