@@ -23,12 +23,12 @@ from probe_kit.extract import ExtractSettings, extract_run
 from probe_kit.hooks import Policy, load_policy
 from probe_kit.intervene import ConditionOutcomes, ImageSwap, Interchange, ReplaySession, ReplaySource
 from probe_kit.intervene.kinds.image_swap import image_swap_effects
-from probe_kit.intervene.kinds.site_maps import patch_effects
-from probe_kit.intervene.pairs import Pair
+from probe_kit.intervene.kinds.interchange import patch_effects
+from probe_kit.intervene.places import Pair
 from probe_kit.intervene.replay import ReplayBatch, replay
-from probe_kit.intervene.results.verdict import classify_behaviour
 from probe_kit.intervene.runner import outcomes_of
-from probe_kit.intervene.sessions.opening import open_session
+from probe_kit.intervene.sessions import open_session
+from probe_kit.intervene.verdict import classify_behaviour
 from probe_kit.runs import Run
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.suite import Suite, build_suite

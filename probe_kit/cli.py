@@ -25,8 +25,7 @@ from probe_kit.doctor_command import doctor
 from probe_kit.extract.commands import ask, extract
 from probe_kit.extract.inspect_commands import check_environment, dataset_app, models, run_app
 from probe_kit.hooks.commands import new_adapter, verify
-from probe_kit.intervene.commands import KindHelp, intervene
-from probe_kit.intervene.run_commands import list_runs, show
+from probe_kit.intervene.commands import KindHelp, intervene, list_runs, show
 from probe_kit.retention.commands import retention
 from probe_kit.study.commands import app as study_app
 from probe_kit.suite.commands import app as suite_app

@@ -55,7 +55,7 @@ STORED = {
     ("probe_kit/intervene/kinds/base.py", "place"),
     ("probe_kit/intervene/kinds/erase.py", "kept"),
     ("probe_kit/intervene/patching/attribution.py", "place"),
-    ("probe_kit/intervene/results/verdict.py", "place"),
+    ("probe_kit/intervene/verdict.py", "place"),
     ("probe_kit/retention/behaviour.py", "one"),
     ("probe_kit/retention/compare/known_used.py", "asked"),
     ("probe_kit/suite/generators/attribute.py", "thing"),

@@ -1,8 +1,7 @@
 """Why a policy ignores an input: does it arrive, does it matter, and where on the way to the action is it lost?
 
-`frames` draws observations of a run. `measure` exchanges their inputs, which `inputs` names. `importance` measures
-how much of the action an input decides, `passage` at which sites it passes. `diagnosis` does all of it on a run,
-and stores it there.
+`inputs` draws observations of a run and names their inputs. `measure` exchanges these. `importance` measures how
+much of the action an input decides. `diagnosis` finds the sites at which it passes, and stores all of it.
 """
 
 from typing import TYPE_CHECKING
@@ -12,8 +11,7 @@ from probe_kit._system.imports import lazy_names
 if TYPE_CHECKING:
     from probe_kit.diagnose.diagnosis import diagnose_run, load_diagnosis
     from probe_kit.diagnose.page import draw_passage, write_page
-    from probe_kit.diagnose.results import Diagnosis
-    from probe_kit.diagnose.sentences import diagnosis_table
+    from probe_kit.diagnose.results import Diagnosis, diagnosis_table
 
 __all__ = ["Diagnosis", "diagnose_run", "diagnosis_table", "draw_passage", "load_diagnosis", "write_page"]
 
@@ -23,7 +21,7 @@ __getattr__, __dir__ = lazy_names(
         "Diagnosis": "results",
         "diagnose_run": "diagnosis",
         "load_diagnosis": "diagnosis",
-        "diagnosis_table": "sentences",
+        "diagnosis_table": "results",
         "draw_passage": "page",
         "write_page": "page",
     },

@@ -11,7 +11,7 @@ from probe_kit._terminal import options as common
 from probe_kit._terminal.console import counter, err, marked, print_json, progress, say
 from probe_kit._terminal.field_options import command_with
 from probe_kit._terminal.options import further_option
-from probe_kit.diagnose.choices import FRAMES
+from probe_kit.diagnose.results import FRAMES
 from probe_kit.errors import UsageError
 from probe_kit.extract import commands as start
 from probe_kit.extract.config_files import MovedOptions, moved_of
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from probe_kit.extract.extraction import Extraction
     from probe_kit.extract.sources.player import Row
     from probe_kit.intervene import ReplaySource
-    from probe_kit.intervene.settings import PairRow
+    from probe_kit.intervene.outcomes import PairRow
     from probe_kit.runs import Run
     from probe_kit.runs.store import Location
 
@@ -100,10 +100,9 @@ def diagnose(
     probe-kit diagnose runs/mine --target side.correct
     """
     from probe_kit.diagnose.diagnosis import diagnose_run
-    from probe_kit.diagnose.inputs import names_of
-    from probe_kit.diagnose.paraphrases import read_paraphrases
+    from probe_kit.diagnose.inputs import names_of, read_paraphrases
     from probe_kit.diagnose.results import check_names
-    from probe_kit.intervene.pairs import read_pairs
+    from probe_kit.intervene.places import read_pairs
     from probe_kit.train.command_options import TargetOptions
 
     # A camera's name is known once the source is open; any other mistake is said before.
@@ -218,7 +217,7 @@ def _prepared(
     from probe_kit.diagnose.diagnosis import check_base_files
     from probe_kit.extract import prepare
     from probe_kit.extract.commands import print_plan
-    from probe_kit.intervene.pairs import check_pairs
+    from probe_kit.intervene.places import check_pairs
     from probe_kit.runs.store import locate
 
     in_scene = not {"dataset", "env", "pictures"} & set(typed)
@@ -255,7 +254,7 @@ Planned = tuple[str, Sequence[Any], list[str]]
 def _planned(name: str, typed: Mapping[str, Any], request: _Request, out_folder: str | None) -> Planned:
     """Return what a diagnosis of this run, or of a planned one, would exchange and patch."""
     from probe_kit.diagnose.inputs import cameras_of
-    from probe_kit.intervene.settings import has_sides
+    from probe_kit.intervene.outcomes import has_sides
 
     if _is_run(name, typed):
         run = _stored(name, request)
@@ -291,7 +290,7 @@ def _say_cost(planned: Planned, request: _Request, inside: bool) -> None:
 
 
 def _print(diagnosis: "Diagnosis", output_format: str) -> None:
-    from probe_kit.diagnose.sentences import diagnosis_table
+    from probe_kit.diagnose.results import diagnosis_table
 
     if output_format == "json":
         print_json(diagnosis.to_json())

@@ -6,35 +6,144 @@ from contextlib import suppress
 from copy import copy
 from dataclasses import replace
 from datetime import UTC, datetime
+from math import nan
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from probe_kit.diagnose.choices import FRAMES
-from probe_kit.diagnose.frames import frames_of, tabled_frames
-from probe_kit.diagnose.inputs import cameras_of, names_of
+from probe_kit.diagnose.importance import ActionScale
+from probe_kit.diagnose.inputs import cameras_of, frames_of, names_of, tabled_frames
 from probe_kit.diagnose.measure import Actions, Infer, InputExchange
-from probe_kit.diagnose.passage import measure_passage
-from probe_kit.diagnose.results import Diagnosis, InputDiagnosis, check_names
+from probe_kit.diagnose.results import (
+    FRAMES,
+    LIKE_NONE,
+    Diagnosis,
+    InputDiagnosis,
+    Knowledge,
+    Limits,
+    SiteKnowledge,
+    SitePassage,
+    check_names,
+)
 from probe_kit.errors import CheckpointError, ObservationError, UnsupportedInterventionError, UsageError
 from probe_kit.extract.sources.inputs import STATE, with_input
 from probe_kit.hooks.contract.card import EMBEDDED
+from probe_kit.hooks.contract.sites import KV_STREAM
 from probe_kit.hooks.family import SIZE
-from probe_kit.intervene.pairs import Pair
-from probe_kit.intervene.settings import PairRow, key_of
-from probe_kit.intervene.tokens import roles_of_tokens
+from probe_kit.intervene.outcomes import PairRow, key_of
+from probe_kit.intervene.patching.patch import Cell, patched
+from probe_kit.intervene.places import ALL, Chunk, Given, Pair, SiteGroup, resolve_sites, roles_of_tokens
 from probe_kit.runs.layout import DIAGNOSES
 from probe_kit.runs.reader import origin_of
 from probe_kit.runs.records import as_json
 from probe_kit.runs.results import HEAD, read_bundle, write_bundle
 
 if TYPE_CHECKING:
-    from probe_kit.hooks import Policy
+    from probe_kit.hooks import ActivationCache, Model, Policy
     from probe_kit.hooks.contract.observation import Observation
-    from probe_kit.intervene.sessions.session import LoadPolicy, ReplaySession, ReplaySource
+    from probe_kit.intervene.sessions import LoadPolicy, ReplaySession, ReplaySource
     from probe_kit.runs.run import Run
-    from probe_kit.train import Target
+    from probe_kit.train import ProbeResults, Target
+
+
+POOLED = "all"
+"""The category that pools all episodes."""
+
+
+def measure_knowledge(run: "Run", target: "Target | str", seed: int = 0) -> Knowledge:
+    """Probe a target at every site of a run, all episodes pooled, or load these probes.
+
+    Raises what `train_probes` raises, such as TooFewGroupsError.
+    """
+    from probe_kit.train import train_probes
+
+    results = train_probes(run, [POOLED], target=target, seed=seed)
+    # A layer of a stream with iterations is one site of a diagnosis: the farthest above chance stands for it.
+    frame = results.scores.assign(excess=lambda scores: scores["score"] - scores["chance"])
+    best = frame.sort_values("excess", ascending=False).drop_duplicates(["stream", "layer"]).sort_index()
+    sites = tuple(
+        SiteKnowledge(f"{stream}.{layer:02d}", part, float(score), float(chance), bool(signal))
+        for stream, layer, part, score, chance, signal in zip(
+            *(best[name] for name in ("stream", "layer", "part", "score", "chance", "signal")), strict=True
+        )
+    )
+    value, limits, note = _retention(run, results)
+    metric = str(frame["metric"].iloc[0])
+    return Knowledge(results.settings.target, results.key, metric, sites, value, limits, note)
+
+
+def _retention(run: "Run", results: "ProbeResults") -> tuple[float, Limits, str]:
+    from probe_kit.retention.rows.label_rows import target_row
+
+    retained = target_row(run, results, POOLED, results.settings.views[0]).retention
+    low, high = retained.ci or (None, None)
+    return _or_nan(retained.value), (_or_nan(low), _or_nan(high)), retained.note
+
+
+def _or_nan(value: float | None) -> float:
+    return nan if value is None else value
+
+
+def places_of(model: "Model") -> list[SiteGroup]:
+    """Every layer of every stored stream, and what the backbone hands over, in the order of the network."""
+    streams = list(model.streams)
+    if model.prompt_kv is not None:
+        streams.insert(1, KV_STREAM)
+    return [group for stream in streams for group in resolve_sites(f"{stream}.*", model)]
+
+
+def measure_passage(
+    session: "ReplaySession", pairs: Sequence[Pair], scale: ActionScale
+) -> tuple[SitePassage, ...]:
+    """Both numbers at every site, over pairs of equally many tokens; two inferences per pair, and one per site.
+
+    scale: of the session's actions. Raises what `capture` and `patched` raise.
+    """
+    model, places = session.policy, places_of(session.policy)
+    differences = np.zeros((len(pairs), len(places)))
+    moved, squares = np.zeros((len(pairs), len(places))), np.zeros(len(pairs))
+    for row, pair in enumerate(pairs):
+        clean, before = _captured(session, pair.clean, pair.seed, places)
+        donated, donor = _captured(session, pair.source, pair.seed, places)
+        change = scale.changes(donated[None], clean[None])[0]
+        squares[row] = change @ change
+        memo: dict[object, object] = {}
+        for column, group in enumerate(places):
+            differences[row, column] = _relative_difference(group, before, donor)
+            # Elsewhere the patch would put in what is there already: an inference saved, and a share of 0.
+            if squares[row] and differences[row, column] > LIKE_NONE:
+                with patched(model, pair, [Cell(group, ALL)], donor, memo=memo):
+                    edited = session.act(pair.clean, pair.seed)
+                moved[row, column] = scale.changes(edited[None], clean[None])[0] @ change
+    # A ratio of sums: pairs whose action hardly changes have little weight.
+    shares = moved.sum(axis=0) / squares.sum() if squares.any() else np.full(len(places), np.nan)
+    return tuple(
+        SitePassage(group.name, float(difference), float(share))
+        for group, difference, share in zip(places, differences.mean(axis=0), shares, strict=True)
+    )
+
+
+def _captured(
+    session: "ReplaySession", observation: Given, seed: int, places: Sequence[SiteGroup]
+) -> "tuple[Chunk, ActivationCache]":
+    """The actions of one inference in the session's units, which of recordings are the checkpoint's own."""
+    from probe_kit.hooks import capture
+
+    with capture(session.policy, [site for group in places for site in group.sites]) as cache:
+        chunk = session.act(observation, seed)
+    return chunk, cache
+
+
+def _relative_difference(group: SiteGroup, before: "ActivationCache", after: "ActivationCache") -> float:
+    """Norm of the difference over all tokens and iterations of a place, relative to the norm before."""
+    difference = norm = 0.0
+    for site in group.sites:
+        clean, donated = before[site].float(), after[site].float()
+        difference += float((donated - clean).square().sum())
+        norm += float(clean.square().sum())
+    return float(np.sqrt(difference / norm)) if norm else 0.0
+
 
 FORMAT, FILE = "probe_kit diagnosis 4", "diagnosis.json"
 Progress = Callable[[str], None]
@@ -66,9 +175,7 @@ def diagnose_run(
     Raises UsageError for a model that does not act, a run with too few groups, an unknown input, a pair of a frame
     that the run lacks, or a base with other inputs, and of a target what `train_probes` raises.
     """
-    from probe_kit.diagnose.knowledge import measure_knowledge
-    from probe_kit.intervene.sessions.opening import open_session
-    from probe_kit.intervene.sessions.session import ReplaySource
+    from probe_kit.intervene.sessions import ReplaySource, open_session
 
     check_network(run)
     check_names(inputs, names_of(cameras_of(run)))
@@ -128,7 +235,7 @@ def load_diagnosis(run: "Run", key: str) -> Diagnosis:
 
 
 def _load_base(run: "Run", source: "ReplaySource", checkpoint: str, load: "LoadPolicy | None") -> "Policy":
-    from probe_kit.intervene.sessions.session import load_policy_of
+    from probe_kit.intervene.sessions import load_policy_of
 
     return (load or load_policy_of)(run, replace(source, checkpoint=checkpoint))
 

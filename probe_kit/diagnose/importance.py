@@ -13,7 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit._tables.numbers import whole_percent
-from probe_kit.diagnose.results import IDLE, MATTERS, BaseComparison, Change, InputDiagnosis, Verdict
+from probe_kit.diagnose.results import (
+    IDLE,
+    INPUTS_DECIDE,
+    MATTERS,
+    BaseComparison,
+    Change,
+    InputDiagnosis,
+    Verdict,
+)
 from probe_kit.hashing import derive_seed
 from probe_kit.statistics.bootstrap import unbounded_student_interval
 from probe_kit.statistics.paired_tests import least_column_p, max_t
@@ -21,8 +29,6 @@ from probe_kit.statistics.significance import SIGNIFICANCE
 
 DECIDES = 0.5
 """Of what all inputs change together: from here on an input decides."""
-INPUTS_DECIDE = 0.25
-"""Of the variance of the actions: where all inputs together change less, the seed decides and no input does."""
 TRACE = 0.01
 """Of the variance: a tenth of the actions' spread. An effect below it does not matter."""
 LEAST_SPREAD = 1e-3

@@ -1,13 +1,20 @@
-"""The inputs that frames hold, their blanks and their controls. Loads no model."""
+"""The inputs that frames hold, and the frames of a run that are diagnosed: first inferences, of many groups."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from hashlib import sha256
+from itertools import zip_longest
+from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
+from probe_kit._system.counting import counted
+from probe_kit._system.text_tables import open_table
+from probe_kit.diagnose.results import LEAST_GROUPS, count_groups
 from probe_kit.errors import UsageError
 from probe_kit.extract.sources.inputs import (
     INSTRUCTION,
@@ -20,8 +27,11 @@ from probe_kit.extract.sources.inputs import (
 )
 from probe_kit.hooks.contract.card import shown_cameras
 from probe_kit.hooks.contract.observation import Observation
+from probe_kit.intervene.sessions import ObservedSession
 
 if TYPE_CHECKING:
+    from probe_kit.intervene.outcomes import PairRow
+    from probe_kit.intervene.sessions import ReplaySession
     from probe_kit.runs import Run
 
 
@@ -77,3 +87,143 @@ def _retyped(words: str) -> list[str]:
     """The full stop added or removed, and the first letter in the other case; then one of both alone."""
     stopped = with_other_stop(words)
     return [text[:1].swapcase() + text[1:] for text in (stopped, words)] + [stopped]
+
+
+COLUMNS = ("instruction", "other")
+
+
+def read_paraphrases(file: Path) -> dict[str, str]:
+    """Return, by instruction, its other words.
+
+    Raises UsageError for a file without the columns, a blank cell, and an instruction with two other texts.
+    """
+    table = open_table(file, COLUMNS)
+    if missing := [name for name in COLUMNS if name not in table.names]:
+        raise UsageError(f"{file} has no column {missing[0]}; expected columns instruction and other")
+    words: dict[str, str] = {}
+    for line, cells in table.rows(COLUMNS):
+        instruction, other = (cells[name] or "" for name in COLUMNS)
+        where = table.where(line)
+        if not instruction or not other or instruction == other:
+            raise UsageError(f"{where}: expected two different texts, found {instruction!r}, {other!r}")
+        if words.setdefault(instruction, other) != other:
+            raise UsageError(
+                f"{where} has {other!r} for {instruction!r}, and a line above has {words[instruction]!r}; "
+                "expected one. Leave one out"
+            )
+    return words
+
+
+GOLDEN = (5**0.5 - 1) / 2
+"""The golden ratio: its multiples, without their whole part, cover 0 to 1 evenly for any number of them.
+
+Thus episodes are looked at in different phases.
+"""
+
+
+def frames_of(
+    session: "ReplaySession", count: int, paraphrases: Mapping[str, str] = MappingProxyType({})
+) -> list[Frame]:
+    """The frames of `count` episodes; all where the run has fewer.
+
+    Of the scene, two first frames of each group; of other sources, frames of as many groups as possible.
+
+    paraphrases: by instruction, other words of the same meaning. Raises UsageError for a run with too few groups.
+    """
+    listed = _observed(session, count) if isinstance(session, ObservedSession) else _drawn(session, count)
+    frames = [_read(frame, paraphrases) for frame in listed]
+    _check_groups(frames, lambda: f"{session.run.location} has", "Extract more episodes or items")
+    return frames
+
+
+def tabled_frames(
+    session: "ReplaySession", table: Sequence["PairRow"], paraphrases: Mapping[str, str] = MappingProxyType({})
+) -> tuple[list[Frame], list[tuple[int, int]]]:
+    """Return the frames that a table of pairs names, each once, and its rows as (frame, donor) among them.
+
+    table: of frames that the run has, which `open_session` checks. Of the scene they are first frames.
+    paraphrases: as in `frames_of`. Raises UsageError for clean frames of too few groups.
+    """
+    if isinstance(session, ObservedSession):
+        by_name = session.frames.by_name
+    else:
+        names = {name for row in table for name in (row[0], row[2])}
+        rows = np.flatnonzero(session.run.episodes["episode_id"].isin(names))
+        by_name = {(frame.name, 0): frame for frame in _first_frames(session, rows)}
+    pairs = [(by_name[row[:2]], by_name[row[2:]]) for row in table]
+    # One frame may be named by its episode and by its item.
+    frames = list({frame.name: frame for pair in pairs for frame in pair}.values())
+    at = {frame.name: number for number, frame in enumerate(frames)}
+    _check_groups([clean for clean, _ in pairs], lambda: "the table of pairs has", "Add pairs of other groups")
+    numbered = dict.fromkeys((at[clean.name], at[donor.name]) for clean, donor in pairs)
+    return [_read(frame, paraphrases) for frame in frames], sorted(numbered)
+
+
+def _check_groups(frames: Sequence[Frame], subject: Callable[[], str], remedy: str) -> None:
+    groups = len({frame.group for frame in frames})
+    if groups < LEAST_GROUPS:
+        has = f"{subject()} frames of {counted(groups, 'group')}"
+        raise UsageError(f"{has}; a diagnosis needs at least {LEAST_GROUPS}. {remedy}")
+
+
+def _read(frame: Frame, paraphrases: Mapping[str, str]) -> Frame:
+    """The frame with its observation in memory: every input of it is compared and exchanged many times."""
+    observation = frame.observation
+    other_words = paraphrases.get(observation.instruction, "")
+    return replace(frame, observe=lambda _: observation, other_words=other_words)
+
+
+def _observed(session: ObservedSession, count: int) -> Iterator[Frame]:
+    """Frames of recordings or of an environment: one of every group in turn, spread over groups and episodes."""
+    by_group: dict[str, list[Frame]] = {}
+    for frame in session.frames.index:
+        by_group.setdefault(frame.group, []).append(frame)
+    groups = list(by_group.values())
+    # Data sets are often sorted by task: the first episodes alone would hold one instruction.
+    drawn = np.linspace(0, len(groups) - 1, min(count, len(groups))).round().astype(int)
+    turns = -(-count // len(drawn))
+    spread = [_spread(groups[group], turns, number * GOLDEN % 1) for number, group in enumerate(drawn)]
+    in_turn = [frame for turn in zip_longest(*spread) for frame in turn if frame is not None]
+    yield from in_turn[:count]
+
+
+def _spread(frames: list[Frame], turns: int, phase: float) -> list[Frame]:
+    """Up to `turns` frames of a group at equal distances. phase: of the first, in distances, from 0 up to 1."""
+    turns = min(turns, len(frames))
+    return [frames[int(len(frames) * (turn + phase) / turns)] for turn in range(turns)]
+
+
+def _drawn(session: "ReplaySession", count: int) -> Iterator[Frame]:
+    """First frames of the scene: of every group one of each item, in the same layout; see `count_groups`."""
+    episodes = session.run.episodes
+    ordered = order_of_first_frames(episodes, count_groups(count))[:count]
+    yield from _first_frames(session, episodes.index.get_indexer(ordered).tolist())
+
+
+def _first_frames(session: "ReplaySession", rows: Iterable[int]) -> Iterator[Frame]:
+    """The first frames of some of the scene's episodes. rows: their positions in the table of episodes."""
+    episodes = session.run.episodes
+    for row in rows:
+        for pair in session.pairs(str(episodes["item_id"].iloc[row])):
+            if pair.row == row:
+                assert isinstance(pair.clean, Observation), "runs of policies hold observations"
+                yield Frame.of(pair.episode, pair.clean, pair.group or pair.episode, pair.seed)
+
+
+def order_of_first_frames(episodes: pd.DataFrame, groups: int) -> pd.Index:
+    """Return the rows of the scene's episodes in the order in which their first frames are taken.
+
+    groups: that are taken first, with two frames each; then come further groups, then further frames.
+    """
+    by_item = episodes.groupby("item_id", sort=False)
+    order = pd.DataFrame({"group": pd.factorize(episodes["group_id"])[0], "layout": by_item.cumcount()})
+    order["item"] = order.assign(item=by_item.ngroup()).groupby("group")["item"].rank("dense").astype(int) - 1
+    of_group = order.groupby("group")
+    items, layouts = (of_group[name].transform("max") + 1 for name in ("item", "layout"))
+    # Another item and another layout begin in every group: else all would ask for the same side of one layout.
+    order["item"] = (order["item"] + order["group"]) % items
+    order["layout"] = (order["layout"] + order["group"] // items) % layouts
+    order = order.sort_values(["group", "layout", "item"], kind="stable")
+    turn = order.groupby("group").cumcount()
+    order = order.assign(turn=turn, couple=turn // 2, block=order["group"] // groups)
+    return order.sort_values(["couple", "block", "turn", "group"], kind="stable").index

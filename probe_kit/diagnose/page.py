@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from probe_kit.diagnose.sentences import diagnosis_table, sentences
+from probe_kit.diagnose.results import diagnosis_table, sentences
 from probe_kit.retention.displays.base.style import footer, legend_above, panels, plain, series
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""The results of a diagnosis, input by input, as they are printed and stored. Loads no model."""
+"""The results of a diagnosis, input by input: as they are stored, their table and sentences. Loads no model."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -8,15 +8,36 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BeforeValidator, PlainSerializer
 
+from probe_kit._tables.numbers import p_text, whole_percent, with_limits
+from probe_kit._tables.table import Cell, Heading, Table
 from probe_kit.errors import UsageError
 
 if TYPE_CHECKING:
     from pydantic import TypeAdapter
 
+
+FRAMES = 24
+"""With so many, words that decide were seen to in nine of ten draws or more; see `docs/notes/causal.md`."""
+LEAST_GROUPS = 6
+"""Fewer groups cannot show at p < 0.05 that anything matters, by sign flips of whole groups: 2⁻⁵ is 0.03."""
+
+
+def count_groups(frames: int) -> int:
+    """Return of how many groups of the scene so many frames are drawn: two frames of each.
+
+    The two items of a group ask for one side each, before the same pictures. A policy that goes to one side where
+    it does not understand is moved by other words in one of both, whichever side that is. The mean of both varies
+    half as much between groups as one frame does.
+    """
+    return max(LEAST_GROUPS, -(-frames // 2))
+
+
 Verdict = Literal["decides", "moves", "no effect", "open", "does not arrive", "not varied", "not an input"]
 MATTERS: tuple[Verdict, ...] = ("decides", "moves")
 IDLE: tuple[Verdict, ...] = ("no effect", "does not arrive")
 """Verdicts that an input does not matter; `open` is none."""
+INPUTS_DECIDE = 0.25
+"""Of the variance of the actions: where all inputs together change less, the seed decides and no input does."""
 CARRIES = 0.5
 """Share of the change of the action from which a site is said to carry an input."""
 LIKE_NONE = 1e-6
@@ -263,3 +284,93 @@ def exit_code(inputs: Sequence[InputDiagnosis], required: Sequence[str] = ()) ->
     tested = [diagnosed for diagnosed in inputs if diagnosed.matters is not None]
     judged = [diagnosed for diagnosed in inputs if diagnosed.name in required] if required else tested
     return 0 if judged and all(diagnosed.matters for diagnosed in judged) else 1
+
+
+_HEADINGS = (
+    Heading("input"),
+    Heading("arrives", "whether any number of any action changed under another value"),
+    Heading("effect", "decides, moves, no effect, open, does not arrive, not varied, not an input"),
+    Heading("decides %", "share of the action's variance that is due to it: total-effect index, 95 % by groups"),
+    Heading("control %", "the same of a change that should not matter"),
+    Heading("all inputs %", "the same of all inputs together; the seed decides the rest"),
+    Heading("p", "that it changes more than its control, by permutation in whole groups"),
+)
+_FINDINGS = {
+    "decides": "decides the action",
+    "moves": "moves the action, is not shown to decide it",
+    "no effect": "arrives and changes the action by less than 1 % more than a change without meaning",
+    "open": "arrives; whether it matters is open",
+    "does not arrive": "does not arrive",
+    "not varied": "was not tested",
+    "not an input": "is no input of this model",
+}
+_CHANGES = {
+    "lost in fine-tuning": "it was lost in fine-tuning",
+    "weaker": "it is weaker than in the base",
+    "never there": "the base does not use it either",
+    "in both": "the base uses it too",
+    "stronger": "it is stronger than in the base",
+    "gained": "it was gained in fine-tuning",
+    "open": "the difference to the base is open",
+}
+_OF_BASE = (
+    Heading("base %", "the share of the base checkpoint, on the same pairs"),
+    Heading("difference %", "of both shares, tuned minus base, 95 % by groups"),
+    Heading("p of the difference", "two-sided, by sign flips of whole groups"),
+    Heading("change"),
+)
+
+
+def diagnosis_table(diagnosis: "Diagnosis") -> Table:
+    """One line per input, with one sentence per input below it, and one of the target."""
+    headings = (*_HEADINGS, *_OF_BASE) if diagnosis.base else _HEADINGS
+    rows = [_row(diagnosed, headings) for diagnosed in diagnosis.inputs]
+    title = f"Inputs of {diagnosis.label}: {diagnosis.n_frames} frames of {diagnosis.n_groups} groups"
+    title += f"; base {diagnosis.base}" * bool(diagnosis.base)
+    numbers = tuple(diagnosis.to_json()["inputs"])
+    return Table.of(title, headings, rows, notes=sentences(diagnosis), numbers=numbers)
+
+
+def _row(diagnosed: "InputDiagnosis", headings: Sequence[Heading]) -> Sequence[Cell]:
+    tested = diagnosed.matters is not None
+    texts = [
+        diagnosed.name,
+        ("yes" if diagnosed.arrives else "no") if tested else "–",
+        diagnosed.verdict,
+        with_limits(diagnosed.share, diagnosed.share_ci, whole_percent),
+        whole_percent(diagnosed.control),
+        whole_percent(diagnosed.every),
+        p_text(diagnosed.p),
+    ]
+    if (base := diagnosed.base) is not None:
+        texts += [
+            whole_percent(base.share),
+            with_limits(base.difference, base.ci, whole_percent),
+            p_text(base.p),
+            base.change,
+        ]
+    texts += ["–"] * (len(headings) - len(texts))
+    alarms = {"arrives", "effect"} if diagnosed.matters is False else set()
+    if base is not None and base.change == "lost in fine-tuning":
+        alarms.add("change")
+    return [Cell(text, alarm=heading.text in alarms) for heading, text in zip(headings, texts, strict=True)]
+
+
+def sentences(diagnosis: "Diagnosis") -> list[str]:
+    """Return what became of every input, whether the seed decides more than they do, and of the target."""
+    lines = [sentence(diagnosed) for diagnosed in diagnosis.inputs]
+    together = max((diagnosed.every for diagnosed in diagnosis.inputs if diagnosed.matters is not None), default=1)
+    if together < INPUTS_DECIDE:
+        lines.append(f"all inputs together change {whole_percent(together)} % of the action: the seed decides it.")
+    if diagnosis.knowledge is not None:
+        decided = any(diagnosed.verdict == "decides" for diagnosed in diagnosis.inputs)
+        lines.append(diagnosis.knowledge.describe(decided))
+    return lines
+
+
+def sentence(diagnosed: "InputDiagnosis") -> str:
+    """Return one sentence: what became of an input, and where."""
+    reason = "" if diagnosed.verdict in MATTERS else f" ({diagnosed.reason})"
+    where = f"; {diagnosed.where}" if diagnosed.where else ""
+    base = f"; {_CHANGES[diagnosed.base.change]}" if diagnosed.base is not None else ""
+    return f"{diagnosed.name} {_FINDINGS[diagnosed.verdict]}{reason}{where}{base}."

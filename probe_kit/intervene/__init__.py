@@ -19,16 +19,20 @@ if TYPE_CHECKING:
     from probe_kit.intervene.kinds.erase import ConceptErasure, ErasureEffect
     from probe_kit.intervene.kinds.image_swap import ImageSwap, ImageSwapEffect, stored_image_swaps
     from probe_kit.intervene.kinds.instruction_swap import InputSensitivity, InstructionSwap, InstructionSwapEffect
-    from probe_kit.intervene.kinds.interchange import Interchange
+    from probe_kit.intervene.kinds.interchange import (
+        Interchange,
+        PatchEffect,
+        best_patch_targets,
+        stored_site_effects,
+    )
     from probe_kit.intervene.kinds.joint import JointEffect, JointPlaces, stored_joint_places
-    from probe_kit.intervene.kinds.site_maps import PatchEffect, best_patch_targets, stored_site_effects
     from probe_kit.intervene.kinds.steer import Steering
     from probe_kit.intervene.outcomes import ConditionOutcomes, stored_interventions
     from probe_kit.intervene.patching.attribution import AttributionEffect
-    from probe_kit.intervene.results.results import InterventionResult, load_effects
-    from probe_kit.intervene.results.verdict import Behaviour, Places, UseVerdict, classify_all, classify_use
+    from probe_kit.intervene.results import InterventionResult, load_effects
     from probe_kit.intervene.runner import run_intervention
-    from probe_kit.intervene.sessions.session import ReplaySession, ReplaySource
+    from probe_kit.intervene.sessions import ReplaySession, ReplaySource
+    from probe_kit.intervene.verdict import Behaviour, Places, UseVerdict, classify_all, classify_use
     from probe_kit.runs.direction_files import write_directions
 
 __all__ = [
@@ -78,7 +82,7 @@ __getattr__, __dir__ = lazy_names(
         "InputSensitivity": "kinds.instruction_swap",
         "InstructionSwapEffect": "kinds.instruction_swap",
         "InstructionSwap": "kinds.instruction_swap",
-        "stored_site_effects": "kinds.site_maps",
+        "stored_site_effects": "kinds.interchange",
         "PatchEffect": "kinds.interchange",
         "Steering": "kinds.steer",
         "AttributionEffect": "patching.attribution",
@@ -89,26 +93,26 @@ __getattr__, __dir__ = lazy_names(
         "AttentionReadout": "kinds.attention",
         "AttentionShares": "kinds.attention",
         "stored_attention": "kinds.attention",
-        "ReplaySession": "sessions.session",
+        "ReplaySession": "sessions",
         "ClosedLoopEffect": "kinds.closed_loop",
         "ClosedLoop": "kinds.closed_loop",
-        "best_patch_targets": "kinds.site_maps",
-        "InterventionResult": "results.results",
+        "best_patch_targets": "kinds.interchange",
+        "InterventionResult": "results",
         "ConceptErasure": "kinds.erase",
         "ErasureEffect": "kinds.erase",
         "ImageSwap": "kinds.image_swap",
         "ImageSwapEffect": "kinds.image_swap",
-        "UseVerdict": "results.verdict",
-        "ReplaySource": "sessions.session",
-        "Behaviour": "results.verdict",
+        "UseVerdict": "verdict",
+        "ReplaySource": "sessions",
+        "Behaviour": "verdict",
         "JointEffect": "kinds.joint",
         "JointPlaces": "kinds.joint",
-        "Places": "results.verdict",
+        "Places": "verdict",
         "stored_joint_places": "kinds.joint",
         "run_intervention": "runner",
-        "classify_use": "results.verdict",
-        "classify_all": "results.verdict",
-        "load_effects": "results.results",
+        "classify_use": "verdict",
+        "classify_all": "verdict",
+        "load_effects": "results",
         "stored_image_swaps": "kinds.image_swap",
         "stored_interventions": "outcomes",
         "write_directions": "probe_kit.runs.direction_files",

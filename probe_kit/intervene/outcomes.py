@@ -1,4 +1,4 @@
-"""The store of interventions: `RUN/interventions/<key>/`, complete or not there. Reading needs no model.
+"""The settings of an intervention, its store `RUN/interventions/<key>/`, and the choice among stored ones.
 
 settings.json      the head: what was asked, of which commits, and the hashes of the rest; written last
 episodes.npz       per condition and episode where the action would go, and how far it changed
@@ -6,33 +6,159 @@ effects.csv        the same in numbers per category, for people and other progra
 attention.npz      of the kind `attention`: shares per inference, block, iteration, head and role
 attention_patches.npz  of it, where the family says which token sees what: shares per inference, block and patch
 certificate.json   what was loaded, and what was checked
+
+A stored intervention is chosen by what it is about, never by when it was made: another map, role, direction,
+coefficient, or a try on fewer episodes replaces nothing. Conditions that were played on the same episodes are
+pooled, whichever intervention they came with. Needs no model.
 """
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from io import BytesIO
 from types import MappingProxyType
-from typing import Any
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit._system.bounded_files import open_arrays
-from probe_kit.errors import NoInterventionsError
-from probe_kit.intervene.settings import FORMAT, key_of
+from probe_kit.errors import NoInterventionsError, UnknownCategoryError, UsageError
+from probe_kit.hashing import sha256_json
+from probe_kit.hooks.contract.declared import Readout
 from probe_kit.runs.layout import INTERVENTIONS
-from probe_kit.runs.reader import RunReader
+from probe_kit.runs.reader import SIDE, RunReader
 from probe_kit.runs.records import as_json
-from probe_kit.runs.results import (
-    HEAD,
-    Bundle,
-    complete_key,
-    read_bundles,
-    tidy_bundle,
-    write_bundle,
-)
+from probe_kit.runs.results import HEAD, Bundle, complete_key, read_bundles, tidy_bundle, write_bundle
+from probe_kit.runs.run import Run
 from probe_kit.runs.store import Location
+
+FORMAT = 2  # raise when stored numbers would be others
+DONORS = 2  # the rule of `draw_donors`; raise when it gives other donors
+FIRST_CHUNK: Readout = "first-chunk"
+PER_STEP: Readout = "per-step"
+
+
+PairRow = tuple[str, int, str, int]
+"""Episode and frame of the clean inference, and of its donor."""
+
+
+class PairChoice(Protocol):
+    """The pairs that an intervention takes of a run without sides."""
+
+    @property
+    def varied(self) -> str:
+        """Return the input that the source has of its donor."""
+
+    @property
+    def frames(self) -> int | None:
+        """Return the number of frames of each episode, evenly spaced; None for the default."""
+
+    @property
+    def pairs(self) -> tuple[PairRow, ...]:
+        """Return pairs of the user's own; empty for donors that are drawn."""
+
+    def items_in(self, run: Run) -> list[str]:
+        """Return the items of a run that are replayed."""
+
+
+class Asked(PairChoice, Protocol):
+    """The settings of an intervention, of whichever kind; see `kinds.base.Intervention`."""
+
+    kind: ClassVar[str]
+
+    @property
+    def categories(self) -> tuple[str, ...] | None:
+        """Return the categories of the run; None for all."""
+
+    @property
+    def items(self) -> int | None:
+        """Return the number of items of each category, the first ones; None for all."""
+
+    @property
+    def readout(self) -> Readout:
+        """Return the part of the policy's answer that is read."""
+
+    def parameters(self) -> dict[str, Any]:
+        """Return all else that decides its numbers, as plain JSON."""
+
+
+def categories_in(run: Run, categories: Sequence[str] | None) -> tuple[str, ...]:
+    """Return some categories, by default all of a run. Raises UnknownCategoryError for one that it lacks."""
+    available = list(dict.fromkeys(run.episodes["category"].astype(str)))
+    for category in categories or ():
+        if category not in available:
+            raise UnknownCategoryError(
+                f"{run.location} has no category {category!r}; it has: {', '.join(available)}"
+            )
+    return tuple(categories or available)
+
+
+def items_of(run: Run, categories: Sequence[str] | None, items: int | None) -> list[str]:
+    """Return the items that are replayed, category by category. Raises UsageError if there is none."""
+    if items is not None and items < 1:
+        raise UsageError(f"items is {items}; expected at least 1")
+    episodes, selected = run.episodes, list[str]()
+    for category in categories_in(run, categories):
+        names = episodes.loc[episodes["category"] == category, "item_id"].astype(str)
+        selected += list(dict.fromkeys(names))[:items]
+    if not selected:
+        raise UsageError(f"{run.location} has no episode yet; extract some first")
+    return selected
+
+
+def settings_of(intervention: Asked, run: Run) -> dict[str, Any]:
+    """Return everything that decides the numbers, as plain JSON; its hash is the key."""
+    return {
+        "format": FORMAT,
+        "kind": intervention.kind,
+        "run_settings": run.settings_sha256,
+        "stamp": run.stamp,
+        "weights": run.weights_sha256,
+        "wording": run.wording,
+        "categories": list(categories_in(run, intervention.categories)),
+        "items": intervention.items,
+        "readout": intervention.readout,
+        **({} if has_sides(run) else _pairs_of(intervention)),
+        **intervention.parameters(),
+    }
+
+
+def _pairs_of(choice: PairChoice) -> dict[str, Any]:
+    drawn = {} if choice.pairs else {"donors": DONORS}
+    return {"vary": choice.varied, "frames": choice.frames, "pairs": [list(row) for row in choice.pairs], **drawn}
+
+
+def has_sides(run: Run) -> bool:
+    """Whether a run's questions have a correct picture on a side."""
+    return SIDE in run.episodes
+
+
+def key_of(settings: Mapping[str, Any]) -> str:
+    """First 12 hex digits of the settings' sha256: the name of the results' folder."""
+    return sha256_json(settings)[:12]
+
+
+def check_run_fits(run: Run) -> None:
+    """Raise UsageError for a run whose policy did not act, or acted in a way that is not done again here."""
+    settings = run.settings
+    why = None
+    if "ask" in settings:
+        why = f"{run.model} was asked and did not act; intervene on a run of `probe-kit extract`"
+    elif run.weights_sha256 is None or not run.streams:
+        why = f"{run.model} is scripted: it has no network in which anything could be changed"
+    elif not has_sides(run) and run.inputs is None:
+        why = "it stores no inputs, with which a repeated observation could be compared"
+    elif run.capture_only and not run.recorded:
+        why = (
+            f"{run.model} only captured activations (--no-act): no action was stored with which the effect of a "
+            "change could be compared. Extract a run without --no-act, of a checkpoint whose actions move this arm"
+        )
+    elif settings.get("edits"):
+        why = "its streams were edited already, and the stored run does not hold the vectors"
+    if why is not None:
+        raise UsageError(f"{run.location}: {why}")
+
 
 CLEAN, IMAGE_SWAP, INSTRUCTION_SWAP, NOISE = "clean", "image_swap", "instruction_swap", "noise"
 """Conditions: as in the run, the two pictures swapped, the counterpart's instruction, the noise drawn anew."""
@@ -238,3 +364,112 @@ def find_stored(run: RunReader, key: str | None = None, kind: str | None = None)
         return candidates[-1]
     by_key = {intervention.key: intervention for intervention in candidates}
     return by_key[complete_key(key, by_key, run.location, "interventions")]
+
+
+Rank = tuple[bool, int, bool]
+
+
+@dataclass(frozen=True)
+class StoredResult:
+    """The part of one stored intervention that is of one category. outcomes: of its episodes alone.
+
+    own_readout: whether it was read as its family says it should be. wrong_readout: whether it was not, and the
+    family is one whose first inference says little (`per-step`).
+    """
+
+    stored: StoredIntervention
+    category: str
+    outcomes: ConditionOutcomes
+    own_readout: bool
+    wrong_readout: bool
+
+    @classmethod
+    def all_of(cls, stored: StoredIntervention) -> "list[StoredResult]":
+        """One per category. Raises RunDamagedError if it was changed."""
+        readout = stored.settings.get("readout", FIRST_CHUNK)
+        family = stored.certificate().get("supported", {}).get("readout", FIRST_CHUNK)
+        return [
+            cls(stored, category, outcomes, readout == family, family == PER_STEP != readout)
+            for category, outcomes in stored.outcomes().by_category()
+        ]
+
+    @property
+    def readout(self) -> str:
+        """`first-chunk` or `per-step`."""
+        return str(self.stored.settings.get("readout", FIRST_CHUNK))
+
+    @property
+    def rank(self) -> Rank:
+        """The larger, the more it says: rightly read, then of more episodes."""
+        return not self.wrong_readout, self.outcomes.episodes.size, self.own_readout
+
+    @property
+    def newest(self) -> tuple[str, str]:
+        """Return the time, which decides between what says as much."""
+        return self.stored.created, self.stored.key
+
+
+def stored_results(run: RunReader, kind: str) -> list[StoredResult]:
+    """Return results by category as the run has them; of each what says most comes last.
+
+    Of what says as much the newest. Raises RunDamagedError.
+    """
+    order = {name: at for at, name in enumerate(dict.fromkeys(run.episodes["category"].astype(str)))}
+    every = [result for stored in stored_interventions(run, kind) for result in StoredResult.all_of(stored)]
+    return sorted(
+        every,
+        key=lambda result: (order.get(result.category, len(order)), result.category, result.rank, result.newest),
+    )
+
+
+def preferred_by_category(run: RunReader, kind: str, readout: str | None = None) -> dict[str, StoredResult]:
+    """Return by category, of all that is stored of a kind, the result that says most. Raises RunDamagedError.
+
+    readout: of those alone; None for any.
+    """
+    results = stored_results(run, kind)
+    return {result.category: result for result in results if readout in (None, result.readout)}
+
+
+@dataclass(frozen=True)
+class PooledConditions:
+    """Conditions that several interventions played on the same episodes of one category.
+
+    like: one of them. sources: by condition, of whom it is; without those in which nothing was changed.
+    """
+
+    like: StoredResult
+    sources: dict[str, StoredResult]
+
+    def outcomes(self, conditions: Sequence[str]) -> ConditionOutcomes:
+        """Some of the conditions, in the order that is asked for, behind what was unchanged."""
+        base = self.like.outcomes
+        unchanged = [name for name in (CLEAN, IMAGE_SWAP) if name in base.conditions]
+        every = [(base, name) for name in unchanged] + [(self.sources[name].outcomes, name) for name in conditions]
+        rows = [(outcomes, outcomes.conditions.index(name)) for outcomes, name in every]
+        stacked = {field: _stacked(field, rows) for field in BY_CONDITION}
+        return replace(base, conditions=tuple(name for _, name in every), **stacked)
+
+
+def _stacked(field: str, rows: Sequence[tuple[ConditionOutcomes, int]]) -> Any:
+    """A field of the conditions in these rows, (K, …); None where any of them was stored without it."""
+    values = [getattr(outcomes, field) for outcomes, _ in rows]
+    if any(value is None for value in values):
+        return None
+    return np.stack([value[row] for value, (_, row) in zip(values, rows, strict=True)])
+
+
+def pool_conditions(results: Iterable[StoredResult], setting: Sequence[str] = ()) -> list[PooledConditions]:
+    """Pool what was played on the same episodes, with the same actions where nothing was changed.
+
+    results: as `stored_results` orders them. setting: names of settings in which they must agree as well.
+    """
+    pooled: dict[tuple[object, ...], PooledConditions] = {}
+    for result in results:
+        outcomes = result.outcomes
+        agreed = tuple(str(result.stored.settings.get(name)) for name in ("readout", *setting))
+        unchanged = [outcomes.of(name).tobytes() for name in (CLEAN, IMAGE_SWAP) if name in outcomes.conditions]
+        same = (result.category, *agreed, tuple(outcomes.episodes.tolist()), *unchanged)
+        sources = pooled.setdefault(same, PooledConditions(result, {})).sources
+        sources.update({name: result for name in outcomes.conditions if name not in UNCHANGED})
+    return list(pooled.values())

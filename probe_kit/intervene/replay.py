@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from probe_kit.hooks.capturing.edits import LOG_FIELDS, EditLog
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.intervene.outcomes import BY_CONDITION, CLEAN, CONTROL_INPUT, DONOR, IMAGE_SWAP
-from probe_kit.intervene.pairs import Chunk, Given, Pair
 from probe_kit.intervene.patching.patch import Cell, patched
+from probe_kit.intervene.places import Chunk, Given, Pair
 
 if TYPE_CHECKING:
     from probe_kit.hooks import ActivationCache
     from probe_kit.intervene.directions import DirectionBasis
-    from probe_kit.intervene.sessions.session import ReplaySession
+    from probe_kit.intervene.sessions import ReplaySession
 
 
 @dataclass

@@ -20,10 +20,9 @@ from probe_kit.hashing import derive_seed
 from probe_kit.hooks.capturing.edits import EditLog
 from probe_kit.hooks.contract.declared import PLAIN
 from probe_kit.hooks.contract.observation import Observation
-from probe_kit.intervene.pairs import Chunk, Pair
+from probe_kit.intervene.places import Chunk, Pair
 from probe_kit.intervene.replay import AttentionRecord, Condition, ConditionContext, ReplayBatch
-from probe_kit.intervene.sessions.scene import SceneSession
-from probe_kit.intervene.sessions.session import ReplaySession
+from probe_kit.intervene.sessions import ReplaySession, SceneSession
 
 
 @dataclass(frozen=True)

@@ -12,15 +12,31 @@ from probe_kit.hooks.registry import get_family
 from probe_kit.intervene.kinds.base import ConditionName, Intervention, Measurement
 from probe_kit.intervene.kinds.image_swap import ImageSwap, tiles_apart
 from probe_kit.intervene.kinds.interchange import Interchange
-from probe_kit.intervene.outcomes import DONOR, IMAGE_SWAP, ConditionOutcomes, is_stored, save
+from probe_kit.intervene.outcomes import (
+    DONOR,
+    IMAGE_SWAP,
+    PER_STEP,
+    ConditionOutcomes,
+    check_run_fits,
+    has_sides,
+    is_stored,
+    key_of,
+    save,
+    settings_of,
+)
 from probe_kit.intervene.places import check_roles_have_tokens, resolve_sites, unread_places
 from probe_kit.intervene.replay import Condition, ReplayBatch
-from probe_kit.intervene.results.results import InterventionResult, effects_csv, load_effects
+from probe_kit.intervene.results import InterventionResult, effects_csv, load_effects
 from probe_kit.intervene.rollout import evaluate_per_step
-from probe_kit.intervene.sessions.opening import open_session
-from probe_kit.intervene.sessions.session import LoadPolicy, Progress, ReplaySession, ReplaySource
-from probe_kit.intervene.settings import PER_STEP, check_run_fits, has_sides, key_of, settings_of
-from probe_kit.intervene.spread import displacements_toward, sizes
+from probe_kit.intervene.sessions import (
+    LoadPolicy,
+    Progress,
+    ReplaySession,
+    ReplaySource,
+    displacements_toward,
+    open_session,
+    sizes,
+)
 from probe_kit.runs.layout import INTERVENTIONS
 from probe_kit.runs.results import Pieces, tidy_bundle
 from probe_kit.runs.run import Run

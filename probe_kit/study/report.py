@@ -9,7 +9,7 @@ from probe_kit._system.bounded_files import read_regular
 from probe_kit._system.drafts import write_whole
 from probe_kit._tables.table import Table
 from probe_kit.errors import UsageError
-from probe_kit.intervene.kinds.site_maps import stored_steering
+from probe_kit.intervene.kinds.interchange import stored_steering
 from probe_kit.retention.displays import curves_side_by_side, dose_response, layer_curve
 from probe_kit.retention.displays.base.report_figure import ONLY_FILLED, ReportFigure, figure_of
 from probe_kit.retention.displays.base.style import BLUE, VERMILION, footer, panels, plain

@@ -14,12 +14,11 @@ from probe_kit._system.escaping import terminal_safe, without_places
 from probe_kit._tables.numbers import p_text, percent, with_limits
 from probe_kit._tables.table import Row, Table
 from probe_kit.diagnose.diagnosis import load_diagnosis
-from probe_kit.diagnose.sentences import diagnosis_table
+from probe_kit.diagnose.results import diagnosis_table
 from probe_kit.env.scoring import RULES
 from probe_kit.errors import RunDamagedError
 from probe_kit.intervene.outcomes import stored_interventions
-from probe_kit.intervene.results.inventory import listed_interventions
-from probe_kit.intervene.results.results import effects_of
+from probe_kit.intervene.results import effects_of, listed_interventions
 from probe_kit.retention import RetentionRow
 from probe_kit.retention.columns.columns import (
     ACCURACY,

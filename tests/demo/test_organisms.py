@@ -26,7 +26,7 @@ from probe_kit.demo.pipeline import (
 from probe_kit.errors import SettingsMismatchError
 from probe_kit.extract import extract_run
 from probe_kit.intervene import ImageSwap, InstructionSwap, UseVerdict, run_intervention
-from probe_kit.intervene.results.verdict import Behaviour
+from probe_kit.intervene.verdict import Behaviour
 from probe_kit.retention import RetentionRow
 from probe_kit.retention.behaviour import SuccessRate, regime
 from probe_kit.retention.columns.sentences import verdict

@@ -15,16 +15,14 @@ from typer.testing import CliRunner
 import probe_kit as pk
 from probe_kit.cli import app
 from probe_kit.diagnose.diagnosis import diagnose_run, load_diagnosis, with_inputs_of
-from probe_kit.diagnose.frames import frames_of
-from probe_kit.diagnose.paraphrases import read_paraphrases
+from probe_kit.diagnose.inputs import frames_of, read_paraphrases
 from probe_kit.diagnose.results import Diagnosis
 from probe_kit.env import SceneSpec
 from probe_kit.errors import UsageError
 from probe_kit.extract import ExtractSettings, LeRobotSource, extract_run
 from probe_kit.hooks import Interventions, Policy
 from probe_kit.hooks.families.pi0.adapter import load_pi0_tiny
-from probe_kit.intervene.sessions.opening import open_session
-from probe_kit.intervene.sessions.session import ReplaySource
+from probe_kit.intervene.sessions import ReplaySource, open_session
 from probe_kit.runs import Run, verify_run
 from probe_kit.suite import Suite
 from tests.support.lerobot_recordings import CAMERA, write_recording

@@ -6,10 +6,10 @@ from typing import Any, cast
 import numpy as np
 import pandas as pd
 
-from probe_kit.diagnose.frames import LEAST_GROUPS, frames_of, order_of_first_frames
+from probe_kit.diagnose.inputs import LEAST_GROUPS, frames_of, order_of_first_frames
 from probe_kit.extract.sources.inputs import Frame
 from probe_kit.hooks.contract.observation import Observation
-from probe_kit.intervene.sessions.observed import ObservedSession
+from probe_kit.intervene.sessions import ObservedSession
 
 
 def played(groups: int, items: int, layouts: int) -> pd.DataFrame:

@@ -13,8 +13,16 @@ from numpy.typing import NDArray
 from probe_kit.diagnose.importance import Exchanges, importance_of
 from probe_kit.diagnose.inputs import PICTURE, STATE
 from probe_kit.diagnose.measure import InputExchange, count_inferences
-from probe_kit.diagnose.results import Diagnosis, InputDiagnosis, SitePassage, Verdict, describe_passage, exit_code
-from probe_kit.diagnose.sentences import sentence, sentences
+from probe_kit.diagnose.results import (
+    Diagnosis,
+    InputDiagnosis,
+    SitePassage,
+    Verdict,
+    describe_passage,
+    exit_code,
+    sentence,
+    sentences,
+)
 from probe_kit.errors import InstructionError, UsageError
 from probe_kit.extract.sources.inputs import Frame
 from probe_kit.hooks.contract.observation import Observation

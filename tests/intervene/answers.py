@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 
 from probe_kit.intervene import ConditionOutcomes
 from probe_kit.intervene.kinds.base import Measurement
-from probe_kit.intervene.outcomes import save
-from probe_kit.intervene.results.results import effects_csv
-from probe_kit.intervene.settings import key_of
+from probe_kit.intervene.outcomes import key_of, save
+from probe_kit.intervene.results import effects_csv
 from probe_kit.runs import Location
 
 Cell = NDArray[np.float64]

@@ -14,9 +14,7 @@ from probe_kit.extract import EnvSource, ExtractSettings, prepare
 from probe_kit.extract.config_files import moved_of
 from probe_kit.hooks import Observation
 from probe_kit.intervene import AttentionReadout, ImageSwap, InstructionSwap, Interchange, run_intervention
-from probe_kit.intervene.sessions.observed import ObservedSession
-from probe_kit.intervene.sessions.opening import open_session
-from probe_kit.intervene.sessions.session import ReplaySource
+from probe_kit.intervene.sessions import ObservedSession, ReplaySource, open_session
 from probe_kit.runs import Run, open_run
 
 if TYPE_CHECKING:

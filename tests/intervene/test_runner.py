@@ -33,8 +33,7 @@ from probe_kit.intervene import (
     stored_interventions,
 )
 from probe_kit.intervene.runner import too_few_groups
-from probe_kit.intervene.sessions.opening import open_session
-from probe_kit.intervene.sessions.session import ReplaySession, load_policy_of
+from probe_kit.intervene.sessions import ReplaySession, load_policy_of, open_session
 from probe_kit.retention import retention_table
 from probe_kit.runs import Run, open_run, verify_run
 from probe_kit.runs.reader import Origin

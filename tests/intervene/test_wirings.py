@@ -11,21 +11,20 @@ from probe_kit import patching as pt
 from probe_kit.errors import UsageError
 from probe_kit.hooks import Site, capture
 from probe_kit.intervene import ConditionOutcomes, ImageSwapEffect, UseVerdict, classify_all
+from probe_kit.intervene.evidence import describe_tie, tie_at_site
 from probe_kit.intervene.kinds.base import Measurement
 from probe_kit.intervene.kinds.image_swap import image_swap_effects
-from probe_kit.intervene.kinds.interchange import patch_of, patches_within
+from probe_kit.intervene.kinds.interchange import localised_sites, patch_effects, patch_of, patches_within
 from probe_kit.intervene.kinds.joint import (
     JointEffect,
     JointPlaces,
     describe_joint_places,
     describe_remainder,
 )
-from probe_kit.intervene.kinds.site_maps import localised_sites, patch_effects
+from probe_kit.intervene.outcomes import PER_STEP
 from probe_kit.intervene.patching import Cell
 from probe_kit.intervene.places import resolve_sites
 from probe_kit.intervene.replay import Condition
-from probe_kit.intervene.results.evidence import describe_tie, tie_at_site
-from probe_kit.intervene.settings import PER_STEP
 from tests.intervene.wirings import WIRINGS, WORDS, WiredSession, outcomes_of, replay_inputs
 
 pytestmark = pytest.mark.slow  # `tests/acceptance` holds what a user sees of it

@@ -15,14 +15,18 @@ from probe_kit.errors import OtherFramesError, UsageError
 from probe_kit.extract import ExtractSettings, LeRobotSource, extract_run
 from probe_kit.hooks import Observation
 from probe_kit.intervene import ImageSwap, Interchange, ReplaySource, run_intervention
-from probe_kit.intervene.kinds.site_maps import patch_effects
-from probe_kit.intervene.pairs import Pair, read_pairs
+from probe_kit.intervene.kinds.interchange import patch_effects
+from probe_kit.intervene.places import Pair, read_pairs
 from probe_kit.intervene.replay import replay
 from probe_kit.intervene.runner import outcomes_of
-from probe_kit.intervene.sessions.observed import ObservedSession
-from probe_kit.intervene.sessions.opening import open_session
-from probe_kit.intervene.sessions.scene import SceneSession
-from probe_kit.intervene.spread import displacements_toward, sizes, spread_of
+from probe_kit.intervene.sessions import (
+    ObservedSession,
+    SceneSession,
+    displacements_toward,
+    open_session,
+    sizes,
+    spread_of,
+)
 from probe_kit.runs import Run, open_run
 from tests.support.lerobot_recordings import CAMERA, write_recording
 

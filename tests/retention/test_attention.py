@@ -9,8 +9,7 @@ import pytest
 from probe_kit.errors import NoInterventionsError
 from probe_kit.intervene import AttentionShares
 from probe_kit.intervene.kinds.attention import PatchAttention
-from probe_kit.intervene.outcomes import ATTENTION_FILE, PATCHES_FILE
-from probe_kit.intervene.settings import FORMAT
+from probe_kit.intervene.outcomes import ATTENTION_FILE, FORMAT, PATCHES_FILE
 from probe_kit.retention import retention_table
 from probe_kit.retention.displays import AttentionDisplay, attention_curve, attention_on_picture, collect_figures
 from probe_kit.runs.thumbnails import as_thumbnail, thumbnail_key

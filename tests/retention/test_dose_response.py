@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from probe_kit.errors import NoInterventionsError
-from probe_kit.intervene.settings import FORMAT
+from probe_kit.intervene.outcomes import FORMAT
 from probe_kit.retention import retention_table
 from probe_kit.retention.displays import DoseResponseDisplay, collect_figures, dose_response
 from probe_kit.retention.displays.dose_response import _share

@@ -9,8 +9,7 @@ import pytest
 
 from probe_kit.errors import NoInterventionsError
 from probe_kit.intervene import UseVerdict
-from probe_kit.intervene.outcomes import ConditionOutcomes
-from probe_kit.intervene.settings import FORMAT
+from probe_kit.intervene.outcomes import FORMAT, ConditionOutcomes
 from probe_kit.retention import RetentionRow, retention_table
 from probe_kit.retention.displays import SiteEffectDisplay, collect_figures, site_effect_curve
 from probe_kit.train import ArrayRun, load_results

@@ -9,8 +9,7 @@ from probe_kit.diagnose.diagnosis import FILE, FORMAT
 from probe_kit.diagnose.results import Diagnosis, InputDiagnosis
 from probe_kit.hashing import sha256_json
 from probe_kit.intervene.kinds.image_swap import ImageSwap
-from probe_kit.intervene.outcomes import ConditionOutcomes, save
-from probe_kit.intervene.settings import key_of, settings_of
+from probe_kit.intervene.outcomes import ConditionOutcomes, key_of, save, settings_of
 from probe_kit.runs import Run, open_run
 from probe_kit.runs.layout import DIAGNOSES
 from probe_kit.runs.records import as_json

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 _HOMES = {
     file.stem.replace("_", "-"): f"{__name__}.{file.stem}"
     for file in sorted(Path(__file__).parent.glob("*.py"))
-    if file.stem not in ("__init__", "base", "site_maps")
+    if file.stem not in ("__init__", "base")
 }
 
 

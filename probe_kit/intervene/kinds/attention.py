@@ -18,12 +18,26 @@ from probe_kit.hooks.contract.declared import InterventionKind
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.sites import first_of
 from probe_kit.intervene.kinds.base import Intervention, Measurement, TableContext, effect_table
-from probe_kit.intervene.outcomes import ATTENTION, ATTENTION_FILE, PATCHES_FILE, RECORDED, Effect
-from probe_kit.intervene.places import ALL, TILE_ROLES, roles_of
+from probe_kit.intervene.outcomes import (
+    ATTENTION,
+    ATTENTION_FILE,
+    PATCHES_FILE,
+    RECORDED,
+    Effect,
+    StoredResult,
+    has_sides,
+    stored_results,
+)
+from probe_kit.intervene.places import (
+    ALL,
+    TILE_ROLES,
+    TILES,
+    role_token_mask,
+    roles_of,
+    shown_cameras,
+    token_boxes,
+)
 from probe_kit.intervene.replay import CleanRun, Condition, ConditionContext, ConditionResult, ReplayBatch
-from probe_kit.intervene.selection import StoredResult, stored_results
-from probe_kit.intervene.settings import has_sides
-from probe_kit.intervene.tokens import TILES, role_token_mask, shown_cameras, token_boxes
 from probe_kit.runs.reader import RunReader
 from probe_kit.runs.run import Run
 from probe_kit.statistics.bootstrap import GAINS, student_interval, units_seed
@@ -34,7 +48,7 @@ if TYPE_CHECKING:
     from probe_kit._tables.table import Table
     from probe_kit.hooks import Policy
     from probe_kit.hooks.capturing.attention import AttentionMass
-    from probe_kit.intervene.sessions.session import ReplaySession
+    from probe_kit.intervene.sessions import ReplaySession
 
 ROLES = ("image", *TILES, "language", "state", "special")
 """Whose tokens are asked about, where a family has them and, of tiles, says which tokens see them."""

@@ -24,7 +24,7 @@ from probe_kit.intervene.kinds.base import (
 )
 from probe_kit.intervene.kinds.image_swap import share_of_swap, swap_sign
 from probe_kit.intervene.kinds.interchange import cells_at, check_sites_and_roles, patch_of
-from probe_kit.intervene.outcomes import CLEAN, ConditionOutcomes
+from probe_kit.intervene.outcomes import CLEAN, FIRST_CHUNK, ConditionOutcomes
 from probe_kit.intervene.patching.attribution import (
     AGREEMENT,
     AttributionEffect,
@@ -38,8 +38,7 @@ from probe_kit.intervene.patching.attribution import (
     worst_anchor,
 )
 from probe_kit.intervene.patching.patch import Cell, sites_of_cells
-from probe_kit.intervene.patching.sets import pooled_share
-from probe_kit.intervene.patching.sweep import share_fields
+from probe_kit.intervene.patching.sweep import pooled_share, share_fields
 from probe_kit.intervene.places import ALL, resolve_all
 from probe_kit.intervene.replay import (
     CleanRun,
@@ -49,13 +48,12 @@ from probe_kit.intervene.replay import (
     ReplayBatch,
     SourceRun,
 )
-from probe_kit.intervene.settings import FIRST_CHUNK
 from probe_kit.runs.run import Run
 from probe_kit.statistics.paired_tests import max_t
 
 if TYPE_CHECKING:
     from probe_kit._tables.table import Table
-    from probe_kit.intervene.sessions.session import ReplaySession
+    from probe_kit.intervene.sessions import ReplaySession
 
 NAME = "attribution"
 SITES = (f"{KV_STREAM}.*", "backbone.*")

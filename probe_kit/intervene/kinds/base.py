@@ -17,11 +17,17 @@ from probe_kit.hashing import derive_seed
 from probe_kit.hooks.capturing.edits import LOG_FIELDS
 from probe_kit.hooks.contract.declared import InterventionKind, Readout
 from probe_kit.hooks.contract.sites import KV_STREAM
-from probe_kit.intervene.outcomes import ConditionOutcomes, Effect
-from probe_kit.intervene.places import SEPARATOR
+from probe_kit.intervene.outcomes import (
+    FIRST_CHUNK,
+    ConditionOutcomes,
+    Effect,
+    PairRow,
+    categories_in,
+    has_sides,
+    items_of,
+)
+from probe_kit.intervene.places import SEPARATOR, TILES
 from probe_kit.intervene.replay import Condition, ReplayBatch, replay
-from probe_kit.intervene.settings import FIRST_CHUNK, PairRow, categories_in, has_sides, items_of
-from probe_kit.intervene.tokens import TILES
 from probe_kit.runs.direction_files import FileDirection, names_file, read_direction
 from probe_kit.runs.reader import RunReader
 from probe_kit.runs.run import Run
@@ -32,7 +38,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from probe_kit._tables.table import Table
-    from probe_kit.intervene.sessions.session import ReplaySession
+    from probe_kit.intervene.sessions import ReplaySession
 
 Values = NDArray[np.float64]
 CONTROL = "control-"

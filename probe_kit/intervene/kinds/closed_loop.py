@@ -39,11 +39,10 @@ from probe_kit.intervene.kinds.base import (
     text_of,
 )
 from probe_kit.intervene.kinds.image_swap import net_interval
-from probe_kit.intervene.kinds.interchange import patch_of, patches_within
-from probe_kit.intervene.kinds.site_maps import best_patch_targets
-from probe_kit.intervene.outcomes import CLEAN, ConditionOutcomes
+from probe_kit.intervene.kinds.interchange import best_patch_targets, patch_of, patches_within
+from probe_kit.intervene.outcomes import CLEAN, FIRST_CHUNK, ConditionOutcomes, categories_in
 from probe_kit.intervene.patching.patch import Cell, sites_of_cells
-from probe_kit.intervene.places import ALL, SEPARATOR, resolve_sites
+from probe_kit.intervene.places import ALL, SEPARATOR, TILES, resolve_sites, role_tokens
 from probe_kit.intervene.replay import (
     Condition,
     ConditionContext,
@@ -51,8 +50,6 @@ from probe_kit.intervene.replay import (
     ReplayBatch,
     SourceRun,
 )
-from probe_kit.intervene.settings import FIRST_CHUNK, categories_in
-from probe_kit.intervene.tokens import TILES, role_tokens
 from probe_kit.runs.run import Run
 from probe_kit.statistics.paired_tests import sign_p
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -60,7 +57,7 @@ from probe_kit.statistics.sufficiency import SMALLEST_EFFECT_OF_INTEREST
 
 if TYPE_CHECKING:
     from probe_kit._tables.table import Table
-    from probe_kit.intervene.sessions.session import ReplaySession
+    from probe_kit.intervene.sessions import ReplaySession
 
 MIN_IN_ZONE_RATIO = 0.5
 """Share of the clean in-zone share below which the task is called disrupted."""

@@ -36,13 +36,11 @@ from probe_kit.intervene.kinds.base import (
 )
 from probe_kit.intervene.kinds.image_swap import net_interval
 from probe_kit.intervene.kinds.interchange import cells_at
-from probe_kit.intervene.outcomes import CLEAN, ERASE, PROBE_ACCURACY, ConditionOutcomes
+from probe_kit.intervene.outcomes import CLEAN, ERASE, FIRST_CHUNK, PROBE_ACCURACY, ConditionOutcomes
 from probe_kit.intervene.patching.attribution import LOCALISATION_SHARE
 from probe_kit.intervene.patching.patch import Cell
-from probe_kit.intervene.places import resolve_all
+from probe_kit.intervene.places import TILES, resolve_all, role_tokens
 from probe_kit.intervene.replay import CleanRun, Condition, ConditionContext, ConditionResult, ReplayBatch
-from probe_kit.intervene.settings import FIRST_CHUNK
-from probe_kit.intervene.tokens import TILES, role_tokens
 from probe_kit.runs.run import Run
 from probe_kit.statistics.folds import Fold
 from probe_kit.statistics.paired_tests import paired_greater_p
@@ -54,7 +52,7 @@ if TYPE_CHECKING:
 
     from probe_kit._tables.table import Table
     from probe_kit.intervene.directions import TokenFeatures
-    from probe_kit.intervene.sessions.session import ReplaySession
+    from probe_kit.intervene.sessions import ReplaySession
 
 LEACE = "leace"
 Finding = Literal[

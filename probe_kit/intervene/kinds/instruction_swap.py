@@ -13,11 +13,11 @@ import numpy as np
 from probe_kit.errors import UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.declared import InterventionKind
-from probe_kit.intervene.inputs import InputEffect
 from probe_kit.intervene.kinds.base import Intervention, Measurement, TableContext, effect_table
 from probe_kit.intervene.kinds.image_swap import (
     SWAP_COLUMNS,
     ImageSwapEffect,
+    InputEffect,
     Reach,
     begin_sentence,
     exchanged_effects,
@@ -27,7 +27,7 @@ from probe_kit.intervene.kinds.image_swap import (
     swap_columns,
     swap_rates,
 )
-from probe_kit.intervene.outcomes import CLEAN, IMAGE_SWAP, INSTRUCTION_SWAP, NOISE, ConditionOutcomes
+from probe_kit.intervene.outcomes import CLEAN, IMAGE_SWAP, INSTRUCTION_SWAP, NOISE, ConditionOutcomes, has_sides
 from probe_kit.intervene.replay import (
     CleanRun,
     Condition,
@@ -37,12 +37,11 @@ from probe_kit.intervene.replay import (
     DonorRun,
     SourceRun,
 )
-from probe_kit.intervene.settings import has_sides
 from probe_kit.statistics.significance import SIGNIFICANCE
 
 if TYPE_CHECKING:
     from probe_kit._tables.table import Table
-    from probe_kit.intervene.sessions.session import ReplaySession
+    from probe_kit.intervene.sessions import ReplaySession
 
 _CONDITIONS = {"instruction": INSTRUCTION_SWAP, "images": IMAGE_SWAP, "noise": NOISE}
 _LEGEND = (

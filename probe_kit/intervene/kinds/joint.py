@@ -24,31 +24,29 @@ from probe_kit.intervene.kinds.base import (
 )
 from probe_kit.intervene.kinds.image_swap import share_of_swap, swap_sign
 from probe_kit.intervene.kinds.interchange import cells_at, check_sites_and_roles
-from probe_kit.intervene.outcomes import CLEAN, ConditionOutcomes, Effect
-from probe_kit.intervene.pairs import Pair
+from probe_kit.intervene.outcomes import CLEAN, PER_STEP, ConditionOutcomes, Effect, StoredResult, stored_results
 from probe_kit.intervene.patching.patch import Cell, all_but, sites_of_cells
-from probe_kit.intervene.patching.sets import (
+from probe_kit.intervene.patching.sweep import (
     CARRIES,
     KEEP,
     NOTHING,
+    SwapShare,
     carries_nothing,
     choosing_half,
     find_minimal_set,
     finding_of_cell,
     pooled_share,
+    share_fields,
 )
-from probe_kit.intervene.patching.sweep import SwapShare, share_fields
-from probe_kit.intervene.places import SEPARATOR, list_places, resolve_all
+from probe_kit.intervene.places import SEPARATOR, Pair, list_places, resolve_all
 from probe_kit.intervene.replay import CleanRun, Condition, Patched, ReplayBatch, SourceRun, replay
-from probe_kit.intervene.selection import StoredResult, stored_results
-from probe_kit.intervene.settings import PER_STEP
 from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.paired_tests import max_t, paired_greater_p, smallest_flip_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 
 if TYPE_CHECKING:
     from probe_kit._tables.table import Table
-    from probe_kit.intervene.sessions.session import ReplaySession
+    from probe_kit.intervene.sessions import ReplaySession
 
 NAME = "joint"
 SITES, ROLES = ("kv.*",), ("image", "language", "state")

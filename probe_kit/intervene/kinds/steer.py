@@ -17,17 +17,15 @@ from probe_kit.errors import UsageError
 from probe_kit.hooks.capturing.edits import AddVector, apply_patch
 from probe_kit.intervene.kinds.base import AlongDirection, ConditionName, Measurement
 from probe_kit.intervene.kinds.image_swap import SMALLEST_REACH
-from probe_kit.intervene.kinds.interchange import Interchange
-from probe_kit.intervene.kinds.site_maps import PatchEffect
+from probe_kit.intervene.kinds.interchange import Interchange, PatchEffect
 from probe_kit.intervene.patching.patch import Cell
-from probe_kit.intervene.places import resolve_all
+from probe_kit.intervene.places import TILES, resolve_all, role_tokens
 from probe_kit.intervene.replay import CleanRun, Condition, ConditionContext, ConditionResult, SourceRun
-from probe_kit.intervene.tokens import TILES, role_tokens
 from probe_kit.runs.run import Run
 
 if TYPE_CHECKING:
     from probe_kit.intervene.directions import DirectionBasis
-    from probe_kit.intervene.sessions.session import ReplaySession
+    from probe_kit.intervene.sessions import ReplaySession
 
 TargetSide = Literal["wrong", "correct", "left", "right"]
 LARGE_CHANGE = 2.0

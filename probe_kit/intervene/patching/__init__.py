@@ -16,14 +16,27 @@ from probe_kit._system.imports import lazy_names
 
 if TYPE_CHECKING:
     from probe_kit.hooks.capturing.readouts import logit_lens, project_heads
-    from probe_kit.intervene.pairs import Pair
     from probe_kit.intervene.patching.attribution import Screen, attribute_cells
-    from probe_kit.intervene.patching.inference import HookPoint, run_with_cache, run_with_hooks
-    from probe_kit.intervene.patching.patch import Cell, all_but, find_cells, patch_cells
-    from probe_kit.intervene.patching.patterns import AttentionPattern, attention_patterns
-    from probe_kit.intervene.patching.sets import MinimalCells, compare_alone_and_without, find_minimal_cells
-    from probe_kit.intervene.patching.sweep import Sweep, sweep_cells
-    from probe_kit.intervene.sessions.opening import find_pairs, open_session
+    from probe_kit.intervene.patching.patch import (
+        AttentionPattern,
+        Cell,
+        HookPoint,
+        all_but,
+        attention_patterns,
+        find_cells,
+        patch_cells,
+        run_with_cache,
+        run_with_hooks,
+    )
+    from probe_kit.intervene.patching.sweep import (
+        MinimalCells,
+        Sweep,
+        compare_alone_and_without,
+        find_minimal_cells,
+        sweep_cells,
+    )
+    from probe_kit.intervene.places import Pair
+    from probe_kit.intervene.sessions import find_pairs, open_session
 
 __all__ = [
     "AttentionPattern",
@@ -52,26 +65,26 @@ __all__ = [
 __getattr__, __dir__ = lazy_names(
     __name__,
     {
-        "AttentionPattern": "patterns",
+        "AttentionPattern": "patch",
         "Cell": "patch",
-        "HookPoint": "inference",
-        "MinimalCells": "sets",
-        "Pair": "probe_kit.intervene.pairs",
+        "HookPoint": "patch",
+        "MinimalCells": "sweep",
+        "Pair": "probe_kit.intervene.places",
         "Screen": "attribution",
         "Sweep": "sweep",
         "all_but": "patch",
-        "attention_patterns": "patterns",
+        "attention_patterns": "patch",
         "attribute_cells": "attribution",
-        "compare_alone_and_without": "sets",
+        "compare_alone_and_without": "sweep",
         "find_cells": "patch",
-        "find_minimal_cells": "sets",
-        "find_pairs": "probe_kit.intervene.sessions.opening",
+        "find_minimal_cells": "sweep",
+        "find_pairs": "probe_kit.intervene.sessions",
         "logit_lens": "probe_kit.hooks.capturing.readouts",
-        "open_session": "probe_kit.intervene.sessions.opening",
+        "open_session": "probe_kit.intervene.sessions",
         "patch_cells": "patch",
         "project_heads": "probe_kit.hooks.capturing.readouts",
-        "run_with_cache": "inference",
-        "run_with_hooks": "inference",
+        "run_with_cache": "patch",
+        "run_with_hooks": "patch",
         "sweep_cells": "sweep",
     },
 )

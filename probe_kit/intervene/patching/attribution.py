@@ -17,9 +17,7 @@ from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.sites import KV_STREAM
 from probe_kit.intervene.outcomes import Effect
-from probe_kit.intervene.pairs import Given, Pair
-from probe_kit.intervene.patching.inference import infer
-from probe_kit.intervene.patching.patch import Cell, sites_of_cells
+from probe_kit.intervene.patching.patch import Cell, infer, sites_of_cells
 from probe_kit.intervene.patching.sweep import (
     DRAWS,
     SwapShare,
@@ -29,8 +27,16 @@ from probe_kit.intervene.patching.sweep import (
     share_of_whole,
     sweep_cells,
 )
-from probe_kit.intervene.places import ALL, RESIDUAL, PlaceName, SiteGroup, resolve_sites
-from probe_kit.intervene.tokens import role_token_mask
+from probe_kit.intervene.places import (
+    ALL,
+    RESIDUAL,
+    Given,
+    Pair,
+    PlaceName,
+    SiteGroup,
+    resolve_sites,
+    role_token_mask,
+)
 from probe_kit.statistics.significance import SIGNIFICANCE
 
 if TYPE_CHECKING:

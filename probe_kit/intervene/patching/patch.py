@@ -1,14 +1,15 @@
-"""Cells, and one patched inference: the activations of cells come from another inference."""
+"""One inference of a model: with activations captured, changed by functions, or patched from another inference."""
 
-from collections.abc import Iterator, MutableMapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import TYPE_CHECKING, Any, Union
 
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.errors import UsageError
+from probe_kit.errors import EmptyRoleError, RolesMismatchError, UsageError
 from probe_kit.hooks.capturing.edits import (
     EditLog,
     ReplaceInSubspace,
@@ -18,14 +19,110 @@ from probe_kit.hooks.capturing.edits import (
     apply_patches,
 )
 from probe_kit.hooks.contract.declared import ALL_EDITS
+from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.sites import Site, plays
-from probe_kit.intervene.pairs import Pair
-from probe_kit.intervene.patching.inference import Output, infer, run_with_cache
-from probe_kit.intervene.places import ALL, SEPARATOR, TILE_ROLES, SiteGroup, positions_of, resolve_sites
-from probe_kit.intervene.tokens import role_tokens
+from probe_kit.intervene.places import (
+    ALL,
+    ANSWERS_NOTHING,
+    RESIDUAL,
+    SEPARATOR,
+    TILE_ROLES,
+    Given,
+    Pair,
+    SiteGroup,
+    positions_of,
+    resolve_sites,
+    role_tokens,
+    roles_of_tokens,
+)
 
 if TYPE_CHECKING:
-    from probe_kit.hooks import ActivationCache, Model
+    from torch import Tensor
+
+    from probe_kit.hooks import ActivationCache, Model, Reading, Roles
+
+
+Output = Union[NDArray[np.float32], "Reading"]
+"""(chunk, 7) actions of a policy, or what a model that answers read."""
+
+
+@dataclass(frozen=True)
+class HookPoint:
+    """The place of a hook's call. roles: of the site's tokens; None for a stream without roles, such as vision."""
+
+    site: Site
+    roles: "Roles | None"
+
+    @property
+    def iteration(self) -> int | None:
+        """Return the site's flow-matching step or action token; None where the stream runs once."""
+        return self.site.iteration
+
+
+HookFunction = Callable[["Tensor", HookPoint], "Tensor"]
+"""From an activation (1, T, D) and its place to the activation that passes instead, of the same shape."""
+
+
+def infer(model: "Model", model_input: Given, seed: int = 0) -> Output:
+    """One inference. Raises UsageError for an observation of a model that does not act, and the reverse."""
+    from probe_kit.hooks import AnswerModel, Policy
+
+    if isinstance(model_input, Observation):
+        if isinstance(model, Policy):
+            # A policy whose actions do not fit the arm still has activations, and a chunk that patches change.
+            act = model.act if model.embodiment_mismatch() is None else model.infer_without_acting
+            return np.asarray(act([model_input], [seed])[0], np.float32)
+        raise UsageError(f"{model.card.family} does not act: give it a question, hooks.Prompt(observation, text)")
+    if isinstance(model, AnswerModel):
+        return model.read([model_input])
+    raise UsageError(ANSWERS_NOTHING.format(model.card.family))
+
+
+def sites_of(model: "Model", patterns: Sequence[str]) -> list[Site]:
+    """The sites of all places that patterns name, each once; see `resolve_sites`."""
+    sites = [
+        site for pattern in patterns for site_group in resolve_sites(pattern, model) for site in site_group.sites
+    ]
+    return list(dict.fromkeys(sites))
+
+
+def run_with_cache(
+    model: "Model", model_input: Given, seed: int = 0, places: Sequence[str] | None = None
+) -> "tuple[Output, ActivationCache]":
+    """The output of one inference, and the activations (1, T, D) of it.
+
+    places: patterns such as `backbone.*`, `kv.*`, `expert.03@0-4` or `backbone.*.heads`; None for the residual
+    streams that an extraction stores. Raises UnknownSiteError, and what `capture` raises.
+    """
+    from probe_kit.hooks import capture
+
+    with capture(model, model.sites(RESIDUAL) if places is None else sites_of(model, places)) as cache:
+        output = infer(model, model_input, seed)
+    return output, cache
+
+
+def run_with_hooks(model: "Model", model_input: Given, hooks: Mapping[str, HookFunction], seed: int = 0) -> Output:
+    """The output of one inference in which functions change activations.
+
+    hooks: by pattern of places a function of (activation, `HookPoint`), called at each of their sites; the
+    activation may be changed in place, but must be returned. Raises UsageError for a site that two patterns name,
+    and what `edit` raises.
+    """
+    from probe_kit.hooks import edit
+
+    roles = roles_of_tokens(model, model_input)
+    edits: dict[Site, Callable[[Tensor], Tensor]] = {}
+    for pattern, function in hooks.items():
+        for site in sites_of(model, [pattern]):
+            if site in edits:
+                raise UsageError(f"two patterns name {site}; give every site one function")
+            edits[site] = partial(_call, function, HookPoint(site, roles.get(site.stream)))
+    with edit(model, edits):
+        return infer(model, model_input, seed)
+
+
+def _call(function: HookFunction, point: HookPoint, activation: "Tensor") -> "Tensor":
+    return function(activation, point)
 
 
 @dataclass(frozen=True)
@@ -160,3 +257,54 @@ def _change(source: "ActivationCache", tokens: int, along: Basis | None, complem
             f"along has shape {basis.shape} and rows that are not orthonormal; take those of numpy.linalg.qr"
         )
     return ReplaceInSubspace(source, tokens, basis, complement)
+
+
+@dataclass(frozen=True)
+class AttentionPattern:
+    """The attention of the heads of a block, in one inference.
+
+    weights: (H, S, T) float32, rows sum to 1. queries: roles of the S tokens that attend; keys: of the T attended
+    ones. Both are None for a stream whose tokens have no roles, such as a vision tower.
+    """
+
+    weights: NDArray[np.float32]
+    queries: "Roles | None"
+    keys: "Roles | None"
+
+    def mean_share(self, role: str, asking: str = "") -> NDArray[np.float64]:
+        """(H,) the share on tokens of `role`, a mean over tokens of the role `asking`, or over all real tokens.
+
+        Raises EmptyRoleError if no token attends, or the stream has no roles.
+        """
+        if self.queries is None or self.keys is None:
+            raise EmptyRoleError("the tokens of this stream have no roles; use weights (H, S, T)")
+        rows = self.queries.mask(asking) if asking else self.queries.valid
+        if not rows.any():
+            raise EmptyRoleError(f"no token with the role {asking!r} attends here")
+        weights = self.weights[:, rows][..., self.keys.mask(role)]
+        return np.asarray(weights.sum(axis=-1, dtype=np.float64).mean(axis=-1))
+
+
+def attention_patterns(
+    model: "Model", model_input: Given, places: Sequence[str], seed: int = 0
+) -> dict[Site, AttentionPattern]:
+    """The model's own attention patterns in one inference, by site.
+
+    places: patterns of heads, such as `backbone.*.heads` or `expert.02.heads@9`. Raises what `capture_patterns`
+    raises.
+    """
+    from probe_kit.hooks import attended_roles, capture_patterns
+
+    with capture_patterns(model, sites_of(model, places)) as captured:
+        infer(model, model_input, seed)
+    roles = {name: [stream_roles] for name, stream_roles in roles_of_tokens(model, model_input).items()}
+    patterns = {}
+    for site, weights in captured.items():
+        queries = keys = None
+        if site.stream in roles:
+            (queries,) = roles[site.stream]
+            (keys,) = attended_roles(model, roles, site, weights.shape[-1])
+            if len(queries) != weights.shape[2]:
+                raise RolesMismatchError(f"{site} has {weights.shape[2]} tokens; its roles are of {len(queries)}")
+        patterns[site] = AttentionPattern(weights[0].numpy(), queries, keys)
+    return patterns

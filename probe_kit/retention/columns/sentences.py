@@ -7,7 +7,7 @@ from typing import Literal, cast
 from probe_kit._system.counting import counted, enumerated
 from probe_kit._tables.numbers import Limits, number, whole_percent, with_limits
 from probe_kit.hooks.contract.sites import label_of
-from probe_kit.intervene.results.verdict import UNTESTED, UseVerdict, describe_swap
+from probe_kit.intervene.verdict import UNTESTED, UseVerdict, describe_swap
 from probe_kit.retention.behaviour import Regime, SuccessRate
 from probe_kit.retention.columns.text import is_vlm, model_name
 from probe_kit.retention.rows.probe_parts import NO_STEP

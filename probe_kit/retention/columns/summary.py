@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 from probe_kit._tables.numbers import Limits, points, signed, whole_percent, with_limits
 from probe_kit._tables.table import Cell, Heading, Row, Table
-from probe_kit.intervene.results.verdict import UseVerdict, describe_readouts, more_groups, size_of_groups
+from probe_kit.intervene.verdict import UseVerdict, describe_readouts, more_groups, size_of_groups
 from probe_kit.retention.behaviour import Regime
 from probe_kit.retention.columns.sentences import (
     chance_only,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import NoInterventionsError
-from probe_kit.intervene.kinds.site_maps import PatchEffect, stored_steering
+from probe_kit.intervene.kinds.interchange import PatchEffect, stored_steering
 from probe_kit.retention.columns.text import title_of
 from probe_kit.retention.displays.base.panels import Panelled, draw_series, in_panels
 from probe_kit.retention.displays.base.provenance_line import ProvenanceLine

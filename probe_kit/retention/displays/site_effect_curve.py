@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import NoInterventionsError
 from probe_kit.hooks.contract.sites import KV_STREAM
-from probe_kit.intervene.kinds.site_maps import BACKBONE, PatchEffect, stored_site_effects
+from probe_kit.intervene.kinds.interchange import BACKBONE, PatchEffect, stored_site_effects
 from probe_kit.intervene.places import ALL, PlaceName
 from probe_kit.retention.columns.text import title_of
 from probe_kit.retention.displays.base.panels import Panelled, draw_series, in_panels

@@ -11,9 +11,9 @@ import numpy as np
 
 from probe_kit.env.scoring import DEFAULT_RULE
 from probe_kit.errors import UnknownSiteError
+from probe_kit.intervene.evidence import StoredEvidence, stored_other_readouts, stored_places, stored_ties
 from probe_kit.intervene.kinds.image_swap import ImageSwapEffect, stored_image_swaps
-from probe_kit.intervene.results.evidence import StoredEvidence, stored_other_readouts, stored_places, stored_ties
-from probe_kit.intervene.results.verdict import Places, UseVerdict, classify_use, control_for
+from probe_kit.intervene.verdict import Places, UseVerdict, classify_use, control_for
 from probe_kit.retention.behaviour import (
     SuccessRate,
     ask_of,

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from typing import Literal, Self
 
 from probe_kit.hooks.contract.sites import first_of, label_of
-from probe_kit.intervene.results.verdict import UseVerdict
+from probe_kit.intervene.verdict import UseVerdict
 from probe_kit.retention.behaviour import SuccessRate, ask_of, capture_only
 from probe_kit.retention.estimators import Limits
 from probe_kit.retention.rows.outcome_rules import OutcomeRuleScores

@@ -17,7 +17,7 @@ from probe_kit.hooks.contract.declared import ASKED_AS, InterventionKind
 from probe_kit.intervene import commands, kinds, load_effects
 from probe_kit.intervene.kinds import every_kind, kind_names, kind_of
 from probe_kit.intervene.places import TILE_ROLES
-from probe_kit.intervene.results.inventory import listed_interventions
+from probe_kit.intervene.results import listed_interventions
 from probe_kit.retention import retention_table
 from probe_kit.runs import Run
 from probe_kit.suite import Suite

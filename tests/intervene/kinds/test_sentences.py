@@ -8,21 +8,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from probe_kit.intervene.inputs import Finding, InputEffect
 from probe_kit.intervene.kinds import every_kind
 from probe_kit.intervene.kinds.attribution import AttributionPatching
 from probe_kit.intervene.kinds.base import Intervention, Measurement, TableContext
 from probe_kit.intervene.kinds.closed_loop import ClosedLoop, ClosedLoopEffect
 from probe_kit.intervene.kinds.erase import ConceptErasure, ErasureEffect
-from probe_kit.intervene.kinds.image_swap import ImageSwap, ImageSwapEffect
+from probe_kit.intervene.kinds.image_swap import Finding, ImageSwap, ImageSwapEffect, InputEffect
 from probe_kit.intervene.kinds.instruction_swap import InstructionSwap
-from probe_kit.intervene.kinds.interchange import Interchange
+from probe_kit.intervene.kinds.interchange import Interchange, PatchEffect
 from probe_kit.intervene.kinds.joint import EVERY, MINIMAL, JointEffect, JointPlaces
-from probe_kit.intervene.kinds.site_maps import PatchEffect
 from probe_kit.intervene.kinds.steer import Steering
 from probe_kit.intervene.outcomes import CLEAN, ConditionOutcomes
 from probe_kit.intervene.patching.attribution import AttributionEffect
-from probe_kit.intervene.results.verdict import UseVerdict, classify_use
+from probe_kit.intervene.verdict import UseVerdict, classify_use
 from probe_kit.retention.columns.summary import MOST_NUMBERS, MOST_WORDS, count_words
 
 SWAPS = {

@@ -5,8 +5,7 @@ import pytest
 
 from probe_kit import patching as pt
 from probe_kit.errors import UnknownCategoryError, UsageError
-from probe_kit.intervene.kinds.interchange import patch_of
-from probe_kit.intervene.kinds.site_maps import patch_effects
+from probe_kit.intervene.kinds.interchange import patch_effects, patch_of
 from tests.intervene.wirings import WiredSession, outcomes_of
 
 KV = "kv.*|image,language,state"

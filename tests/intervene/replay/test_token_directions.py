@@ -19,7 +19,7 @@ from probe_kit.intervene.directions import (
 )
 from probe_kit.intervene.erasers import Method, PaddedTokens
 from probe_kit.intervene.places import resolve_sites
-from probe_kit.intervene.sessions.session import ReplaySession
+from probe_kit.intervene.sessions import ReplaySession
 from probe_kit.runs import Run
 
 pytestmark = pytest.mark.slow

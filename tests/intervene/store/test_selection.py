@@ -19,17 +19,15 @@ from probe_kit.intervene import (
     stored_attention,
     stored_image_swaps,
 )
-from probe_kit.intervene.kinds.site_maps import (
+from probe_kit.intervene.evidence import StoredEvidence, stored_places
+from probe_kit.intervene.kinds.interchange import (
     localised_by_category,
     stored_site_effects,
     stored_steering,
     stored_subspace_effects,
 )
-from probe_kit.intervene.outcomes import ATTENTION_FILE, StoredIntervention
-from probe_kit.intervene.results.evidence import StoredEvidence, stored_places
-from probe_kit.intervene.results.inventory import listed_interventions
-from probe_kit.intervene.results.results import effects_of, verdicts_of
-from probe_kit.intervene.settings import FORMAT, key_of
+from probe_kit.intervene.outcomes import ATTENTION_FILE, FORMAT, StoredIntervention, key_of
+from probe_kit.intervene.results import effects_of, listed_interventions, verdicts_of
 from probe_kit.runs.layout import INTERVENTIONS
 from probe_kit.runs.results import read_bundles, write_bundle
 from probe_kit.train import ArrayRun

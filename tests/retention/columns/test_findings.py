@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from probe_kit.intervene.results.verdict import UseVerdict
+from probe_kit.intervene.verdict import UseVerdict
 from probe_kit.retention.behaviour import Regime
 from probe_kit.retention.columns.summary import MOST_NUMBERS, MOST_WORDS, count_words, finding, next_step
 from probe_kit.retention.rows.row import ActionPart, BackbonePart, RetentionRow, SwapEffect

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import pytest
 
 from probe_kit.intervene.kinds.image_swap import ImageSwapEffect
-from probe_kit.intervene.results.verdict import Places
+from probe_kit.intervene.verdict import Places
 from probe_kit.retention.behaviour import Regime, SuccessRate
 from probe_kit.retention.columns.sentences import conclusion, describe_category, verdict
 from probe_kit.retention.rows.build import add_image_swap

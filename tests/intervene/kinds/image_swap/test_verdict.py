@@ -10,7 +10,7 @@ import pytest
 import probe_kit
 from probe_kit.intervene import ImageSwapEffect, classify_all, classify_use
 from probe_kit.intervene.kinds.image_swap import image_swap_effects
-from probe_kit.intervene.results.verdict import classify_behaviour, size_of_groups
+from probe_kit.intervene.verdict import classify_behaviour, size_of_groups
 from probe_kit.statistics.sufficiency import groups_for_not_used
 from tests.intervene.answers import Cell, follower, habit, outcomes_of
 
@@ -26,7 +26,7 @@ def test_one_module_alone_makes_a_verdict() -> None:
     """The retention table, the demo and the intervention had one each."""
     root = Path(probe_kit.__file__).parent
     made = [path for path in root.rglob("*.py") if re.search(r"\bUseVerdict\(", path.read_text(encoding="utf-8"))]
-    assert [path.relative_to(root).as_posix() for path in made] == ["intervene/results/verdict.py"]
+    assert [path.relative_to(root).as_posix() for path in made] == ["intervene/verdict.py"]
 
 
 @pytest.mark.parametrize(

@@ -36,16 +36,16 @@ from probe_kit.intervene.kinds.attention import (
     stored_patch_attention,
 )
 from probe_kit.intervene.kinds.base import Measurement, TableContext
-from probe_kit.intervene.pairs import Pair
+from probe_kit.intervene.places import BANDS, TILES, Pair, patch_embeddings, token_boxes, tokens_overlapping
 from probe_kit.intervene.replay import ConditionContext, ReplayBatch
-from probe_kit.intervene.sessions.session import ReplaySession
-from probe_kit.intervene.tokens import BANDS, TILES, patch_embeddings, token_boxes, tokens_overlapping
+from probe_kit.intervene.sessions import ReplaySession
 from probe_kit.runs import Run, open_run, verify_run
 from tests.intervene.answers import follower, outcomes_of
 from tests.support.smolvla_checkpoints import write_smolvla
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
+
 
 BLOCKS, ITERATIONS, HEADS = 3, 10, 8
 STEPS = 4

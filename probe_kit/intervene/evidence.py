@@ -9,15 +9,7 @@ from probe_kit.hooks.contract.sites import KV_STREAM, role_of_view
 from probe_kit.hooks.registry import get_family
 from probe_kit.intervene.directions import DIRECTIONS, MEAN_DIFFERENCE
 from probe_kit.intervene.kinds.image_swap import ImageSwapEffect, stored_image_swaps
-from probe_kit.intervene.kinds.joint import (
-    EVERY,
-    JointEffect,
-    describe_joint_places,
-    describe_remainder,
-    is_read_jointly,
-    stored_joint_places,
-)
-from probe_kit.intervene.kinds.site_maps import (
+from probe_kit.intervene.kinds.interchange import (
     BACKBONE,
     PatchEffect,
     best_cell,
@@ -28,11 +20,19 @@ from probe_kit.intervene.kinds.site_maps import (
     stored_site_effects,
     stored_subspace_effects,
 )
+from probe_kit.intervene.kinds.joint import (
+    EVERY,
+    JointEffect,
+    describe_joint_places,
+    describe_remainder,
+    is_read_jointly,
+    stored_joint_places,
+)
+from probe_kit.intervene.outcomes import FIRST_CHUNK, PER_STEP
 from probe_kit.intervene.patching.attribution import LOCALISATION_SHARE
-from probe_kit.intervene.patching.sets import NOTHING, carries_nothing
+from probe_kit.intervene.patching.sweep import NOTHING, carries_nothing
 from probe_kit.intervene.places import ALL, list_places, unread_places
-from probe_kit.intervene.results.verdict import Places, UseVerdict, classify_behaviour, control_for
-from probe_kit.intervene.settings import FIRST_CHUNK, PER_STEP
+from probe_kit.intervene.verdict import Places, UseVerdict, classify_behaviour, control_for
 from probe_kit.runs.reader import RunReader
 
 if TYPE_CHECKING:

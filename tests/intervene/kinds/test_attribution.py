@@ -17,12 +17,10 @@ from probe_kit.intervene import (
     load_effects,
     run_intervention,
 )
-from probe_kit.intervene.kinds.attribution import (
-    EXACT,
-)
+from probe_kit.intervene.kinds.attribution import EXACT
 from probe_kit.intervene.kinds.base import Measurement, TableContext
 from probe_kit.intervene.patching.attribution import kind_of_place
-from probe_kit.intervene.results.results import verdicts_of
+from probe_kit.intervene.results import verdicts_of
 from probe_kit.runs import Run
 from tests.intervene.wirings import WiredSession, outcomes_of, replay_inputs
 

@@ -1,1 +1,0 @@
-"""Results of interventions, loaded from a run."""

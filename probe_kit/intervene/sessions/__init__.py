@@ -1,1 +1,0 @@
-"""Sessions: a run's model and observations, set up again."""
