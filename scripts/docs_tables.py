@@ -12,9 +12,6 @@ DATA = ROOT / "docs" / "demo.json"
 README = ROOT / "README.md"
 PAGES = (ROOT / "docs" / "embedded.md",)
 TRAINED = "trained"
-PROBED = ("backbone % [95 %]", "action %", "retention [95 %]")
-"""Columns of what probes found: the cross-fitted scores of both streams and their ratio."""
-
 _BLOCK = re.compile(r"(<!-- from docs/demo.json: (?P<name>[a-z]+) -->\n).*?(<!-- end of it -->)", re.DOTALL)
 Row = Mapping[str, Any]
 
@@ -32,22 +29,23 @@ def blocks(page: str) -> list[str]:
 def trained_table(data: Mapping[str, Any]) -> str:
     """What the demo prints of the trained policy, a row per category."""
     rows = _of(data["demo"], TRAINED)
-    heading = ("demo", "items", f"SR % (Δ {_span(rows, 'chance_margin')})", *PROBED)
+    rate = f"SR % (Δ {_span(rows, 'chance_margin')})"
+    heading = ("demo", "items", rate, "backbone % [95 %]", "action %", "retention [95 %]")
     lines = [(category, str(row["items"]), *cells) for row in rows for category, *cells in [_cells(row)]]
     return _table(heading, lines)
 
 
 def organisms_table(data: Mapping[str, Any]) -> str:
     """The verdicts on all organisms; those of untrained ones in a line each, since nothing is to be seen."""
-    heading = ("policy", "category", "expected", "measured", "agreement", "SR %", *PROBED)
+    heading = ("policy", "category", "expected", "measured", "agreement", "SR %")
     lines: list[tuple[str, ...]] = []
     compared = data["compare"]
     for name in dict.fromkeys(row["organism"] for row in compared["organisms"]):
         rows = _of(compared, name)
         if len({(row["expected"], row["measured"], row["retention"]) for row in rows}) == 1 < len(rows):
-            lines.append(_joined(rows))
+            lines.append(_with_verdict(rows, f"the same {len(rows)}"))
         else:
-            lines += [_with_verdict(row) for row in rows]
+            lines += [_with_verdict([row], row["category"].capitalize()) for row in rows]
     agreements = count_agreements([row["agreement"] for row in compared["organisms"]])
     margin = _span(compared["organisms"], "chance_margin")
     episodes = 2 * compared["organisms"][0]["items"]
@@ -76,31 +74,22 @@ def _cells(row: Row) -> tuple[str, ...]:
     return (
         row["category"].capitalize(),
         _percent(row["sr"]),
-        f"{_percent(row['backbone'])} [{low}, {high}], {_verdict([row])}",
+        f"{_percent(row['backbone'])} [{low}, {high}], {_verdict(row)}",
         _percent(row["action"]),
         _retention(row),
     )
 
 
-def _with_verdict(row: Row) -> tuple[str, ...]:
-    category, *measures = _cells(row)
-    return row["organism"], category, row["expected"], row["measured"], row["agreement"], *measures
-
-
-def _joined(rows: Sequence[Row]) -> tuple[str, ...]:
+def _with_verdict(rows: Sequence[Row], category: str) -> tuple[str, ...]:
     first = rows[0]
-    return (
-        first["organism"], f"the same {len(rows)}", first["expected"], first["measured"], first["agreement"],
-        _span(rows, "sr"), f"{_span(rows, 'backbone')}, {_verdict(rows)}", _span(rows, "action"),
-        _retention(first),
-    )  # fmt: skip
+    verdicts = (first[key] for key in ("expected", "measured", "agreement"))
+    return first["organism"], category, *verdicts, _span(rows, "sr")
 
 
-def _verdict(rows: Sequence[Row]) -> str:
+def _verdict(row: Row) -> str:
     """What was found in the backbone; unless it is shown, how accurate its best site could be at most."""
-    verdicts = {row["verdict"] for row in rows}
-    most = "" if verdicts == {"shown"} else f" (at most {_percent(max(row['at_most'] for row in rows))})"
-    return " or ".join(sorted(verdicts)) + most
+    most = "" if row["verdict"] == "shown" else f" (at most {_percent(row['at_most'])})"
+    return row["verdict"] + most
 
 
 def _span(rows: Sequence[Row], name: str) -> str:

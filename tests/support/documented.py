@@ -16,7 +16,6 @@ SHELLS = ("bash", "console", "sh")
 NOT_COMMANDS = {
     ("docs/architecture.md", "suite ──► env"): "a diagram",
     ("docs/architecture.md", "extract ──► RUN"): "a diagram",
-    ("docs/capture.md", "passed   Every stream declares"): "output of check-adapter",
     ("docs/diagnose.md", "Inputs of pi0-tiny"): "output of diagnose",
     ("docs/storage.md", "RUN/"): "a tree of files",
     (
