@@ -42,7 +42,7 @@ def parts(device: str, checkpoint: str | None) -> dict[str, list[str]]:
         capture += ["--families", "qwen3-vl", "--repeats", "1"]
     return {
         "parity": [*pytest, *PARITY, "-k", "device_changes and cpu and not vl or gpu" if small else ON_DEVICE],
-        "golden": [*pytest, "tests/hooks/verification/test_verify.py" if small else "tests/hooks", "-k", GOLDEN],
+        "golden": [*pytest, "tests/hooks/test_verify.py" if small else "tests/hooks", "-k", GOLDEN],
         "capture": _benchmark("capture.py", "--host", *capture),
         "probes": _benchmark(
             "probes.py", "--device", device, "--sizes", "60" if small else "300,3440",

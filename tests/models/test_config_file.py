@@ -9,6 +9,7 @@ import pytest
 
 from probe_kit.errors import CheckpointError
 from probe_kit.models.config_file import ConfigFile, Count
+from probe_kit.models.decoding import Packed
 from probe_kit.models.embedded.tiny import SIZE
 from probe_kit.models.internvla import InternVLAConfig
 from probe_kit.models.magma import MagmaConfig
@@ -89,3 +90,9 @@ def test_a_file_of_another_model_is_refused_by_its_type(tmp_path: Path) -> None:
         Sizes.from_folder(tmp_path)
     (tmp_path / "config.json").write_text('{"model_type": "sized", "width": 1}', encoding="utf-8")
     assert Sizes.from_folder(tmp_path) == Sizes(width=1)
+
+
+def test_padding_stands_before_the_last_token_so_that_no_other_token_moves() -> None:
+    packed = Packed.of([[1, 7, 8, 9, 10], [1, 7, 29]], padding=0)
+    assert packed.ids.tolist() == [[1, 7, 8, 9, 10], [1, 7, 0, 0, 29]]
+    assert packed.mask.tolist() == [[True] * 5, [True, True, False, False, True]]
