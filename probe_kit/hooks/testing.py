@@ -29,7 +29,7 @@ __all__ = [
 ]
 
 
-_MODEL_CHECKS = checks_of(captures, captures, captures, captures, captures, loading)
-POLICY_CHECKS: Sequence[Check] = (*_MODEL_CHECKS, *checks_of(policies, policies, policies))
+_MODEL_CHECKS = checks_of(captures, loading)
+POLICY_CHECKS: Sequence[Check] = (*_MODEL_CHECKS, *checks_of(policies))
 ANSWER_CHECKS: Sequence[Check] = (*_MODEL_CHECKS, *checks_of(answering))
 CONTRACTS: Mapping[type[Subject], Sequence[Check]] = {PolicySubject: POLICY_CHECKS, AnswerSubject: ANSWER_CHECKS}

@@ -88,7 +88,7 @@ def an_option_that_is_not_declared_is_refused(subject: Subject) -> None:
 
 @check(
     "Untrained networks differ by their seed, repeat by it, and say so in the card.",
-    "Take `random_weights` and `weights_seed` in the loader; `models.initialisation.initialise` draws them.",
+    "Take `random_weights` and `weights_seed` in the loader; `models.building.initialise` draws them.",
 )
 def random_twins_differ_by_their_seed_and_repeat_by_it(subject: Subject) -> None:
     checkpoint, options = str(subject.checkpoint), subject.loading_options
