@@ -116,11 +116,11 @@ class MagmaConfig(ConfigFile):
 
 
 def shipped_statistics() -> dict[str, Any]:
-    """Per data set, the quantiles that un-normalise its actions; `statistics.json` names their source.
+    """Per data set, the quantiles that un-normalise its actions; `magma_statistics.json` names their source.
 
     No checkpoint holds them: the evaluation's client has them in its code.
     """
-    return dict(load_json(Path(__file__).parent / "statistics.json")["norm_stats"])
+    return dict(load_json(Path(__file__).parent / "magma_statistics.json")["norm_stats"])
 
 
 Colour = tuple[float, float, float]

@@ -48,7 +48,7 @@ def of(error: BaseException | None) -> Outcome:
         if error is not None:
             raise error
 
-    return tried("name", "A promise.", "Do it.", body, "tests.hooks.conformance")
+    return tried("name", "A promise.", "Do it.", body, "tests.hooks")
 
 
 def test_no_error_is_passed_and_a_skip_has_its_reason() -> None:
@@ -432,7 +432,7 @@ def test_a_loader_that_breaks_a_promise_fails_its_check(
 ) -> None:
     with subject_of("tests.support.encoder_vla.policy:load", checkpoint, monkeypatch) as good:
         CHECKS[name](good)
-    sloppy = subject_of("tests.hooks.conformance.test_checks:load_sloppily", checkpoint, monkeypatch)
+    sloppy = subject_of("tests.hooks.test_conformance:load_sloppily", checkpoint, monkeypatch)
     with sloppy as bad, pytest.raises((CheckFailedError, UsageError), match=said):
         CHECKS[name](bad)
 

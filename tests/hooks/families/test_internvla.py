@@ -218,7 +218,7 @@ def test_a_runs_configuration_may_be_json(run_folder: Path, tmp_path: Path, obse
     values = yaml.safe_load((copy / "config.yaml").read_text(encoding="utf-8"))
     (copy / "config.yaml").unlink()
     (copy / "dims.json").rename(copy / "aside")
-    with pytest.raises(CheckpointError, match=r"config\.yaml or config\.json of a run_folder is missing"):
+    with pytest.raises(CheckpointError, match=r"config\.yaml or config\.json of a run is missing"):
         find_parts(str(copy), None)
     (copy / "aside").rename(copy / "dims.json")
     (copy / "config.json").write_text(json.dumps(values), encoding="utf-8")

@@ -169,7 +169,7 @@ def test_zero_is_not_false() -> None:
 
 POLICIES = {
     "pi0": "pi0.adapter:Pi0",
-    "pi05": "pi05.adapter:Pi05",
+    "pi05": "pi0.adapter:Pi05",
     "pi0_fast": "pi0_fast.adapter:Pi0Fast",
     "smolvla": "smolvla.adapter:SmolVLA",
 }

@@ -34,7 +34,7 @@ from probe_kit.hooks.families.shared.kinds import IMAGES, STATE
 from probe_kit.hooks.families.shared.lerobot.flow import PackedBatch, PackedPolicy, Tokens, chat_labels
 from probe_kit.hooks.families.shared.lerobot.pipelines import PREPROCESSOR, check_same, saved_steps
 from probe_kit.hooks.families.shared.lerobot.policy import checked_steps
-from probe_kit.hooks.families.shared.taps import Stack, TokenStack, kept_prompt
+from probe_kit.hooks.families.shared.taps import Stack, kept_prompt, token_stack
 from probe_kit.models.building import build_empty, building_device, fill_rotary, replaced
 from probe_kit.models.checkpoint_files import load_pretrained
 from probe_kit.models.decoding import PromptKV
@@ -208,7 +208,7 @@ class Eo1(PackedPolicy):
         decoder = self.network.model.vlm_backbone.model.language_model
         steps = checked_steps(int(self.config.num_denoise_steps), self.folder)
         shared = (decoder.layers, decoder.norm, int(decoder.config.hidden_size))
-        return {"backbone": TokenStack(*shared, None), "expert": TokenStack(*shared, steps, first=1)}
+        return {"backbone": token_stack(*shared, None), "expert": token_stack(*shared, steps, first=1)}
 
     def watched(self) -> dict[str, nn.Module]:
         """The velocity."""

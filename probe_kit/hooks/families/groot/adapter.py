@@ -17,8 +17,6 @@ import torch
 from torch import Tensor, nn
 
 from probe_kit.errors import UsageError
-from probe_kit.hooks.contract.model import Tap
-from probe_kit.hooks.contract.sites import HEADS, Site, Stream
 from probe_kit.hooks.families.groot import BRIDGE, INTERVENTIONS
 from probe_kit.hooks.families.groot.network import (
     GrootChoice,
@@ -32,8 +30,8 @@ from probe_kit.hooks.families.groot.network import (
 from probe_kit.hooks.families.groot.packing import NvidiasPictures, Packing, Steps, lerobots_rule, read_steps
 from probe_kit.hooks.families.groot.units import BoundedUnits, StateUnits, action_units, state_units
 from probe_kit.hooks.families.shared.lerobot.flow import PackedPolicy
-from probe_kit.hooks.families.shared.qwen import tower_tap
-from probe_kit.hooks.families.shared.taps import Stack
+from probe_kit.hooks.families.shared.qwen import merger_norm
+from probe_kit.hooks.families.shared.taps import TOWER, Stack
 from probe_kit.hooks.outputs import Produce, RecordedRun, numpy_of
 
 _MODEL = "_groot_model."
@@ -41,57 +39,8 @@ _EMBEDDING = f"{_MODEL}backbone.model.model.language_model.embed_tokens.weight"
 _HEAD = f"{_MODEL}backbone.model.lm_head.weight"
 
 
-class DiffusersStack(Stack):
-    """Blocks of diffusers: what each adds is its one attention, to the prompt or itself, and its MLP."""
-
-    def tap(self, site: Site) -> Tap:
-        """Return the tap as in other stacks, under diffusers' names."""
-        fires = self.iterations or 1
-        if site.layer == len(self.layers):
-            return super().tap(site)
-        block: Any = self.layers[site.layer]
-        if site.quantity == "mlp":
-            return Tap(block.ff, fires, "output")
-        if site.quantity == "attention":
-            return Tap(block.attn1, fires, "output")
-        return Tap(block.attn1.to_out[0], fires) if site.quantity == HEADS else super().tap(site)
-
-    def stream(self, name: str) -> Stream:
-        """The stored stream."""
-        heads = int(self.layers[0].attn1.heads)  # type: ignore[union-attr, arg-type]
-        return Stream(name, len(self.layers) + 1, self.width, self.iterations, heads=heads)
-
-
-class BridgeStack(DiffusersStack):
-    """Blocks without a norm behind them; `norm` is the whole, whose output is the last residual."""
-
-    def tap(self, site: Site) -> Tap:
-        """The end is what the expert reads."""
-        return Tap(self.norm, 1, "output") if site.layer == len(self.layers) else super().tap(site)
-
-    def stream(self, name: str) -> Stream:
-        """The stored stream."""
-        return Stream(name, len(self.layers) + 1, self.width, part="bridge", quantities=BRIDGE)
-
-
-class BackboneStack(Stack):
-    """Qwen's layers up to the cut."""
-
-    def stream(self, name: str) -> Stream:
-        """DeepStack adds pictures between its first blocks."""
-        return replace(super().stream(name), sums=False)
-
-
-class TowerStack(Stack):
-    """Qwen's vision tower, which runs over the patches of all pictures of an observation at once."""
-
-    def tap(self, site: Site) -> Tap:
-        """`norm` is the tower."""
-        return tower_tap(self.norm, site.layer, lambda patches: patches[None])
-
-    def stream(self, name: str) -> Stream:
-        """The input of each block, and of the merger."""
-        return Stream(name, len(self.layers) + 1, self.width, part="vision", quantities=("residual",))
+_DIFFUSERS = {"attention": "attn1", "heads": "attn1.to_out.0", "mlp": "ff"}
+"""What a block of diffusers adds: its one attention, to the prompt or itself, and its MLP."""
 
 
 class Groot(PackedPolicy):
@@ -243,18 +192,36 @@ class Groot(PackedPolicy):
     def _stacks(self) -> dict[str, Stack]:
         backbone, head = self.network._groot_model.backbone, self._head
         text, tower, dit = backbone.language_model, backbone.visual, head.model
-        steps = int(head.num_inference_timesteps)
-        bridge: dict[str, Stack] = {}
-        if (blocks := getattr(head.vl_self_attention, "transformer_blocks", None)) is not None:
-            width = int(head.vl_self_attention.inner_dim)
-            bridge["bridge"] = BridgeStack(blocks, head.vl_self_attention, width, None, "norm1")
-        return {
-            # What the bridge's norm reads is the end of the backbone: Qwen's own last norm is not read.
-            "backbone": BackboneStack(text.layers, head.vlln, int(text.config.hidden_size), None),
-            **bridge,
-            "expert": DiffusersStack(dit.transformer_blocks, dit.norm_out, int(dit.inner_dim), steps, "norm1"),
-            "vision": TowerStack(tower.blocks, tower, int(backbone.model.config.vision_config.hidden_size), None),
+        stacks = {
+            # What the bridge's norm reads is the end of the backbone: Qwen's own last norm is not read. DeepStack
+            # adds pictures between its first blocks.
+            "backbone": Stack(
+                text.layers, head.vlln, int(text.config.hidden_size), None, stream_fields={"sums": False}
+            )
         }
+        if (blocks := getattr(head.vl_self_attention, "transformer_blocks", None)) is not None:
+            # No norm stands behind its blocks: the output of the whole is the last residual.
+            bridge, fields = head.vl_self_attention, {"part": "bridge", "quantities": BRIDGE, "heads": 0}
+            width = int(bridge.inner_dim)
+            stacks["bridge"] = Stack(
+                blocks, bridge, width, None, "norm1", _DIFFUSERS, "output", stream_fields=fields
+            )
+        steps, heads = int(head.num_inference_timesteps), int(dit.transformer_blocks[0].attn1.heads)
+        stacks["expert"] = Stack(
+            dit.transformer_blocks,
+            dit.norm_out,
+            int(dit.inner_dim),
+            steps,
+            "norm1",
+            _DIFFUSERS,
+            stream_fields={"heads": heads},
+        )
+        # The tower runs over the patches of all pictures of an observation at once.
+        width, view = int(backbone.model.config.vision_config.hidden_size), {"view": lambda patches: patches[None]}
+        stacks["vision"] = Stack(
+            tower.blocks, merger_norm(tower), width, None, "norm1", tap_fields=view, stream_fields=TOWER
+        )
+        return stacks
 
     # -- verification ------------------------------------------------------------------------------------
 

@@ -7,9 +7,9 @@ from torch import Tensor
 from transformers import InternVLConfig
 
 from probe_kit.errors import UsageError
-from probe_kit.hooks.contract.model import Tap
 from probe_kit.hooks.families.shared.loading import Loaded, Recipe
 from probe_kit.hooks.families.shared.qwen import ASSISTANT, USER
+from probe_kit.hooks.families.shared.taps import TOWER, Stack
 from probe_kit.hooks.families.shared.text import Frame
 from probe_kit.hooks.families.shared.vlm import Pictures, VisionLanguageModel
 from probe_kit.models.internvl import FILE_NAMES, TiledPictures, build_internvl
@@ -31,17 +31,11 @@ class InternVL(VisionLanguageModel):
         self.tiles = tiles
         super().__init__(loaded, tokenizer, tiles=tiles)
 
-    @property
-    def vision_size(self) -> tuple[int, int]:
-        """Blocks and width of the vision tower."""
-        vision = self.network.config.vision_config
-        return int(vision.num_hidden_layers), int(vision.hidden_size)
-
-    def vision_tap(self, layer: int) -> Tap:
-        """The first norm of a block; the last site is what leaves the tower. A row per tile."""
-        tower = self.network.model.vision_tower
-        blocks = tower.encoder.layer
-        return Tap(tower.layernorm if layer == len(blocks) else blocks[layer].layernorm_before, 1)
+    @cached_property
+    def vision(self) -> Stack:
+        """The vision tower; the last site is what leaves it. A row per tile."""
+        tower, width = self.network.model.vision_tower, int(self.network.config.vision_config.hidden_size)
+        return Stack(tower.encoder.layer, tower.layernorm, width, None, "layernorm_before", stream_fields=TOWER)
 
     @property
     def _side(self) -> int:

@@ -12,7 +12,7 @@ actions of a chunk.
 from collections.abc import Callable, Sequence
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,12 +26,13 @@ from probe_kit.hooks.contract.card import ARM
 from probe_kit.hooks.contract.model import Rows, Tap
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.roles import Roles
-from probe_kit.hooks.contract.sites import HEADS, Site, Stream
+from probe_kit.hooks.contract.sites import Site, Stream
 from probe_kit.hooks.families.internvla import INTERVENTIONS, ActionUnits
 from probe_kit.hooks.families.internvla.checkpoint import Parts, find_parts
 from probe_kit.hooks.families.shared.action_statistics import DIMENSIONS, open_or_closed
 from probe_kit.hooks.families.shared.loading import Loaded, load_network
 from probe_kit.hooks.families.shared.qwen import BACKBONE_ROLES, QwenVLA, recorded_inputs
+from probe_kit.hooks.families.shared.taps import decoder_tap
 from probe_kit.hooks.families.shared.token_decoder import seeded_noise
 from probe_kit.hooks.outputs import Arrays, Outputs, Produce, numpy_of, stream_outputs, watch
 from probe_kit.models.checkpoint_files import STATISTICS_FILE
@@ -58,7 +59,6 @@ class InternVLA(QwenVLA):
 
     interventions = INTERVENTIONS
     draws_noise = True
-    fast_pictures: ClassVar[bool] = True
 
     def __init__(
         self,
@@ -76,7 +76,7 @@ class InternVLA(QwenVLA):
         self.streams = self._streams()
         dino = self.config.dino
         self.further_streams = {
-            "vision": self.vision_stream(),
+            "vision": self.vision.stream("vision"),
             "vision_dino": Stream(
                 "vision_dino", dino.blocks + 1, dino.width, part="vision", quantities=("residual",)
             ),
@@ -214,36 +214,21 @@ class InternVLA(QwenVLA):
         if stream == "backbone":
             return self.backbone_tap(site)
         if stream == "vision":
-            return self.vision_tap(site)
+            return self.vision.tap(site)
         if stream == "vision_dino":
             body = self.network.dino_encoder.body
-            block: Any = body.norm if site.layer == len(body.blocks) else body.blocks[site.layer]
-            return Tap(block if site.layer == len(body.blocks) else block.norm1, 1)
+            return decoder_tap(body.blocks, body.norm, site, entry="norm1")
         return self._bridge_tap(site) if stream == "bridge" else self._expert_tap(site)
 
     def _bridge_tap(self, site: Site) -> Tap:
-        layers = self.network.layer_qformer.layers
-        if site.layer == len(layers):
-            return Tap(layers[-1], 1, "output")
-        layer: Any = layers[site.layer]
-        if site.quantity == "residual":
-            return Tap(layer.norm1, 1)
-        return Tap(layer.cross_attn if site.quantity == "attention" else layer.mlp, 1, "output")
+        layers, parts = self.network.layer_qformer.layers, {"attention": "cross_attn", "mlp": "mlp"}
+        return decoder_tap(layers, layers[-1], site, entry="norm1", added=parts, end="output")
 
     def _expert_tap(self, site: Site) -> Tap:
-        head, steps = self.network.head, len(self.schedule)
-        blocks = 2 if guided(self.guidance) else 1
-        rows = Rows(1 if site.stream == _UNCONDITIONAL else 0, blocks)
-        if site.quantity == "final_norm":
-            return Tap(head.final_layer.norm_final, steps, "output", rows=rows)
-        if site.layer == len(head.blocks):
-            return Tap(head.final_layer.norm_final, steps, rows=rows)
-        block: Any = head.blocks[site.layer]
-        if site.quantity == "residual":
-            return Tap(block.norm1, steps, rows=rows)
-        if site.quantity == HEADS:
-            return Tap(block.attn.proj, steps, rows=rows)
-        return Tap(block.attn if site.quantity == "attention" else block.mlp, steps, "output", rows=rows)
+        head, parts = self.network.head, {"attention": "attn", "heads": "attn.proj", "mlp": "mlp"}
+        rows = Rows(1 if site.stream == _UNCONDITIONAL else 0, 2 if guided(self.guidance) else 1)
+        norm, steps = head.final_layer.norm_final, len(self.schedule)
+        return decoder_tap(head.blocks, norm, site, steps, "norm1", parts, rows=rows)
 
 
 def internvla_units(checkpoint: str, *, unnorm_key: str | None = None, vlm: str | None = None, **_: Any) -> str:

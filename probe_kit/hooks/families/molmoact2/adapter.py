@@ -35,14 +35,14 @@ from torch import Tensor, nn
 from probe_kit.errors import CaptureError, CheckpointError
 from probe_kit.hooks.checkpoints.folders import inside_or_hub
 from probe_kit.hooks.contract.model import Tap
-from probe_kit.hooks.contract.sites import Site, Stream, kv_stream
+from probe_kit.hooks.contract.sites import Site, kv_stream
 from probe_kit.hooks.families.molmoact2 import EXPERT, LAYERWISE
 from probe_kit.hooks.families.molmoact2.packing import STEPS, Packing, SteppedUnits, in_packed_order, read_steps
 from probe_kit.hooks.families.shared.lerobot.flow import PackedPolicy
 from probe_kit.hooks.families.shared.lerobot.normaliser import Normaliser
 from probe_kit.hooks.families.shared.lerobot.pipelines import Inert
 from probe_kit.hooks.families.shared.lerobot.policy import checked_steps
-from probe_kit.hooks.families.shared.taps import Note, Stack, recording_weights, shares
+from probe_kit.hooks.families.shared.taps import TOWER, Note, Stack, recording_weights, shares
 from probe_kit.hooks.outputs import Produce, RecordedRun, stacked
 from probe_kit.models.building import build_empty, building_device, replaced
 from probe_kit.models.checkpoint_files import load_pretrained
@@ -229,27 +229,8 @@ def uses_cuda_graphs(policy: Any) -> bool:
 _PRECISION = "dtype"
 
 
-class ExpertStack(Stack):
-    """The expert: what a block adds is read behind its gates, and its end in front of the last modulation."""
-
-    def tap(self, site: Site) -> Tap:
-        """Return the tap as in other stacks, with two attentions in a block."""
-        if site.quantity in ("attention", "cross_attention", "mlp") and site.layer < len(self.layers):
-            gate = getattr(self.layers[site.layer], f"{site.quantity}_gate")
-            return Tap(gate, self.iterations or 1, "output")
-        return super().tap(site)
-
-    def stream(self, name: str) -> Stream:
-        """Without heads: keys of its self-attention are its own positions, not the prompt's."""
-        return Stream(name, len(self.layers) + 1, self.width, self.iterations, quantities=EXPERT, sums=False)
-
-
-class TowerStack(Stack):
-    """The vision tower, whose last blocks are read in two places and meet no final norm."""
-
-    def stream(self, name: str) -> Stream:
-        """The input of each block."""
-        return Stream(name, len(self.layers), self.width, part="vision", quantities=("residual",))
+_GATES = {quantity: f"{quantity}_gate" for quantity in ("attention", "cross_attention", "mlp")}
+"""What a block of the expert adds is read behind its gates."""
 
 
 class MolmoAct2(PackedPolicy):
@@ -385,13 +366,18 @@ class MolmoAct2(PackedPolicy):
         text, expert, tower = backbone.transformer, backbone.action_expert, backbone.vision_backbone.image_vit
         steps = int(self.config.num_inference_steps or backbone.config.flow_matching_num_steps)
         checked_steps(steps, self.folder)
-        last = expert.final_layer.norm
+        # Keys of the expert's self-attention are its own positions, not the prompt's: it declares no heads. Its
+        # end is read in front of the last modulation.
+        last, gated = expert.final_layer.norm, {"quantities": EXPERT, "sums": False, "heads": 0}
+        # The tower's last blocks are read in two places and meet no final norm.
+        seeing = tower.transformer.resblocks
+        width, fields = tower.config.hidden_size, {**TOWER, "layers": len(seeing)}
         return {
             "backbone": Stack(text.blocks, text.ln_f, text.config.hidden_size, None, "attn_norm"),
-            "expert": ExpertStack(expert.blocks, last, expert.config.hidden_size, steps, "self_norm"),
-            "vision": TowerStack(
-                tower.transformer.resblocks, last, tower.config.hidden_size, None, "attention_norm"
+            "expert": Stack(
+                expert.blocks, last, expert.config.hidden_size, steps, "self_norm", _GATES, stream_fields=gated
             ),
+            "vision": Stack(seeing, last, width, None, "attention_norm", stream_fields=fields),
         }
 
     def tap(self, site: Site) -> Tap:

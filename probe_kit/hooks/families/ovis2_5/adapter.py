@@ -9,9 +9,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from probe_kit.hooks.contract.model import Prompt, Tap
+from probe_kit.hooks.contract.model import Prompt
 from probe_kit.hooks.families.shared.loading import Recipe
-from probe_kit.hooks.families.shared.qwen import ASSISTANT, USER, by_picture
+from probe_kit.hooks.families.shared.qwen import ASSISTANT, USER, ByPicture
+from probe_kit.hooks.families.shared.taps import NOTHING, TOWER, Stack
 from probe_kit.hooks.families.shared.text import Frame
 from probe_kit.hooks.families.shared.vlm import Pictures, VisionLanguageModel
 from probe_kit.hooks.outputs import Produce, numpy_of
@@ -25,7 +26,7 @@ from probe_kit.models.ovis2_5 import (
 )
 
 
-class Ovis25(VisionLanguageModel):
+class Ovis25(ByPicture, VisionLanguageModel):
     """A loaded Ovis2.5."""
 
     family: ClassVar[str] = "ovis2.5"
@@ -33,8 +34,6 @@ class Ovis25(VisionLanguageModel):
     recipe: ClassVar[Recipe] = Recipe(OvisConfig.from_values, build_ovis2_5)
     marks: ClassVar[int] = 1
     stream_tolerance: ClassVar[float] = 1e-4  # pictures enter through a softmax over visual words
-    _grid: Tensor | None = None
-    """Of the pictures under way: the tower runs over the patches of all rows at once."""
 
     @property
     def language(self) -> Any:
@@ -51,21 +50,12 @@ class Ovis25(VisionLanguageModel):
         """The language model's configuration."""
         return self.network.config.text
 
-    @property
-    def vision_size(self) -> tuple[int, int]:
-        """Blocks and width of the vision tower."""
-        vision = self.network.config.vision
-        return vision.blocks, vision.width
-
-    def vision_tap(self, layer: int) -> Tap:
-        """The first norm of a block; the last site is what the last block puts out. Patches word by word."""
-        blocks = self.network.visual_tokenizer.vit.vision_model.encoder.layers
-        if layer == len(blocks):
-            return Tap(blocks[-1], 1, "output", view=self._by_picture)
-        return Tap(blocks[layer].layer_norm1, 1, view=self._by_picture)
-
-    def _by_picture(self, patches: Tensor) -> Tensor:
-        return by_picture(patches, self._grid)
+    @cached_property
+    def vision(self) -> Stack:
+        """The vision tower; the last site is what the last block puts out. Patches word by word."""
+        blocks, view = self.network.visual_tokenizer.vit.vision_model.encoder.layers, {"view": self._by_picture}
+        width = self.network.config.vision.width
+        return Stack(blocks, blocks[-1], width, None, "layer_norm1", NOTHING, "output", view, TOWER)
 
     @cached_property
     def pictures(self) -> OvisPictures:

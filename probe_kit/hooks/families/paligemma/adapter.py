@@ -9,8 +9,8 @@ from torch import Tensor
 from transformers import PaliGemmaConfig
 
 from probe_kit.hooks.contract.card import EMBEDDED
-from probe_kit.hooks.contract.model import Tap
 from probe_kit.hooks.families.shared.loading import Recipe
+from probe_kit.hooks.families.shared.taps import TOWER, Stack
 from probe_kit.hooks.families.shared.text import Frame
 from probe_kit.hooks.families.shared.vlm import Pictures, VisionLanguageModel
 from probe_kit.models.decoding import LeftPacked
@@ -28,17 +28,12 @@ class PaliGemma(VisionLanguageModel):
     recipe: ClassVar[Recipe] = Recipe(PaliGemmaConfig.from_dict, build_paligemma, FILE_NAMES)
     picture_token: ClassVar[str | None] = "<image>"
 
-    @property
-    def vision_size(self) -> tuple[int, int]:
-        """Blocks and width of the vision tower."""
-        vision = self.network.config.vision_config
-        return int(vision.num_hidden_layers), int(vision.hidden_size)
-
-    def vision_tap(self, layer: int) -> Tap:
-        """The first norm of a block; the last site enters the norm that ends the tower."""
-        tower = self.network.model.vision_tower.vision_model
-        blocks = tower.encoder.layers
-        return Tap(tower.post_layernorm if layer == len(blocks) else blocks[layer].layer_norm1, 1)
+    @cached_property
+    def vision(self) -> Stack:
+        """The vision tower; the last site enters the norm that ends it."""
+        tower, width = self.network.model.vision_tower.vision_model, self.network.config.vision_config.hidden_size
+        layers, norm = tower.encoder.layers, tower.post_layernorm
+        return Stack(layers, norm, int(width), None, "layer_norm1", stream_fields=TOWER)
 
     @cached_property
     def pictures(self) -> SquarePictures:

@@ -25,9 +25,7 @@ from probe_kit._system.bounded_files import load_json
 from probe_kit.errors import CheckpointError
 from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE, without_revision
 from probe_kit.hooks.contract.card import EMBEDDED
-from probe_kit.hooks.contract.model import Tap
 from probe_kit.hooks.contract.observation import ARM_NUMBERS, laid_out
-from probe_kit.hooks.contract.sites import Site
 from probe_kit.hooks.families.shared.kinds import STATE, Picture
 from probe_kit.hooks.families.shared.lerobot.flow import LerobotFlow, PaliGemmaPolicy, StatePrompt, sizes_file
 from probe_kit.hooks.families.shared.lerobot.normaliser import (
@@ -258,16 +256,6 @@ load_pi0_tiny_state = partial(load_pi0_tiny, name="pi0-tiny-state")
 """The embedded default, trained to act on State too."""
 
 
-class GatedStack(Stack):
-    """The expert, whose blocks add what they compute through a gate."""
-
-    def tap(self, site: Site) -> Tap:
-        """Return the tap; a block's addition is read behind its gate."""
-        if site.quantity in ("attention", "mlp") and site.layer < len(self.layers):
-            return Tap(getattr(self.layers[site.layer], f"{site.quantity}_gate"), self.iterations or 1, "output")
-        return super().tap(site)
-
-
 class Pi05(StatePrompt, Pi0):
     """A loaded pi0.5."""
 
@@ -301,6 +289,7 @@ class Pi05(StatePrompt, Pi0):
 
     def _stacks(self) -> dict[str, Stack]:
         stacks = super()._stacks()
-        return {**stacks, "expert": GatedStack(**vars(stacks["expert"]))}
+        gates = {"attention": "attention_gate", "mlp": "mlp_gate"}  # behind which a block's additions are read
+        return {**stacks, "expert": replace(stacks["expert"], added=gates)}
 
     suffix_labels = LerobotPolicy.suffix_labels

@@ -50,10 +50,10 @@ from probe_kit.hooks.families.shared.taps import (
     LAST,
     Note,
     Stack,
-    TokenStack,
     flow_stacks,
     kept_prompt,
     of_decoder,
+    token_stack,
 )
 from probe_kit.hooks.families.shared.token_decoder import chooser
 from probe_kit.hooks.outputs import Arrays, Produce, RecordedRun, numpy_of
@@ -451,8 +451,8 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
         vision = self.network.model.paligemma_with_expert.paligemma.model.vision_tower.vision_model
         layers, norm, width = decoder.layers, decoder.norm, decoder.config.hidden_size
         return {
-            "backbone": TokenStack(layers, norm, width, None, tokens=ALL_BUT_LAST),
-            "action": TokenStack(layers, norm, width, self.evaluation.captured_tokens, tokens=LAST),
+            "backbone": token_stack(layers, norm, width, None, tokens=ALL_BUT_LAST),
+            "action": token_stack(layers, norm, width, self.evaluation.captured_tokens, tokens=LAST),
             "vision": flow_stacks(decoder, decoder, vision, 1)["vision"],
         }
 

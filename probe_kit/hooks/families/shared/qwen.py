@@ -1,7 +1,7 @@
 """Base adapters of models on Qwen's vision-language models: those that answer, and policies."""
 
 from abc import abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
@@ -14,7 +14,8 @@ from probe_kit.hooks.contract.model import Policy, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import IMAGE_ROLE, PADDING, Site, Stream
-from probe_kit.hooks.families.shared.taps import decoder_tap, kept_prompt
+from probe_kit.hooks.families.shared.loading import Loaded
+from probe_kit.hooks.families.shared.taps import TOWER, Stack, decoder_tap, kept_prompt
 from probe_kit.hooks.families.shared.text import Frame, TokenizerFile
 from probe_kit.hooks.families.shared.vlm import Pictures, VisionLanguageModel
 from probe_kit.hooks.outputs import Arrays
@@ -22,24 +23,50 @@ from probe_kit.models.decoding import LeftPacked
 from probe_kit.models.qwen import QwenInputs, QwenPictures, image_slots, merged_tokens, pack_inputs
 
 
-def tower_tap(tower: Any, layer: int, view: Callable[[Tensor], Tensor]) -> Tap:
-    """The first norm of a block, or the merger's norm, which reads the last one; patches in the tower's order.
-
-    view: from patches (N, D) to the activation of a site.
-    """
-    if layer < len(tower.blocks):
-        return Tap(tower.blocks[layer].norm1, 1, view=view)
-    merger = tower.merger
-    return Tap(merger.ln_q if hasattr(merger, "ln_q") else merger.norm, 1, view=view)
+def merger_norm(tower: Any) -> Any:
+    """Return the norm that reads the last block of one of Qwen's vision towers."""
+    return tower.merger.ln_q if hasattr(tower.merger, "ln_q") else tower.merger.norm
 
 
-def by_picture(patches: Tensor, grid: Tensor | None) -> Tensor:
-    """(pictures, patches of one, D) of (patches, D); (1, patches, D) where pictures differ in size.
+class ByPicture:
+    """Vision towers that run over the patches of all pictures at once."""
 
-    grid: (pictures, 3) patches of each picture along time, height and width.
-    """
-    count = 1 if grid is None or bool((grid != grid[0]).any()) else len(grid)
-    return patches.view(count, -1, patches.shape[-1])
+    _grid: Tensor | None = None
+    """(pictures, 3) patches of each picture under way along time, height and width."""
+
+    def _by_picture(self, patches: Tensor) -> Tensor:
+        """(pictures, patches of one, D) of (patches, D); (1, patches, D) where pictures differ in size."""
+        grid = self._grid
+        count = 1 if grid is None or bool((grid != grid[0]).any()) else len(grid)
+        return patches.view(count, -1, patches.shape[-1])
+
+
+class QwenVision(ByPicture):
+    """The vision side of `vlm`, one of transformers' Qwen networks. folder: of preprocessor_config.json."""
+
+    vlm: Any
+    folder: Path
+    fast_pictures: ClassVar[bool] = True
+    """Which of Qwen's two picture processors the model's authors ran."""
+
+    @property
+    def tower(self) -> Any:
+        """Qwen's vision tower."""
+        return self.vlm.model.visual
+
+    @cached_property
+    def vision(self) -> Stack:
+        """The tower; the last site is what its merger reads. Patches in the tower's own order."""
+        width, view = int(self.vlm.config.vision_config.hidden_size), {"view": self._by_picture}
+        norm = merger_norm(self.tower)
+        return Stack(self.tower.blocks, norm, width, None, "norm1", tap_fields=view, stream_fields=TOWER)
+
+    @cached_property
+    def pictures(self) -> QwenPictures:
+        """The processor of pictures into patches. Raises CheckpointError naming the missing file."""
+        vision = self.vlm.config.vision_config
+        sizes = (int(vision.patch_size), int(vision.temporal_patch_size), int(vision.spatial_merge_size))
+        return QwenPictures.from_folder(self.folder, *sizes, fast=self.fast_pictures)
 
 
 SYSTEM = "<|im_start|>system\nYou are a helpful assistant.<|im_end|>\n"
@@ -51,36 +78,14 @@ def qwen_frame(system: str = "") -> Frame:
     return Frame(f"{system}{USER}<|vision_start|>", "<|vision_end|>", f"{system}{USER}", ASSISTANT)
 
 
-class QwenVLM(VisionLanguageModel):
+class QwenVLM(QwenVision, VisionLanguageModel):
     """A VLM on one of transformers' Qwen networks."""
 
     picture_token: ClassVar[str | None] = "<|image_pad|>"
-    _grid: Tensor | None = None
-    """Of the pictures under way: towers run over the patches of all rows at once."""
 
-    @property
-    def tower(self) -> Any:
-        """The vision tower."""
-        return self.network.model.visual
-
-    @property
-    def vision_size(self) -> tuple[int, int]:
-        """Blocks and width of the vision tower."""
-        return len(self.tower.blocks), int(self.network.config.vision_config.hidden_size)
-
-    def vision_tap(self, layer: int) -> Tap:
-        """The first norm of a block, or what reads the last one; patches in the tower's own order."""
-        return tower_tap(self.tower, layer, self._by_picture)
-
-    def _by_picture(self, patches: Tensor) -> Tensor:
-        return by_picture(patches, self._grid)
-
-    @cached_property
-    def pictures(self) -> QwenPictures:
-        """The processor of pictures into patches. Raises CheckpointError naming the missing file."""
-        vision = self.network.config.vision_config
-        sizes = (int(vision.patch_size), int(vision.temporal_patch_size), int(vision.spatial_merge_size))
-        return QwenPictures.from_folder(self.loaded.folder, *sizes, fast=True)
+    def __init__(self, loaded: Loaded[Any], tokenizer: str | None = None, **settings: str) -> None:
+        self.vlm, self.folder = loaded.network, loaded.folder
+        super().__init__(loaded, tokenizer, **settings)
 
     def picture_ids(self, height: int, width: int) -> list[int]:
         """Ids at a picture's positions, as many as its size demands."""
@@ -112,31 +117,21 @@ class QwenVLM(VisionLanguageModel):
 BACKBONE_ROLES = (IMAGE_ROLE, "language", "special", PADDING)
 
 
-class QwenVLA(Policy):
+class QwenVLA(QwenVision, Policy):
     """A policy whose backbone is one of transformers' Qwen vision-language models.
 
     Subclasses define the model's inputs, and what follows the backbone.
     """
 
-    fast_pictures: ClassVar[bool]
-    """Which of Qwen's two picture processors the model's authors ran."""
-
     def __init__(self, vlm: Any, folder: Path, tokenizer: str | None, device: str) -> None:
         """vlm: `Qwen…VLForConditionalGeneration`. folder: of tokenizer.json and preprocessor_config.json."""
         self.vlm, self.folder, self.device = vlm, folder, device
         self._tokenizer_folder = folder if tokenizer is None else Path(tokenizer).expanduser()
-        # Pictures of the inference under way: vision towers run over the patches of all rows at once.
-        self._grid: Tensor | None = None
 
     @property
     def language(self) -> Any:
         """The decoder."""
         return self.vlm.model.language_model
-
-    @property
-    def tower(self) -> Any:
-        """Qwen's vision tower."""
-        return self.vlm.model.visual
 
     def backbone_stream(self) -> Stream:
         """The decoder's stream."""
@@ -147,11 +142,6 @@ class QwenVLA(Policy):
     def backbone_kv(self) -> Stream:
         """The decoder's keys and values."""
         return kept_prompt(self.vlm.config.text_config)
-
-    def vision_stream(self) -> Stream:
-        """The vision tower's stream; the last site is what its merger reads."""
-        vision = self.vlm.config.vision_config
-        return Stream("vision", len(self.tower.blocks) + 1, int(vision.hidden_size), quantities=("residual",))
 
     # -- what a family decides ---------------------------------------------------------------------------
 
@@ -188,13 +178,6 @@ class QwenVLA(Policy):
         tokenizer.check_present()
         tokenizer.check_vocabulary(int(self.vlm.config.text_config.vocab_size))
         return tokenizer
-
-    @cached_property
-    def pictures(self) -> QwenPictures:
-        """The processor of pictures into patches. Raises CheckpointError naming the missing file."""
-        vision = self.vlm.config.vision_config
-        sizes = (int(vision.patch_size), int(vision.temporal_patch_size), int(vision.spatial_merge_size))
-        return QwenPictures.from_folder(self.folder, *sizes, fast=self.fast_pictures)
 
     def prompt(self, instruction: str) -> list[int]:
         """Ids of the whole prompt, one for the picture."""
@@ -252,13 +235,6 @@ class QwenVLA(Policy):
     def backbone_tap(self, site: Site) -> Tap:
         """The first norm of the block the site enters, the final norm, or a block's output."""
         return decoder_tap(self.language.layers, self.language.norm, site)
-
-    def vision_tap(self, site: Site) -> Tap:
-        """The first norm of the block, or what reads the last one; patches in the tower's own order."""
-        return tower_tap(self.tower, site.layer, self._by_picture)
-
-    def _by_picture(self, patches: Tensor) -> Tensor:
-        return by_picture(patches, self._grid)
 
 
 def recorded_inputs(policy: QwenVLA, recorded: Arrays) -> QwenInputs:

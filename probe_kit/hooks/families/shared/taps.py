@@ -2,17 +2,17 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import count
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
 from probe_kit.errors import CaptureError, UnsupportedInterventionError
-from probe_kit.hooks.contract.model import EVERY, HeadsTap, Tap
+from probe_kit.hooks.contract.model import HeadsTap, Tap
 from probe_kit.hooks.contract.sites import HEADS, Site, Stream, kv_stream
 from probe_kit.models.decoding import PromptKV
 
@@ -20,34 +20,38 @@ _PROJECTIONS = ("o_proj", "out_proj", "attn_out", "dense")
 """Names that networks give to the output projection of an attention."""
 
 
+NOTHING: Mapping[str, Any] = MappingProxyType({})
+
+
 def decoder_tap(
-    layers: Sequence[Any],
-    norm: nn.Module,
+    layers: Any,
+    norm: Any,
     site: Site,
     fires: int = 1,
-    tokens: slice = EVERY,
     entry: str = "input_layernorm",
-    added: Mapping[str, str] = MappingProxyType({}),
+    added: Mapping[str, str] = NOTHING,
+    end: Literal["input", "output"] = "input",
+    **fields: Any,
 ) -> Tap:
-    """Return the tap of a site: the first norm of the block it enters, the final norm, or a block's output.
+    """Return the tap of a site: the first norm of the block it enters, the last norm, or a part of a block.
 
-    norm: behind the last block. fires, tokens: of the `Tap`. entry: name of the block's first submodule. added:
-    by quantity, the submodule whose output a block adds, where it is neither the MLP nor the output projection.
+    norm: behind the last block; `end`: at which of its ends the last residual passes. entry: path of the block's
+    first submodule, empty for the block itself. added: by quantity, the path of the submodule whose output a block
+    adds, where it is neither `mlp` nor the output projection; of `heads`, whose input they are. fires, fields: of
+    `Tap`.
     """
     if site.quantity == "final_norm":
-        return Tap(norm, fires, "output", tokens)
-    if site.layer == len(layers):  # behind the last block: what the final norm reads
-        return Tap(norm, fires, tokens=tokens)
+        return Tap(norm, fires, "output", **fields)
+    if site.layer == len(layers):
+        return Tap(norm, fires, end, **fields)
     block = layers[site.layer]
-    if site.quantity == HEADS:
-        return Tap(output_projection(block.self_attn), fires, tokens=tokens)
+    if site.quantity == "residual":
+        return Tap(block.get_submodule(entry), fires, **fields)
     if site.quantity in added:
-        return Tap(getattr(block, added[site.quantity]), fires, "output", tokens)
-    if site.quantity == "mlp":
-        return Tap(block.mlp, fires, "output", tokens)
-    if site.quantity == "attention":
-        return Tap(output_projection(block.self_attn), fires, "output", tokens)
-    return Tap(getattr(block, entry), fires, tokens=tokens)
+        module = block.get_submodule(added[site.quantity])
+    else:
+        module = block.mlp if site.quantity == "mlp" else output_projection(block.self_attn)
+    return Tap(module, fires, "input" if site.quantity == HEADS else "output", **fields)
 
 
 def output_projection(attention: Any) -> Any:
@@ -57,39 +61,47 @@ def output_projection(attention: Any) -> Any:
 
 @dataclass(frozen=True)
 class Stack:
-    """One transformer stack inside a policy; `entry` names the block's first submodule."""
+    """One transformer stack inside a policy.
+
+    entry, added, end: as `decoder_tap` has them. tap_fields: further ones of every tap, such as the positions that
+    belong to the stream. stream_fields: of the `Stream`; heads are counted where they are not among them.
+    """
 
     layers: Sequence[nn.Module]
     norm: nn.Module
     width: int
     iterations: int | None
     entry: str = "input_layernorm"
+    added: Mapping[str, str] = NOTHING
+    end: Literal["input", "output"] = "input"
+    tap_fields: Mapping[str, Any] = NOTHING
+    stream_fields: Mapping[str, Any] = NOTHING
 
     def tap(self, site: Site) -> Tap:
         """Return the tap of a site of this stack."""
-        return decoder_tap(self.layers, self.norm, site, self.iterations or 1, entry=self.entry)
+        fires, tap_fields = self.iterations or 1, dict(self.tap_fields)
+        return decoder_tap(self.layers, self.norm, site, fires, self.entry, self.added, self.end, **tap_fields)
 
     def stream(self, name: str) -> Stream:
         """The stored stream: the input of every block, and of the final norm."""
-        attention: Any = self.layers[0].self_attn
-        heads = int(output_projection(attention).in_features) // int(attention.head_dim)
-        return Stream(name, len(self.layers) + 1, self.width, self.iterations, heads=heads)
+        fields = dict(self.stream_fields)
+        if "heads" not in fields:
+            attention: Any = self.layers[0].self_attn
+            fields["heads"] = int(output_projection(attention).in_features) // int(attention.head_dim)
+        return Stream(name, fields.pop("layers", len(self.layers) + 1), self.width, self.iterations, **fields)
 
 
-@dataclass(frozen=True)
-class TokenStack(Stack):
-    """A decoder that runs over the prompt and then over what it puts out, in one of these two roles.
+TOWER: Mapping[str, Any] = MappingProxyType({"part": "vision", "quantities": ("residual",), "heads": 0})
+"""Fields of the stream of a vision tower that is read between its blocks alone."""
 
-    tokens: the positions of its passes that belong to the stream. first: passes before those of the stream.
-    iterations: the captured passes, or None for the prompt.
+
+def token_stack(layers: Any, norm: Any, width: int, iterations: int | None, **tap_fields: Any) -> Stack:
+    """Return a decoder that runs over the prompt and then over what it puts out, in one of these two roles.
+
+    iterations: the captured passes, or None for the prompt; calls behind them belong to no site. tap_fields: the
+    `tokens` of its passes that belong to the stream, and `first`, the passes before those of the stream.
     """
-
-    tokens: slice = EVERY
-    first: int = 0
-
-    def tap(self, site: Site) -> Tap:
-        """Calls behind those of the captured passes belong to no site."""
-        return replace(super().tap(site), tokens=self.tokens, first=self.first, more=True)
+    return Stack(layers, norm, width, iterations, tap_fields={"more": True, **tap_fields})
 
 
 def flow_stacks(backbone: Any, expert: Any, vision: Any, iterations: int) -> dict[str, Stack]:

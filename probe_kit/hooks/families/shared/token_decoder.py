@@ -144,7 +144,7 @@ class TokenDecoder(Model):
         if stream.part == "vision":
             return self.vision_tap(site)
         tokens = ALL_BUT_LAST if site.stream == "backbone" else LAST
-        return decoder_tap(self.decoder.layers, self.final_norm, site, self.steps, tokens, added=self.added)
+        return decoder_tap(self.decoder.layers, self.final_norm, site, self.steps, added=self.added, tokens=tokens)
 
     def roles_of(self, rows: Sequence[Sequence[str]]) -> dict[str, list[Roles]]:
         """The roles of a batch. rows: labels of the backbone's positions, padded behind to the longest."""

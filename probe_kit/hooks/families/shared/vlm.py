@@ -28,7 +28,7 @@ from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import IMAGE_ROLE, PADDING, Site, Stream
 from probe_kit.hooks.families.shared.loading import Loaded, Recipe, load_vlm
-from probe_kit.hooks.families.shared.taps import ALL_BUT_LAST, ALL_TOKENS, LAST, decoder_tap
+from probe_kit.hooks.families.shared.taps import ALL_BUT_LAST, ALL_TOKENS, LAST, Stack, decoder_tap
 from probe_kit.hooks.families.shared.text import Frame, FramedText, TokenPrompt
 from probe_kit.hooks.outputs import Arrays, Outputs, Produce, numpy_of, watch
 from probe_kit.models.decoding import Decoded, LeftPacked, positions
@@ -161,10 +161,7 @@ class VisionLanguageModel(SpeakingModel):
             "backbone": Stream("backbone", layers, width, sums=self.sums, heads=heads),
             ANSWER: Stream(ANSWER, layers, width, 1, part="action", sums=self.sums, heads=heads),
         }
-        blocks, vision_width = self.vision_size
-        self.further_streams = {
-            "vision": Stream("vision", blocks + 1, vision_width, part="vision", quantities=("residual",))
-        }
+        self.further_streams = {"vision": self.vision.stream("vision")}
         self.role_names = {"backbone": (IMAGE_ROLE, "language", "special", PADDING), ANSWER: (ANSWER,)}
         options = {"frame": str(self.frame), "tokenizer": tokenizer or "the checkpoint's", **settings}
         self.card = loaded.card(self.family, options, tokenizer=tokenizer)
@@ -190,14 +187,10 @@ class VisionLanguageModel(SpeakingModel):
 
     # -- what a family decides ---------------------------------------------------------------------------
 
-    @property
+    @cached_property
     @abstractmethod
-    def vision_size(self) -> tuple[int, int]:
-        """Blocks and width of the vision tower."""
-
-    @abstractmethod
-    def vision_tap(self, layer: int) -> Tap:
-        """Return the tap of the input of block `layer` of the vision tower; the last is the tower's output."""
+    def vision(self) -> Stack:
+        """The vision tower; the last site is its output."""
 
     @abstractmethod
     def picture_ids(self, height: int, width: int) -> list[int]:
@@ -339,7 +332,7 @@ class VisionLanguageModel(SpeakingModel):
     def tap(self, site: Site) -> Tap:
         """The first norm of the block the site enters, the final norm, or a block's output."""
         if self.stream_of(site).part == "vision":
-            return self.vision_tap(site.layer)
+            return self.vision.tap(site)
         tokens = self._backbone_tokens if site.stream == "backbone" else LAST
         return decoder_tap(self.language.layers, self.language.norm, site, tokens=tokens)
 

@@ -28,12 +28,12 @@ from probe_kit.hooks.contract.card import ARM
 from probe_kit.hooks.contract.model import Policy, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
-from probe_kit.hooks.contract.sites import HEADS, IMAGE_ROLE, Site, Stream
+from probe_kit.hooks.contract.sites import IMAGE_ROLE, Site, Stream
 from probe_kit.hooks.families.prismatic.adapter import BYTES, TextTokenizer, find_tokenizer
 from probe_kit.hooks.families.shared.action_statistics import ActionStatistics, open_or_closed
 from probe_kit.hooks.families.shared.kinds import TOKENS
 from probe_kit.hooks.families.shared.loading import DTYPES, Loaded, load_network
-from probe_kit.hooks.families.shared.taps import Note, kept_prompt, of_decoder
+from probe_kit.hooks.families.shared.taps import Note, decoder_tap, kept_prompt, of_decoder
 from probe_kit.hooks.families.shared.token_decoder import TokenDecoder, warn_of_unknown
 from probe_kit.models.checkpoint_files import stored_statistics
 from probe_kit.models.decoding import Decoded, Packed
@@ -371,17 +371,7 @@ class SpatialVLA(TokenDecoder, Policy):
 
     def vision_tap(self, site: Site) -> Tap:
         """The first norm of a block, the norm behind the last, or what a block adds."""
-        tower = self.tower
-        if site.quantity == "final_norm":
-            return Tap(tower.post_layernorm, 1, "output")
-        if site.layer == len(tower.encoder.layers):
-            return Tap(tower.post_layernorm, 1)
-        block = tower.encoder.layers[site.layer]
-        if site.quantity == "residual":
-            return Tap(block.layer_norm1, 1)
-        if site.quantity == HEADS:
-            return Tap(block.self_attn.out_proj, 1)
-        return Tap(block.self_attn.out_proj if site.quantity == "attention" else block.mlp, 1, "output")
+        return decoder_tap(self.tower.encoder.layers, self.tower.post_layernorm, site, entry="layer_norm1")
 
 
 def _preset(loaded: LoadedSpatialVLA, camera: str) -> Intrinsics | None:

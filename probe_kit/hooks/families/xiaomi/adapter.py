@@ -28,11 +28,11 @@ from probe_kit.hooks.contract.card import ARM
 from probe_kit.hooks.contract.model import Tap
 from probe_kit.hooks.contract.observation import ARM_NUMBERS, Observation, laid_out
 from probe_kit.hooks.contract.roles import Roles
-from probe_kit.hooks.contract.sites import HEADS, Site, Stream
+from probe_kit.hooks.contract.sites import Site, Stream
 from probe_kit.hooks.families.shared.action_statistics import DIMENSIONS, open_or_closed
 from probe_kit.hooks.families.shared.loading import DTYPES, Loaded, load_network
 from probe_kit.hooks.families.shared.qwen import BACKBONE_ROLES, QwenVLA, recorded_inputs
-from probe_kit.hooks.families.shared.taps import Note, kv_tap, recording_weights
+from probe_kit.hooks.families.shared.taps import Note, decoder_tap, kv_tap, recording_weights
 from probe_kit.hooks.families.shared.token_decoder import seeded_noise
 from probe_kit.hooks.families.xiaomi import INTERVENTIONS
 from probe_kit.hooks.outputs import Arrays, Outputs, Produce, euler_path, numpy_of, stream_outputs, watch
@@ -53,6 +53,7 @@ from probe_kit.models.xiaomi import (
 )
 
 DEFAULT_CHECKPOINT = "XiaomiRobotics/Xiaomi-Robotics-0-SimplerEnv-WidowX"
+_PARTS = {"attention": "attn_gate", "heads": "attn.o_proj", "middle": "middle_layernorm", "mlp": "mlp_gate"}
 EXECUTE = 4
 """Actions the released evaluation carries out before it looks again."""
 
@@ -93,7 +94,7 @@ class Xiaomi(QwenVLA):
                 heads=int(first.attn.heads),
             ),
         }
-        self.further_streams = {"vision": self.vision_stream()}
+        self.further_streams = {"vision": self.vision.stream("vision")}
         self.prompt_kv = self.backbone_kv()
         self.role_names = {"backbone": BACKBONE_ROLES, "expert": ("special", "state", "action")}
         units = self.units_or_reason()
@@ -222,19 +223,11 @@ class Xiaomi(QwenVLA):
             return kv_tap(self.network.prompt_kv, site)
         if stream.name == "backbone":
             return self.backbone_tap(site)
-        return self.vision_tap(site) if stream.name == "vision" else self._expert_tap(site)
+        return self.vision.tap(site) if stream.name == "vision" else self._expert_tap(site)
 
     def _expert_tap(self, site: Site) -> Tap:
-        layers = self.network.dit.layers
-        if site.layer == len(layers):
-            return Tap(layers[-1], self.steps, "output")
-        layer: Any = layers[site.layer]
-        parts = {"attention": layer.attn_gate, "middle": layer.middle_layernorm, "mlp": layer.mlp_gate}
-        if site.quantity == "residual":
-            return Tap(layer.input_layernorm, self.steps)
-        if site.quantity == HEADS:
-            return Tap(layer.attn.o_proj, self.steps)
-        return Tap(parts[site.quantity], self.steps, "output")
+        layers: Any = self.network.dit.layers
+        return decoder_tap(layers, layers[-1], site, self.steps, added=_PARTS, end="output")
 
 
 def xiaomi_units(checkpoint: str, *, robot: str | None = None, **_: Any) -> str:
@@ -306,7 +299,7 @@ def xiaomi_outputs(load: Callable[..., Xiaomi], folder: Path, recorded: Arrays) 
         "merger": policy.tower.merger,
     }
     actions, tape, calls = watch(policy, lambda: policy.infer(inputs, state, mask, noise), modules)
-    streams, vision = stream_outputs(policy, tape), policy.vision_stream()
+    streams, vision = stream_outputs(policy, tape), policy.vision.stream("vision")
     cache = calls["model"][0].past_key_values.layers
     produced: dict[str, Produce] = {
         **streams,

@@ -33,10 +33,9 @@ from torch import Tensor, nn
 from probe_kit.errors import CheckpointError, ObservationError, UsageError
 from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
-from probe_kit.hooks.contract.model import Tap
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.roles import Roles
-from probe_kit.hooks.contract.sites import HEADS, PADDING, Site, Stream
+from probe_kit.hooks.contract.sites import PADDING
 from probe_kit.hooks.families.shared.kinds import IMAGES, STATE, Evaluation
 from probe_kit.hooks.families.shared.lerobot.flow import DenoisingPolicy
 from probe_kit.hooks.families.shared.lerobot.pipelines import (
@@ -188,43 +187,9 @@ class XvlaChoice(Evaluation):
     domain: int | None = None
 
 
-class PostNormStack(Stack):
-    """Blocks that norm behind each addition: `residual` is the normed stream; `norm` is the last block."""
-
-    def tap(self, site: Site) -> Tap:
-        """The input of a block; behind the last, its output."""
-        if site.layer == len(self.layers):
-            return Tap(self.norm, 1, "output")
-        block: Any = self.layers[site.layer]
-        if site.quantity == "mlp":
-            return Tap(block.fc2, 1, "output")
-        if site.quantity in ("attention", HEADS):
-            return Tap(block.self_attn.out_proj, 1, "output" if site.quantity == "attention" else "input")
-        return Tap(block, 1)
-
-    def stream(self, name: str) -> Stream:
-        """The stored stream."""
-        heads = int(self.layers[0].self_attn.num_heads)  # type: ignore[union-attr, arg-type]
-        return Stream(name, len(self.layers) + 1, self.width, quantities=BLOCK, sums=False, heads=heads)
-
-
-class SoftPromptedStack(Stack):
-    """The expert's whole sequence; `norm` is the last block, as the norm behind it reads the actions alone."""
-
-    def tap(self, site: Site) -> Tap:
-        """The first norm of a block; behind the last, its output."""
-        fires = self.iterations or 1
-        if site.layer == len(self.layers):
-            return Tap(self.norm, fires, "output")
-        block: Any = self.layers[site.layer]
-        if site.quantity in ("attention", "mlp"):
-            return Tap(block.attn if site.quantity == "attention" else block.mlp, fires, "output")
-        return Tap(block.attn.proj if site.quantity == HEADS else block.norm1, fires)
-
-    def stream(self, name: str) -> Stream:
-        """The stored stream."""
-        heads = int(self.layers[0].attn.num_heads)  # type: ignore[union-attr, arg-type]
-        return Stream(name, len(self.layers) + 1, self.width, self.iterations, quantities=BLOCK, heads=heads)
+_FLORENCE = {"attention": "self_attn.out_proj", "heads": "self_attn.out_proj", "mlp": "fc2"}
+_EXPERT = {"attention": "attn", "heads": "attn.proj", "mlp": "mlp"}
+"""By quantity, what a block adds or reads."""
 
 
 class Xvla(DenoisingPolicy):
@@ -419,10 +384,23 @@ class Xvla(DenoisingPolicy):
     def _stacks(self) -> dict[str, Stack]:
         encoder, expert = self.network.model.vlm.language_model.encoder, self.network.model.transformer
         steps = max(1, int(self.config.num_denoising_steps))
-        width = int(encoder.config.d_model)
+        layers, blocks, width = encoder.layers, expert.blocks, int(encoder.config.d_model)
+        normed = {"quantities": BLOCK, "sums": False, "heads": int(layers[0].self_attn.num_heads)}
+        prompted = {"quantities": BLOCK, "heads": int(blocks[0].attn.num_heads)}
         return {
-            "backbone": PostNormStack(encoder.layers, encoder.layers[-1], width, None),
-            "expert": SoftPromptedStack(expert.blocks, expert.blocks[-1], int(expert.hidden_size), steps, "norm1"),
+            # A block norms behind each addition: `residual` is the normed stream.
+            "backbone": Stack(layers, layers[-1], width, None, "", _FLORENCE, "output", stream_fields=normed),
+            # The whole sequence: the norm behind the last block reads the actions alone.
+            "expert": Stack(
+                blocks,
+                blocks[-1],
+                int(expert.hidden_size),
+                steps,
+                "norm1",
+                _EXPERT,
+                "output",
+                stream_fields=prompted,
+            ),
         }
 
     # -- verification ------------------------------------------------------------------------------------
