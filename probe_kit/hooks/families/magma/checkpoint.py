@@ -233,7 +233,7 @@ def _check_trained(tensors: Mapping[str, Tensor], source: str) -> None:
         )
 
 
-PACKAGED = "the package (its statistics.json says whence)"
+PACKAGED = "the package (its magma_statistics.json says whence)"
 
 
 def magma_statistics(folder: Path, file: str | None) -> tuple[Mapping[str, Any], str]:
