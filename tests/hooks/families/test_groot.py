@@ -386,7 +386,7 @@ def test_roles_name_pictures_and_the_instruction_as_lerobot_writes_it(
 
 
 def test_two_cameras_are_told_apart_in_the_checkpoints_order(tmp_path: Path, seen: list[Observation]) -> None:
-    policy = Groot.load(str(write_groot(tmp_path, cameras=("image", "wrist")))).showing(["image", "wrist"])
+    policy = Groot.load(str(write_groot(tmp_path, cameras=("image", "wrist")))).with_cameras(["image", "wrist"])
     one = replace(seen[0], cameras={"wrist": seen[0].image[:, ::-1].copy()})
     (roles,) = policy.roles([one])["bridge"]
     counts = [int(roles.mask(f"image.{camera}").sum()) for camera in ("image", "wrist")]

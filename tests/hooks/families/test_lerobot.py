@@ -237,7 +237,7 @@ def test_pi05_acts_as_lerobots_own_loading_processors_and_policy_bit_for_bit(
         theirs = modeling_pi05.PI05Policy.from_pretrained(folder).eval()
     every = Pi05.load(str(folder))
     for shown in (CAMERAS, CAMERAS[:1]):
-        ours = every.showing(shown)
+        ours = every.with_cameras(shown)
         for seed, one in enumerate(seen()):
             pictures = {"base": one.image, **one.cameras}
             packed = before(raw(one, {name: pictures[name] for name in shown}))

@@ -87,7 +87,7 @@ def test_actions_are_those_of_lerobots_saved_pipelines_and_policy(
     place = str(tmp_path / "vlm")  # the other action mode reads a FAST tokenizer on the hub
     before, behind = save_pipelines(tmp_path, change, action_mode="continuous", checkpoint_path=place, **fields)
     ours = MolmoAct2.load(str(tmp_path))
-    ours = ours.showing(ours.cameras)
+    ours = ours.with_cameras(ours.cameras)
     theirs = network.lerobots_policy(copy(ours.config), network.network_config(Path(place)), Path(place))
     theirs.load_state_dict(load_file(tmp_path / "model.safetensors"))
     states = np.array([LOW + 0.3 * (HIGH - LOW), LOW - 0.1 * (HIGH - LOW)], np.float32)
@@ -225,7 +225,9 @@ def test_roles_name_pictures_instruction_and_state(molmoact2: MolmoAct2, seen: l
 
 
 def test_two_cameras_are_told_apart(tmp_path: Path) -> None:
-    policy = MolmoAct2.load(str(write_molmoact2(tmp_path, cameras=("image", "wrist")))).showing(["image", "wrist"])
+    policy = MolmoAct2.load(str(write_molmoact2(tmp_path, cameras=("image", "wrist")))).with_cameras(
+        ["image", "wrist"]
+    )
     (one,) = examples_for(policy, "put the cube on the star")
     one = replace(one, cameras={"wrist": one.image[:, ::-1].copy()})
     (roles,) = policy.roles([one])["backbone"]

@@ -26,7 +26,7 @@ from tests.support.smolvla_checkpoints import write_smolvla
 )
 def test_roles_name_the_positions_that_lerobot_masks(tmp_path: Path, fields: dict, shown: int) -> None:
     cameras = ("top", "wrist")
-    policy = SmolVLA.load(str(write_smolvla(tmp_path, cameras=cameras, **fields))).showing(cameras[:shown])
+    policy = SmolVLA.load(str(write_smolvla(tmp_path, cameras=cameras, **fields))).with_cameras(cameras[:shown])
     seen = example_observations(["Put the cube on the star", "Put the cube on the red shape"], cameras)
     batch = policy.batch(seen)
     images, masks = policy.network.prepare_images(batch)
@@ -40,11 +40,11 @@ def test_roles_name_the_positions_that_lerobot_masks(tmp_path: Path, fields: dic
 
 
 def test_a_second_camera_is_needed_once_it_is_shown(tmp_path: Path) -> None:
-    policy = SmolVLA.load(str(write_smolvla(tmp_path, cameras=("top", "wrist")))).showing(["top", "wrist"])
+    policy = SmolVLA.load(str(write_smolvla(tmp_path, cameras=("top", "wrist")))).with_cameras(["top", "wrist"])
     with pytest.raises(ObservationError, match=r"no camera\.wrist"):
         policy.act(example_observations(["Put the cube on the star"]), [0])
     with pytest.raises(ObservationError, match="in order"):
-        policy.showing(["wrist"])
+        policy.with_cameras(["wrist"])
 
 
 def test_words_are_checked_without_the_network(tmp_path: Path) -> None:

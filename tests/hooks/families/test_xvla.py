@@ -210,7 +210,7 @@ def test_each_layer_of_the_backbone_norms_what_it_adds(xvla: Xvla, seen: list[Ob
 
 def test_further_cameras_reach_the_expert_past_the_backbone(tmp_path: Path, seen: list[Observation]) -> None:
     folder = write_xvla(tmp_path, cameras=("image", "wrist"), views=3)
-    policy = Xvla.load(str(folder)).showing(["image", "wrist"])
+    policy = Xvla.load(str(folder)).with_cameras(["image", "wrist"])
     one = replace(seen[0], cameras={"wrist": seen[0].image[:, ::-1].copy()})
     other = replace(one, cameras={"wrist": seen[0].image})
     roles = policy.roles([one])

@@ -109,7 +109,7 @@ def test_attention_on_patches_adds_up_to_the_pictures_share_and_patches_lie_wher
 @pytest.mark.slow
 def test_every_camera_has_its_patches_where_they_look_and_a_frame_shows_them_side_by_side(tmp_path: Path) -> None:
     cameras = ("top", "wrist")
-    policy = SmolVLA.load(str(write_smolvla(tmp_path, cameras=cameras))).showing(cameras)
+    policy = SmolVLA.load(str(write_smolvla(tmp_path, cameras=cameras))).with_cameras(cameras)
     (observation,) = example_observations(["Put the cube on the star"], cameras[1:])
     boxes = {camera: token_boxes(policy, observation, camera) for camera in cameras}
     for at, camera in enumerate(cameras):

@@ -43,6 +43,11 @@ _DIFFUSERS = {"attention": "attn1", "heads": "attn1.to_out.0", "mlp": "ff"}
 """What a block of diffusers adds: its one attention, to the prompt or itself, and its MLP."""
 
 
+def _lerobots_names(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return tensors by lerobot's names, also of NVIDIA's files."""
+    return {name if name.startswith(_MODEL) else f"{_MODEL}{name}": tensor for name, tensor in tensors.items()}
+
+
 class Groot(PackedPolicy):
     """A loaded GR00T N1.7. One observation per call: its bridge reads padding, which changes the actions."""
 
@@ -53,6 +58,7 @@ class Groot(PackedPolicy):
     interventions = INTERVENTIONS
     unread = (_HEAD,)
     tied: ClassVar[Mapping[str, str]] = {_EMBEDDING: _HEAD}
+    current_names = _lerobots_names
 
     other_roles: ClassVar[tuple[str, ...]] = ("language", "special")
     suffix_roles = ("state", "action")
@@ -106,11 +112,6 @@ class Groot(PackedPolicy):
         )
         return network
 
-    @classmethod
-    def current_names(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Return tensors by lerobot's names, also of NVIDIA's files."""
-        return {name if name.startswith(_MODEL) else f"{_MODEL}{name}": tensor for name, tensor in tensors.items()}
-
     def parts(self) -> dict[str, Path]:
         """The base model and the vision-language model."""
         return {"base": self.config.places.base, "vlm": self.config.places.vlm}
@@ -133,7 +134,7 @@ class Groot(PackedPolicy):
         del feature
         steps = self._steps
         if kind == "STATE":
-            return state_units(steps.pack, self._state_numbers, steps.source, steps.fields)
+            return state_units(steps.pack, self.state_numbers, steps.source, steps.fields)
         return action_units(steps.decode, self._action_numbers, steps.source, steps.fields)
 
     @property

@@ -69,18 +69,14 @@ class BoundedUnits:
             restored[..., self.sign] = -np.sign(2 * restored[..., self.sign] - 1)
         return restored
 
-    def slope(self, numbers: int) -> NDArray[np.float32]:
-        """(D,) of `restore`, where it does not clamp; 0 for a number that jumps."""
-        scores = np.where(self.high == 0, 1, self.high)
-        slopes = np.where(self._scored, scores, (self.high - self.low) / 2).astype(np.float32)[:numbers]
-        if self.sign is not None:
-            slopes[self.sign] = 0
-        return slopes
-
     def slopes(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(..., D) of `restore` at these outputs of the network; 0 where it clamps."""
+        """(..., D) of `restore` at these outputs of the network; 0 where it clamps or jumps."""
         inside = (np.abs(values) <= 1) | self._scored if self.clamp else np.ones(values.shape, bool)
-        return np.asarray(inside * self.slope(values.shape[-1]), np.float32)
+        scores = np.where(self.high == 0, 1, self.high)
+        slopes = np.where(self._scored, scores, (self.high - self.low) / 2).astype(np.float32) * inside
+        if self.sign is not None:
+            slopes[..., self.sign] = 0
+        return np.asarray(slopes, np.float32)
 
     def unusual(self, values: NDArray[np.float32]) -> NDArray[np.bool_]:
         """(..., D): outside the bounds, or far from the mean."""
@@ -137,10 +133,6 @@ class StateUnits:
         if self.angles or self.excluded:
             raise CheckpointError(f"{self.source}: a state that is {self.mode} has no way back to physical units")
         return self.bounded.restore(values)
-
-    def slope(self, numbers: int) -> NDArray[np.float32]:
-        """(D,) of `restore`."""
-        return self.bounded.slope(numbers)
 
     def slopes(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """(..., D) of `restore`."""

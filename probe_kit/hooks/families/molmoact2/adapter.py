@@ -315,7 +315,7 @@ class MolmoAct2(PackedPolicy):
         if units is None:
             return None
         assert isinstance(units, Normaliser)
-        numbers = self._state_numbers if kind == "STATE" else self._action_numbers
+        numbers = self.state_numbers if kind == "STATE" else self._action_numbers
         stored = load_file(self.folder / units.source) if units.mode != "IDENTITY" else {}
         unscaled = _of_width(~stored.get(f"{feature}.mask", np.ones(0, bool)).astype(bool), numbers)
         if kind != "STATE":

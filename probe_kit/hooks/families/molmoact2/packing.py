@@ -94,16 +94,11 @@ class SteppedUnits:
         inside = values.clip(-1, 1) if self.clamp else values
         return self.frame.left(np.where(self.unscaled, inside, self.units.restore(inside)))
 
-    def slope(self, numbers: int) -> NDArray[np.float32]:
-        """(D,) of `restore`, where it does not clip."""
-        slopes = np.where(self.unscaled, 1, self.units.slope(numbers)).astype(np.float32)
-        slopes[: len(self.frame.signs)] *= self.frame.signs
-        return slopes
-
     def slopes(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """(..., D) of `restore` at these outputs of the network; 0 where it clips."""
-        inside = (np.abs(values) <= 1) | (not self.clamp)
-        return np.asarray(inside * self.slope(values.shape[-1]), np.float32)
+        slopes = np.where(self.unscaled, 1, self.units.slopes(values)).astype(np.float32)
+        slopes[..., : len(self.frame.signs)] *= self.frame.signs
+        return np.asarray(((np.abs(values) <= 1) | (not self.clamp)) * slopes, np.float32)
 
     def unusual(self, values: NDArray[np.float32]) -> NDArray[np.bool_]:
         """(..., D): as without the clamp; numbers that stay as they are have no statistics."""

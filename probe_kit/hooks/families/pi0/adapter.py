@@ -79,8 +79,20 @@ EVALUATED_WITH: Mapping[str, str] = {"juexzz/INTACT-pi0-finetune-bridge": "bridg
 """Checkpoints whose units only their evaluation has, and the shipped statistics that it has."""
 
 
-class EvaluatedPi0(LerobotFlow):
-    """The settings that `Evaluation` decides of a pi0, and their defaults."""
+class Pi0(PaliGemmaPolicy, LerobotFlow):
+    """A loaded pi0."""
+
+    family = "pi0"
+    config_type = "pi0"
+    takes_unread = True
+    known_steps: ClassVar[tuple[str, ...]] = (CROP, "pi0_new_line_processor")
+    unread = tuple(f"model.paligemma_with_expert.{part}.lm_head.weight" for part in ("paligemma", "gemma_expert"))
+    current_names = current_pi0_keys
+
+    other_roles: ClassVar[tuple[str, ...]] = ("language", "special")
+    suffix_roles: ClassVar[tuple[str, ...]] = ("state", "action")
+
+    # -- what an evaluation decides ------------------------------------------------------------------------
 
     @classmethod
     def current_values(cls, values: dict[str, Any], path: Path) -> dict[str, Any]:
@@ -118,7 +130,7 @@ class EvaluatedPi0(LerobotFlow):
         if self._statistics is not None:
             part: Literal["proprio", "action"] = "proprio" if kind == "STATE" else "action"
             action_numbers = int(self.config.output_features["action"].shape[0])
-            return self._statistics.bounds(part, self._state_numbers if kind == "STATE" else action_numbers)
+            return self._statistics.bounds(part, self.state_numbers if kind == "STATE" else action_numbers)
         if (units := self.own_units(feature, kind)) is not None:
             return units
         raise CheckpointError(
@@ -168,20 +180,9 @@ class EvaluatedPi0(LerobotFlow):
     def laid_out(self, states: NDArray[np.float32]) -> NDArray[np.float32]:
         """Seven numbers where the evaluation's statistics are of seven."""
         seven = self.evaluation.statistics is not None or self._statistics is not None
-        return laid_out(states, self._state_numbers if seven else ARM_NUMBERS, self.evaluation.openness)
+        return laid_out(states, self.state_numbers if seven else ARM_NUMBERS, self.evaluation.openness)
 
-
-class Pi0(PaliGemmaPolicy, EvaluatedPi0):
-    """A loaded pi0."""
-
-    family = "pi0"
-    config_type = "pi0"
-    takes_unread = True
-    known_steps: ClassVar[tuple[str, ...]] = (CROP, "pi0_new_line_processor")
-    unread = tuple(f"model.paligemma_with_expert.{part}.lm_head.weight" for part in ("paligemma", "gemma_expert"))
-
-    other_roles: ClassVar[tuple[str, ...]] = ("language", "special")
-    suffix_roles: ClassVar[tuple[str, ...]] = ("state", "action")
+    # -- the network -----------------------------------------------------------------------------------------
 
     @classmethod
     def build(cls, config: Any, folder: Path) -> nn.Module:
@@ -194,11 +195,6 @@ class Pi0(PaliGemmaPolicy, EvaluatedPi0):
         """lerobot's policy of this size; None for the released one."""
         network: nn.Module = build_pi0(config, size)
         return network
-
-    @classmethod
-    def current_names(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Old layouts brought to today's."""
-        return current_pi0_keys(tensors)
 
     def _stacks(self) -> dict[str, Stack]:
         joint = self._joint
@@ -274,6 +270,7 @@ class Pi05(StatePrompt, Pi0):
     )
 
     prompt_end = "Action: "
+    current_names = current_pi05_keys
     suffix_roles = ("action",)
 
     @classmethod
@@ -281,11 +278,6 @@ class Pi05(StatePrompt, Pi0):
         """lerobot's policy of this size."""
         network: nn.Module = build_pi05(config, size)
         return network
-
-    @classmethod
-    def current_names(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Older names brought to today's."""
-        return current_pi05_keys(tensors)
 
     def _stacks(self) -> dict[str, Stack]:
         stacks = super()._stacks()

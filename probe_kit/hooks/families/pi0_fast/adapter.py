@@ -328,6 +328,7 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
     interventions = FAST
     # Its head puts out tokens, and is read.
     tied: ClassVar[Mapping[str, str]] = {EMBEDDING: LM_HEAD, LM_HEAD: EMBEDDING}
+    current_names = current_pi0_fast_keys
 
     acting_stream = "action"
     suffix_roles = ("action",)
@@ -352,11 +353,6 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
         sizes = sizes_file(folder)
         network: nn.Module = build_pi0_fast(config, None if sizes is None else Pi0FastSize.from_file(sizes))
         return network
-
-    @classmethod
-    def current_names(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Old layouts brought to today's."""
-        return current_pi0_fast_keys(tensors)
 
     @property
     def temperature(self) -> float:

@@ -129,6 +129,7 @@ class SmolVLA(LerobotFlow):
         "smolvla_new_line_processor",
     )
     unread = ("model.vlm_with_expert.vlm.lm_head.weight",)
+    current_names = current_smolvla_keys
 
     other_roles = ("language", "state", "special")
     suffix_roles = ("action",)
@@ -145,11 +146,6 @@ class SmolVLA(LerobotFlow):
         config.vlm_model_name = str(_folder_of(config.vlm_named))
         network: nn.Module = build_smolvla(config, folder)
         return network
-
-    @classmethod
-    def current_names(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Old files' statistics left out."""
-        return current_smolvla_keys(tensors)
 
     def _stacks(self) -> dict[str, Stack]:
         joint = self._joint

@@ -200,6 +200,7 @@ class Xvla(DenoisingPolicy):
     choice = XvlaChoice
     known_steps = STEPS
     tied: ClassVar[Mapping[str, str]] = dict((EMBEDDINGS, EMBEDDINGS[::-1]))
+    current_names = current_xvla_keys
     interventions = INTERVENTIONS
 
     other_roles: ClassVar[tuple[str, ...]] = ("language", "special")
@@ -234,11 +235,6 @@ class Xvla(DenoisingPolicy):
             )
         network: nn.Module = build_xvla(config)
         return network
-
-    @classmethod
-    def current_names(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Also those of files with Florence-2 in its authors' layout."""
-        return current_xvla_keys(tensors)
 
     @property
     def steps(self) -> XvlaSteps:

@@ -271,7 +271,7 @@ class PackedPolicy(DenoisingPolicy):
         cls._text_reader(checkpoint, options).token_ids(instructions)
 
     def _no_state(self, rows: int) -> NDArray[np.float32]:
-        return np.zeros((rows, self._state_numbers), np.float32)
+        return np.zeros((rows, self.state_numbers), np.float32)
 
 
 _TOKENIZER = "google/paligemma-3b-pt-224"

@@ -57,11 +57,11 @@ class Units(Protocol):
     def restore(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """Network output to physical units; (..., D)."""
 
-    def slope(self, numbers: int) -> NDArray[np.float32]:
-        """(D,) by how much `restore` changes per unit of the network's output; 0 for a number that jumps."""
-
     def slopes(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(..., D) the same at these outputs of the network; 0 where `restore` clips them."""
+        """(..., D) by how much `restore` changes per unit of these outputs of the network.
+
+        0 for a number that jumps, and where `restore` clips.
+        """
 
     def unusual(self, values: NDArray[np.float32]) -> NDArray[np.bool_]:
         """(..., D) which physical values lie far from those of the statistics, also where `normalise` clips."""
@@ -107,16 +107,11 @@ class Normaliser:
         span = np.where(self.high == self.low, self.eps, self.high - self.low)
         return np.asarray((values + 1) / 2 * span + self.low, np.float32)
 
-    def slope(self, numbers: int) -> NDArray[np.float32]:
-        """(D,) of `restore`, which is a line in each of the D numbers."""
-        # By two points, so that the slope is that of `restore` in every mode.
-        ends = (np.full((1, numbers), value, np.float32) for value in (0, 1))
-        low, high = (self.restore(values)[0] for values in ends)
-        return np.asarray(high - low, np.float32)
-
     def slopes(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(..., D): `slope` everywhere."""
-        return self.slope(values.shape[-1]) * np.ones_like(values)
+        """(..., D) of `restore`, which is a line in each of the D numbers."""
+        # By two points, so that the slope is that of `restore` in every mode.
+        low, high = (self.restore(np.full_like(values, value)) for value in (0, 1))
+        return np.asarray(high - low, np.float32)
 
     def unusual(self, values: NDArray[np.float32]) -> NDArray[np.bool_]:
         """(..., D): more than five deviations from the mean, or outside the bounds."""
@@ -250,15 +245,11 @@ class Bounds:
         metres[..., -1] = values[..., -1] > _OPEN
         return metres
 
-    def slope(self, numbers: int) -> NDArray[np.float32]:
-        """(D,) of `restore`; 0 of the gripper, which is open or closed."""
-        slopes = np.asarray((self.high - self.low) / 2, np.float32) * np.ones(numbers, np.float32)
-        slopes[-1] = 0
-        return slopes
-
     def slopes(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(..., D): `slope` everywhere."""
-        return self.slope(values.shape[-1]) * np.ones_like(values)
+        """(..., D) of `restore`; 0 of the gripper, which is open or closed."""
+        slopes = np.asarray((self.high - self.low) / 2, np.float32) * np.ones_like(values)
+        slopes[..., -1] = 0
+        return slopes
 
     def unusual(self, values: NDArray[np.float32]) -> NDArray[np.bool_]:
         """(..., D): outside the bounds, where `normalise` clips."""

@@ -33,7 +33,7 @@ def lerobot_outputs(load: Callable[..., LerobotPolicy], folder: Path, recorded: 
     """Run the recorded inputs through the adapter; see `LerobotPolicy.further_outputs` for those of a family."""
     policy = load(str(folder / "checkpoint"), dtype="float32")
     if "in_lang_tokens" in recorded:
-        policy = policy.showing([camera for camera in policy.cameras if f"in_image_{camera}" in recorded])
+        policy = policy.with_cameras([camera for camera in policy.cameras if f"in_image_{camera}" in recorded])
         batch = _prepared(policy, recorded)
     else:
         batch = policy.batch(_observations(policy, recorded))

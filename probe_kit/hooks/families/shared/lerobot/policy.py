@@ -87,6 +87,8 @@ class LerobotPolicy(Policy):
     """Parameters that inference never reads and a file may lack."""
     tied: ClassVar[Mapping[str, str]] = MappingProxyType({})
     """By the name of a tensor that a file may lack, the one tied to it, which is read in its place."""
+    current_names: ClassVar[Callable[[Mapping[str, Tensor]], dict[str, Tensor]]] = dict
+    """From a file's tensors to those under the names that the network has."""
     newer_fields: ClassVar[Inert] = {}
     """Fields of its configuration in a newer lerobot than the installed one."""
     takes_unread: ClassVar[bool] = False
@@ -112,7 +114,7 @@ class LerobotPolicy(Policy):
         self.cameras = cameras_of(self.config.image_features)
         self._show(self.cameras[:1])
 
-    def showing(self, cameras: Sequence[str]) -> Self:
+    def with_cameras(self, cameras: Sequence[str]) -> Self:
         """The same policy, given pictures of several cameras; all but the first from `Observation.cameras`.
 
         Raises ObservationError unless they are the first ones of the configuration, in its order: lerobot moves
@@ -149,11 +151,6 @@ class LerobotPolicy(Policy):
     @abstractmethod
     def build(cls, config: Any, folder: Path) -> nn.Module:
         """The network with uninitialised weights."""
-
-    @classmethod
-    def current_names(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """A file's tensors under the names the network has."""
-        return dict(tensors)
 
     @classmethod
     def current_keys(cls, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -247,10 +244,6 @@ class LerobotPolicy(Policy):
         if not (folder / "config.json").is_file():
             raise CheckpointError(f"{folder / 'config.json'} is missing; {folder} is not a lerobot checkpoint")
         config: Any = cls.parse_config(folder, evaluation)
-        if config.type != cls.config_type:
-            raise CheckpointError(
-                f"{folder} holds a {config.type!r} policy; expected {cls.config_type}. Pass the right --model"
-            )
         check_one_frame(config, folder)
         cls._check_steps(folder, PREPROCESSOR)
         if hasattr(config, "tokenizer_max_length"):
@@ -320,7 +313,7 @@ class LerobotPolicy(Policy):
 
     def _units(self) -> str:
         """The source of the statistics that turn actions into metres, or the reason why there are none."""
-        if self._lacks_state:
+        if self.predicts_relative:
             return "actions are changes relative to the state, which nothing here adds"
         try:
             action, state = self.action_units, self.state_units
@@ -358,7 +351,7 @@ class LerobotPolicy(Policy):
         """(B, chunk, action numbers) as the network puts them out, without units."""
         self.check(observations, seeds)
         zeros = (
-            np.zeros((len(observations), self._state_numbers), np.float32) if self.zero_filled_inputs() else None
+            np.zeros((len(observations), self.state_numbers), np.float32) if self.zero_filled_inputs() else None
         )
         return self.put_out(self.batch(observations, zeros), seeds)
 
@@ -366,9 +359,9 @@ class LerobotPolicy(Policy):
         """One chunk per recorded observation, by the checkpoint's own statistics; see the contract."""
         self.check(observations, seeds)
         states = np.stack([np.asarray(observation.state, np.float32) for observation in observations])
-        if states.shape[1] != self._state_numbers:
+        if states.shape[1] != self.state_numbers:
             raise ObservationError(
-                f"the recorded state has {states.shape[1]} numbers; this checkpoint reads {self._state_numbers}"
+                f"the recorded state has {states.shape[1]} numbers; this checkpoint reads {self.state_numbers}"
             )
         restore, normalised = self.action_units.restore, self.state_units.normalise(states)
         return restore(self.put_out(self.batch(observations, normalised), seeds))
@@ -376,11 +369,7 @@ class LerobotPolicy(Policy):
     @property
     def state_numbers(self) -> int:
         """The count of numbers in the checkpoint's configuration."""
-        return self._state_numbers
-
-    def with_cameras(self, cameras: Sequence[str]) -> Self:
-        """See `showing`."""
-        return self.showing(cameras)
+        return int(self.config.input_features[STATE].shape[0])
 
     @property
     def action_names(self) -> tuple[str, ...] | None:
@@ -408,13 +397,9 @@ class LerobotPolicy(Policy):
         """(n, D): more than five deviations from the mean, or outside the bounds of the statistics."""
         return self.action_units.unusual(actions)
 
-    @property
+    @cached_property
     def predicts_relative(self) -> bool:
         """Whether the configuration or a step says so: lerobot then adds the state, which is not done here."""
-        return self._lacks_state
-
-    @cached_property
-    def _lacks_state(self) -> bool:
         return bool(getattr(self.config, "use_relative_actions", False)) or adds_state(self.folder)
 
     def embodiment_mismatch(self) -> str | None:
@@ -430,7 +415,7 @@ class LerobotPolicy(Policy):
         dimensions = self.config.output_features["action"].shape[0]
         if dimensions != _DIMENSIONS:
             return f"{self.checkpoint} acts in {dimensions} dimensions; the arm needs a 7-DoF end-effector delta"
-        if self._lacks_state:
+        if self.predicts_relative:
             return f"{self.checkpoint} predicts changes relative to the state, and nothing here adds the state"
         return None
 
@@ -439,13 +424,9 @@ class LerobotPolicy(Policy):
 
     def _state_misfit(self) -> str | None:
         example = self.laid_out(np.zeros((1, ARM_NUMBERS), np.float32)).shape[1]
-        if example != self._state_numbers:
-            return f"{self.checkpoint} reads {self._state_numbers} numbers as its state; the arm's are {example}"
+        if example != self.state_numbers:
+            return f"{self.checkpoint} reads {self.state_numbers} numbers as its state; the arm's are {example}"
         return _problem(lambda: self.state_units)
-
-    @property
-    def _state_numbers(self) -> int:
-        return int(self.config.input_features[STATE].shape[0])
 
     def check_pictures(self, batch: Mapping[str, Tensor]) -> None:
         """Raise ObservationError unless a batch in lerobot's keys has pictures in [0, 1]: lerobot never rescales.
@@ -485,9 +466,9 @@ class LerobotPolicy(Policy):
     def state(self, observations: Sequence[Observation]) -> NDArray[np.float32]:
         """(B, numbers) as the network reads them. Raises ObservationError for another count of numbers."""
         rows = self.laid_out(np.stack([np.asarray(o.state, np.float32) for o in observations]))
-        if rows.shape[1] != self._state_numbers:
+        if rows.shape[1] != self.state_numbers:
             raise ObservationError(
-                f"the state has {rows.shape[1]} numbers; this checkpoint reads {self._state_numbers}"
+                f"the state has {rows.shape[1]} numbers; this checkpoint reads {self.state_numbers}"
             )
         return self.state_units.normalise(rows)
 
@@ -517,7 +498,7 @@ class LerobotPolicy(Policy):
         state: (B, numbers) as the network reads them, for prompts that hold it; None for zeros.
         """
         if state is None:
-            state = np.zeros((len(instructions), self._state_numbers), np.float32)
+            state = np.zeros((len(instructions), self.state_numbers), np.float32)
         prompts, length = self.prompts(instructions, state), self.config.tokenizer_max_length
         rows = [self.tokenizer(text)["input_ids"] for text in prompts]
         for text, row in zip(prompts, rows, strict=True):
@@ -589,7 +570,7 @@ class LerobotPolicy(Policy):
             units: Normaliser | None = read_normaliser(self.folder, pipeline, feature, kind)
         else:
             units = from_buffers(self._buffers, self.config.normalization_mapping, feature, kind, self.checkpoint)
-        numbers = self._state_numbers if kind == "STATE" else int(self.config.output_features["action"].shape[0])
+        numbers = self.state_numbers if kind == "STATE" else int(self.config.output_features["action"].shape[0])
         if units is not None and units.mode != "IDENTITY" and units.low.shape != (numbers,):
             raise CheckpointError(
                 f"{self.checkpoint} has statistics of shape {units.low.shape} for its {feature}, which has "
@@ -614,7 +595,7 @@ class LerobotPolicy(Policy):
 
         A recorded state of the checkpoint's own width is read, whatever the arm has.
         """
-        recorded = {np.shape(observation.state) for observation in observations} == {(self._state_numbers,)}
+        recorded = {np.shape(observation.state) for observation in observations} == {(self.state_numbers,)}
         if self.zero_filled_inputs() and not (recorded and _problem(lambda: self.state_units) is None):
             return None
         return self.state(observations)
