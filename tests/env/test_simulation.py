@@ -10,7 +10,7 @@ import pybullet
 import pytest
 from PIL import Image
 
-from probe_kit._system.installing import install_command
+from probe_kit._system.imports import install_command
 from probe_kit.env.scene import FLOOR_COLOR, TABLE_COLOR
 from probe_kit.env.simulation import (
     TEXTURE_PIXELS,

@@ -17,10 +17,9 @@ from probe_kit.cli import app
 from probe_kit.env import SceneSpec
 from probe_kit.errors import InstructionError
 from probe_kit.extract import AskSettings, ExtractSettings, ask_run, extract_run
-from probe_kit.extract.preparation import open_checked
+from probe_kit.extract.extraction import open_checked
+from probe_kit.extract.prompts import ORDERS, TEMPLATES, Phrase
 from probe_kit.extract.protocols import scene_of
-from probe_kit.extract.vqa.phrases import Phrase
-from probe_kit.extract.vqa.templates import ORDERS, TEMPLATES
 from probe_kit.hooks.contract.model import Prompt
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.families.paligemma.adapter import PaliGemma, load_vlm_tiny

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.errors import UnitsError, UsageError
-from probe_kit.extract.sources.units import check_units, unusual_shares
+from probe_kit.extract.sources.source import check_units, unusual_shares
 from probe_kit.hooks import load_policy
 from probe_kit.hooks.registry import find_family, own_families
 from tests.support.every_checkpoint import WRITERS
