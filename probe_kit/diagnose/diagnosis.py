@@ -74,7 +74,7 @@ def measure_knowledge(run: "Run", target: "Target | str", seed: int = 0) -> Know
 
 
 def _retention(run: "Run", results: "ProbeResults") -> tuple[float, Limits, str]:
-    from probe_kit.retention.rows.label_rows import target_row
+    from probe_kit.retention.rows.probe_parts import target_row
 
     retained = target_row(run, results, POOLED, results.settings.views[0]).retention
     low, high = retained.ci or (None, None)
