@@ -245,11 +245,6 @@ STAND_INS = {
         r"train runs/xiaomi": "train runs/xiaomi --permutations 20",
     },
     "docs/causal.md": {r"^(probe-kit intervene RUN)(?! --kind (interchange|erase))": r"\1 --items 2"},
-    "docs/embedded.md": {
-        r"--items 40": "--categories color,shape --items 12",
-        r"--model pi0-tiny": "--model pi0-tiny --max-steps 12",
-        r"train runs/pi0-tiny": "train runs/pi0-tiny --permutations 20",
-    },
     "docs/families.md": {
         r"--model pi0 --checkpoint lerobot/pi0_base": "--model pi0-tiny --categories color --items 12",
         r"train runs/pi0-base": "train runs/pi0-base --permutations 20",
