@@ -36,7 +36,7 @@ from probe_kit.runs.provenance import provenance_here
 from probe_kit.runs.root import label_run, read_root
 from probe_kit.runs.run import Run, open_run
 from probe_kit.runs.run_folders import check_if_full
-from probe_kit.runs.store import Location, locate
+from probe_kit.runs.store import Location, check_exclusive, locate
 from probe_kit.runs.verify import seal
 from probe_kit.runs.writer import RunWriter, check_other_settings, further_rows
 
@@ -398,7 +398,7 @@ class Extraction(Prepared):
                 check_if_full(space_needed(addition, self.settings), location)
             writer = self.writer(location)
             with writer.owned():
-                location.check_exclusive(RUN_FILE)
+                check_exclusive(location, RUN_FILE)
                 if self.settings.label is not None:
                     label_run(location, run_label(self.settings))
                 remaining = writer.remaining()

@@ -10,10 +10,9 @@ import fcntl
 import os
 import secrets
 import shutil
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, BinaryIO
 
@@ -21,7 +20,7 @@ from zarr.abc.store import Store
 from zarr.storage import LocalStore
 
 from probe_kit._system.drafts import draft_of
-from probe_kit.errors import FULL_DISK, DiskSpaceError, RunDamagedError, SettingsMismatchError, StoreError
+from probe_kit.errors import FULL_DISK, DiskSpaceError, RunDamagedError, SettingsMismatchError
 from probe_kit.runs.layout import COLUMNS, DATA, RUN_FILE
 
 MOST_RECORD_BYTES, MOST_OBJECT_BYTES = 256 << 20, 4 << 30
@@ -41,122 +40,6 @@ def check_size(key: str, size: int, where: object) -> None:
         )
 
 
-class Location(ABC):
-    """The place of a run. `str()` gives what the user called it."""
-
-    @property
-    @abstractmethod
-    def name(self) -> str:
-        """The last part: what the run is called."""
-
-    @property
-    @abstractmethod
-    def path(self) -> Path:
-        """The folder. Raises UsageError in an object store, where there is none."""
-
-    @property
-    @abstractmethod
-    def address(self) -> str:
-        """The text by which `locate` finds the same location in another process, in any working directory."""
-
-    @abstractmethod
-    def path_of_export(self, name: str) -> Path:
-        """Default path of a file that is made from the run."""
-
-    @abstractmethod
-    def free_bytes(self) -> int | None:
-        """Free space, None where it has no bound."""
-
-    @abstractmethod
-    def in_words(self) -> AbstractContextManager[None]:
-        """Errors in the body that come from what is below (a full disk, a network) say what to do.
-
-        Raises DiskSpaceError or StoreError in place of the system's error.
-        """
-
-    # -- objects ---------------------------------------------------------------------------------------
-
-    @abstractmethod
-    def exists(self, key: str) -> bool:
-        """Whether there is an object of that key."""
-
-    @abstractmethod
-    def read(self, key: str) -> bytes:
-        """All of one object. Raises FileNotFoundError."""
-
-    def pieces(self, key: str) -> Iterator[bytes | memoryview]:
-        """One object from its beginning to its end; a piece is good until the next one is asked for.
-
-        Raises FileNotFoundError.
-        """
-        yield self.read(key)
-
-    @abstractmethod
-    def open(self, key: str) -> BinaryIO:
-        """One object as a file with random access. Raises FileNotFoundError."""
-
-    @abstractmethod
-    def read_all(self, folder: str, suffix: str) -> dict[str, bytes]:
-        """The objects right in `folder` whose name ends so, by name, in order."""
-
-    @abstractmethod
-    def keys(self, folder: str) -> list[str]:
-        """The objects anywhere below `folder`, in order."""
-
-    @abstractmethod
-    def sizes(self, folder: str, keys: Iterable[str]) -> dict[str, int]:
-        """Bytes of the objects `keys` below `folder`, as far as they exist."""
-
-    @abstractmethod
-    def flush(self, keys: Iterable[str]) -> None:
-        """Bring these objects, just written by Zarr, onto the disk. Called before a record names them."""
-
-    @abstractmethod
-    def create(self, key: str, content: bytes) -> bool:
-        """Write an object unless it exists; True if this call wrote it. Complete or not at all, and durable."""
-
-    @abstractmethod
-    def write(self, key: str, content: bytes, durable: bool = True) -> None:
-        """Write an object over any former one. Complete or not at all; durable unless it can be made again."""
-
-    def check_exclusive(self, key: str) -> None:
-        """Raise StoreError unless a second `create` of the object `key` is refused, on which commits rely."""
-        if self.create(key, self.read(key)):
-            raise StoreError(
-                f"{self}: the store created {key} a second time: it ignores conditional puts (If-None-Match), and "
-                "cannot keep two writers apart. Use another store, or a folder"
-            )
-
-    @abstractmethod
-    def delete(self, key: str) -> None:
-        """Remove one object, if it exists."""
-
-    @abstractmethod
-    def remove(self, folder: str) -> None:
-        """Remove everything below `folder`, if there is anything."""
-
-    @abstractmethod
-    def store(self, folder: str, read_only: bool = False) -> Store:
-        """Return Zarr's store for the group or array that lies in `folder`."""
-
-    # -- runs ------------------------------------------------------------------------------------------
-
-    @abstractmethod
-    def begin(self, objects: Mapping[str, bytes], last: str) -> None:
-        """Begin with these objects; `last`, one of them, never appears without all others.
-
-        If another process is first, its objects stay. Raises SettingsMismatchError if something else is there.
-        """
-
-    @abstractmethod
-    def locked(self, clear: Callable[[], None]) -> AbstractContextManager[None]:
-        """Lock the run while the body runs. A process that is alone first calls `clear` to remove leftovers."""
-
-    @abstractmethod
-    def tended(self, folder: str) -> AbstractContextManager[None]:
-        """Let processes that work on `folder` take turns; drafts of killed ones in it are removed."""
-
-
 _DRAFTS = ("*.tmp", "*/*.tmp", f"{DATA}/**/*.partial", f"{COLUMNS}/**/*.partial")
 """Patterns of what a killed process leaves: objects without their final name."""
 _PIECE = 1 << 20
@@ -167,8 +50,10 @@ _FLUSHERS = 16
 """Files that are flushed at once, so that the file system writes its journal once for many."""
 
 
-class Folder(Location):
-    """A folder on a file system that knows hard links and `flock`.
+class Folder:
+    """A folder on a file system that knows hard links and `flock`. `str()` gives what the user called it.
+
+    Its methods are the contract of a location, which `store.Bucket` keeps too.
 
     Zarr's own `LocalStore` reads and writes the arrays: the object_store library takes twice the processor time to
     read them (docs/notes/storage.md).
@@ -182,31 +67,34 @@ class Folder(Location):
 
     @property
     def name(self) -> str:
-        """The name of the folder."""
+        """The last part: what the run is called."""
         return self._path.resolve().name
 
     @property
     def path(self) -> Path:
-        """The path as the user typed it."""
+        """The folder as the user typed it. Raises UsageError in an object store, where there is none."""
         return self._path
 
     @property
     def address(self) -> str:
-        """Absolute."""
+        """The text by which `locate` finds the same location in another process, in any working directory."""
         return str(self._path.resolve())
 
     def path_of_export(self, name: str) -> Path:
-        """Next to the folder."""
+        """Default path of a file that is made from the run: next to the folder."""
         return self._path.resolve().parent / name if self._path.name in ("", "..") else self._path.with_name(name)
 
     def free_bytes(self) -> int:
-        """Return the free space of the disk where the folder lies or will lie."""
+        """Return the free space of the disk where the folder lies or will lie; None where it has no bound."""
         existing = next(p for p in (self._path, *self._path.resolve().parents) if p.exists())
         return shutil.disk_usage(existing).free
 
     @contextmanager
     def in_words(self) -> Iterator[None]:
-        """A full disk."""
+        """Errors in the body that come from what is below (a full disk, a network) say what to do.
+
+        Raises DiskSpaceError or StoreError in place of the system's error.
+        """
         try:
             yield
         except OSError as error:
@@ -221,28 +109,31 @@ class Folder(Location):
     # -- objects ---------------------------------------------------------------------------------------
 
     def exists(self, key: str) -> bool:
-        """Whether the file exists."""
+        """Whether there is an object of that key."""
         return _inside(key) and (self._path / key).is_file()
 
     def read(self, key: str) -> bytes:
-        """The file."""
+        """All of one object. Raises FileNotFoundError."""
         path = self._object(key)
         check_size(key, path.stat().st_size, self)
         return path.read_bytes()
 
     def pieces(self, key: str) -> Iterator[memoryview]:
-        """Into the same memory again and again, which stays in the processor's cache."""
-        buffer = memoryview(bytearray(_PIECE))
+        """One object from its beginning to its end; a piece is good until the next one is asked for.
+
+        Raises FileNotFoundError.
+        """
+        buffer = memoryview(bytearray(_PIECE))  # again and again: it stays in the processor's cache
         with self._object(key).open("rb", buffering=0) as file:
             while length := file.readinto(buffer):
                 yield buffer[:length]
 
     def open(self, key: str) -> BinaryIO:
-        """The file."""
+        """One object as a file with random access. Raises FileNotFoundError."""
         return self._object(key).open("rb")
 
     def read_all(self, folder: str, suffix: str) -> dict[str, bytes]:
-        """One file after another."""
+        """The objects right in `folder` whose name ends so, by name, in order."""
         contents = {}
         for path in sorted((self._path / folder).glob(f"*{suffix}")):
             with suppress(FileNotFoundError):  # no plain file, or removed since: seals and failures come and go
@@ -250,30 +141,30 @@ class Folder(Location):
         return contents
 
     def keys(self, folder: str) -> list[str]:
-        """Every file."""
+        """The objects anywhere below `folder`, in order."""
         below = (self._path / folder).rglob("*")
         return sorted(path.relative_to(self._path).as_posix() for path in below if path.is_file())
 
     def sizes(self, folder: str, keys: Iterable[str]) -> dict[str, int]:
-        """Read the directory entries."""
+        """Bytes of the objects `keys` below `folder`, as far as they exist."""
         paths = {key: self._path / folder / key for key in keys if _inside(key)}
         return {key: path.stat().st_size for key, path in paths.items() if path.is_file()}
 
     def flush(self, keys: Iterable[str]) -> None:
-        """Flush each file by `fsync`, many at once."""
+        """Bring these objects, just written by Zarr, onto the disk. Called before a record names them."""
         with ThreadPoolExecutor(_FLUSHERS) as threads:
             list(threads.map(_flush, [self._path / key for key in keys]))
 
     def create(self, key: str, content: bytes) -> bool:
-        """Linked to its name, which only one process can."""
+        """Write an object unless it exists; True if this call wrote it. Complete or not at all, and durable."""
         try:
-            self._put(key, content, os.link)
+            self._put(key, content, os.link)  # which only one process can
         except FileExistsError:
             return False
         return True
 
     def write(self, key: str, content: bytes, durable: bool = True) -> None:
-        """Renamed to its name."""
+        """Write an object over any former one. Complete or not at all; durable unless it can be made again."""
         self._put(key, content, os.replace, durable)
 
     def _put(
@@ -293,15 +184,15 @@ class Folder(Location):
                     raise
 
     def delete(self, key: str) -> None:
-        """The file."""
+        """Remove one object, if it exists."""
         self._inner(key).unlink(missing_ok=True)
 
     def remove(self, folder: str) -> None:
-        """The folder and all in it."""
+        """Remove everything below `folder`, if there is anything."""
         shutil.rmtree(self._path / folder, ignore_errors=True)
 
     def store(self, folder: str, read_only: bool = False) -> Store:
-        """Plain files."""
+        """Return Zarr's store for the group or array that lies in `folder`."""
         return LocalStore(self._path / folder, read_only=read_only)
 
     def _object(self, key: str) -> Path:
@@ -326,9 +217,13 @@ class Folder(Location):
     # -- runs ------------------------------------------------------------------------------------------
 
     def begin(self, objects: Mapping[str, bytes], last: str) -> None:
-        """Made as a draft and renamed, so that the folder appears with all objects or not at all."""
+        """Begin with these objects; `last`, one of them, never appears without all others.
+
+        If another process is first, its objects stay. Raises SettingsMismatchError if something else is there.
+        """
         with draft_of(self._path) as draft:
-            # The renaming fails where a folder with content lies: another process was first, or it is no run.
+            # Renamed, so that the folder appears with all objects or not at all. That fails where a folder with
+            # content lies: another process was first, or it is no run.
             try:
                 for key, content in objects.items():
                     (draft / key).parent.mkdir(parents=True, exist_ok=True)
@@ -343,10 +238,10 @@ class Folder(Location):
 
     @contextmanager
     def locked(self, clear: Callable[[], None]) -> Iterator[None]:
-        """Every process that works holds a shared lock, so only one that finds itself alone may clear.
+        """Lock the run while the body runs. A process that is alone first calls `clear` to remove leftovers.
 
-        An apparent leftover may be another process's work. The last process to finish removes what
-        others left that were killed meanwhile.
+        Every process that works holds a shared lock, as an apparent leftover may be another process's work. The
+        last one to finish removes what others left that were killed meanwhile.
         """
         with (self._path / RUN_FILE).open("rb") as file:
             if _alone(file):
@@ -364,7 +259,7 @@ class Folder(Location):
 
     @contextmanager
     def tended(self, folder: str) -> Iterator[None]:
-        """Lock the folder itself, so that drafts in it have no owner any more."""
+        """Let processes that work on `folder` take turns; drafts of killed ones in it are removed."""
         path = self._path / folder
         path.mkdir(parents=True, exist_ok=True)
         handle = os.open(path, os.O_RDONLY)

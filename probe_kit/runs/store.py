@@ -30,7 +30,7 @@ from zarr.storage import WrapperStore
 
 from probe_kit._system.imports import require
 from probe_kit.errors import SettingsMismatchError, StoreError, UsageError
-from probe_kit.runs.folder import Folder, Location, check_size
+from probe_kit.runs.folder import Folder, check_size
 
 if TYPE_CHECKING:
     from obstore import ReadableFile
@@ -57,7 +57,7 @@ _METADATA_SERVICES = ("169.254.169.254", "169.254.170.2", "metadata.google.inter
 """Services of cloud machines, where a client looks last for credentials."""
 
 
-class Bucket(Location):
+class Bucket:
     """A prefix of a bucket. Endpoint and credentials come from the environment, such as AWS_ACCESS_KEY_ID.
 
     Raises MissingExtraError without obstore, UsageError for a URL without bucket or name, StoreError if the store
@@ -200,6 +200,10 @@ class Bucket(Location):
 
         return self._answer(content)
 
+    def pieces(self, key: str) -> Iterator[bytes]:
+        """All of it at once."""
+        yield self.read(key)
+
     def open(self, key: str) -> BinaryIO:
         """Reads ranges when they are asked for."""
         import obstore
@@ -296,7 +300,7 @@ class Bucket(Location):
                     "or beginning now in another process. Choose another --out, or remove it"
                 )
         # Tried on a real key, before the run exists: a store that cannot keep writers apart is refused at once.
-        self.check_exclusive(next(key for key in objects if key != last))
+        check_exclusive(self, next(key for key in objects if key != last))
         self.create(last, objects[last])
 
     @contextmanager
@@ -398,6 +402,19 @@ class _Ranges(RawIOBase):
 
 
 SCHEMES = ("s3", "gs", "az")
+
+
+Location = Folder | Bucket
+"""The place of a run; `Folder` has the contract of its methods."""
+
+
+def check_exclusive(location: Location, key: str) -> None:
+    """Raise StoreError unless a second `create` of the object `key` is refused, on which commits rely."""
+    if location.create(key, location.read(key)):
+        raise StoreError(
+            f"{location}: the store created {key} a second time: it ignores conditional puts (If-None-Match), and "
+            "cannot keep two writers apart. Use another store, or a folder"
+        )
 
 
 def locate(where: str | Path | Location) -> Location:

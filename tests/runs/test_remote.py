@@ -13,7 +13,7 @@ from probe_kit.extract import ExtractSettings, extract_run
 from probe_kit.hooks import Site
 from probe_kit.runs import Run, open_run, seal, verify_run
 from probe_kit.runs.layout import COLUMNS
-from probe_kit.runs.store import Location, locate
+from probe_kit.runs.store import Location, check_exclusive, locate
 from probe_kit.suite import Suite, build_suite
 from probe_kit.train import load_results, train_probes
 from tests.runs.contents import objects
@@ -111,8 +111,8 @@ def test_a_run_is_not_continued_in_a_store_that_ignores_conditions(whole: Path, 
     for key in here.keys(""):
         there.write(key, here.read(key))
     with pytest.raises(StoreError, match=r"created run\.json a second time"):
-        there.check_exclusive("run.json")
-    here.check_exclusive("run.json")
+        check_exclusive(there, "run.json")
+    check_exclusive(here, "run.json")
 
 
 @pytest.mark.slow
