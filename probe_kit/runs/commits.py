@@ -9,7 +9,7 @@ comes from them, and the folder may be deleted as a unit. A record that is missi
 """
 
 import re
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Annotated, Any, ClassVar
@@ -290,31 +290,23 @@ def write_seconds(root: Root, number: int, seconds: Seconds) -> None:
 
 def read_seconds(root: Root, commits: Mapping[int, Commit]) -> dict[int, Seconds]:
     """Read the seconds by episode number, NaN where none are stored. Raises RunDamagedError for a wrong one."""
-    records = {number: _parse(root, number, key, raw) for number, key, raw in numbered(root.location, TIMES)}
-    if problem := next(_missing(root, commits, records), None):
-        raise RunDamagedError(problem)
-    stored = {number: Seconds(record.inference, record.simulation) for number, record in records.items()}
+    stored, problems = seconds_and_problems(root, commits)
+    if problems:
+        raise RunDamagedError(problems[0])
     return {number: stored.get(number, NOT_MEASURED) for number in commits}
 
 
-def seconds_problems(root: Root, commits: Mapping[int, Commit]) -> Iterator[str]:
-    """Records that were changed or are missing, a sentence each."""
-    stored = set()
+def seconds_and_problems(root: Root, commits: Mapping[int, Commit]) -> tuple[dict[int, Seconds], list[str]]:
+    """The stored seconds by episode number, and a sentence per record that was changed or is missing."""
+    stored, problems = dict[int, Seconds](), []
     for number, key, raw in numbered(root.location, TIMES):
-        stored.add(number)
+        stored[number] = NOT_MEASURED
         try:
-            _parse(root, number, key, raw)
+            record = SecondsRecord.parse(raw, f"{root.location}/{key}", _ADVICE, run=root.identity, episode=number)
+            stored[number] = Seconds(record.inference, record.simulation)
         except RunDamagedError as error:
-            yield str(error)
-    yield from _missing(root, commits, stored)
-
-
-def _missing(root: Root, commits: Mapping[int, Commit], stored: Collection[int]) -> Iterator[str]:
-    """A sentence per episode without seconds, unless no episode has any."""
-    for number in sorted(commits) if stored else ():
-        if number not in stored:
-            yield f"{root.location}/{seconds_key(number)} is missing. {_ADVICE}"
-
-
-def _parse(root: Root, number: int, key: str, raw: bytes) -> SecondsRecord:
-    return SecondsRecord.parse(raw, f"{root.location}/{key}", _ADVICE, run=root.identity, episode=number)
+            problems.append(str(error))
+    missing = [number for number in sorted(commits) if stored and number not in stored]
+    return stored, problems + [
+        f"{root.location}/{seconds_key(number)} is missing. {_ADVICE}" for number in missing
+    ]

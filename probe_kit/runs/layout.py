@@ -22,8 +22,8 @@ RUN/
 Every object is bound to the root by hashes, see `records`.
 """
 
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -99,40 +99,6 @@ def stored_inputs_of(settings: Mapping[str, Any]) -> Mapping[str, Any]:
     return described
 
 
-def _is_count(value: Any) -> bool:
-    return type(value) is int and value > 0
-
-
-def _is_text(value: Any) -> bool:
-    return isinstance(value, str)
-
-
-def _is_flag(value: Any) -> bool:
-    return isinstance(value, bool)
-
-
-def _are_names(value: Any) -> bool:
-    return isinstance(value, list) and all(map(_is_text, value)) and len(set(value)) == len(value)
-
-
-_STREAM_PARTS: Mapping[str, Callable[[Any], bool]] = {
-    "name": _is_text,
-    "layers": _is_count,
-    "width": _is_count,
-    "iterations": lambda value: value is None or _is_count(value),
-    "tokens": _is_count,
-    "views": _are_names,
-    "part": lambda value: value is None or _is_text(value),
-    "label": _is_text,
-    "quantities": _are_names,
-    "probed": _is_flag,
-    "sums": _is_flag,
-}
-"""Parts of a stream as `run.json` stores it, each with the check of its value."""
-_STORAGE = ("tokens", "views")
-"""Of these, what a run adds to the declared `Stream`."""
-
-
 @dataclass(frozen=True)
 class StoredStream:
     """The storage of one stream.
@@ -155,17 +121,9 @@ class StoredStream:
     @classmethod
     def of(cls, stream: Stream, tokens: int, views: tuple[str, ...]) -> "StoredStream":
         """A declared stream, stored."""
-        stored = {name: value for name, value in asdict(stream).items() if name in _STREAM_PARTS}
-        return cls(**{**stored, "tokens": tokens, "views": views})
-
-    @classmethod
-    def from_json(cls, values: Mapping[str, Any]) -> "StoredStream":
-        """Parse what `to_json` wrote. Raises TypeError or KeyError for values of another kind."""
-        for name, is_valid in _STREAM_PARTS.items():
-            if not is_valid(values[name]):
-                raise TypeError(f"{name} is {values[name]!r}")
-        lists = {name: tuple(values[name]) for name in ("views", "quantities")}
-        return cls(**{**values, **lists})
+        declared = {part.name: getattr(stream, part.name) for part in fields(Stream) if part.init}
+        declared.pop("heads")  # which is not stored
+        return cls(**declared, tokens=tokens, views=views)
 
     def to_json(self) -> dict[str, Any]:
         """Return the values as stored in `run.json`."""
@@ -174,7 +132,9 @@ class StoredStream:
     @property
     def stream(self) -> Stream:
         """The stream without its storage."""
-        return Stream(**{name: getattr(self, name) for name in _STREAM_PARTS if name not in _STORAGE})
+        parts = dict(vars(self))
+        del parts["tokens"], parts["views"]
+        return Stream(**parts)
 
     @property
     def lead(self) -> tuple[int, ...]:

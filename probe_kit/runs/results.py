@@ -166,43 +166,32 @@ def write_bundle(
     What killed processes left in its folder is removed.
     """
     with location.tended(f"{home}/{key}"):
-        _write_bundle(location, home, key, head, files, times)
+        folder, run = f"{home}/{key}", _identity(location)
+        before = read_bundle(location, home, key) if location.exists(f"{folder}/{HEAD}") else None
+        former = dict(before.files) if before else {}
+        files_now = dict(former)
+        for name, content in files.items():
+            content_sum = Sum.of(content)
+            if name not in former or former[name][1] != content_sum:
+                actual = name if before is None else _renamed(name, content_sum)
+                location.write(f"{folder}/{actual}", content)
+                files_now[name] = actual, content_sum
+        # Files, then times, then the head that names them, and only then are former files removed: a crash in
+        # between leaves the former result whole.
+        location.write(f"{folder}/{TIMES}", Times.model_validate({**times, "key": key, "run": run}).to_bytes())
+        stored = {name: [actual, *content_sum.to_json()] for name, (actual, content_sum) in files_now.items()}
+        record = Head.model_validate({**head, "key": key, "run": run, "files": stored}).to_bytes()
+        if before is None or location.read(f"{folder}/{HEAD}") != record:
+            location.write(f"{folder}/{HEAD}", record)
+        for name, (actual, _) in former.items():
+            if files_now[name][0] != actual:
+                location.delete(f"{folder}/{actual}")
 
 
 def tidy_bundle(location: Location, home: str, key: str) -> None:
     """Remove what killed processes left of a bundle that is complete: files and folders that never counted."""
     with location.tended(f"{home}/{key}"):
         location.remove(f"{home}/.{key}{PARTIAL}")
-
-
-def _write_bundle(
-    location: Location,
-    home: str,
-    key: str,
-    head: Mapping[str, Any],
-    files: Mapping[str, bytes],
-    times: Mapping[str, str],
-) -> None:
-    folder, run = f"{home}/{key}", _identity(location)
-    before = read_bundle(location, home, key) if location.exists(f"{folder}/{HEAD}") else None
-    former = dict(before.files) if before else {}
-    files_now = dict(former)
-    for name, content in files.items():
-        content_sum = Sum.of(content)
-        if name not in former or former[name][1] != content_sum:
-            actual = name if before is None else _renamed(name, content_sum)
-            location.write(f"{folder}/{actual}", content)
-            files_now[name] = actual, content_sum
-    # Files, then times, then the head that names them, and only then are former files removed: a crash in between
-    # leaves the former result whole.
-    location.write(f"{folder}/{TIMES}", Times.model_validate({**times, "key": key, "run": run}).to_bytes())
-    stored = {name: [actual, *content_sum.to_json()] for name, (actual, content_sum) in files_now.items()}
-    record = Head.model_validate({**head, "key": key, "run": run, "files": stored}).to_bytes()
-    if before is None or location.read(f"{folder}/{HEAD}") != record:
-        location.write(f"{folder}/{HEAD}", record)
-    for name, (actual, _) in former.items():
-        if files_now[name][0] != actual:
-            location.delete(f"{folder}/{actual}")
 
 
 def _renamed(name: str, content_sum: Sum) -> str:
@@ -216,8 +205,7 @@ def read_bundle(location: Location, home: str, key: str) -> Bundle:
 
 
 def _read_bundle(location: Location, home: str, key: str, run: str | None) -> Bundle:
-    folder = f"{home}/{key}"
-    expected = {"key": key, "run": run}
+    folder, expected = f"{home}/{key}", {"key": key, "run": run}
     head = Head.read(location, f"{folder}/{HEAD}", advice_for(folder), **expected)
     times = Times.read(location, f"{folder}/{TIMES}", advice_for(folder), **expected)
     if strange := sorted(

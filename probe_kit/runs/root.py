@@ -18,10 +18,13 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import count
 from pathlib import Path
-from typing import Any, ClassVar, NoReturn
+from typing import Annotated, Any, ClassVar, NoReturn
+
+from pydantic import BaseModel, ConfigDict, Field
 
 from probe_kit.errors import ActivationsLeftOutError, RunDamagedError, RunNotFoundError, UsageError
 from probe_kit.hashing import sha256_json
+from probe_kit.hooks.contract.sites import Part
 from probe_kit.runs.layout import (
     DATA,
     DATASET,
@@ -213,14 +216,34 @@ _CHUNKS = "/c/"
 """Between the name of an array and the position of a chunk in a key of Zarr v3."""
 
 
+_Count = Annotated[int, Field(gt=0)]
+
+
+class StreamEntry(BaseModel):
+    """One stream in `run.json`, as `StoredStream`; without `tokens` unless every token is stored."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+    name: str
+    layers: _Count
+    width: _Count
+    iterations: _Count | None
+    tokens: _Count = 1
+    views: list[str]
+    part: Part | None
+    label: str
+    quantities: list[str]
+    probed: bool
+    sums: bool
+
+
 class Card(Record):
-    """`run.json`. streams: without T, unless every token is stored. objects: metadata of the arrays."""
+    """`run.json`. objects: metadata of the arrays."""
 
     kind: ClassVar[str] = "card"
     schema_version: int
     settings: dict[str, Any]
     settings_sha256: str
-    streams: list[dict[str, Any]]
+    streams: list[StreamEntry]
     objects: Sums
 
 
@@ -247,17 +270,24 @@ class Root:
     """`run.json`, checked, and the plan that goes with it.
 
     own_settings: those of the card, without the parts that a selection decides. identity: hash of the card.
-    own_streams: as it stores them, by name. sums: of the arrays' metadata.
     """
 
     location: Location
     card: Card
-    own_streams: Mapping[str, StoredStream]
 
     @property
     def identity(self) -> str:
         """The hash of the card, 64 hex digits."""
         return self.card.hash
+
+    @cached_property
+    def own_streams(self) -> Mapping[str, StoredStream]:
+        """The storage of every stream, by name; with one token where a selection decides their number."""
+        entries = [dict(entry) for entry in self.card.streams]
+        tuples = [{name: tuple(entry[name]) for name in ("views", "quantities")} for entry in entries]
+        return {
+            entry["name"]: StoredStream(**{**entry, **lists}) for entry, lists in zip(entries, tuples, strict=True)
+        }
 
     @property
     def own_settings(self) -> dict[str, Any]:
@@ -317,14 +347,6 @@ class Root:
         """The planned episodes in order; none in a run that has no plan yet."""
         return self.stored_plan.rows
 
-    @property
-    def suite_parent(self) -> str | None:
-        """Content hash of the suite that the run's suite was selected from.
-
-        None for a whole suite.
-        """
-        return self.stored_plan.suite_parent
-
     @cached_property
     def settings(self) -> dict[str, Any]:
         """The settings of the run and of the selection that it has now: suite, categories, items and wordings."""
@@ -340,9 +362,9 @@ class Root:
         """
         tokens = self.stored_plan.tokens
         lacking = [
-            stream["name"]
-            for stream in self.card.streams
-            if "tokens" not in stream and stream["name"] not in tokens
+            entry.name
+            for entry in self.card.streams
+            if "tokens" not in entry.model_fields_set and entry.name not in tokens
         ]
         if lacking and self.plan:
             name = f"{self.location}/{plan_key(len(self.stored_plan.extents) - 1)}"
@@ -353,15 +375,9 @@ class Root:
         }
 
     def _check_row(self, row: Any, name: str) -> None:
-        expect(row if isinstance(row, dict) else {}, self._episode_parts, name, RESTORE)
-
-    @property
-    def _episode_parts(self) -> dict[str, type]:
-        if DATASET in self.own_settings:
-            return _STRETCH
-        if ENVIRONMENT in self.own_settings:
-            return _PLAYED
-        return _EPISODE
+        settings = self.own_settings
+        parts = _STRETCH if DATASET in settings else _PLAYED if ENVIRONMENT in settings else _EPISODE
+        expect(row if isinstance(row, dict) else {}, parts, name, RESTORE)
 
     @cached_property
     def planned(self) -> dict[int, dict[str, Any]]:
@@ -395,7 +411,9 @@ class Root:
         return ("pooled",) if self.later_views == "all" else ("pooled", "later")
 
 
-def new_root(settings: Mapping[str, Any], streams: list[dict[str, Any]], objects: Mapping[str, bytes]) -> Card:
+def new_card(
+    settings: Mapping[str, Any], streams: Iterable[Mapping[str, Any]], objects: Mapping[str, bytes]
+) -> Card:
     """The card of a run that begins with these arrays' metadata.
 
     streams: without the number of tokens, which a selection decides, unless every token is stored.
@@ -404,7 +422,7 @@ def new_root(settings: Mapping[str, Any], streams: list[dict[str, Any]], objects
         schema_version=SCHEMA_VERSION,
         settings=dict(settings),
         settings_sha256=sha256_json(settings),
-        streams=streams,
+        streams=[StreamEntry.model_validate(stream) for stream in streams],
         objects={key: Sum.of(content) for key, content in objects.items()},
     )
 
@@ -438,7 +456,7 @@ def find_root(location: Location) -> Root | None:
     if sha256_json(card.settings) != card.settings_sha256:
         raise RunDamagedError(f"{name}: the settings do not have the hash stored beside them. {RESTORE}")
     _check_settings(card.settings, name)
-    root = Root(location, card, _read_streams(card.streams, name))
+    root = Root(location, card)
     if lost := {f"{DATA}/{array}/zarr.json" for array in root.arrays} - {*root.sums}:
         raise RunDamagedError(f"{name} names no hash of {min(lost)}. {RESTORE}")
     return root
@@ -451,17 +469,6 @@ def _check_settings(settings: Mapping[str, Any], name: str) -> None:
         if source in settings:
             expect(settings, {source: dict}, f"{name}: the settings", RESTORE)
             expect(settings[source], parts, f"{name}: the {source}", RESTORE)
-
-
-def _read_streams(stored: list[Any], name: str) -> dict[str, StoredStream]:
-    try:
-        # The card has no number of tokens unless all are stored; `Root.streams` puts in that of the plan.
-        streams = [StoredStream.from_json({"tokens": 1, **entry}) for entry in stored]
-    except (TypeError, ValueError, KeyError) as error:
-        raise RunDamagedError(f"{name} describes its streams wrongly: {error!r}. {RESTORE}") from error
-    if len({stream.name for stream in streams}) < len(streams):
-        raise RunDamagedError(f"{name} describes two streams of one name. {RESTORE}")
-    return {stream.name: stream for stream in streams}
 
 
 LONGEST_LABEL = 200

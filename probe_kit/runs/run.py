@@ -240,7 +240,7 @@ class Run:
 
         None for a whole suite.
         """
-        return self.root.suite_parent
+        return self.root.stored_plan.suite_parent
 
     @cached_property
     def items(self) -> pd.DataFrame:

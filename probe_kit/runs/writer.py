@@ -50,7 +50,7 @@ from probe_kit.runs.provenance import (
 )
 from probe_kit.runs.records import Sum
 from probe_kit.runs.results import BUNDLES, bundle_keys
-from probe_kit.runs.root import Label, PlanRecord, Root, grown_record, new_root, plan_key, read_root, while_growing
+from probe_kit.runs.root import Label, PlanRecord, Root, grown_record, new_card, plan_key, read_root, while_growing
 from probe_kit.runs.store import Location
 from probe_kit.runs.trajectories import create_trajectories, write_trajectory
 
@@ -290,7 +290,7 @@ class RunWriter[PlanT: WrittenPlan]:
         if source := stored_inputs_of(self.settings):
             create_inputs(store, self.settings["captured_calls"], source["inputs"], self.settings["codec"])
         objects = {f"{DATA}/{key}": value.to_bytes() for key, value in arrays.items()}
-        card = new_root(self.settings, [self._without_length(stream) for stream in self.plan.streams], objects)
+        card = new_card(self.settings, [self._without_length(stream) for stream in self.plan.streams], objects)
         label = Label(run=card.hash, label=self._label)
         return {**objects, LABEL_FILE: label.to_bytes(), RUN_FILE: card.to_bytes()}
 
