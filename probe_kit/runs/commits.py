@@ -19,7 +19,7 @@ from pydantic import Field
 from probe_kit.errors import RunDamagedError
 from probe_kit.hashing import sha256_json
 from probe_kit.runs.layout import COMMITS, DATA, FAILED, ILLUSTRATIONS, PLANS, TIMES, TRAJECTORY, TRAJECTORY_AXES
-from probe_kit.runs.records import Record, Sum, Sums
+from probe_kit.runs.records import Record, Sums
 from probe_kit.runs.root import Root, is_left_out
 from probe_kit.runs.store import Location
 
@@ -194,14 +194,6 @@ def size_problems(root: Root, commits: Mapping[int, Commit]) -> Iterator[str]:
             # An object of another size is damage in a copy too; only a missing one can be left out on purpose.
             if problem and not (size is None and is_left_out(key, root.left_out)):
                 yield f"{DATA}/{key} of episode {commit.episode_id} {problem}. {redo(number)}"
-
-
-def committed_sums(root: Root, commits: Mapping[int, Commit]) -> dict[str, Sum]:
-    """Sums of all objects of `data.zarr`, by key: metadata, and those that commits name."""
-    sums = {key.removeprefix(f"{DATA}/"): expected for key, expected in root.sums.items()}
-    for commit in commits.values():
-        sums |= commit.objects
-    return sums
 
 
 def stamp_of(commits: Mapping[int, Commit]) -> str:

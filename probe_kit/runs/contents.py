@@ -74,7 +74,7 @@ def record_keys(root: Root, commits: Mapping[int, Commit], columns: Columns | No
 
 def stored_objects(root: Root, commits: Mapping[int, Commit], columns: Columns | None) -> Iterator[StoredObject]:
     """All objects whose hash a record holds. Results with a damaged head are left out."""
-    for key, expected in root.sums.items():
+    for key, expected in root.card.objects.items():
         yield StoredObject(key, expected, RESTORE)
     pictures = {folder for folder in ILLUSTRATIONS if root.location.keys(folder)}
     for number, commit in commits.items():

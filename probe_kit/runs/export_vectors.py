@@ -95,20 +95,16 @@ def choose(run: Run, sites: Sequence[str] | None, view: str | None) -> tuple[Str
 
 def blocks(run: Run, choices: Sequence[StreamChoice]) -> Iterator[Block]:
     """All vectors, episode by episode and inference by inference. Raises RunDamagedError for damaged bytes."""
-    kinds: tuple[ArrayKind, ...] = (TOKENS, *run.root.vector_kinds)
-    rows = {
-        (choice.name, kind): run.rows(choice.name, kind)
-        for choice in choices
-        for kind in kinds
-        if (kind == TOKENS) == is_tokens(choice.views[0])
-    }
+    rows: dict[str, dict[ArrayKind, Rows]] = {}
+    for choice in choices:
+        kinds: tuple[ArrayKind, ...] = (TOKENS,) if is_tokens(choice.views[0]) else run.root.vector_kinds
+        rows[choice.name] = {kind: run.rows(choice.name, kind) for kind in kinds}
     for position, commit in enumerate(run.commits()):
         for choice in choices:
-            stream_rows = {kind: rows[choice.name, kind] for kind in kinds if (choice.name, kind) in rows}
             if is_tokens(choice.views[0]):
-                yield from _token_blocks(stream_rows[TOKENS], choice, position, commit.roles)
+                yield from _token_blocks(rows[choice.name][TOKENS], choice, position, commit.roles)
             else:
-                yield from _pooled_blocks(run, stream_rows, choice, position, len(commit.roles))
+                yield from _pooled_blocks(run, rows[choice.name], choice, position, len(commit.roles))
 
 
 def count_vectors(run: Run, choice: StreamChoice) -> int:
@@ -264,23 +260,13 @@ class Origins:
 
 def write_parquet(run: Run, choices: Sequence[StreamChoice], out: Path, about: str) -> None:
     """One file; a row group per episode, inference and stream. about: stored as metadata."""
-    pq = require("pyarrow.parquet", "export")
-    origins = Origins(run)
-    schema = _schema(origins).with_metadata({ABOUT: about})
+    pa, pq = require("pyarrow", "export"), require("pyarrow.parquet", "export")
+    origins, text = Origins(run), pa.string()
+    fields = [*origins.fields, ("site", text), ("view", text), ("vector", pa.list_(pa.float32()))]
+    schema = pa.schema(fields).with_metadata({ABOUT: about})
     with pq.ParquetWriter(out, schema) as writer:
-        for table in _tables(run, choices, origins, schema):
-            writer.write_table(table)
-
-
-def _schema(origins: Origins) -> Any:
-    pa = origins.pa
-    text = pa.string()
-    return pa.schema([*origins.fields, ("site", text), ("view", text), ("vector", pa.list_(pa.float32()))])
-
-
-def _tables(run: Run, choices: Sequence[StreamChoice], origins: Origins, schema: Any) -> Iterator[Any]:
-    for block in blocks(run, choices):
-        yield _table(block, origins, schema)
+        for block in blocks(run, choices):
+            writer.write_table(_table(block, origins, schema))
 
 
 def _table(block: Block, origins: Origins, schema: Any) -> Any:
@@ -304,33 +290,6 @@ _READ_AT_ONCE, _INDEXED_AT_ONCE = 1 << 12, 1 << 18
 """Rows of a matrix, and of its index. They bound memory: 4,096 rows of 4,096 float32 are 64 MB."""
 
 
-@dataclass(frozen=True)
-class RowOrigins:
-    """The origins of the N rows of the matrices of a stream, as in `Block`.
-
-    positions, inferences, tokens: (N,) int32. roles: (N,) int32, places in role_names.
-    """
-
-    positions: NDArray[np.int32]
-    inferences: NDArray[np.int32]
-    tokens: NDArray[np.int32]
-    roles: NDArray[np.int32]
-    role_names: list[str]
-
-    @classmethod
-    def of(cls, count: int) -> "RowOrigins":
-        """Return origins for so many rows, which `put` fills."""
-        positions, inferences, tokens, roles = np.zeros((4, count), np.int32)
-        return cls(positions, inferences, tokens, roles, [])
-
-    def put(self, places: Any, block: Block) -> None:
-        """The rows at `places` are those of `block`."""
-        self.positions[places], self.inferences[places] = block.position, block.inference
-        self.tokens[places] = block.tokens
-        self.role_names.extend(role for role in dict.fromkeys(block.roles) if role not in self.role_names)
-        self.roles[places] = [self.role_names.index(role) for role in block.roles]
-
-
 def write_sae(
     run: Run, choices: Sequence[StreamChoice], folder: Path, about: str, dtype: SaeDtype, seed: int
 ) -> None:
@@ -349,18 +308,21 @@ def write_sae(
         # One order for all sites of a stream, so that row i is one token at every layer, and one index serves all.
         order = np.random.default_rng(derive_seed("export sae", seed)).permutation(count_vectors(run, choice))
         stored = np.dtype(np.float16 if dtype == "float16" else np.uint16)
-        rows, files = _write_matrices(run, choice, stream_folder, stored, order)
+        rows, roles, files = _write_matrices(run, choice, stream_folder, stored, order)
         for site, file in files.items():
             scales[str(site)] = {"file": file.relative_to(folder).as_posix(), **_scale(file)}
-        _write_index(run, rows, stream_folder / INDEX)
+        _write_index(run, rows, roles, stream_folder / INDEX)
     head = {"dtype": dtype, "seed": seed, "sites": scales, "about": json.loads(about)}
     (folder / SCALES).write_text(json.dumps(head, indent=2), encoding="utf-8", newline="\n")
 
 
 def _write_matrices(
     run: Run, choice: StreamChoice, folder: Path, dtype: np.dtype[Any], order: NDArray[np.intp]
-) -> tuple[RowOrigins, dict[Site, Path]]:
-    """A file per site, filled in one pass over the run. order: (N,) row of every vector."""
+) -> tuple[NDArray[np.int32], list[str], dict[Site, Path]]:
+    """Fill a file per site in one pass over the run. order: (N,) row of every vector.
+
+    Returns (4, N) position, inference, token and role of every row, as in `Block`, names of the roles, and files.
+    """
     count = count_vectors(run, choice)
     files = {site: folder / f"{site}.npy" for site in choice.sites}
     shape = count, choice.stored.width
@@ -370,17 +332,20 @@ def _write_matrices(
     }
     for file in files.values():
         _reserve(file)
-    rows, start = RowOrigins.of(count), 0
+    rows, roles, start = np.zeros((4, count), np.int32), dict[str, int](), 0
     for block in blocks(run, [choice]):
         end = start + block.tokens.size
         places = order[start:end]
-        rows.put(places, block)
-        for site, values in zip(choice.sites, block.values, strict=True):
-            maps[site][places] = _as_stored(values, dtype, site, run)
+        codes = [roles.setdefault(role, len(roles)) for role in block.roles]
+        origins: tuple[Any, ...] = (block.position, block.inference, block.tokens, codes)
+        for row, cells in zip(rows, origins, strict=True):
+            row[places] = cells
+        for site, vectors in zip(choice.sites, block.values, strict=True):
+            maps[site][places] = _as_stored(vectors, dtype, site, run)
         start = end
     for memory_map in maps.values():
         memory_map.flush()
-    return rows, files
+    return rows, list(roles), files
 
 
 def _reserve(file: Path) -> None:
@@ -414,15 +379,13 @@ def _scale(file: Path) -> dict[str, float]:
     return {"mean_squared_norm": mean, "scale": float(np.sqrt(stored.shape[1] / mean)) if mean else 1.0}
 
 
-def _write_index(run: Run, rows: RowOrigins, out: Path) -> None:
+def _write_index(run: Run, rows: NDArray[np.int32], roles: list[str], out: Path) -> None:
     """Row i of the index is of row i of every matrix of the stream."""
     pa, pq = require("pyarrow", "export"), require("pyarrow.parquet", "export")
-    origins, names = Origins(run), np.array(rows.role_names)
+    origins, names = Origins(run), np.array(roles)
     schema = pa.schema(origins.fields)
     with pq.ParquetWriter(out, schema) as writer:
-        for start in range(0, rows.positions.size, _INDEXED_AT_ONCE):
-            part = slice(start, start + _INDEXED_AT_ONCE)
-            columns = origins.columns(
-                rows.positions[part], rows.inferences[part], rows.tokens[part], names[rows.roles[part]]
-            )
+        for start in range(0, rows.shape[1], _INDEXED_AT_ONCE):
+            positions, inferences, tokens, codes = rows[:, start : start + _INDEXED_AT_ONCE]
+            columns = origins.columns(positions, inferences, tokens, names[codes])
             writer.write_table(pa.table([columns[name] for name in schema.names], schema=schema))

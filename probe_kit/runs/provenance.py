@@ -47,7 +47,7 @@ def provenance_here(device: str = "cpu", dtype: str | None = None) -> dict[str, 
         "dtype": dtype,
         "python": platform.python_version(),
         "machine": platform.machine(),
-        "versions": {"probe-kit": probe_kit.version.__version__, **_versions()},
+        "versions": {"probe-kit": probe_kit.version.__version__, **{name: _version(name) for name in _LIBRARIES}},
         "code_sha256": code_sha256(),
     }
 
@@ -59,14 +59,11 @@ def _gpu_name(device: str) -> str | None:
     return torch.cuda.get_device_name(device) if torch.cuda.is_available() else None
 
 
-def _versions() -> dict[str, str | None]:
-    versions: dict[str, str | None] = {}
-    for name in _LIBRARIES:
-        try:
-            versions[name] = version(name)
-        except PackageNotFoundError:
-            versions[name] = None
-    return versions
+def _version(library: str) -> str | None:
+    try:
+        return version(library)
+    except PackageNotFoundError:
+        return None
 
 
 @cache
@@ -122,21 +119,20 @@ def check_provenances(stored: Mapping[str, Provenance], names: Iterable[str], lo
 
 def differences(provenances: Iterable[Provenance]) -> tuple[str, ...]:
     """The decisive parts that are not the same in all of them, such as `versions.torch`."""
-    decisive = [dict(_decisive(provenance)) for provenance in provenances]
+    decisive = [_decisive(provenance) for provenance in provenances]
     return tuple(part for part in DECISIVE if len({parts[part] for parts in decisive}) > 1)
 
 
-def _decisive(provenance: Provenance) -> Iterable[tuple[str, Any]]:
-    for part in DECISIVE:
-        outer, _, inner = part.partition(".")
-        yield part, provenance.get(outer, {}).get(inner) if inner else provenance.get(outer)
+def _decisive(provenance: Provenance) -> dict[str, Any]:
+    versions = {f"versions.{name}": version for name, version in provenance.get("versions", {}).items()}
+    return {part: {**provenance, **versions}.get(part) for part in DECISIVE}
 
 
 def check_other_provenance(stored: Iterable[Provenance], current: Provenance, where: str) -> None:
     """Raise SettingsMismatchError naming what differs here from what made the episodes of a run so far."""
     for former in stored:
         if different := differences([former, current]):
-            was, now = dict(_decisive(former)), dict(_decisive(current))
+            was, now = _decisive(former), _decisive(current)
             lines = [f"  {part}: stored {was[part]!r}, here {now[part]!r}" for part in different]
             raise SettingsMismatchError(
                 f"{where} holds episodes that were made elsewhere, and this changes numbers:\n"

@@ -294,11 +294,6 @@ class Root:
         """The settings of the card."""
         return self.card.settings
 
-    @property
-    def sums(self) -> Mapping[str, Sum]:
-        """Length and hash of the arrays' metadata, by key in the run."""
-        return self.card.objects
-
     def check_continuable(self) -> None:
         """Raise ActivationsLeftOutError for a copy without activations."""
         if self.left_out:
@@ -322,14 +317,14 @@ class Root:
     def check(self) -> None:
         """Raise RunDamagedError unless the plan and all metadata are what was written."""
         _ = self.plan
-        for key in self.sums:
+        for key in self.card.objects:
             self.check_metadata(key)
 
     def check_metadata(self, key: str) -> None:
         """Raise RunDamagedError if the metadata of an array is missing or was changed."""
         name = f"{self.location}/{key}"
         try:
-            problem = self.sums[key].problem(self.location.read(key))
+            problem = self.card.objects[key].problem(self.location.read(key))
         except FileNotFoundError:
             problem = "is missing"
         if problem:
@@ -398,7 +393,7 @@ class Root:
     @property
     def has_trajectories(self) -> bool:
         """Whether the run was begun with room for what happens in episodes step by step."""
-        return f"{DATA}/{TRAJECTORY}/zarr.json" in self.sums
+        return f"{DATA}/{TRAJECTORY}/zarr.json" in self.card.objects
 
     @property
     def later_views(self) -> LaterViews:
@@ -457,7 +452,7 @@ def find_root(location: Location) -> Root | None:
         raise RunDamagedError(f"{name}: the settings do not have the hash stored beside them. {RESTORE}")
     _check_settings(card.settings, name)
     root = Root(location, card)
-    if lost := {f"{DATA}/{array}/zarr.json" for array in root.arrays} - {*root.sums}:
+    if lost := {f"{DATA}/{array}/zarr.json" for array in root.arrays} - {*root.card.objects}:
         raise RunDamagedError(f"{name} names no hash of {min(lost)}. {RESTORE}")
     return root
 

@@ -6,7 +6,7 @@ from copy import copy
 from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pandas as pd
@@ -35,7 +35,6 @@ from probe_kit.runs.columns import Columns, find_columns
 from probe_kit.runs.commits import (
     Commit,
     Seconds,
-    committed_sums,
     read_commits,
     read_failures,
     read_seconds,
@@ -65,7 +64,7 @@ from probe_kit.runs.reader import Origin, RunSource, run_html, run_text, select_
 from probe_kit.runs.records import RESTORE, Sum
 from probe_kit.runs.root import read_label, read_root, while_growing
 from probe_kit.runs.store import Location, locate
-from probe_kit.runs.trajectories import Trajectories, Watched, judged, names_trajectory, watch, with_outcomes
+from probe_kit.runs.trajectories import Trajectories, judged, watch, with_outcomes
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -73,9 +72,8 @@ if TYPE_CHECKING:
     from probe_kit.env.scoring import Trajectory
 
 
-_OUTCOME = ("outcome", "side_placed")
-"""What every outcome says, and so a table of no episodes too."""
-_SECONDS = ("seconds_inference", "seconds_simulation")
+_OUTCOME = ("outcome", "side_placed", "seconds_inference", "seconds_simulation")
+"""Columns of every episode behind those of its plan, and so of a table of no episodes too."""
 
 
 class NotSealedWarning(UserWarning):
@@ -177,8 +175,7 @@ class Run:
     @property
     def weights_sha256(self) -> str | None:
         """Hash of the weights that acted; None for a scripted run."""
-        weights: str | None = self.settings["weights_sha256"]
-        return weights
+        return cast("str | None", self.settings["weights_sha256"])
 
     @property
     def random_weights(self) -> bool:
@@ -427,18 +424,19 @@ class Run:
         """
         plan = self.root.planned
         rows = [
-            {**plan[number], **self._commits[number].outcome, **self._seconds_columns(number)}
+            {
+                **plan[number],
+                **self._commits[number].outcome,
+                "seconds_inference": self._seconds[number].inference,
+                "seconds_simulation": self._seconds[number].simulation,
+            }
             for number in self._numbers
         ]
-        return pd.DataFrame(rows or None, columns=None if rows else [*self.root.plan[0], *_OUTCOME, *_SECONDS])
+        return pd.DataFrame(rows or None, columns=None if rows else [*self.root.plan[0], *_OUTCOME])
 
     @cached_property
     def _seconds(self) -> dict[int, Seconds]:
         return read_seconds(self.root, self._commits)
-
-    def _seconds_columns(self, number: int) -> dict[str, float]:
-        seconds = self._seconds[number]
-        return dict(zip(_SECONDS, (seconds.inference, seconds.simulation), strict=True))
 
     @cached_property
     def control_steps(self) -> NDArray[np.int64]:
@@ -478,9 +476,12 @@ class Run:
 
         Runs made before it was stored do not, nor those whose model did not act, nor copies without it.
         """
-        if TRAJECTORY in self.root.left_out:
+        if TRAJECTORY in self.root.left_out or not self.root.has_trajectories:
             return False
-        return self.root.has_trajectories and all(map(names_trajectory, self._commits.values()))
+        keeps = (
+            any(key.startswith(f"{TRAJECTORY}/") for key in commit.objects) for commit in self._commits.values()
+        )
+        return all(keeps)  # the commit of an episode that did not act names none
 
     @cached_property
     def trajectories(self) -> Trajectories:
@@ -508,7 +509,7 @@ class Run:
         released evaluation averages over 11. Raises UsageError for an unknown rule, NoTrajectoryError.
         """
         if last_steps == 1:
-            return self._watched.verdicts[check_rule(rule)].copy()
+            return self._watched[0][check_rule(rule)].copy()
         return judged(self.trajectories, self.episodes["side_correct"], self.settings["scene"], rule, last_steps)
 
     def under(self, rule: str, last_steps: int = 1) -> "Run":
@@ -526,11 +527,12 @@ class Run:
 
         Raises NoTrajectoryError if the run keeps no trajectories.
         """
-        table = self._watched.behaviour
-        return table.assign(episode_id=self.episodes["episode_id"]).set_index("episode_id").reset_index()
+        return (
+            self._watched[1].assign(episode_id=self.episodes["episode_id"]).set_index("episode_id").reset_index()
+        )
 
     @cached_property
-    def _watched(self) -> Watched:
+    def _watched(self) -> tuple[dict[str, pd.DataFrame], pd.DataFrame]:
         return watch(self.trajectories, self.episodes["side_correct"], self.settings["scene"])
 
     def instruction_ids(self, episode: str | int) -> tuple[int, ...] | None:
@@ -619,19 +621,20 @@ class Run:
             at = f" at inference {call}, with --later-views mean" if self._keeps_mean_of(call) else ""
             raise UnknownSiteError(f"no view {view!r} of {site.stream}{at}; stored: {', '.join(views)}")
         if self.columns is None:
-            self._note_slow_reading()
-            return self._column_of_rows(stored, site, view, call)
+            warnings.warn(
+                f"{self.location} is not sealed; columns are put together from rows, which is slow but gives the "
+                f"same numbers. `probe-kit run verify {self.location} --seal` makes it fast",
+                NotSealedWarning,
+                stacklevel=2,
+            )
+            index: tuple[Any, ...] = (slice(None), call - 1, *stored.at(site))
+            if self._keeps_mean_of(call):
+                return decode_bfloat16(self._committed_rows(site.stream, "later")[index])
+            index = (slice(None), call, *stored.at(site), stored.views.index(view))
+            return np.asarray(self._committed_rows(site.stream, "pooled")[index])
         if self._keeps_mean_of(call):
             return self.columns.later_column(stored, site, call)[self._columns_rows]
         return self.columns.column(stored, site, view, call)[self._columns_rows]
-
-    def _column_of_rows(self, stored: StoredStream, site: Site, view: str, call: int) -> NDArray[np.float32]:
-        at = stored.at(site)
-        index: tuple[Any, ...] = (slice(None), call - 1, *at)
-        if self._keeps_mean_of(call):
-            return decode_bfloat16(self._committed_rows(site.stream, "later")[index])
-        index = (slice(None), call, *at, stored.views.index(view))
-        return np.asarray(self._committed_rows(site.stream, "pooled")[index])
 
     @property
     def sealed(self) -> bool:
@@ -642,14 +645,6 @@ class Run:
     def columns(self) -> Columns | None:
         """The sealed columns, None if there are none of exactly these episodes. Raises RunDamagedError."""
         return find_columns(self.root, self._commits)
-
-    def _note_slow_reading(self) -> None:
-        warnings.warn(
-            f"{self.location} is not sealed; columns are put together from rows, which is slow but gives the same "
-            f"numbers. `probe-kit run verify {self.location} --seal` makes it fast",
-            NotSealedWarning,
-            stacklevel=3,
-        )
 
     def rows(self, stream: str, kind: ArrayKind = "pooled") -> Rows:
         """The stored rows of the committed episodes: all that was captured in one episode at a time.
@@ -668,7 +663,11 @@ class Run:
 
     @cached_property
     def _sums(self) -> dict[str, Sum]:
-        return committed_sums(self.root, self._commits)
+        """Sums of all objects of `data.zarr`, by key: metadata, and those that commits name."""
+        sums = {key.removeprefix(f"{DATA}/"): expected for key, expected in self.root.card.objects.items()}
+        for commit in self._commits.values():
+            sums |= commit.objects
+        return sums
 
     def _advice(self, key: str) -> str:
         """The remedy for a damaged object of `data.zarr`."""
@@ -719,7 +718,7 @@ class Run:
         Values outside the mask are zero. For large runs use `iter_token_blocks`, which holds one block.
         Raises UnknownSiteError if the run was extracted without `--tokens all`, or never had that role.
         """
-        mask = self._role_mask(site, role, call)
+        mask = self.token_mask(site, role, call)
         values = np.zeros((*mask.shape, self.stored(site.stream).width), np.float32)
         for block in self.iter_token_blocks(site, role, call):
             values[:, block.start : block.start + block.mask.shape[1]] = block.values
@@ -727,14 +726,23 @@ class Run:
 
     def token_mask(self, site: Site, role: str | None = None, call: int = 0) -> NDArray[np.bool_]:
         """(E, T) bool: the positions of `role` at one site, or of all tokens but padding; see `tokens`."""
-        return self._role_mask(site, role, call)
+        stored = self._check(site, call)
+        if self.settings["tokens"] != "all":
+            raise UnknownSiteError(f"{self.location} stores pooled views only; extract with --tokens all")
+        calls = [commit.roles for commit in self.commits()]
+        spans = [episode_roles[call][site.stream] if call < len(episode_roles) else [] for episode_roles in calls]
+        mask = role_mask(spans, stored.stored_tokens, role)
+        if not mask[self.reached(call)].any(axis=1).all():
+            roles = sorted({name for episode in spans for name, _, _ in episode})
+            raise UnknownSiteError(f"not every episode has a token of role {role!r} at {site}; roles: {roles}")
+        return mask
 
     def iter_token_blocks(self, site: Site, role: str | None = None, call: int = 0) -> Iterator[TokenBlock]:
         """The tokens of one site, at most 128 positions of all episodes at a time; see `tokens`.
 
         Only blocks that hold a token of `role` are read.
         """
-        mask = self._role_mask(site, role, call)
+        mask = self.token_mask(site, role, call)
         stored = self.stored(site.stream)
         rows = self.rows(site.stream, "tokens")
         return token_blocks(rows, (call, *stored.at(site)), mask, stored.token_block)
@@ -751,15 +759,3 @@ class Run:
             kernel += flat @ flat.T
             counts += block.mask.sum(axis=1)
         return np.asarray(kernel / np.sqrt(np.outer(counts, counts)))
-
-    def _role_mask(self, site: Site, role: str | None, call: int) -> NDArray[np.bool_]:
-        stored = self._check(site, call)
-        if self.settings["tokens"] != "all":
-            raise UnknownSiteError(f"{self.location} stores pooled views only; extract with --tokens all")
-        calls = [commit.roles for commit in self.commits()]
-        spans = [episode_roles[call][site.stream] if call < len(episode_roles) else [] for episode_roles in calls]
-        mask = role_mask(spans, stored.stored_tokens, role)
-        if not mask[self.reached(call)].any(axis=1).all():
-            roles = sorted({name for episode in spans for name, _, _ in episode})
-            raise UnknownSiteError(f"not every episode has a token of role {role!r} at {site}; roles: {roles}")
-        return mask

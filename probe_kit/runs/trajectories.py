@@ -7,7 +7,7 @@ those of `probe_kit.env.scoring.trajectory`.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any, cast
 
 import numpy as np
@@ -21,7 +21,6 @@ from probe_kit.env.scoring import CHANNELS, RULES, Trajectory, behaviour_of, jud
 from probe_kit.env.spec import SceneSpec
 from probe_kit.errors import RunDamagedError
 from probe_kit.runs.arrays import ROOM, Rows, codecs
-from probe_kit.runs.commits import Commit
 from probe_kit.runs.layout import TRAJECTORY
 from probe_kit.suite.items import Side, other_side
 
@@ -40,11 +39,6 @@ def create_trajectories(store: Store, frames: int, codec: str) -> None:
         attributes={"channels": list(CHANNELS)},
         config={"write_empty_chunks": True},
     )
-
-
-def names_trajectory(commit: Commit) -> bool:
-    """Whether an episode's commit names a trajectory; one that did not act has none."""
-    return any(key.startswith(f"{TRAJECTORY}/") for key in commit.objects)
 
 
 def write_trajectory(store: Store, number: int, frames: NDArray[np.float32], config: ArrayConfigLike) -> None:
@@ -121,17 +115,12 @@ def with_outcomes(episodes: pd.DataFrame, verdicts: pd.DataFrame) -> pd.DataFram
     )
 
 
-@dataclass(frozen=True)
-class Watched:
-    """The content of the trajectories of all episodes: `Judgement` by rule, at the last step, and `Behaviour`."""
+def watch(
+    trajectories: Iterable[Trajectory], sides: Iterable[Side], scene: Mapping[str, Any]
+) -> tuple[dict[str, pd.DataFrame], pd.DataFrame]:
+    """`Judgement` by rule, at the last step, and `Behaviour` of all episodes.
 
-    verdicts: Mapping[str, pd.DataFrame]
-    behaviour: pd.DataFrame
-
-
-def watch(trajectories: Iterable[Trajectory], sides: Iterable[Side], scene: Mapping[str, Any]) -> Watched:
-    """All of it in one reading of the trajectories, which takes longer than every judgement of them.
-
+    In one reading of the trajectories, which takes longer than every judgement of them.
     scene: `SceneSpec.to_json()`.
     """
     default = SceneSpec()  # scenes without these fields have the default ones
@@ -143,4 +132,4 @@ def watch(trajectories: Iterable[Trajectory], sides: Iterable[Side], scene: Mapp
         for name, rule in rules.items():
             verdicts[name].append(asdict(judge(trajectory, rule, side, 1, scene["max_steps"])))
         acts.append(asdict(behaviour_of(trajectory, side, half, scene["moved"])))
-    return Watched({name: pd.DataFrame(rows) for name, rows in verdicts.items()}, pd.DataFrame(acts))
+    return {name: pd.DataFrame(rows) for name, rows in verdicts.items()}, pd.DataFrame(acts)

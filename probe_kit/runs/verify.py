@@ -251,7 +251,10 @@ def _audit(location: Location, deep: bool) -> Audit:
     objects = list(stored_objects(root, commits, columns))
     sizes = sizes_of(location, objects)
     problems += filter(None, (stored.problem(sizes.get(stored.key)) for stored in objects))
-    problems += _content_problems(location, objects) if deep else _metadata_problems(root)
+    if deep:
+        problems += _content_problems(location, objects)
+    for key in () if deep else root.card.objects:
+        checked(partial(root.check_metadata, key), None)
     if deep and not problems and planned:  # readers of a damaged run would only repeat what is known
         run = Run(location)
         problems += _differences(run) if columns is not None else ()
@@ -275,15 +278,6 @@ def _check_records(root: Root, commits: Mapping[int, Commit]) -> None:
     check_provenances(read_provenances(root), {commit.provenance for commit in commits.values()}, root.location)
     if commits:
         read_certificate(root)
-
-
-def _metadata_problems(root: Root) -> Iterator[str]:
-    """Arrays whose metadata was changed; it is small and read by every opening."""
-    for key in root.sums:
-        try:
-            root.check_metadata(key)
-        except RunDamagedError as error:
-            yield str(error)
 
 
 def _content_problems(location: Location, objects: Iterable[StoredObject]) -> Iterator[str]:
