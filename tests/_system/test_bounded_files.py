@@ -131,7 +131,7 @@ ELSEWHERE = {
     "_system/machine.py": "files of the system",
     "doctor.py": "files of the system",
     "hooks/new_adapter/__init__.py": "files of the package",
-    "hooks/families/shared/statistics_bounds.py": "files of the package",
+    "hooks/families/shared/lerobot/normaliser.py": "files of the package",
     "hooks/conformance/loading.py": "a copy of a checkpoint that was read",
     "suite/generators/drawing.py": "files of the package",
     "suite/pictures.py": "`stored_picture`: files of the package",
