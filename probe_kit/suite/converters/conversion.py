@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from PIL import Image
 
 from probe_kit._system.bounded_files import open_regular
 from probe_kit.errors import SuiteError, UsageError
@@ -27,7 +26,6 @@ from probe_kit.suite.converters.candidates import (
     Reading,
     SourcePicture,
     VlThinkOptions,
-    Wording,
     options_from,
 )
 from probe_kit.suite.converters.curation import apply_curation, read_curation, write_curation
@@ -127,10 +125,6 @@ def convert(
     return conversion.save(bundles, out, Path(curation) if curation is not None else None)
 
 
-def _load(picture: SourcePicture) -> Image.Image:
-    return picture.load()
-
-
 @dataclass
 class _Conversion:
     """One run: what was read, and how many candidates every stage left."""
@@ -144,7 +138,7 @@ class _Conversion:
     def __post_init__(self) -> None:
         self.stages: dict[str, Counter[str]] = {}
         self.looks: dict[str, Look] = {}
-        self.load = lru_cache(maxsize=_PICTURES_KEPT)(_load)
+        self.load = lru_cache(maxsize=_PICTURES_KEPT)(lambda picture: picture.load())
 
     def propose(self, category: str) -> list[Bundle]:
         """Filter, rewrite and pair the candidates of one category."""
@@ -155,7 +149,10 @@ class _Conversion:
         stage["rule_selected"] = len(candidates)
         candidates = [c for c in candidates if self._keep(self._picture_problem(c))]
         stage["image_ok"] = len(candidates)
-        worded = [self._worded(candidate) for candidate in candidates]
+        worded = [
+            replace(c, wording=c.wording or rewrite(c.question, c.answer) or propose_wording(c, self.options))
+            for c in candidates
+        ]
         usable = [candidate for candidate in worded if self._keep(self._text_problem(candidate))]
         stage["text_ok"] = sum(candidate.wording is not None for candidate in usable)
         stage["needs_edit"] = len(usable) - stage["text_ok"]
@@ -192,10 +189,6 @@ class _Conversion:
             self.looks[picture.image_id] = look_of(self.load(picture))
         return self.looks[picture.image_id]
 
-    def _worded(self, candidate: Candidate) -> Candidate:
-        wording = candidate.wording or rewrite(candidate.question, candidate.answer)
-        return replace(candidate, wording=wording or propose_wording(candidate, self.options))
-
     def _text_problem(self, candidate: Candidate) -> str | None:
         """A question without a wording passes: a person may still write one."""
         wording = candidate.wording
@@ -212,19 +205,15 @@ class _Conversion:
 
     def without_review(self, bundles: list[Bundle]) -> list[Bundle]:
         """Bundles that need no review: worded by a rule, or by a trusted model."""
-        return _reviewed(
-            bundles, {p.candidate_id: self._unreviewed(p) for b in bundles for p in b if self._passes(p)}
-        )
-
-    def _passes(self, proposal: Proposal) -> bool:
-        wording: Wording | None = proposal.wording
-        return wording is not None and not proposal.needs_person and (
-            wording.proposed_by is None or self.options.trust_llm
-        )  # fmt: skip
-
-    def _unreviewed(self, proposal: Proposal) -> Proposal:
-        by_model = proposal.wording is not None and proposal.wording.proposed_by is not None
-        return replace(proposal, curation_status="llm-trusted" if by_model else "rules-only")
+        accepted = {}
+        for proposal in (proposal for bundle in bundles for proposal in bundle):
+            if proposal.wording is None or proposal.needs_person:
+                continue
+            by_model = proposal.wording.proposed_by is not None
+            if self.options.trust_llm or not by_model:
+                status = "llm-trusted" if by_model else "rules-only"
+                accepted[proposal.candidate_id] = replace(proposal, curation_status=status)
+        return _reviewed(bundles, accepted)
 
     def save(self, bundles: dict[str, list[Bundle]], out: Path, curation: Path | None) -> Suite:
         """Sample, lay out and write; nothing is written if no item is left."""
@@ -241,19 +230,14 @@ class _Conversion:
             pictures |= files
         if not items:
             raise SuiteError(f"{self.kind.name}: no item left to write. {self._why_none()}")
-        grouped = with_groups(items)
         extra = {
             "annotation_files": {path.name: _file_sha256(path) for path in self.reading.files},
             "curation_sha256": _file_sha256(curation) if curation else "none",
             "source_url": self.reading.url,
         }
-        settings = asdict(self.options) | {
-            "items_per_category": self.n,
-            "seed": self.seed,
-            "source": self.kind.name,
-        }
-        settings = {name: value for name, value in settings.items() if name not in _PLACES}
-        suite = new_suite(f"a2a-{self.kind.name}", VERSION, grouped, settings, extra)
+        numbers = {"items_per_category": self.n, "seed": self.seed, "source": self.kind.name}
+        options = {name: value for name, value in asdict(self.options).items() if name not in _PLACES}
+        suite = new_suite(f"a2a-{self.kind.name}", VERSION, with_groups(items), options | numbers, extra)
         return save_suite(suite, pictures, self._stats(), out)
 
     def _stats(self) -> dict[str, Any]:
@@ -261,15 +245,13 @@ class _Conversion:
             category: dict(stage) | {"paper_pool": PAPER_POOL[category], "paper_items": PAPER_ITEMS[category]}
             for category, stage in self.stages.items()
         }
-        return stats | {"reasons": dict(sorted(self.reading.reasons.items())), "notes": self._notes()}
-
-    def _notes(self) -> list[str]:
         far = [
             f"{category}: pool of {stage['pool']}, the paper has {PAPER_POOL[category]}; releases differ"
             for category, stage in self.stages.items()
             if abs(stage["pool"] - PAPER_POOL[category]) > _POOL_TOLERANCE * PAPER_POOL[category]
         ]
-        return self.reading.notes + far
+        reasons = dict(sorted(self.reading.reasons.items()))
+        return stats | {"reasons": reasons, "notes": self.reading.notes + far}
 
     def _why_none(self) -> str:
         counts = "; ".join(

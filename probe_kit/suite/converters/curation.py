@@ -1,7 +1,7 @@
 """The curation file: a person's decisions (accept, reject, reword) as JSON lines or CSV, with previews."""
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -39,33 +39,27 @@ def write_curation(path: Path, proposals: Sequence[Proposal], render: Render) ->
     In the previews the picture asked for lies left. `.csv` and `.tsv` give CSV, anything else JSON lines. Raises
     SuiteError if the file is there and a person has reviewed any row of it, or if it cannot be read.
     """
-    _check_reviewed(path)
+    if path.exists():
+        try:
+            reviewed = sum(row["status"] != STATUSES[0] for row in read_curation(path))
+        except SuiteError as error:
+            raise SuiteError(
+                f"{path} exists and would be written anew, and is no review that can be read: {error} Name "
+                "another file as emit_curation (--emit-curation), or remove this one"
+            ) from error
+        if reviewed:
+            raise SuiteError(
+                f"{path} holds the review of {reviewed} pairs, and would be written anew without it. Give it as "
+                "curation (--curation), or another file as emit_curation (--emit-curation)"
+            )
     previews = path.with_name(f"{path.stem}-previews")
     previews.mkdir(parents=True, exist_ok=True)
     rows = [_row(proposal, _previews(proposal, previews, render)) for proposal in proposals]
-    text = (
-        _to_csv(rows)
-        if path.suffix.lower() in _TABLES
-        else "".join(json.dumps(row, ensure_ascii=False) + "\n" for row in rows)
-    )
+    if path.suffix.lower() in _TABLES:
+        text = csv_of_rows(COLUMNS, ({**row, "llm": json.dumps(row["llm"])} for row in rows))
+    else:
+        text = "".join(json.dumps(row, ensure_ascii=False) + "\n" for row in rows)
     write_whole(path, text)
-
-
-def _check_reviewed(path: Path) -> None:
-    if not path.exists():
-        return
-    try:
-        reviewed = sum(row["status"] != STATUSES[0] for row in read_curation(path))
-    except SuiteError as error:
-        raise SuiteError(
-            f"{path} exists and would be written anew, and is no review that can be read: {error} Name another "
-            "file as emit_curation (--emit-curation), or remove this one"
-        ) from error
-    if reviewed:
-        raise SuiteError(
-            f"{path} holds the review of {reviewed} pairs, and would be written anew without it. Give it as "
-            "curation (--curation), or another file as emit_curation (--emit-curation)"
-        )
 
 
 def read_curation(path: Path) -> list[dict[str, Any]]:
@@ -75,9 +69,13 @@ def read_curation(path: Path) -> list[dict[str, Any]]:
     """
     if not path.is_file():
         raise SuiteError(f"curation file {path} not found. Make one with emit_curation (--emit-curation).")
+    records: Iterable[tuple[str, Row]] = _from_lines(path)
+    if path.suffix.lower() in _TABLES:
+        table = open_table(path, COLUMNS, SuiteError)
+        records = ((table.where(line), cells) for line, cells in table.rows())
     rows: dict[str, tuple[str, dict[str, Any]]] = {}
-    for where, record in _from_csv(path) if path.suffix.lower() in _TABLES else _from_lines(path):
-        row = _checked({name: _text(cell) for name, cell in record.items()}, where)
+    for where, record in records:
+        row = _decided({name: _text(cell) for name, cell in record.items()}, where)
         before = rows.setdefault(row["candidate_id"], (where, row))
         changed = [name for name in _DECIDED if before[1].get(name, "") != row.get(name, "")]
         if changed:
@@ -96,23 +94,18 @@ def _text(cell: Any) -> Any:
     return "" if is_missing(text) else text
 
 
-def _checked(row: dict[str, Any], where: str) -> dict[str, Any]:
+def _decided(row: dict[str, Any], where: str) -> dict[str, Any]:
     """The row with its decisions in lower case. Raises SuiteError."""
     missing = [name for name in ("candidate_id", "question_sha256", "status") if not row.get(name)]
     if missing:
         raise SuiteError(f"{where} has no {missing[0]}; expected the columns {', '.join(COLUMNS)}.")
-    status = str(row["status"]).lower()
+    where, status = f"{where} ({row['candidate_id']})", str(row["status"]).lower()
     if status not in STATUSES:
-        raise SuiteError(
-            f"{where} ({row['candidate_id']}): status is {row['status']!r}; expected one of {', '.join(STATUSES)}."
-        )
-    recognisable = row.get("recognisable", "")
-    truth = None if recognisable == "" else truth_of(recognisable)
-    if truth is None and recognisable != "":
-        raise SuiteError(
-            f"{where} ({row['candidate_id']}): recognisable is {recognisable!r}; expected yes, no or an empty "
-            "cell."
-        )
+        raise SuiteError(f"{where}: status is {row['status']!r}; expected one of {', '.join(STATUSES)}.")
+    answer = row.get("recognisable", "")
+    truth = None if answer == "" else truth_of(answer)
+    if truth is None and answer != "":
+        raise SuiteError(f"{where}: recognisable is {answer!r}; expected yes, no or an empty cell.")
     return {**row, "status": status, "recognisable": "" if truth is None else "yes" if truth else "no"}
 
 
@@ -129,7 +122,9 @@ def apply_curation(proposals: Sequence[Proposal], rows: Sequence[Row], path: Pat
             "Use the root, categories, seed and options that the file was made with."
         )
     stale = [
-        row["candidate_id"] for row in rows if row["question_sha256"] != by_id[row["candidate_id"]].question_sha256
+        row["candidate_id"]
+        for row in rows
+        if row["question_sha256"] != by_id[row["candidate_id"]].candidate.question_sha256
     ]
     if stale:
         raise SuiteError(
@@ -164,25 +159,22 @@ def _reviewed(proposal: Proposal, row: Row, path: Path) -> Proposal:
 
 
 def _row(proposal: Proposal, previews: tuple[str, str]) -> dict[str, Any]:
-    wording = proposal.wording
+    wording, candidate = proposal.wording, proposal.candidate
     return {
         "candidate_id": proposal.candidate_id,
-        "category": proposal.category,
+        "category": candidate.category,
         "source_id": proposal.source_id,
         "left_preview": previews[0],
         "right_preview": previews[1],
-        "question": proposal.question,
-        "question_sha256": proposal.question_sha256,
+        "question": candidate.question,
+        "question_sha256": candidate.question_sha256,
         "proposed_instruction": proposal.instruction,
         "rule_id": wording.rule_id if wording else "R0",
         "status": "pending",
         "instruction": proposal.instruction,
         "object_phrase": wording.phrase if wording else "",
         "polarity": proposal.polarity,
-        "recognisable": "",
-        "reason": "",
-        "reviewer": "",
-        "date": "",
+        **dict.fromkeys(("recognisable", "reason", "reviewer", "date"), ""),
         "llm": dict(wording.proposed_by or {}) if wording else {},
     }
 
@@ -196,16 +188,6 @@ def _previews(proposal: Proposal, folder: Path, render: Render) -> tuple[str, st
         image.save(folder / name)
         names.append(f"{folder.name}/{name}")
     return names[0], names[1]
-
-
-def _to_csv(rows: Sequence[Row]) -> str:
-    return csv_of_rows(COLUMNS, ({**row, "llm": json.dumps(row["llm"])} for row in rows))
-
-
-def _from_csv(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:
-    table = open_table(path, COLUMNS, SuiteError)
-    for line, cells in table.rows():
-        yield table.where(line), dict(cells)
 
 
 def _from_lines(path: Path) -> Iterator[tuple[str, dict[str, Any]]]:

@@ -16,23 +16,23 @@ from probe_kit.suite.suite import Picture, make_item, squared_picture
 
 @dataclass(frozen=True)
 class Proposal:
-    """One would-be item. `wording` is None if a person has to write it; `status` is how it stands in review."""
+    """One would-be item that asks the question of `candidate`.
 
+    `wording` is None if a person has to write it; `curation_status` is how it stands in review.
+    """
+
+    candidate: Candidate
     candidate_id: str
-    category: str
     source_id: str
     pair_key: str
-    question: str
-    question_sha256: str
     target: SourcePicture
     distractor: SourcePicture
     wording: Wording | None
-    polarity: str
     target_concept: str
     distractor_concept: str
     construction: str
     needs_person: bool
-    side_word: bool
+    polarity: str = "none"
     curation_status: str = "rules-only"
 
     @property
@@ -59,8 +59,16 @@ def pair_candidates(
     """
     native = [candidate for candidate in candidates if candidate.distractor is not None]
     single = [candidate for candidate in candidates if candidate.distractor is None]
-    bundles = list(_native(native, paper_polarity, rng))
-    couples = _every_couple(single, rng) if reuse else _disjoint_couples(single, rng)
+    negate = rng.permutation(len(native)) % 2 == 1
+    bundles: list[Bundle] = [
+        (_native(candidate, bool(negated) and not paper_polarity),)
+        for candidate, negated in zip(native, negate, strict=True)
+    ]
+    if reuse:
+        couples = [(first, second) for first, second in combinations(single, 2) if _may_meet(first, second)]
+        couples = [couples[int(index)] for index in rng.permutation(len(couples))]
+    else:
+        couples = _disjoint_couples(single, rng)
     bundles += [
         (_ask(first, second), _ask(second, first))
         for first, second in couples
@@ -69,75 +77,47 @@ def pair_candidates(
     return [bundles[int(index)] for index in rng.permutation(len(bundles))]
 
 
-def _native(candidates: Sequence[Candidate], paper_polarity: bool, rng: np.random.Generator) -> Iterator[Bundle]:
-    negate = rng.permutation(len(candidates)) % 2 == 1
-    for candidate, negated in zip(candidates, negate, strict=True):
-        wording, opposite = candidate.wording, candidate.wording.opposite if candidate.wording else None
-        negative = bool(negated) and opposite is not None and not paper_polarity
-        proposal = _native_proposal(candidate, wording)
-        yield (_opposite(proposal) if negative else proposal,)
-
-
-def _native_proposal(candidate: Candidate, wording: Wording | None) -> Proposal:
+def _native(candidate: Candidate, negated: bool) -> Proposal:
+    """The question of a candidate with both pictures. negated: asked for by its opposite, if it has one."""
     assert candidate.distractor is not None
-    phrase = wording.phrase if wording else candidate.question
-    opposite = wording.opposite if wording else None
+    wording = candidate.wording
+    phrase, opposite = (wording.phrase, wording.opposite) if wording else (candidate.question, None)
+    concepts = phrase, opposite or f"not {phrase}"
+    pictures = candidate.target, candidate.distractor
+    if wording is not None and opposite is not None and negated:
+        concepts, pictures = concepts[::-1], pictures[::-1]
+        wording = replace(wording, phrase=opposite, opposite=phrase)
     return Proposal(
-        candidate_id=_candidate_id(candidate.category, candidate.source_id),
-        category=candidate.category,
+        candidate,
+        _candidate_id(candidate.category, candidate.source_id),
         source_id=candidate.source_id,
         pair_key=candidate.source_id,
-        question=candidate.question,
-        question_sha256=candidate.question_sha256,
-        target=candidate.target,
-        distractor=candidate.distractor,
+        target=pictures[0],
+        distractor=pictures[1],
         wording=wording,
-        polarity="pos" if opposite else "none",
-        target_concept=phrase,
-        distractor_concept=opposite or f"not {phrase}",
+        target_concept=concepts[0],
+        distractor_concept=concepts[1],
         construction=candidate.construction,
         needs_person=candidate.needs_person,
-        side_word=candidate.side_word,
-    )
-
-
-def _opposite(proposal: Proposal) -> Proposal:
-    """The same two pictures, asked for by the opposite."""
-    wording = proposal.wording
-    assert wording is not None
-    assert wording.opposite is not None
-    return replace(
-        proposal,
-        target=proposal.distractor,
-        distractor=proposal.target,
-        wording=replace(wording, phrase=wording.opposite, opposite=wording.phrase),
-        polarity="neg",
-        target_concept=proposal.distractor_concept,
-        distractor_concept=proposal.target_concept,
+        polarity="none" if not opposite else "neg" if negated else "pos",
     )
 
 
 def _ask(candidate: Candidate, other: Candidate) -> Proposal:
     """One of two candidates asked for, with the other's picture as the wrong one."""
-    ids = sorted((candidate.source_id, other.source_id))
+    recolored = "recolored" in (candidate.construction, other.construction)
     return Proposal(
-        candidate_id=_candidate_id(candidate.category, candidate.source_id, other.source_id),
-        category=candidate.category,
+        candidate,
+        _candidate_id(candidate.category, candidate.source_id, other.source_id),
         source_id=f"{candidate.source_id}|{other.source_id}",
-        pair_key="+".join(ids),
-        question=candidate.question,
-        question_sha256=candidate.question_sha256,
+        pair_key="+".join(sorted((candidate.source_id, other.source_id))),
         target=candidate.target,
         distractor=other.target,
         wording=candidate.wording,
-        polarity="none",
         target_concept=candidate.concept,
         distractor_concept=other.concept,
-        construction="recolored"
-        if "recolored" in (candidate.construction, other.construction)
-        else candidate.construction,
+        construction="recolored" if recolored else candidate.construction,
         needs_person=candidate.needs_person or other.needs_person,
-        side_word=candidate.side_word,
     )
 
 
@@ -152,11 +132,6 @@ def _may_meet(first: Candidate, second: Candidate) -> bool:
         and not first.forbids & second.shows
         and not second.forbids & first.shows
     )
-
-
-def _every_couple(candidates: Sequence[Candidate], rng: np.random.Generator) -> list[tuple[Candidate, Candidate]]:
-    couples = [(a, b) for a, b in combinations(candidates, 2) if _may_meet(a, b)]
-    return [couples[int(index)] for index in rng.permutation(len(couples))]
 
 
 def _disjoint_couples(
@@ -241,6 +216,7 @@ def _item(
 ) -> Item:
     left, right = (target, distractor) if side == "left" else (distractor, target)
     assert proposal.wording is not None
+    category = proposal.candidate.category
     content = {
         "instruction": proposal.instruction,
         "correct_side": side,
@@ -249,8 +225,8 @@ def _item(
         "source_id": proposal.source_id,
     }
     return make_item(
-        f"{source}-{proposal.category}-{sha256_json(content)[:10]}",
-        proposal.category,
+        f"{source}-{category}-{sha256_json(content)[:10]}",
+        category,
         side,
         (left, right),
         construction=proposal.construction,
@@ -260,7 +236,7 @@ def _item(
         polarity=proposal.polarity,
         target_concept=proposal.target_concept,
         distractor_concept=proposal.distractor_concept,
-        pair_id=f"{source}-{proposal.category}-{sha256_json(proposal.pair_key)[:12]}",
+        pair_id=f"{source}-{category}-{sha256_json(proposal.pair_key)[:12]}",
         rule_id=proposal.wording.rule_id,
         curation_status=proposal.curation_status,
         license=reading.license,
@@ -273,10 +249,10 @@ def _item(
             "split": reading.split,
             "source_id": proposal.source_id,
             "url": reading.url,
-            "question": proposal.question,
+            "question": proposal.candidate.question,
             "left_original_pixels_sha256": left.original_pixels,
             "right_original_pixels_sha256": right.original_pixels,
             "picture_operation": left.operation,
         },
-        side_word=proposal.side_word,
+        side_word=proposal.candidate.side_word,
     )

@@ -18,7 +18,7 @@ from probe_kit.suite.generators.drawing import (
     jittered,
     polygon,
 )
-from probe_kit.suite.generators.generator import Concept, Generator
+from probe_kit.suite.generators.generator import Concept, Generator, each
 
 _DARK = (52, 40, 36)
 _WOOD = (118, 76, 40)
@@ -214,10 +214,6 @@ def _scatter(concept: Count, rng: np.random.Generator) -> Scatter:
     return Scatter(concept.glyph, color, placements, ink=ink, background=background_for(ink, rng))
 
 
-def _tiles(left: Count, right: Count, rng: np.random.Generator) -> tuple[Scatter, Scatter]:
-    return _scatter(left, rng), _scatter(right, rng)
-
-
 def _count(number: int, glyph: str) -> Count:
     word = _NUMBERS[number - 1]
     return Count(word, f"picture with {GLYPHS[glyph].counted(word)}", number=number, glyph=glyph)
@@ -231,5 +227,5 @@ COUNTING = Generator(
         for fewer in range(1, len(_NUMBERS) + 1)
         for more in range(fewer + 1, min(fewer + _LARGEST_DIFFERENCE, len(_NUMBERS)) + 1)
     ),
-    tiles=_tiles,
+    tiles=each(_scatter),
 )

@@ -19,7 +19,7 @@ from probe_kit.suite.generators.drawing import (
     polygon,
     random_placement,
 )
-from probe_kit.suite.generators.generator import Concept, Generator
+from probe_kit.suite.generators.generator import Concept, Generator, each
 
 SKINS: tuple[RGB, ...] = (
     *((255, 224, 196), (240, 194, 150), (224, 172, 105)),
@@ -204,10 +204,6 @@ def _face(concept: Feeling, rng: np.random.Generator) -> Face:
     )
 
 
-def _tiles(left: Feeling, right: Feeling, rng: np.random.Generator) -> tuple[Face, Face]:
-    return _face(left, rng), _face(right, rng)
-
-
 EMOTION = Generator(
     category="emotion",
     pairs=(
@@ -220,5 +216,5 @@ EMOTION = Generator(
             for emotion, (more, less) in _DEGREES.items()
         ),
     ),
-    tiles=_tiles,
+    tiles=each(_face),
 )

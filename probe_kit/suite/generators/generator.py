@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from probe_kit.hashing import derive_seed, sha256_json
-from probe_kit.suite.generators.drawing import Tile
+from probe_kit.suite.generators.drawing import Tile, on_hues
 
 
 @dataclass(frozen=True)
@@ -65,6 +65,20 @@ def half_within[C: Concept](
     within = spread_pairs(concepts, lambda a, b: family(a) == family(b) and allowed(a, b))
     across = spread_pairs(concepts, lambda a, b: family(a) != family(b) and allowed(a, b), most=len(within))
     return within + across
+
+
+def each[C: Concept, T: Tile](
+    draw: Callable[[C, np.random.Generator], T],
+) -> Callable[[C, C, np.random.Generator], tuple[T, T]]:
+    """The drawing of two tiles, one after the other, from the drawing of one."""
+    return lambda left, right, rng: (draw(left, rng), draw(right, rng))
+
+
+def each_on_hues[C: Concept, T: Tile](
+    draw: Callable[[C, np.random.Generator], T],
+) -> Callable[[C, C, np.random.Generator], tuple[T, T]]:
+    """The same, then with backgrounds of any hue, as `on_hues` has them."""
+    return lambda left, right, rng: on_hues(draw(left, rng), draw(right, rng), rng)
 
 
 def none_alike[C: Concept](families: Sequence[set[str]]) -> Callable[[C, C], bool]:

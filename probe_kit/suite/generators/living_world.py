@@ -14,7 +14,7 @@ from probe_kit.suite.generators.drawing import (
     mean_color,
     random_placement,
 )
-from probe_kit.suite.generators.generator import Concept, Generator, half_within, none_alike, spread_pairs
+from probe_kit.suite.generators.generator import Concept, Generator, each, half_within, none_alike, spread_pairs
 
 
 @dataclass(frozen=True)
@@ -124,10 +124,6 @@ def _portrait(concept: Depicted, rng: np.random.Generator) -> Portrait:
     return Portrait(concept.icon, random_placement(rng, (0.9, 1.0), turn=_TURN), ink=ink, background=background)
 
 
-def _tiles(left: Depicted, right: Depicted, rng: np.random.Generator) -> tuple[Portrait, Portrait]:
-    return _portrait(left, rng), _portrait(right, rng)
-
-
 def _animal_pairs() -> tuple[tuple[Depicted, Depicted], ...]:
     """Half of the pairs inside one family; never a whole animal beside a mere face."""
     creature_of = {creature.name: creature for creature in CREATURES}
@@ -154,5 +150,5 @@ _NAMED = _animal_pairs()
 LIVING_WORLD = Generator(
     category="living-world",
     pairs=_NAMED + _alive_or_not(len(_NAMED) // (_ALIVE_SHARE - 1)),
-    tiles=_tiles,
+    tiles=each(_portrait),
 )

@@ -30,11 +30,10 @@ from probe_kit.suite.generators.drawing import (
     ellipse,
     jittered,
     lightness,
-    on_hues,
     polygon,
     random_placement,
 )
-from probe_kit.suite.generators.generator import Concept, Generator
+from probe_kit.suite.generators.generator import Concept, Generator, each, each_on_hues
 
 _AREA = 0.95**2  # in drawing units; the most that keeps every placement of every outline on its tile
 
@@ -206,10 +205,6 @@ def _figure(concept: Concept, rng: np.random.Generator) -> Figure:
     return random_figure(color, concept.name, "hollow" if rng.random() < _HOLLOW_SHARE else "plain", rng)
 
 
-def _outlined_tiles(left: Concept, right: Concept, rng: np.random.Generator) -> tuple[Figure, Figure]:
-    return on_hues(_figure(left, rng), _figure(right, rng), rng)
-
-
 SHAPE = Generator(
     category="shape",
     pairs=tuple(
@@ -217,7 +212,7 @@ SHAPE = Generator(
         for first, second in combinations([Concept(name, name) for name in _NAMES], 2)
         if _distinct(first, second)
     ),
-    tiles=_outlined_tiles,
+    tiles=each_on_hues(_figure),
     name_of=colored_outline,
 )
 
@@ -303,12 +298,8 @@ def _outline(concept: Concept, rng: np.random.Generator) -> Outline:
     )
 
 
-def _symmetry_tiles(left: Concept, right: Concept, rng: np.random.Generator) -> tuple[Outline, Outline]:
-    return _outline(left, rng), _outline(right, rng)
-
-
 SYMMETRY = Generator(
     category="symmetry",
     pairs=((Concept("symmetric", "symmetric shape", "pos"), Concept("asymmetric", "asymmetric shape", "neg")),),
-    tiles=_symmetry_tiles,
+    tiles=each(_outline),
 )

@@ -21,7 +21,7 @@ from probe_kit.suite.generators.drawing import (
     random_placement,
     rectangle,
 )
-from probe_kit.suite.generators.generator import Concept, Generator
+from probe_kit.suite.generators.generator import Concept, Generator, each
 
 _DARK: RGB = (40, 36, 36)
 _WHITE: RGB = (250, 250, 250)
@@ -299,15 +299,11 @@ def _condition(concept: Concept, rng: np.random.Generator) -> Condition:
     return Condition(concept.name, random_placement(rng, FULL_DISK, turn=8), ink=ink, background=background)
 
 
-def _tiles(left: Concept, right: Concept, rng: np.random.Generator) -> tuple[Condition, Condition]:
-    return _condition(left, rng), _condition(right, rng)
-
-
 STATE = Generator(
     category="state",
     pairs=tuple(
         (Concept(states.first, states.first, "pos"), Concept(states.second, states.second, "neg"))
         for states in TWO_STATES
     ),
-    tiles=_tiles,
+    tiles=each(_condition),
 )

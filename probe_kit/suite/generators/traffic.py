@@ -20,13 +20,12 @@ from probe_kit.suite.generators.drawing import (
     background_for,
     ellipse,
     mask_icon,
-    on_hues,
     polygon,
     random_placement,
     rectangle,
     tinted,
 )
-from probe_kit.suite.generators.generator import Concept, Generator, half_within, none_alike
+from probe_kit.suite.generators.generator import Concept, Generator, each_on_hues, half_within, none_alike
 
 _RED: RGB = (200, 20, 34)
 _BLUE: RGB = (16, 76, 170)
@@ -267,10 +266,6 @@ def _sign_post(concept: Concept, rng: np.random.Generator) -> SignPost:
     return SignPost(concept.name, placement, ink=ink, background=background_for(ink, rng))
 
 
-def _tiles(left: Concept, right: Concept, rng: np.random.Generator) -> tuple[SignPost, SignPost]:
-    return on_hues(_sign_post(left, rng), _sign_post(right, rng), rng)
-
-
 TRAFFIC = Generator(
     category="traffic",
     pairs=half_within(
@@ -278,5 +273,5 @@ TRAFFIC = Generator(
         family=lambda concept: ROAD_SIGNS[concept.name].family,
         allowed=none_alike(LOOK_ALIKES),
     ),
-    tiles=_tiles,
+    tiles=each_on_hues(_sign_post),
 )
