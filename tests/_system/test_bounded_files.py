@@ -126,7 +126,7 @@ UNBOUNDED = {
 }  # fmt: skip
 ELSEWHERE = {
     "_system/bounded_files.py": "the reader itself",
-    "runs/export/matrices.py": "the matrix that it has just written",
+    "runs/export_vectors.py": "the matrix that it has just written",
     "_system/parquet_files.py": "the reader itself",
     "_system/machine.py": "files of the system",
     "doctor.py": "files of the system",

@@ -50,13 +50,8 @@ class Tile:
     size: tuple[float, float, float]
 
 
-@dataclass(frozen=True)
-class _Top:
-    """Corners of what faces up: xy (N, 2) metres, uv (N, 2) with v downwards as in glTF; and their material."""
-
-    xy: NDArray[np.float64]
-    uv: NDArray[np.float64]
-    material: Any
+Top = tuple[NDArray[np.float64], NDArray[np.float64], Any]
+"""Corners of what faces up: (N, 2) metres, (N, 2) of the texture with v downwards; and their material."""
 
 
 def read_tile(path: Path, yaw: int = RELEASE_YAW) -> Tile:
@@ -92,7 +87,7 @@ def _meshes(scene: Any) -> Iterator[tuple[NDArray[np.float64], Any]]:
             yield points @ transform[:3, :3].T + transform[:3, 3], mesh
 
 
-def _top(meshes: list[tuple[NDArray[np.float64], Any]], low: float, high: float, path: Path) -> _Top:
+def _top(meshes: list[tuple[NDArray[np.float64], Any]], low: float, high: float, path: Path) -> Top:
     """Return the surface that faces up at the tile's top."""
     upward = []
     for points, mesh in meshes:
@@ -110,13 +105,14 @@ def _top(meshes: list[tuple[NDArray[np.float64], Any]], low: float, high: float,
     uv = getattr(mesh.visual, "uv", None)
     if uv is None or getattr(mesh.visual, "material", None) is None:
         raise SuiteError(f"{path}: what faces up has no texture; expected a picture as baseColorTexture.")
-    return _Top(xy, np.asarray(uv, np.float64)[vertices] * (1, -1) + (0, 1), mesh.visual.material)
+    return xy, np.asarray(uv, np.float64)[vertices] * (1, -1) + (0, 1), mesh.visual.material
 
 
-def _render_top(top: _Top, yaw: int, path: Path) -> Image.Image:
-    texture = _texture(top.material, path)
-    slope = _slope(top, path)
-    pixels = np.asarray(_cut(texture, top.uv, path))
+def _render_top(top: Top, yaw: int, path: Path) -> Image.Image:
+    xy, uv, material = top
+    texture = _texture(material, path)
+    slope = _slope(xy, uv, path)
+    pixels = np.asarray(_cut(texture, uv, path))
     if abs(slope[0, 0]) < abs(slope[0, 1]):  # u runs along y
         pixels, slope = np.swapaxes(pixels, 0, 1), slope[::-1]
     if slope[0, 0] < 0:
@@ -125,7 +121,7 @@ def _render_top(top: _Top, yaw: int, path: Path) -> Image.Image:
         pixels = pixels[::-1]
     turns = (RELEASE_YAW - yaw) // 90
     picture = Image.fromarray(np.ascontiguousarray(np.rot90(pixels, -turns)))
-    across, away = np.ptp(top.xy, axis=0)[:: 1 if turns % 2 == 0 else -1]
+    across, away = np.ptp(xy, axis=0)[:: 1 if turns % 2 == 0 else -1]
     longer = max(picture.size)
     size = (round(longer * across / max(across, away)), round(longer * away / max(across, away)))
     return picture if picture.size == size else picture.resize(size, Image.Resampling.BICUBIC)
@@ -141,12 +137,12 @@ def _texture(material: Any, path: Path) -> Image.Image:
     return rgb_of(texture, f"{path}, texture:", "Check out the assets again.")
 
 
-def _slope(top: _Top, path: Path) -> NDArray[np.float64]:
+def _slope(xy: NDArray[np.float64], uv: NDArray[np.float64], path: Path) -> NDArray[np.float64]:
     """(2, 2): how much of the picture's width and height (u, v) passes along the tile's x and y."""
-    design = np.column_stack([top.xy, np.ones(len(top.xy))])
-    fitted, _, rank, _ = np.linalg.lstsq(design, top.uv, rcond=None)
-    off = float(np.abs(design @ fitted - top.uv).max())
-    slope: NDArray[np.float64] = (fitted[:2] * np.ptp(top.xy, axis=0)[:, None]).T
+    design = np.column_stack([xy, np.ones(len(xy))])
+    fitted, _, rank, _ = np.linalg.lstsq(design, uv, rcond=None)
+    off = float(np.abs(design @ fitted - uv).max())
+    slope: NDArray[np.float64] = (fitted[:2] * np.ptp(xy, axis=0)[:, None]).T
     # Along the sides, every row has one large entry, and not the same column.
     small, large = np.sort(np.abs(slope), axis=1).T
     of_width, of_height = np.abs(slope).argmax(axis=1)

@@ -48,9 +48,11 @@ def read(root: Path, categories: Sequence[str], options: CompBenchOptions) -> Re
         if folder == "fer2013_label" and not options.fer:
             reading.notes.append("FER-2013 left out by option fer")
             continue
+        base = options.pictures_below(root)
+        homes = [base / inner / prefix for inner in ("", "dataset") for prefix in ("", *prefixes)]
         for path in _annotation_files(labels / folder, stem):
             reading.files.append(path)
-            _read_file(path, folder, prefixes, category, categories, options, root, reading)
+            _read_file(path, folder, homes, category, categories, options, reading)
     if not reading.files:
         raise SuiteError(
             f"{SOURCE}: no annotation file found below {labels}; looked for "
@@ -73,11 +75,10 @@ def _annotation_files(folder: Path, stem: str) -> list[Path]:
 def _read_file(
     path: Path,
     folder: str,
-    prefixes: tuple[str, ...],
+    homes: Sequence[Path],
     category: str | None,
     categories: Sequence[str],
     options: CompBenchOptions,
-    root: Path,
     reading: Reading,
 ) -> None:
     records = read_annotations(path, SOURCE, "Unpack the archive `Annotations` again.", list)
@@ -86,7 +87,8 @@ def _read_file(
             reading.reasons["empty record"] += 1
             continue
         where = f"record {number} of {path.name}"
-        slug = category or _category_of(record, where)
+        is_state = category is None and field_of(record, "type", str, SOURCE, where) == "State"
+        slug = category or ("state" if is_state else "attribute")
         if slug not in categories:
             continue
         reading.pool[slug] += 1
@@ -94,32 +96,21 @@ def _read_file(
         if answer not in ("Left", "Right"):
             reading.reasons[f"answer is {answer!r}, not Left or Right"] += 1
             continue
-        pictures = list(_pictures(record, where, folder, prefixes, options, root))
+        pictures = list(_pictures(record, where, folder, homes, options))
         target, distractor = pictures if answer == "Left" else pictures[::-1]
         question = field_of(record, "question", str, SOURCE, where)
         source_id = f"{folder}/{path.stem}/{number:05d}"
         reading.candidates.append(Candidate(source_id, slug, question, target, distractor))
 
 
-def _category_of(record: Any, where: str) -> str:
-    return "state" if field_of(record, "type", str, SOURCE, where) == "State" else "attribute"
-
-
 def _pictures(
-    record: Any, where: str, folder: str, prefixes: tuple[str, ...], options: CompBenchOptions, root: Path
+    record: Any, where: str, folder: str, homes: Sequence[Path], options: CompBenchOptions
 ) -> Iterator[SourcePicture]:
-    base = options.pictures_below(root)
     for key in ("image_1", "image_2"):
         name = field_of(record, key, str, SOURCE, where).replace("\\", "/").lstrip("/")
-        places = [base, *(base / prefix for prefix in prefixes)]
-        tried = [
-            folder_of_pictures / name
-            for folder_of_pictures in (*places, base / "dataset", *(base / "dataset" / p for p in prefixes))
-        ]
-        path = first_existing(tried, SOURCE, where, _REMEDY)
         yield SourcePicture(
             image_id=f"{SOURCE}/{name}",
-            load=photo(path),
+            load=photo(first_existing([home / name for home in homes], SOURCE, where, _REMEDY)),
             original=name,
             least_side=options.fer_min_side if folder == "fer2013_label" else None,
             real_face=folder in _FACES,

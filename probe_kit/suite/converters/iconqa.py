@@ -60,7 +60,10 @@ def read(root: Path, categories: Sequence[str], options: IconQaOptions) -> Readi
         SOURCE,
         "pid",
     )
-    _note_sizes(problems, reading)
+    for name, expected in _SUB_TASK_SIZES.items():
+        count = sum(problem.get("ques_type") == name for problem in problems.values() if isinstance(problem, dict))
+        if count != expected:
+            reading.notes.append(f"{name} has {count} problems; the published release has {expected}")
     for pid in sorted(problems, key=str):
         problem, where = problems[pid], f"problem {pid} of problems.json"
         category = _category_of(problem, skills.get(pid, []), where)
@@ -89,13 +92,6 @@ def _mapping(path: Path, reading: Reading) -> dict[str, Any]:
 def _is_home(split: str) -> bool:
     """Whether a split names a folder, such as `choose_img_train`; `mini…` and `…trainval` repeat others."""
     return split.rpartition("_")[0] in _SUB_TASKS and split.endswith(("_train", "_val", "_test"))
-
-
-def _note_sizes(problems: dict[str, Any], reading: Reading) -> None:
-    for name, expected in _SUB_TASK_SIZES.items():
-        count = sum(problem.get("ques_type") == name for problem in problems.values() if isinstance(problem, dict))
-        if count != expected:
-            reading.notes.append(f"{name} has {count} problems; the published release has {expected}")
 
 
 def _category_of(problem: Any, skills: Sequence[str], where: str) -> str | None:
@@ -217,14 +213,8 @@ def _count_of(problem: Any, where: str) -> int | None:
 
 
 def _singular(noun: str) -> str:
-    for plural, singular in (
-        ("ies", "y"),
-        ("ches", "ch"),
-        ("shes", "sh"),
-        ("xes", "x"),
-        ("sses", "ss"),
-        ("s", ""),
-    ):
+    endings = {"ies": "y", "ches": "ch", "shes": "sh", "xes": "x", "sses": "ss", "s": ""}
+    for plural, singular in endings.items():
         if noun.endswith(plural):
             return noun.removesuffix(plural) + singular
     return noun

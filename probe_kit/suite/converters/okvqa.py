@@ -3,7 +3,6 @@
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -78,14 +77,8 @@ _OTHER_MATTER = re.compile(
 )
 
 
-@dataclass(frozen=True)
-class _Boxes:
-    """Per picture, the share of its area that the largest box of each COCO class covers."""
-
-    largest: Mapping[int, Mapping[str, float]]
-
-    def classes(self, image_id: int) -> frozenset[str]:
-        return frozenset(self.largest.get(image_id, {}))
+Boxes = Mapping[int, Mapping[str, float]]
+"""Per picture, the share of its area that the largest box of each COCO class covers."""
 
 
 def read(root: Path, categories: Sequence[str], options: OkVqaOptions) -> Reading:
@@ -139,15 +132,11 @@ def _read_split(root: Path, split: str, questions: Path, options: OkVqaOptions, 
 
 def _by_question(path: Path, key: str, name: str) -> dict[int, Any]:
     """The records of a file by their question, in its order. Raises SuiteError for a question with two."""
-    places = ((f"{name} {number} of {path.name}", record) for number, record in enumerate(_records(path, key)))
+    value = read_annotations(path, SOURCE, "Unpack the questions and the annotations of the same release.")
+    records = enumerate(field_of(value, key, list, SOURCE, path.name))
+    places = ((f"{name} {number} of {path.name}", record) for number, record in records)
     entries = ((field_of(record, "question_id", int, SOURCE, where), record, where) for where, record in places)
     return by_key(entries, SOURCE, "question_id")
-
-
-def _records(path: Path, key: str) -> list[Any]:
-    value = read_annotations(path, SOURCE, "Unpack the questions and the annotations of the same release.")
-    records: list[Any] = field_of(value, key, list, SOURCE, path.name)
-    return records
 
 
 def _answer(record: Any, question: str, options: OkVqaOptions, where: str) -> tuple[str, str | None]:
@@ -173,7 +162,7 @@ def _candidate(
     split: str,
     root: Path,
     options: OkVqaOptions,
-    boxes: _Boxes | None,
+    boxes: Boxes | None,
     where: str,
 ) -> Candidate | str:
     image_id = field_of(record, "image_id", int, SOURCE, where)
@@ -184,7 +173,7 @@ def _candidate(
     noun = singular(answer)
     coco = COCO_CLASS.get(noun)
     if boxes and coco:
-        share = boxes.largest.get(image_id, {}).get(coco, 0.0)
+        share = boxes.get(image_id, {}).get(coco, 0.0)
         if share < options.min_object_share:
             return "object too small or not boxed"
     return Candidate(
@@ -197,13 +186,13 @@ def _candidate(
         concept=noun,
         construction="cross_item",
         family=KIND_OF[noun],
-        shows=(boxes.classes(image_id) if boxes else frozenset()) | {noun},
+        shows=frozenset((boxes or {}).get(image_id, {})) | {noun},
         forbids=frozenset({coco, noun} if coco else {noun}),
         needs_person=boxes is None or coco is None,
     )
 
 
-def _read_boxes(options: OkVqaOptions, split: str, reading: Reading) -> _Boxes | None:
+def _read_boxes(options: OkVqaOptions, split: str, reading: Reading) -> Boxes | None:
     if options.instances is None:
         return None
     path = Path(options.instances) / f"instances_{split}.json"
@@ -220,4 +209,4 @@ def _read_boxes(options: OkVqaOptions, split: str, reading: Reading) -> _Boxes |
         shares = largest.setdefault(entry["image_id"], {})
         name = names[entry["category_id"]]
         shares[name] = max(shares.get(name, 0.0), width * height / areas[entry["image_id"]])
-    return _Boxes(largest)
+    return largest

@@ -25,74 +25,24 @@ from probe_kit.suite.converters.candidates import Candidate, ConvertOptions, Wor
 from probe_kit.suite.items import instruction_for, side_words
 
 # Opposites that were looked at one by one. Any other comparative is negated as "less" and its base.
-ANTONYMS = {
-    "longer": "shorter",
-    "taller": "shorter",
-    "higher": "lower",
-    "bigger": "smaller",
-    "larger": "smaller",
-    "wider": "narrower",
-    "thicker": "thinner",
-    "darker": "lighter",
-    "brighter": "darker",
-    "older": "younger",
-    "heavier": "lighter",
-    "newer": "older",
-    "fuller": "emptier",
-    "deeper": "shallower",
-    "wetter": "drier",
-    "cleaner": "dirtier",
-    "smoother": "rougher",
-    "harder": "softer",
-    "hotter": "colder",
-    "fewer": "more",
-    "straighter": "curvier",
-    "sharper": "blunter",
-    "denser": "sparser",
-    "rounder": "flatter",
-    "more": "less",
-    "dryer": "wetter",
-    "warmer": "cooler",
-    "stronger": "weaker",
-    "faster": "slower",
-    "closer": "farther",
-}
+_PAIRS = (
+    "longer/shorter taller/shorter higher/lower bigger/smaller larger/smaller wider/narrower "
+    "thicker/thinner darker/lighter brighter/darker older/younger heavier/lighter newer/older "
+    "fuller/emptier deeper/shallower wetter/drier cleaner/dirtier smoother/rougher harder/softer "
+    "hotter/colder fewer/more straighter/curvier sharper/blunter denser/sparser rounder/flatter "
+    "more/less dryer/wetter warmer/cooler stronger/weaker faster/slower closer/farther"
+)
+ANTONYMS = dict(pair.split("/") for pair in _PAIRS.split())
 ANTONYMS |= {value: key for key, value in ANTONYMS.items() if value not in ANTONYMS}
 # Stems that lost an e: one vowel and one consonant, which else would be doubled, or a cluster that needs it.
 _LOST_E = re.compile(r"((?<![aeiou])[aeiou][bcdfgklmnprstvz]|rg|rs|ns|rc|nc|[bpdtg]l|oos|v)$")
 _BASES = {"better": "good", "worse": "bad", "farther": "far", "further": "far", "freer": "free"}
-_NOT_COMPARATIVE = frozenset(
-    (
-        *(
-            "other",
-            "water",
-            "paper",
-            "flower",
-            "tiger",
-            "river",
-            "number",
-            "corner",
-            "finger",
-            "letter",
-            "together",
-        ),
-        *("computer", "summer", "winter", "weather", "center", "feather", "leather", "power", "tower", "shower"),
-        *(
-            "over",
-            "under",
-            "after",
-            "ever",
-            "never",
-            "her",
-            "silver",
-            "copper",
-            "butter",
-            "runner",
-            "player",
-            "together",
-        ),
-    )
+_ENDING_IN_ER = (
+    "other water paper flower tiger river number corner finger letter together computer summer winter "
+    "weather center feather leather power tower shower over under after ever never her silver copper "
+    "butter runner player"
 )
+_NOT_COMPARATIVE = frozenset(_ENDING_IN_ER.split())
 _PREFIX = re.compile(
     r"^(based on (these|the|the two|both) (images|pictures|photos)|looking at the (images|pictures)|"
     r"(in|from) (these|the|the two) (images|pictures)|(of|between) the two (images|pictures)),?\s+",

@@ -2,6 +2,7 @@
 
 import struct
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -99,7 +100,14 @@ def _board(
         return
     colors = [(label.lower(), picture, "cross_item")]
     if options.recolor and label.lower() == "black":
-        colors += [(color, _repainted(picture, board, color), "recolored") for color in _RECOLORS]
+        for color in _RECOLORS:
+            painted = replace(
+                picture,
+                image_id=f"{picture.image_id}:{color}",
+                load=partial(_repaint, board, color),
+                operation=f"{picture.operation}, ink repainted {color}",
+            )
+            colors.append((color, painted, "recolored"))
     for color, board_picture, construction in colors:
         source_id = key if construction == "cross_item" else f"{key}:{color}"
         wording = Wording(f"{color} shape", "label")
@@ -113,15 +121,6 @@ def _label(record: Any, field: str, where: str) -> str:
     if not isinstance(value, str) or not value.strip():
         raise SuiteError(f"{SOURCE}: {where}: field {field!r} is {value!r}; expected a name. Check the release.")
     return value.strip().replace("_", " ")
-
-
-def _repainted(picture: SourcePicture, board: Path, color: str) -> SourcePicture:
-    return SourcePicture(
-        image_id=f"{picture.image_id}:{color}",
-        load=partial(_repaint, board, color),
-        original=picture.original,
-        operation=f"{picture.operation}, ink repainted {color}",
-    )
 
 
 def _repaint(board: Path, color: str) -> Image.Image:
