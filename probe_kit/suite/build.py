@@ -16,7 +16,6 @@ from probe_kit.errors import UsageError
 from probe_kit.hashing import sha256_json, sha256_text
 from probe_kit.suite.categories import CATEGORIES, check_categories
 from probe_kit.suite.generators import GENERATORS
-from probe_kit.suite.generators.drawing import Tile
 from probe_kit.suite.generators.generator import SUITE_NAME, SUITE_VERSION, Couple, Generator, draw_couples
 from probe_kit.suite.items import Item, Side, instruction_for, side_words, with_groups
 from probe_kit.suite.manifest import check_foreign_folder, load_suite, save_suite
@@ -38,7 +37,11 @@ def draw_twins(category: str, count: int, seed: int) -> Iterator[Twins]:
     """The first `count` twins of one category; a smaller count gives the beginning of a larger one."""
     generator = GENERATORS[category]
     for number, couple in enumerate(islice(draw_couples(generator, seed), count)):
-        pictures = _draw(category, couple.left_tile), _draw(category, couple.right_tile)
+        left_picture, right_picture = (
+            picture_of(f"{SUITE_NAME}/{category}/{sha256_json(asdict(tile))[:16]}", tile.draw())
+            for tile in (couple.left_tile, couple.right_tile)
+        )
+        pictures = left_picture, right_picture
         gen = {
             "generator": category,
             "version": SUITE_VERSION,
@@ -50,10 +53,6 @@ def draw_twins(category: str, count: int, seed: int) -> Iterator[Twins]:
         sides: tuple[Side, Side] = ("left", "right") if couple.left_asked_first else ("right", "left")
         first, second = (_item(couple, pictures, side, gen, generator) for side in sides)
         yield Twins((first, second), pictures)
-
-
-def _draw(category: str, tile: Tile) -> Picture:
-    return picture_of(f"{SUITE_NAME}/{category}/{sha256_json(asdict(tile))[:16]}", tile.draw())
 
 
 def _item(
@@ -70,6 +69,8 @@ def _item(
     instruction = instruction_for(target.phrase, "the")
     tiles = (couple.left_tile, couple.right_tile) if side == "left" else (couple.right_tile, couple.left_tile)
     content = {"instruction": instruction, "correct_side": side, "gen": gen}
+    name, other_name = (generator.name_of(tile) if generator.name_of else "" for tile in tiles)
+    tells = name and name != other_name and not side_words(name)  # else the words would fit both or name a side
     return make_item(
         f"{SUITE_NAME}-{category}-{sha256_json(content)[:10]}",
         category,
@@ -97,15 +98,8 @@ def _item(
             "url": "",
         },
         gen=gen,
-        wordings=_wordings(generator, *tiles),
+        wordings={"named": instruction_for(name, "the")} if tells else {},
     )
-
-
-def _wordings(generator: Generator[Any], target: Tile, distractor: Tile) -> dict[str, str]:
-    """Return the item's other wordings; none if the words would fit both tiles or name a side."""
-    name, distractor_name = (generator.name_of(tile) if generator.name_of else "" for tile in (target, distractor))
-    tells = name and name != distractor_name and not side_words(name)
-    return {"named": instruction_for(name, "the")} if tells else {}
 
 
 Progress = Callable[[int, int], None]
@@ -165,7 +159,8 @@ def default_folder(
 ) -> Path:
     """Return the folder in which `default_suite` keeps the suite of these arguments, built or not."""
     key = _cache_key(_options(categories, items_per_category, seed))
-    return _cache_folder() / "suites" / f"{default_identity().replace('@', '-')}-{key}"
+    cache = os.environ.get("PROBE_KIT_CACHE") or Path.home() / ".cache" / "probe_kit"
+    return Path(cache) / "suites" / f"{default_identity().replace('@', '-')}-{key}"
 
 
 def default_identity() -> str:
@@ -215,11 +210,6 @@ def _stats(suite: Suite) -> dict[str, dict[str, int]]:
         category: {"pool": len(GENERATORS[category].pairs), "emitted": emitted}
         for category, emitted in suite.card["counts"].items()
     }
-
-
-def _cache_folder() -> Path:
-    folder = os.environ.get("PROBE_KIT_CACHE")
-    return Path(folder) if folder else Path.home() / ".cache" / "probe_kit"
 
 
 def _cache_key(options: Mapping[str, Any]) -> str:

@@ -128,18 +128,17 @@ def show(
         print_json({"suite": suite.identity, "items": rows})
         return
     out.print(marked("[bold]{}[/]", suite.identity), soft_wrap=True)
+    working_folder = Path.cwd()
     for row in rows:
         # Each path on a line of its own: a column of a table would fold it, so that it could not be copied.
-        pictures = {side: _from_here(row[side]) for side in ("correct", "wrong")}
+        paths = {side: Path(row[side]) for side in ("correct", "wrong")}
+        pictures = {
+            side: str(path.relative_to(working_folder) if path.is_relative_to(working_folder) else path)
+            for side, path in paths.items()
+        }
         out.print(marked("\n[bold]{}[/]", row["instruction"]), soft_wrap=True)
         for name, text in {"category": row["category"], "item": row["item"], **pictures}.items():
             out.print(marked("  {} {}", f"{name:<8}", text), soft_wrap=True)
-
-
-def _from_here(path: str) -> str:
-    """Return a path relative to the working directory where it lies below."""
-    folder = Path.cwd()
-    return str(Path(path).relative_to(folder)) if Path(path).is_relative_to(folder) else path
 
 
 def _list_categories(suite: "Suite", as_json: bool) -> None:
@@ -177,12 +176,17 @@ def validate(
 
     With --baselines, probes on the pictures, the instruction or the side alone must be at chance.
     """
-    from probe_kit.suite import default_suite, validate_suite
+    from probe_kit.statistics.significance import detectable
+    from probe_kit.suite import default_suite, load_suite, validate_suite
+    from probe_kit.suite.suite import count_by_category
 
     location = default_suite().folder if folder is None else folder
     with err.status("checking"):
         report = validate_suite(location, baselines=baselines)
-    least = _least_leaks(location) if power and not report.errors else {}
+    least: dict[str, float] = {}
+    if power and not report.errors:  # the accuracy from which on a leak is found in four of five suites
+        counts = count_by_category(load_suite(location).items)
+        least = {name: detectable(count) for name, count in counts.items()}
     if as_json:
         print_json(report.to_json() | ({"power": least} if power else {}))
     else:
@@ -191,15 +195,6 @@ def validate(
             out.print(line, soft_wrap=True)
         out.print(report.to_text(), soft_wrap=True)
     raise typer.Exit(0 if report.ok else 1)
-
-
-def _least_leaks(folder: Path) -> dict[str, float]:
-    """Return by category the accuracy from which on a baseline is found above chance in four of five suites."""
-    from probe_kit.statistics.significance import detectable
-    from probe_kit.suite import load_suite
-    from probe_kit.suite.suite import count_by_category
-
-    return {name: detectable(count) for name, count in count_by_category(load_suite(folder).items).items()}
 
 
 @app.command()

@@ -297,12 +297,12 @@ def counterparts_of(items: Iterable[Item]) -> Mapping[str, Item]:
     twins: dict[str, Item] = {}
     for together in by_pictures.values():
         for item in together:
-            candidates = [other for other in together if _asks_otherwise(item, other)]
+            target = item.pixels_sha256(item.correct_side)
+            candidates = [
+                other
+                for other in together
+                if other.pixels_sha256(other.correct_side) != target and other.instruction != item.instruction
+            ]
             if candidates:
                 twins[item.item_id] = min(candidates, key=lambda other: other.item_id)
     return twins
-
-
-def _asks_otherwise(item: Item, other: Item) -> bool:
-    target, other_target = (each.pixels_sha256(each.correct_side) for each in (item, other))
-    return target != other_target and item.instruction != other.instruction

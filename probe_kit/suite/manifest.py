@@ -54,8 +54,19 @@ def save_suite(suite: Suite, pictures: Mapping[str, bytes], stats: Mapping[str, 
     if not _is_taken(folder):
         with draft_of(folder) as draft:
             _write(suite, pictures, stats, draft)
-            _rename_unless_taken(draft, folder)
-    return _load_same(suite, folder)
+            try:
+                draft.rename(folder)
+            except OSError as error:
+                if error.errno not in (errno.EEXIST, errno.ENOTEMPTY):
+                    raise
+    check_foreign_folder(folder)
+    stored = load_suite(folder)
+    if stored.identity != suite.identity:
+        raise SuiteError(
+            f"{folder} already holds {stored.identity}; expected {suite.identity} or a new folder. "
+            "Choose another folder, or delete this one if nothing was measured with it."
+        )
+    return stored
 
 
 def check_foreign_folder(folder: Path) -> None:
@@ -70,25 +81,6 @@ def _is_taken(folder: Path) -> bool:
     return folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
 
 
-def _rename_unless_taken(draft: Path, folder: Path) -> None:
-    try:
-        draft.rename(folder)
-    except OSError as error:
-        if error.errno not in (errno.EEXIST, errno.ENOTEMPTY):
-            raise
-
-
-def _load_same(suite: Suite, folder: Path) -> Suite:
-    check_foreign_folder(folder)
-    stored = load_suite(folder)
-    if stored.identity != suite.identity:
-        raise SuiteError(
-            f"{folder} already holds {stored.identity}; expected {suite.identity} or a new folder. "
-            "Choose another folder, or delete this one if nothing was measured with it."
-        )
-    return stored
-
-
 def _write(suite: Suite, pictures: Mapping[str, bytes], stats: Mapping[str, Any], folder: Path) -> None:
     for name, encoded in pictures.items():
         path = folder / ITEMS / name
@@ -99,7 +91,17 @@ def _write(suite: Suite, pictures: Mapping[str, bytes], stats: Mapping[str, Any]
     _write_text(folder / CARD, _pretty(suite.card))
     _write_text(folder / "stats.json", _pretty(dict(stats)))
     _write_text(folder / "LICENSES.md", _licenses(suite.items))
-    _write_attribution(folder / "ATTRIBUTION.csv", suite.items)
+    columns = ("file_name", "image_id", "license", "attribution")
+    rows = {
+        (name, image, item.license, item.attribution)
+        for item in suite.items
+        for name, image in (
+            (item.left_file_name, item.left_image_id),
+            (item.right_file_name, item.right_image_id),
+        )
+    }
+    table = csv_of_rows(columns, (dict(zip(columns, row, strict=True)) for row in sorted(rows)))
+    _write_text(folder / "ATTRIBUTION.csv", table)
 
 
 def _write_text(path: Path, text: str) -> None:
@@ -116,29 +118,8 @@ def _licenses(items: Iterable[Item]) -> str:
         f"| {license_id} | {'yes' if redistributable else 'no'} | {count} |"
         for (license_id, redistributable), count in sorted(counts.items())
     ]
-    return "\n".join(
-        [
-            "# Licences of this suite's pictures",
-            "",
-            "| licence | redistributable | items |",
-            "|---|---|---|",
-            *rows,
-            "",
-        ]
-    )
-
-
-def _write_attribution(path: Path, items: Iterable[Item]) -> None:
-    rows = {
-        row
-        for item in items
-        for row in (
-            (item.left_file_name, item.left_image_id, item.license, item.attribution),
-            (item.right_file_name, item.right_image_id, item.license, item.attribution),
-        )
-    }
-    columns = ("file_name", "image_id", "license", "attribution")
-    _write_text(path, csv_of_rows(columns, (dict(zip(columns, row, strict=True)) for row in sorted(rows))))
+    head = ["# Licences of this suite's pictures", "", "| licence | redistributable | items |", "|---|---|---|"]
+    return "\n".join([*head, *rows, ""])
 
 
 # -- reading -----------------------------------------------------------------------------------------

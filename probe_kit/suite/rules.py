@@ -211,16 +211,12 @@ def _check_file(item: Item, side: Side) -> Generator[Finding, None, int]:
         yield error("E07", where, f"picture {name!r} has {size / 1e6:,.0f} MB; {most}")
     else:
         encoded = read_regular(path)
-        yield from _check_bytes(encoded, item, side)
+        expected, actual = item.file_sha256(side), hashlib.sha256(encoded).hexdigest()
+        if actual != expected:
+            message = f"{side} picture changed on disk (expected {expected[:12]}, found {actual[:12]})"
+            yield error("E06", where, message)
         return (yield from _check_size(encoded, item, side))
     return 0
-
-
-def _check_bytes(encoded: bytes, item: Item, side: Side) -> Iterator[Finding]:
-    expected, actual = item.file_sha256(side), hashlib.sha256(encoded).hexdigest()
-    if actual != expected:
-        message = f"{side} picture changed on disk (expected {expected[:12]}, found {actual[:12]})"
-        yield error("E06", f"item {item.item_id}", message)
 
 
 def _check_size(encoded: bytes, item: Item, side: Side) -> Generator[Finding, None, int]:
@@ -354,18 +350,14 @@ def pixels_as_recorded(suite: Suite) -> Iterator[Finding]:
             if (name, recorded[side]) in checked or not item.picture(side).is_file():
                 continue
             checked.add((name, recorded[side]))
-            yield from _check_pixels(item, side, recorded[side])
-
-
-def _check_pixels(item: Item, side: Side, expected: str) -> Iterator[Finding]:
-    try:
-        actual = pixels_sha256(decode_picture(item.picture(side)))
-    except SuiteError as problem:
-        yield error("E07", f"item {item.item_id}", f"{side} picture cannot be decoded ({problem})")
-        return
-    if actual != expected:
-        message = f"{side} picture has other pixels (expected {expected[:12]}, found {actual[:12]})"
-        yield error("E06", f"item {item.item_id}", message)
+            try:
+                actual = pixels_sha256(decode_picture(item.picture(side)))
+            except SuiteError as problem:
+                yield error("E07", f"item {item.item_id}", f"{side} picture cannot be decoded ({problem})")
+                continue
+            if actual != recorded[side]:
+                message = f"{side} picture has other pixels (expected {recorded[side][:12]}, found {actual[:12]})"
+                yield error("E06", f"item {item.item_id}", message)
 
 
 DECODING_RULES: Sequence[Callable[[Suite], Iterator[Finding]]] = (pixels_as_recorded,)

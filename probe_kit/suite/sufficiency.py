@@ -87,14 +87,11 @@ class Smallest:
         if self.groups >= groups:
             return True, f"{'possible' if at_best else 'yes'}, {need}"
         items = self.items_for(groups)
+        of_category = {item.group_id for item in self.suite.items if item.category == self.category}
         more = (
-            f"take {items}{' or more' if at_best else ' items'}" if items else f"the suite has {self._all_groups}"
+            f"take {items}{' or more' if at_best else ' items'}" if items else f"the suite has {len(of_category)}"
         )
         return False, f"no, {need}: {otherwise}; {more}"
-
-    @property
-    def _all_groups(self) -> int:
-        return len({item.group_id for item in self.suite.items if item.category == self.category})
 
 
 def sufficiencies(suite: Suite, scored: bool, probed: bool) -> Iterator[Sufficiency]:

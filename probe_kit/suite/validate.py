@@ -223,7 +223,7 @@ Rows = npt.NDArray[np.intp]
 class Baseline:
     """The accuracy of one baseline on the correct side in one category.
 
-    interval: 95 %, from resampling groups. limit: what it may not exceed. grouping: what folds kept together.
+    interval: 95 %, groups as the unit. limit: what it may not exceed. grouping: what folds kept together.
     """
 
     category: str
@@ -299,11 +299,12 @@ def _category_baselines(suite: Suite, category: str, seed: int) -> Iterator[Base
         for fold in range(int(folds.max()) + 1):
             train, test = np.flatnonzero(folds != fold), np.flatnonzero(folds == fold)
             hits[test] = predict(train, test) == correct[test]
+        interval = Accuracy.of(hits, groups).interval()
         yield Baseline(
             category=category,
             name=name,
             accuracy=round(float(hits.mean()), 4),
-            interval=_interval(hits, groups),
+            interval=(round(interval.low, 4), round(interval.high, 4)),
             limit=round(limit_for(len(suite.items)), 4),
             items=len(suite.items),
             groups=len(names),
@@ -317,12 +318,6 @@ def _groups(episodes: Sequence[Episode]) -> tuple[npt.NDArray[np.str_], str]:
     if len(np.unique(groups)) >= FOLDS:
         return groups, "group_id"
     return np.array([episode.item.pair_id for episode in episodes]), "pair_id"
-
-
-def _interval(hits: Array, groups: npt.NDArray[np.str_]) -> tuple[float, float]:
-    """95 % interval of an accuracy, groups as the unit."""
-    interval = Accuracy.of(hits, groups).interval()
-    return round(interval.low, 4), round(interval.high, 4)
 
 
 # -- features ----------------------------------------------------------------------------------------
@@ -463,7 +458,11 @@ def validate_suite(
     if baselines and not any(finding.severity == "error" for finding in findings):
         gates = run_baselines(suite, seed, progress)
         save_baselines(suite, gates)
-        findings += _leaks(gates)
+        findings += [
+            warning("W05", category_of(gate.category).title, f"{gate}. {_REMEDIES[gate.name]}")
+            for gate in gates
+            if not gate.ok
+        ]
     once = tuple(dict.fromkeys(findings))  # two pictures of two items can give one line twice
     return Report(suite.identity, tuple(missing_categories(suite.items)), once, gates)
 
@@ -478,12 +477,3 @@ _REMEDIES = {
     "pixels": _BOTH_WAYS,
     "statistics": _BOTH_WAYS,
 }
-
-
-def _leaks(baselines: tuple[Baseline, ...]) -> list[Finding]:
-    """W05: a baseline knows more than a coin."""
-    return [
-        warning("W05", category_of(baseline.category).title, f"{baseline}. {_REMEDIES[baseline.name]}")
-        for baseline in baselines
-        if not baseline.ok
-    ]
