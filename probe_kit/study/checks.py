@@ -12,7 +12,7 @@ from probe_kit.runs.store import SCHEMES
 from probe_kit.statistics.label_permutations import permutations_for, smallest_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.study.cells import FOLDER, PlannedSuite, slug, slugs
-from probe_kit.study.expansion import Member, acts, answers, excludes, members, of_side
+from probe_kit.study.expansion import Member, acts, answers, categories_of, excludes, members, of_side
 from probe_kit.study.schema import (
     BlockTable,
     Mistake,
@@ -110,7 +110,7 @@ _BY_ROLE = ("mean:", "tokens:")
 def misfits(study: Study, suite: PlannedSuite) -> list[Mistake]:
     """Return what does not fit together, in the order of the tables. Every name of the file is known."""
     checks: tuple[Callable[[Study, PlannedSuite], Iterator[Mistake]], ...] = (
-        _out, _suite, _models, _labels, _lineages, _run_blocks, _excludes, _unused, _probes, _comparisons, _drift,
+        _out, _suite, _models, _lineages, _run_blocks, _excludes, _unused, _probes, _comparisons, _drift,
         _tables, _figures,
     )  # fmt: skip
     return [mistake for check in checks for mistake in check(study, suite)]
@@ -118,10 +118,6 @@ def misfits(study: Study, suite: PlannedSuite) -> list[Mistake]:
 
 def _blocks(study: Study, names: Iterable[str]) -> list[BlockTable]:
     return [block for block in study.runs if block.name in names]
-
-
-def _categories(study: Study, block: BlockTable, suite: PlannedSuite) -> tuple[str, ...]:
-    return slugs(block.categories or study.suite.categories or list(suite.items))
 
 
 def _out(study: Study, _: PlannedSuite) -> Iterator[Mistake]:
@@ -159,8 +155,13 @@ def _items(path: Place, items: int | None, suite: PlannedSuite, categories: list
 
 
 def _models(study: Study, _: PlannedSuite) -> Iterator[Mistake]:
+    first: dict[str, str] = {}  # by label, by which tables tell models apart
     for name, model in study.models.items():
         path = ("models", name)
+        label = model.label or name
+        if (other := first.setdefault(label, name)) != name:
+            text = f"{other!r} is called {label!r} too; give each model a label of its own"
+            yield Mistake((*path, *(["label"] if model.label else [])), text)
         if name == FOLDER:
             yield Mistake(path, "is the name of the folder of failures; give the model another")
         if model.family not in SCRIPTED and not model.unavailable:
@@ -178,16 +179,6 @@ def _models(study: Study, _: PlannedSuite) -> Iterator[Mistake]:
             if network.family != model.family or not network.random_weights:
                 text = f"{model.untrained!r} must be of family {model.family} with random_weights = true"
                 yield Mistake((*path, "untrained"), text)
-
-
-def _labels(study: Study, _: PlannedSuite) -> Iterator[Mistake]:
-    """Yield a mistake for two models of one label, by which tables tell them apart."""
-    first: dict[str, str] = {}
-    for name, model in study.models.items():
-        label = model.label or name
-        if (other := first.setdefault(label, name)) != name:
-            path = ("models", name, *(["label"] if model.label else []))
-            yield Mistake(path, f"{other!r} is called {label!r} too; give each model a label of its own")
 
 
 def _lineages(study: Study, _: PlannedSuite) -> Iterator[Mistake]:
@@ -280,7 +271,7 @@ def _few_items(study: Study, block: BlockTable, suite: PlannedSuite, path: Place
     items = block.items or study.suite.items
     few = [
         name
-        for name in _categories(study, block, suite)
+        for name in categories_of(study, block, suite)
         if name in suite.items and min(items or suite.items[name], suite.items[name]) < FEWEST_ITEMS
     ]
     if few:
@@ -430,7 +421,16 @@ def _tables(study: Study, suite: PlannedSuite) -> Iterator[Mistake]:
         if table.kind in _OF_PROBES:
             yield from _unprobed(study, table.runs or [], f"a table of kind {table.kind!r}", (*path, "runs"))
         yield from _absent_categories(study, table.runs or [], table.categories, suite, path)
-        yield from _elsewhere(study, table, (*path, "elsewhere"))
+        if table.elsewhere is None:
+            continue
+        if table.kind != "score":
+            text = f"numbers from elsewhere stand in tables of kind 'score', not {table.kind!r}"
+            yield Mistake((*path, "elsewhere"), text)
+        printed = {model for block in _blocks(study, table.runs or ()) for model in block.models}
+        for model in table.elsewhere.values:
+            if printed and model not in printed:
+                text = f"{model!r} is in no block of `runs`, so its number has no row"
+                yield Mistake((*path, "elsewhere"), text)
 
 
 def _other_comparison(study: Study, table: TableTable, path: Place) -> Iterator[Mistake]:
@@ -487,22 +487,11 @@ def _absent_categories(
     study: Study, runs: list[str], categories: list[str] | None, suite: PlannedSuite, path: Place
 ) -> Iterator[Mistake]:
     """Yield a mistake for categories of a table or figure that none of its blocks has."""
-    played = {name for block in _blocks(study, runs) for name in _categories(study, block, suite)}
+    played = {name for block in _blocks(study, runs) for name in categories_of(study, block, suite)}
     for name in slugs(categories or ()) if played else ():
         if name not in played:
             text = f"{name!r} is in no block of `runs`, which have {', '.join(sorted(played))}"
             yield Mistake((*path, "categories"), text)
-
-
-def _elsewhere(study: Study, table: TableTable, path: Place) -> Iterator[Mistake]:
-    if table.elsewhere is None:
-        return
-    if table.kind != "score":
-        yield Mistake(path, f"numbers from elsewhere stand in tables of kind 'score', not {table.kind!r}")
-    printed = {name for block in _blocks(study, table.runs or ()) for name in block.models}
-    for name in table.elsewhere.values:
-        if printed and name not in printed:
-            yield Mistake(path, f"{name!r} is in no block of `runs`, so its number has no row")
 
 
 def _figures(study: Study, suite: PlannedSuite) -> Iterator[Mistake]:

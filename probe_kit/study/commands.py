@@ -119,7 +119,12 @@ def run(
     if plan.totals()["missing"]:
         plan = plan_study(study, only)
     if plan.totals()["unprobed"] and not no_probes:
-        failed += _probed(plan, jobs or slots or None)
+        from probe_kit.study import fit_probes  # which loads torch
+
+        with progress() as bar:
+            failures = fit_probes(plan, _Counters(bar, "probes of ").show, jobs or slots or None)
+        # What waits for a run is no failure of its own.
+        failed += [failure for failure in failures if failure.stage != "waiting"]
         plan = plan_study(study, only)
     _print(plan, as_json)
     for failure in failed:
@@ -190,15 +195,6 @@ def _played(plan: "StudyPlan", **options: Any) -> "list[Failure]":
                 of_study(stored, totals["episodes"])
 
         return conduct_study(plan, report, **options)
-
-
-def _probed(plan: "StudyPlan", jobs: int | None) -> "list[Failure]":
-    """Fit probes that are missing; what waits for a run is no failure of its own."""
-    from probe_kit.study import fit_probes
-
-    with progress() as bar:
-        failures = fit_probes(plan, _Counters(bar, "probes of ").show, jobs)
-        return [failure for failure in failures if failure.stage != "waiting"]
 
 
 class _Counters:
@@ -367,7 +363,7 @@ def pack(
 
     With --publish the pack is a data set of the Hugging Face hub.
     """
-    from probe_kit.study import load_study, pack_study
+    from probe_kit.study import load_study, pack_study, publish_data_set, write_data_set
     from probe_kit.study.pack import EXTRAS
 
     if publish is None and (pull_request or private):
@@ -378,11 +374,15 @@ def pack(
         check_no_others(
             {"--directions": directions, "--pictures": pictures, "--trajectories": trajectories}, "a data set"
         )
-        _write_data_set(load_study(file), out_file, partial, licence, again=publish is not None)
-        if publish is None:
-            _print_plain(str(out_file))
-            return
-        _upload(out_file, publish, pull_request, private)
+        with err.status("packing"):
+            record = write_data_set(load_study(file), out_file, partial, licence, again=publish is not None)
+        for name, reason in record.missing.items():
+            _print_plain(f"not in it: {name}: {reason}")
+        address = str(out_file)
+        if publish is not None:
+            with err.status("uploading"):
+                address = publish_data_set(out_file, publish, pull_request, private)
+        _print_plain(address)
         return
     if licence is not None:
         raise UsageError("--license is of a data set; give --data-set or --publish OWNER/NAME too")
@@ -394,20 +394,3 @@ def pack(
     )
     for name, reason in record.missing.items():
         _print_plain(f"not packed: {name}: {reason}")
-
-
-def _write_data_set(study: "LoadedStudy", folder: Path, partial: bool, licence: str | None, again: bool) -> None:
-    from probe_kit.study import write_data_set
-
-    with err.status("packing"):
-        record = write_data_set(study, folder, partial, licence, again)
-    for name, reason in record.missing.items():
-        _print_plain(f"not in it: {name}: {reason}")
-
-
-def _upload(folder: Path, repository: str, pull_request: bool, private: bool) -> None:
-    from probe_kit.study import publish_data_set
-
-    with err.status("uploading"):
-        address = publish_data_set(folder, repository, pull_request, private)
-    _print_plain(address)

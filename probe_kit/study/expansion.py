@@ -1,7 +1,7 @@
 """Expansion of a study file into its cells."""
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,7 +10,7 @@ from probe_kit.extract.parts import SCRIPTED, ModelSettings
 from probe_kit.extract.settings import AskSettings, ExtractSettings, Settings
 from probe_kit.hooks.registry import get_family
 from probe_kit.study.cells import Cell, PlannedSuite, Selection, slugs
-from probe_kit.study.schema import AskTable, BlockTable, ConditionTable, Mistake, ModelTable, Place, Study
+from probe_kit.study.schema import BlockTable, ConditionTable, Mistake, ModelTable, Place, Study
 
 
 def answers(model: ModelTable) -> bool:
@@ -73,6 +73,11 @@ def excludes(rule: dict[str, str], model: str, way: str) -> bool:
     return all(names[part] == value for part, value in rule.items())
 
 
+def categories_of(study: Study, block: BlockTable, suite: PlannedSuite) -> tuple[str, ...]:
+    """Return the slugs of a block's categories: its own, else the file's, else all of the suite."""
+    return slugs(block.categories or study.suite.categories or list(suite.items))
+
+
 def expand(study: Study, suite: PlannedSuite) -> tuple[list[Cell], list[Mistake]]:
     """Return the cells of a study without wrong names, and mistakes that only their settings show.
 
@@ -93,7 +98,8 @@ def expand(study: Study, suite: PlannedSuite) -> tuple[list[Cell], list[Mistake]
         except ProbeKitError as error:  # of the one file that a scene is drawn with
             mistakes.append(Mistake(("conditions", member.way, "background"), str(error)))
             continue
-        selections = {member.block.name: _selection(study, member.block, suite)}
+        block = member.block
+        selections = {block.name: Selection(categories_of(study, block, suite), block.items or study.suite.items)}
         cell = cells.get(member.run)
         if cell is None:
             unavailable = study.models[member.model].unavailable or ""
@@ -108,19 +114,9 @@ def expand(study: Study, suite: PlannedSuite) -> tuple[list[Cell], list[Mistake]
     return every, list(dict.fromkeys(mistakes))  # every run of a wrong table repeats its mistake
 
 
-def _ways(study: Study, member: Member) -> tuple[str, Mapping[str, ConditionTable | AskTable]]:
-    """The tables that hold its condition or ask, and their name."""
-    return ("asks", study.asks) if member.block.asks else ("conditions", study.conditions)
-
-
-def _selection(study: Study, block: BlockTable, suite: PlannedSuite) -> Selection:
-    categories = block.categories or study.suite.categories or list(suite.items)
-    return Selection(slugs(categories), block.items or study.suite.items)
-
-
 def _blamed(study: Study, member: Member, message: str) -> Place:
     """The table whose values a settings error is of, and the key in it that the message names."""
-    home, name = _ways(study, member)[0], member.way
+    home, name = "asks" if member.asks else "conditions", member.way
     # If the model's settings are wrong even in a condition without values, the model is to blame.
     try:
         _settings_of(study, member.model, ConditionTable(), None)
@@ -133,9 +129,8 @@ def _blamed(study: Study, member: Member, message: str) -> Place:
 
 def _settings(study: Study, member: Member) -> Settings:
     if member.block.asks:
-        ask = study.asks[member.way]
-        tokens = member.block.tokens or "none"
-        return _ask_settings(study, member.model, ask).changed(tokens=tokens, seed=member.seed)
+        ask = AskSettings(**_common(study, member.model), **study.asks[member.way].model_dump())
+        return ask.changed(tokens=member.block.tokens or "none", seed=member.seed)
     settings = _settings_of(study, member.model, study.conditions[member.way], member.block.tokens)
     return settings.changed(seed=member.seed)
 
@@ -159,10 +154,6 @@ def _settings_of(study: Study, name: str, condition: ConditionTable, tokens: str
         execute=study.models[name].execute,
         tokens=tokens or "pooled",
     ).followed()
-
-
-def _ask_settings(study: Study, name: str, ask: AskTable) -> AskSettings:
-    return AskSettings(**_common(study, name), **ask.model_dump())
 
 
 def _same_settings(cells: list[Cell]) -> list[Mistake]:

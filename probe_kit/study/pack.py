@@ -98,7 +98,14 @@ def _pack(study: LoadedStudy, folder: Path, partial: bool, extras: Collection[Ex
                     "or leave it out (--partial)"
                 ) from error
             missing[cell.name] = str(error)
-    missing |= _write_tables(study, folder / TABLES, partial)
+    (folder / TABLES).mkdir(parents=True)
+    tables, no_table = make_each(study.study.tables, lambda name: make_table(study, name, partial), partial)
+    missing |= {f"table {name}": why for name, why in no_table.items()}
+    for name, table in tables.items():
+        record = json.dumps(table_record(table), indent=1, ensure_ascii=False)
+        (folder / TABLES / f"{name}.json").write_text(record, encoding="utf-8")
+        (folder / TABLES / f"{name}.md").write_text(table.to_markdown() + "\n", encoding="utf-8")
+        (folder / TABLES / f"{name}.tex").write_text(table.to_latex(), encoding="utf-8")
     pack = Pack(
         study=study.study.name,
         version=probe_kit.version.__version__,
@@ -111,18 +118,6 @@ def _pack(study: LoadedStudy, folder: Path, partial: bool, extras: Collection[Ex
     (folder / PACK_FILE).write_text(pack.to_json(), encoding="utf-8")
     write_sums(folder)
     return pack
-
-
-def _write_tables(study: LoadedStudy, folder: Path, partial: bool) -> dict[str, str]:
-    """Write every table in three formats; return why others are missing."""
-    folder.mkdir(parents=True)
-    tables, missing = make_each(study.study.tables, lambda name: make_table(study, name, partial), partial)
-    for name, table in tables.items():
-        record = json.dumps(table_record(table), indent=1, ensure_ascii=False)
-        (folder / f"{name}.json").write_text(record, encoding="utf-8")
-        (folder / f"{name}.md").write_text(table.to_markdown() + "\n", encoding="utf-8")
-        (folder / f"{name}.tex").write_text(table.to_latex(), encoding="utf-8")
-    return {f"table {name}": why for name, why in missing.items()}
 
 
 ARCHIVE, EPISODES, CARD = "study.zip", "episodes.parquet", "README.md"
@@ -214,7 +209,9 @@ def _card(study: LoadedStudy, pack: Pack, table: "pd.DataFrame", licence: str | 
     """`README.md`: what the hub reads, then what people read."""
     import yaml
 
-    features = [{"name": str(name), "dtype": _dtype(kind)} for name, kind in table.dtypes.items()]
+    kinds = {str(name): kind.name for name, kind in table.dtypes.items()}
+    plain = ("float64", "int64", "bool")
+    features = [{"name": name, "dtype": kind if kind in plain else "string"} for name, kind in kinds.items()]
     head: dict[str, Any] = {
         "pretty_name": study.study.name,
         **({} if licence is None else {"license": licence}),
@@ -252,10 +249,6 @@ def _words(study: LoadedStudy, pack: Pack, episodes: int) -> Iterator[str]:
         if (record := study.archive and study.archive / TABLES / f"{name}.md") and record.is_file():
             yield ""
             yield read_regular_text(record).rstrip()
-
-
-def _dtype(kind: Any) -> str:
-    return kind.name if kind.name in ("float64", "int64", "bool") else "string"
 
 
 def data_set_version(folder: Path) -> str:

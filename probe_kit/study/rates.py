@@ -75,17 +75,15 @@ def _disagreement(table: RetentionTable) -> list[str]:
     notes = []
     if any(_disagrees(row) for row in table.rows):
         notes.append("* the 95 % interval and the range of guessing disagree about 50 %")
-    if any(_is_unmarked(row) for row in table.rows):
+    no_regime = [row.success for row in table.rows if row.success.regime == Regime.NO_RELIABLE_KNOWLEDGE]
+    if any(
+        success.sr is not None
+        and success.chance_margin is not None
+        and abs(success.sr - 0.5) > success.chance_margin
+        for success in no_regime
+    ):
         notes.append("rates beyond it whose 95 % interval includes 50 % have no mark: too few items")
     return notes
-
-
-def _is_unmarked(row: RetentionRow) -> bool:
-    """Whether the rate is beyond what guessing reaches, and its interval includes one half."""
-    success = row.success
-    if success.sr is None or success.chance_margin is None or success.regime != Regime.NO_RELIABLE_KNOWLEDGE:
-        return False
-    return abs(success.sr - 0.5) > success.chance_margin
 
 
 def sides_table(table: RetentionTable) -> Table:
@@ -94,18 +92,17 @@ def sides_table(table: RetentionTable) -> Table:
     by_layout = _Column("half", "", lambda _: "original / swapped")
     note = ["left, right: side of the correct picture", _MEAN]
     title = "Success rate % by side and layout"
-    sides = _pivot(table, title, note, [by_side, *_by_category(table, _sides)])
-    layouts = _pivot(table, title, note, [by_layout, *_by_category(table, _layouts)])
+
+    def of_sides(row: RetentionRow) -> str:
+        return _two(row.success.sr_left, row.success.sr_right)
+
+    def of_layouts(row: RetentionRow) -> str:
+        return _two(row.success.sr_original, row.success.sr_swapped)
+
+    sides = _pivot(table, title, note, [by_side, *_by_category(table, of_sides)])
+    layouts = _pivot(table, title, note, [by_layout, *_by_category(table, of_layouts)])
     rows = tuple(row for both in zip(sides.rows, layouts.rows, strict=True) for row in both)
     return replace(sides, rows=rows, names=2)
-
-
-def _sides(row: RetentionRow) -> str:
-    return _two(row.success.sr_left, row.success.sr_right)
-
-
-def _layouts(row: RetentionRow) -> str:
-    return _two(row.success.sr_original, row.success.sr_swapped)
 
 
 def _two(first: float | None, second: float | None) -> str:

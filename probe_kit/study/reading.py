@@ -68,12 +68,8 @@ def find_study(name: str) -> Path:
 
 def shipped_studies() -> dict[str, Path]:
     """The study files of the package by name."""
-    return {file.name.removesuffix(".toml"): file for file in _shipped()}
-
-
-def _shipped() -> list[Path]:
     folder = Path(str(files("probe_kit.study"))) / "studies"
-    return [file for file in sorted(folder.iterdir()) if file.suffix == ".toml"]
+    return {file.stem: file for file in sorted(folder.glob("*.toml"))}
 
 
 def load_study(name: str | Path) -> LoadedStudy:
@@ -92,7 +88,11 @@ def load_study(name: str | Path) -> LoadedStudy:
     except ValidationError as error:
         raise StudyFileError(str(file), content, _mistakes(error, content)) from None
     pack = None if archive is None else Pack.read(archive)
-    suite, mistakes = planned_suite(study.suite) if pack is None else (_packed_suite(pack), [])
+    if pack is None:
+        suite, mistakes = planned_suite(study.suite)
+    else:  # the suite as it was, whose items are not in the archive
+        suite = PlannedSuite(pack.suite.identity, dict(pack.suite.items), None, "the archive")
+        mistakes = []
     mistakes += unknown_names(study, suite)
     cells: list[Cell] = []
     if not mistakes:  # all else is about names that exist
@@ -105,11 +105,6 @@ def load_study(name: str | Path) -> LoadedStudy:
     keys, runs = {name: run.key for name, run in pack.runs.items()}, str(file.parent / RUNS)
     packed = tuple(replace(cell, packed_key=keys.get(cell.name, "")) for cell in cells)
     return LoadedStudy(file, study.model_copy(update={"out": runs}), suite, packed, pack)
-
-
-def _packed_suite(pack: Pack) -> PlannedSuite:
-    """The suite as it was when the study was packed; its items are not in the archive."""
-    return PlannedSuite(pack.suite.identity, dict(pack.suite.items), None, "the archive")
 
 
 def _parsed(file: Path) -> dict[str, Any]:
