@@ -8,7 +8,8 @@ from probe_kit.suite import Suite
 from tests.study.small_study import SCRIPTED, TEXT, bytes_of, run_folders, small_study
 from tests.support.killed_commands import KilledCommand, committed, kill_often, run_problems
 
-KILLS = 20
+KILLS = {SCRIPTED: 20, TEXT: 6}
+"""Of each study. One command of the study with networks takes half a minute of one core, most of it imports."""
 
 
 def command(suite: Suite, text: str, items: int, *options: str) -> KilledCommand:
@@ -26,9 +27,9 @@ def command(suite: Suite, text: str, items: int, *options: str) -> KilledCommand
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("text", "items"), [(SCRIPTED, 6), (TEXT, 12)], ids=["scripted", "probed"])
+@pytest.mark.parametrize(("text", "items"), [(SCRIPTED, 6), (TEXT, 10)], ids=["scripted", "probed"])
 @pytest.mark.parametrize("options", [(), ("--slots", "2")], ids=["here", "processes"])
-def test_twenty_kills_lose_nothing_and_change_no_byte(
+def test_kills_lose_nothing_and_change_no_byte(
     text: str, items: int, options: tuple[str, ...], small_suite: Suite, tmp_path: Path
 ) -> None:
-    print(kill_often(command(small_suite, text, items, *options), tmp_path, KILLS, seed=len(options)))
+    print(kill_often(command(small_suite, text, items, *options), tmp_path, KILLS[text], seed=len(options)))
