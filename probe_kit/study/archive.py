@@ -19,7 +19,6 @@ import stat
 import tempfile
 import zlib
 from collections import Counter
-from collections.abc import Iterator
 from functools import cache
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any, Final, Literal, Self
@@ -210,21 +209,19 @@ def write_zip(folder: Path, out: Path) -> None:
                 shutil.copyfileobj(source, member)
 
 
-def files_of(folder: Path) -> Iterator[Path]:
+def files_of(folder: Path) -> list[Path]:
     """All files below a folder, in order. Raises RunDamagedError for a link, pipe or device there."""
-    yield from sorted(_files_of(folder))
-
-
-def _files_of(folder: Path) -> Iterator[Path]:
+    files = []
     for home, folders, names in os.walk(folder):
         for path in (Path(home) / name for name in (*folders, *names)):
             kind = path.lstat().st_mode
             if stat.S_ISREG(kind):
-                yield path
+                files.append(path)
             elif not stat.S_ISDIR(kind):
                 raise RunDamagedError(
                     f"{path} is a link or no regular file; an archive has regular files and folders. {_RESTORE}"
                 )
+    return sorted(files)
 
 
 def write_sums(folder: Path) -> None:
@@ -242,7 +239,7 @@ def check_sums(folder: Path) -> None:
     sums = folder / SUMS_FILE
     if not sums.is_file():
         raise RunDamagedError(f"{folder} has no {SUMS_FILE}. {_RESTORE}")
-    files = list(files_of(folder))  # first: no link is followed
+    files = files_of(folder)  # first: no link is followed
     _check_sizes(len(files), sum(file.stat().st_size for file in files), str(folder))
     expected = _read_sums(sums)
     present = {file.relative_to(folder).as_posix(): file for file in files if file != sums}

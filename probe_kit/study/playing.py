@@ -155,7 +155,17 @@ def _checked_tasks(
             plan.seconds.get(planned.cell.name, _SECONDS_PER_INFERENCE * planned.missing * planned.cell.units)
             for planned in cells
         )
-        runs = tuple(_task(planned, env_workers) for planned in cells)
+        folder = plan.study.suite.folder
+        suite = None if folder is None else folder.resolve()  # a worker may have another working directory
+        runs = tuple(
+            RunTask(
+                planned.cell.name,
+                planned.cell.settings_to_play.changed(suite=suite, env_workers=env_workers),
+                locate(planned.location).address,
+                planned.stored,
+            )
+            for planned in cells
+        )
         yield ModelTask(model, runs, plan.study.study.models[model].gpus, size)
 
 
@@ -175,14 +185,6 @@ def _problem(planned: PlannedCell, rehearsed: list[SceneSpec], ray: str | None) 
     except ProbeKitError as error:
         return Failure.of("checking", cell.model, cell.name, error)
     return None
-
-
-def _task(planned: PlannedCell, env_workers: int | None) -> RunTask:
-    # A worker may have another working directory: paths travel as absolute ones.
-    folder = planned.cell.suite.folder
-    suite = None if folder is None else folder.resolve()
-    settings = planned.cell.settings_to_play.changed(suite=suite, env_workers=env_workers)
-    return RunTask(planned.cell.name, settings, locate(planned.location).address, planned.stored)
 
 
 # -- one model ---------------------------------------------------------------------------------------------------
@@ -239,7 +241,20 @@ def play_models(tasks: Sequence[ModelTask], report: Report, slots: int = 0, ray:
         for task in tasks:
             play_model(task, report)
         return
-    pool, fits = _on_ray(tasks, ray) if ray is not None else _in_processes(tasks, min(slots, len(tasks)))
+    needs = [task.gpus for task in tasks]
+    if ray is not None:  # a worker for every model, with the GPUs that it needs
+        pool: Pool = RayPool(play_here, None, ray, lambda _cluster: needs)
+    else:
+        device, gpus, size = "cpu", 0, min(slots, len(tasks))
+        if any(needs):
+            import torch
+
+            device, gpus = "cuda", torch.cuda.device_count()
+        pool = ProcessPool(play_here, None, size, partial(share_of_machine, size=size, device=device))
+
+    def fits(slot: int, task: ModelTask) -> bool:
+        return needs[slot] == task.gpus if ray is not None else slot < gpus or not task.gpus
+
     queue = TaskQueue(((task.model, task) for task in tasks), "model", MOST_LOSSES, fits)
     for slot, event in work_off(pool, queue):
         _note(queue, slot, event, report)
@@ -270,22 +285,6 @@ def _note(queue: TaskQueue[ModelTask], slot: int, event: Any, report: Report) ->
         runs = tuple(run for run in task.runs if run.run != event.run)
         queue.replace(slot, event.model, replace(task, runs=runs))
     report(event)
-
-
-def _in_processes(tasks: Sequence[ModelTask], size: int) -> tuple[Pool, Callable[[int, ModelTask], bool]]:
-    device, gpus = "cpu", 0
-    if any(task.gpus for task in tasks):
-        import torch
-
-        device, gpus = "cuda", torch.cuda.device_count()
-    pool = ProcessPool(play_here, None, size, partial(share_of_machine, size=size, device=device))
-    return pool, lambda slot, task: slot < gpus or not task.gpus
-
-
-def _on_ray(tasks: Sequence[ModelTask], address: str) -> tuple[Pool, Callable[[int, ModelTask], bool]]:
-    """Return a worker for every model, with the GPUs that it needs."""
-    gpus = [task.gpus for task in tasks]
-    return RayPool(play_here, None, address, lambda _cluster: gpus), lambda slot, task: gpus[slot] == task.gpus
 
 
 # -- probes ------------------------------------------------------------------------------------------------------

@@ -98,9 +98,7 @@ class _Questions:
         correct: tuple[Picture, str], wrong: tuple[Picture, str],
     ) -> None:  # fmt: skip
         """Add a question. article: as in `instruction_for`. correct, wrong: picture, and what it is called."""
-        source = {
-            "benchmark": self._name, "version": self._version, "split": "eval", "source_id": pair_id, "url": "",
-        }  # fmt: skip
+        origin = {"benchmark": self._name, "version": self._version, "split": "eval"}
         item = make_item(
             item_id,
             category,
@@ -116,7 +114,7 @@ class _Questions:
             rule_id=self._rule,
             curation_status="accepted",
             side_word=bool(side_words(correct[1])),
-            source=source,
+            source={**origin, "source_id": pair_id, "url": ""},
             **asdict(self._terms),
         )
         self.items.append(item)
@@ -167,7 +165,16 @@ def suite_from_pictures(
     pair = PicturePair("living-world", "fox", Path("fox.jpg"), "hare", Path("hare.jpg"))
     suite = suite_from_pictures("suites/mine", [pair], name="mine", license="CC-BY-4.0", attribution="me")
     """
-    _check_pairs(pairs)
+    if not pairs:
+        raise UsageError("no pair of pictures given; expected at least one PicturePair")
+    for category in {pair.category for pair in pairs}:
+        check_slug(category)
+    met: set[frozenset[tuple[str, str]]] = set()
+    for pair in pairs:
+        both_sides = frozenset({(pair.phrase, str(pair.picture)), (pair.other_phrase, str(pair.other_picture))})
+        if both_sides in met:
+            raise UsageError(f"{pair} is given twice; every pair is asked both ways by itself. Leave one out")
+        met.add(both_sides)
     terms = Terms(license, attribution, redistributable, contains_real_face)
     questions = _Questions(Path(folder), name, version, "own-pictures", terms)
     for number, pair in enumerate(pairs):
@@ -182,19 +189,6 @@ def suite_from_pictures(
             instruction = instruction_for(correct[1], "the")
             questions.ask(f"{pair_id}-{side}", pair_id, pair.category, instruction, "the", side, correct, wrong)
     return questions.save({"pairs": len(pairs)})
-
-
-def _check_pairs(pairs: Sequence[PicturePair]) -> None:
-    if not pairs:
-        raise UsageError("no pair of pictures given; expected at least one PicturePair")
-    for category in {pair.category for pair in pairs}:
-        check_slug(category)
-    met: set[frozenset[tuple[str, str]]] = set()
-    for pair in pairs:
-        content = frozenset({(pair.phrase, str(pair.picture)), (pair.other_phrase, str(pair.other_picture))})
-        if content in met:
-            raise UsageError(f"{pair} is given twice; every pair is asked both ways by itself. Leave one out")
-        met.add(content)
 
 
 def suite_from_csv(
@@ -284,7 +278,12 @@ def read_rows(table: Path, category: str = DEFAULT_CATEGORY) -> list[Row]:
     if not rows:
         raise UsageError(f"{table} has no line below its heading; expected one per question")
     _check_contradictions(rows, table)
-    return _with_group_names(rows, opened)
+    grouped = [row for row in rows if row.group]
+    names = group_names(  # one spelling of every group, such as 7 for 7.0
+        [row.group for row in grouped], lambda number: opened.where(grouped[number].line, "group"), UsageError
+    )
+    by_line = {row.line: name for row, name in zip(grouped, names, strict=True)}
+    return [replace(row, group=by_line.get(row.line, "")) for row in rows]
 
 
 def _check_contradictions(rows: Sequence[Row], table: Path) -> None:
@@ -300,16 +299,6 @@ def _check_contradictions(rows: Sequence[Row], table: Path) -> None:
                 f"{table}, lines {opposite} and {row.line} are the same question with opposite answers. Correct "
                 "one, or leave it out"
             )
-
-
-def _with_group_names(rows: Sequence[Row], opened: TextTable) -> list[Row]:
-    """The rows with one spelling of every group, such as 7 for 7.0."""
-    grouped = [row for row in rows if row.group]
-    names = group_names(
-        [row.group for row in grouped], lambda number: opened.where(grouped[number].line, "group"), UsageError
-    )
-    by_line = {row.line: name for row, name in zip(grouped, names, strict=True)}
-    return [replace(row, group=by_line.get(row.line, "")) for row in rows]
 
 
 def _row(record: Mapping[str, str | None], line: int, opened: TextTable, category: str) -> Row:
