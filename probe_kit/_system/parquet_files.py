@@ -103,7 +103,6 @@ def _check(size: int, most: int, unit: str) -> None:
 
 
 def _decoded_bytes(array: Any) -> int:
-    """Bytes of an array whose dictionary is written out."""
     pa, pc = require("pyarrow", "export"), require("pyarrow.compute", "export")
 
     if not pa.types.is_dictionary(array.type):

@@ -77,7 +77,6 @@ def report_unexpected(error: BaseException) -> int:
 
 
 def _written(error: BaseException) -> str:
-    """Write the traceback, and return where it is now."""
     text = "".join(traceback.format_exception(error))
     try:
         handle, name = tempfile.mkstemp(prefix="probe-kit-", suffix="-traceback.txt")

@@ -79,8 +79,6 @@ class _Bar:
 
 
 class _Drawn:
-    """One state of a bar."""
-
     def __init__(self, label: str, finished: int, total: int, seconds: float) -> None:
         remaining = f", about {seconds * (total - finished) / finished:.0f} s left" if 0 < finished < total else ""
         self._text = f"{label}: {finished} of {total}, {seconds:.0f} s{remaining}"

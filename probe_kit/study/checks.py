@@ -263,7 +263,6 @@ def _probes(study: Study, suite: PlannedSuite) -> Iterator[Mistake]:
 
 
 def _stores(block: BlockTable) -> bool:
-    """Whether a block of asks stores activations."""
     return (block.tokens or "none") != "none"
 
 

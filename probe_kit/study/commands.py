@@ -136,7 +136,6 @@ def run(
 
 
 def _print(plan: "StudyPlan", as_json: bool) -> None:
-    """Print a line per run with its state, then what all of them take."""
     from probe_kit._tables.table import Table
 
     if as_json:

@@ -258,7 +258,6 @@ def _why_alone_beside_vlm(before: RunReader, after: RunReader, view: str) -> str
 
 
 def _picture_size(run: Any) -> list[int]:
-    """Width and height in pixels of what the model is handed."""
     scene = run.settings["scene"]
     return list(scene.get("picture_size") or (scene["camera"]["width"], scene["camera"]["height"]))
 

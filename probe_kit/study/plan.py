@@ -320,7 +320,6 @@ def plan_study(study: LoadedStudy, only: str | None = None) -> StudyPlan:
 
 
 def _planned(study: LoadedStudy, cell: Cell) -> PlannedCell:
-    """Return a cell with what is stored of it."""
     location = str(locate(cell.location(study.study.folder)))
     if cell.unavailable:
         return PlannedCell(cell, location, "skipped", 0, f"skipped: {cell.unavailable}")
@@ -412,7 +411,6 @@ def _stored_episodes(cell: Cell, run: "Run") -> int:
 
 
 def _mean_seconds(run: "Run") -> float | None:
-    """Return the mean seconds of an episode, inference and simulation."""
     episodes = run.episodes
     if episodes.empty or not {"seconds_inference", "seconds_simulation"} <= set(episodes):
         return None
@@ -430,7 +428,6 @@ def _by_model(amounts: Iterable[tuple[str, float | None]]) -> dict[str, float | 
 
 
 def _known_sums(sums: Mapping[str, float | None]) -> tuple[dict[str, float], list[str]]:
-    """Return the sums that are known, and the models of the others."""
     return {model: value for model, value in sums.items() if value is not None}, [
         model for model, value in sums.items() if value is None
     ]

@@ -80,7 +80,6 @@ def _curves(
 
 
 def _doses(name: str, runs: StoredRuns) -> list[ReportFigure]:
-    """A figure per run that was steered."""
     steered = [stored for stored in runs.runs if stored_steering(stored.run)]
     if not steered:
         raise UsageError(

@@ -75,11 +75,11 @@ def _order(content: Any, path: Place) -> list[int]:
     return positions
 
 
-def unknown(what: str, name: str, names: Collection[str], none: str = "there are none") -> str:
+def unknown(what: str, name: str, names: Collection[str]) -> str:
     """Return a sentence on a name that is unknown, with the nearest match."""
     near = get_close_matches(name, names, n=1)
     hint = f" Did you mean {near[0]!r}?" if near else ""
-    return f"unknown {what} {shortened(name)!r}; known: {', '.join(names) or none}.{hint}"
+    return f"unknown {what} {shortened(name)!r}; known: {', '.join(names) or 'there are none'}.{hint}"
 
 
 SCHEMA_VERSION = 1

@@ -216,7 +216,6 @@ def stored_runs(
 
 
 def _why_missing(study: LoadedStudy, cell: Cell, error: ProbeKitError) -> str:
-    """Return the reason of the stored failure, or else what is wrong with the run."""
     failure = None if study.archive is not None else Failures(study.study.folder).of(cell)
     if failure is not None:
         return failure.reason

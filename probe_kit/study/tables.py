@@ -81,7 +81,6 @@ def _items(count: int | None, of_count: int | None) -> str:
 
 
 def _remarks(rows: Sequence[Difference]) -> list[str]:
-    """Return the meaning of marks and missing p-values of these rows."""
     left_out = any(row.n_items is not None and (row.n_items < MANY * (row.of_items or 0)) for row in rows)
     few = any(row.n_groups is not None and row.n_groups < FEWEST_GROUPS for row in rows)
     remarks = [f"{_FEW} fewer than {100 * MANY:.0f} % of the items in common"] if left_out else []
@@ -379,7 +378,6 @@ def _of_kind(study: LoadedStudy, table: TableTable, stored: StoredRuns, name: st
 
 
 def _selection(study: LoadedStudy, table: TableTable) -> Callable[[Cell], Selection | None]:
-    """Return a function that gives what a table prints of each cell."""
     if table.kind == "drift":
         pairs = study.study.drift[table.drift or ""].pairs
         names = {cell.name for pair in pairs for side in pair for cell in of_side(study.cells, side)}
@@ -445,7 +443,6 @@ def _sources(study: LoadedStudy, runs: Sequence[StoredRun]) -> list[tuple[str, s
 
 
 def _drift(study: LoadedStudy, table: DriftTable, stored: StoredRuns, name: str, partial: bool) -> Table:
-    """Make the table of every pair of the file whose runs are both stored."""
     by_name, labels = {run.cell.name: run for run in stored.runs}, stored.labels
     drifts: dict[tuple[str, str], list[CategoryDrift]] = {}
     for cells in ([of_side(study.cells, side) for side in pair] for pair in table.pairs):

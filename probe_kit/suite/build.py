@@ -193,7 +193,6 @@ def _options(
 
 
 def _counts(categories: Sequence[str], items_per_category: int | Mapping[str, int]) -> dict[str, int]:
-    """Return the number of items of each category."""
     if isinstance(items_per_category, int):
         return dict.fromkeys(categories, items_per_category)
     if items_per_category.keys() != set(categories):

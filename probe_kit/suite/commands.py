@@ -142,7 +142,6 @@ def show(
 
 
 def _list_categories(suite: "Suite", as_json: bool) -> None:
-    """Print the categories of a suite with their item counts."""
     from rich.table import Table
 
     from probe_kit.suite.categories import category_of

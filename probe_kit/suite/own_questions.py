@@ -75,8 +75,6 @@ class Row:
 
 
 class _Questions:
-    """The questions of one suite, and their pictures by file name."""
-
     def __init__(self, folder: Path, name: str, version: str, rule: str, terms: Terms) -> None:
         check_foreign_folder(folder)
         self._folder, self._name, self._version, self._rule, self._terms = folder, name, version, rule, terms

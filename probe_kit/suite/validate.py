@@ -81,7 +81,6 @@ def role_counts(items: Sequence[Item]) -> dict[tuple[str, str], tuple[int, int]]
 
 
 def _distractor(item: Item, twin: Item | None) -> str:
-    """The concept of an item's wrong picture."""
     if twin is None or twin.target_concept == item.target_concept:
         return item.distractor_concept
     return twin.target_concept

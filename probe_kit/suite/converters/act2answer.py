@@ -88,7 +88,6 @@ def _meshes(scene: Any) -> Iterator[tuple[NDArray[np.float64], Any]]:
 
 
 def _top(meshes: list[tuple[NDArray[np.float64], Any]], low: float, high: float, path: Path) -> Top:
-    """Return the surface that faces up at the tile's top."""
     upward = []
     for points, mesh in meshes:
         corners = points[mesh.faces]
@@ -155,7 +154,6 @@ def _slope(xy: NDArray[np.float64], uv: NDArray[np.float64], path: Path) -> NDAr
 
 
 def _cut(texture: Image.Image, uv: NDArray[np.float64], path: Path) -> Image.Image:
-    """The part of the texture that is shown."""
     low, high = uv.min(axis=0), uv.max(axis=0)
     if (low < -_STRAIGHT).any() or (high > 1 + _STRAIGHT).any():
         raise SuiteError(
