@@ -9,7 +9,7 @@ from tests.study.small_study import SCRIPTED, TEXT, bytes_of, run_folders, small
 from tests.support.killed_commands import KilledCommand, committed, kill_often, run_problems
 
 KILLS = {SCRIPTED: 20, TEXT: 6}
-"""Of each study. A command of the one with networks takes a minute of processor time, and twenty kills ten minutes."""
+"""Of each study. A command of the one with networks takes a minute of processor time, twenty kills ten minutes."""
 
 
 def command(suite: Suite, text: str, items: int, *options: str) -> KilledCommand:
