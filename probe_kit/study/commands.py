@@ -1,6 +1,7 @@
 """`probe-kit study`: a whole study from one file."""
 
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -122,7 +123,7 @@ def run(
         from probe_kit.study import fit_probes  # which loads torch
 
         with progress() as bar:
-            failures = fit_probes(plan, _Counters(bar, "probes of ").show, jobs or slots or None)
+            failures = fit_probes(plan, _counters(bar, "probes of "), jobs or slots or None)
         # What waits for a run is no failure of its own.
         failed += [failure for failure in failures if failure.stage != "waiting"]
         plan = plan_study(study, only)
@@ -181,7 +182,7 @@ def _played(plan: "StudyPlan", **options: Any) -> "list[Failure]":
     from probe_kit.study import Failure, Moved, conduct_study
 
     with progress() as bar:
-        totals, counters = plan.totals(), _Counters(bar, "")
+        totals, count = plan.totals(), _counters(bar, "")
         stored, of_study = totals["episodes"] - totals["missing"], counter(bar, f"study {plan.study.study.name}")
 
         def report(event: "Event") -> None:
@@ -189,25 +190,17 @@ def _played(plan: "StudyPlan", **options: Any) -> "list[Failure]":
             if isinstance(event, Failure):
                 say(marked("[red]{}[/]", event))
             elif isinstance(event, Moved):
-                counters.show(event.run, event.stored, event.planned)
+                count(event.run, event.stored, event.planned)
                 stored += 1
                 of_study(stored, totals["episodes"])
 
         return conduct_study(plan, report, **options)
 
 
-class _Counters:
-    """A bar per run, which appears with the first thing that is counted."""
-
-    def __init__(self, bar: Any, prefix: str) -> None:
-        self._bar, self._prefix = bar, prefix
-        self._of_run: dict[str, Callable[..., None]] = {}
-
-    def show(self, run: str, count: int, total: int, last: str = "") -> None:
-        """Show how far a run is."""
-        if run not in self._of_run:
-            self._of_run[run] = counter(self._bar, f"{self._prefix}{run}")
-        self._of_run[run](count, total, *([last] if last else []))
+def _counters(bar: Any, prefix: str) -> Callable[..., None]:
+    """A callback (run, done, total, …) with a bar per run, which appears with the first thing that is counted."""
+    of_run = cache(lambda run: counter(bar, f"{prefix}{run}"))
+    return lambda run, finished, total, *_: of_run(run)(finished, total)
 
 
 @app.command("table")

@@ -378,18 +378,7 @@ class _Assets:
 
     def compare_sizes(self) -> None:
         """Warn, and note in the statistics, where the box that is scored is not the tile that is drawn."""
-        differing = list(self._unlike())
-        if differing:
-            name, scored, drawn = differing[0]
-            note = (
-                f"{len(differing)} of {len(self._tiles)} tiles are drawn larger or smaller than the box that is "
-                f"scored: {name} is {drawn:.4f} m wide and scored as {scored:.4f} m. Choose --tile-side for what "
-                "is drawn; outcome rules have their own size"
-            )
-            self.notes.append(note)
-            warnings.warn(f"{SOURCE}: {note}", BoundingBoxWarning, stacklevel=4)
-
-    def _unlike(self) -> Iterator[tuple[str, float, float]]:
+        differing = []
         for name, (tile, _) in self._tiles.items():
             where = f"tile {name} of {self._root / TILES}"
             box = field_of(self._records[name], "bbox", dict, SOURCE, where)
@@ -402,4 +391,13 @@ class _Assets:
                 raise SuiteError(f"{SOURCE}: {where}: bbox or scales hold no numbers ({problem}).") from problem
             drawn = [extent * float(scale) for extent in tile.size]
             if any(abs(side - drawn_side) > _SAME_SIZE for side, drawn_side in zip(scored, drawn, strict=False)):
-                yield name, scored[0], drawn[0]
+                differing.append((name, scored[0], drawn[0]))
+        if differing:
+            name, scored_width, drawn_width = differing[0]
+            note = (
+                f"{len(differing)} of {len(self._tiles)} tiles are drawn larger or smaller than the box that is "
+                f"scored: {name} is {drawn_width:.4f} m wide and scored as {scored_width:.4f} m. Choose --tile-side for what "
+                "is drawn; outcome rules have their own size"
+            )
+            self.notes.append(note)
+            warnings.warn(f"{SOURCE}: {note}", BoundingBoxWarning, stacklevel=4)
