@@ -396,8 +396,8 @@ class _Assets:
             name, scored_width, drawn_width = differing[0]
             note = (
                 f"{len(differing)} of {len(self._tiles)} tiles are drawn larger or smaller than the box that is "
-                f"scored: {name} is {drawn_width:.4f} m wide and scored as {scored_width:.4f} m. Choose --tile-side "
-                "for what is drawn; outcome rules have their own size"
+                f"scored: {name} is {drawn_width:.4f} m wide and scored as {scored_width:.4f} m. Choose "
+                "--tile-side for what is drawn; outcome rules have their own size"
             )
             self.notes.append(note)
             warnings.warn(f"{SOURCE}: {note}", BoundingBoxWarning, stacklevel=4)
