@@ -3,6 +3,7 @@
 from collections.abc import Callable, Collection, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -150,6 +151,16 @@ def forward_outputs(network: nn.Module, *inputs: Any) -> tuple[NDArray[Any], NDA
     """Return hidden states (L+1, B, S, D) and logits (B, S, V) of one pass."""
     output = network(*inputs)
     return numpy_of(torch.stack(output.hidden_states)), numpy_of(output.logits)
+
+
+def pass_outputs(**passes: Callable[[], tuple[NDArray[Any], NDArray[Any]]]) -> dict[str, Produce]:
+    """Return `<name>_hidden_states` and `<name>_logits` of passes that return both, each run once."""
+    produced: dict[str, Produce] = {}
+    for name, run in passes.items():
+        once = cache(run)
+        produced[f"{name}_hidden_states"] = lambda once=once: once()[0]  # type: ignore[misc]
+        produced[f"{name}_logits"] = lambda once=once: once()[1]  # type: ignore[misc]
+    return produced
 
 
 def euler_path(noise: Tensor, velocities: list[Tensor], step: Callable[[Tensor], Tensor]) -> NDArray[Any]:

@@ -544,6 +544,11 @@ class Intrinsics:
         return scaled
 
 
+def is_camera(matrix: NDArray[np.floating[Any]]) -> bool:
+    """Whether a matrix is an invertible one of 3 × 3 numbers."""
+    return matrix.shape == (3, 3) and bool(np.isfinite(matrix).all()) and np.linalg.det(matrix) != 0
+
+
 def known_cameras(values: Mapping[str, Any], source: str) -> dict[str, Intrinsics]:
     """The cameras of the data sets that `intrinsic_config` of a `processor_config.json` names.
 
@@ -552,7 +557,7 @@ def known_cameras(values: Mapping[str, Any], source: str) -> dict[str, Intrinsic
     cameras = {}
     for key, entry in values.get("intrinsic_config", {}).items():
         matrix = np.asarray(entry["intrinsic"], np.float64)
-        if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or np.linalg.det(matrix) == 0:
+        if not is_camera(matrix):
             raise CheckpointError(f"{source}: intrinsic_config of {key} is not an invertible 3 × 3 matrix")
         cameras[key] = Intrinsics(matrix, int(entry["width"]), int(entry["height"]))
     return cameras

@@ -256,11 +256,7 @@ def load_internvla(
 ) -> InternVLA:
     """Load InternVLA-M1 from a run's folder, one of its weight files, a converted folder, or a hub id.
 
-    unnorm_key: data set whose units the actions get; default the only one. steps: of DDIM.
-    guidance: its scale; 1 or less runs the condition alone. vlm: folder or hub id of Qwen2.5-VL's configuration,
-    tokenizer and processor. tokenizer: folder of another one. weights: name of the file of a step, see
-    `find_parts`; the card names the one that was read.
-    Raises CheckpointError, WeightsError, and UsageError for options that cannot be.
+    Options: see the family. Raises CheckpointError, WeightsError, and UsageError for options that cannot be.
     """
     name = checkpoint or DEFAULT_CHECKPOINT
     parts = find_parts(name, vlm, weights, unread=random_weights)

@@ -30,8 +30,6 @@ from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import IMAGE_ROLE, Site, Stream
 from probe_kit.hooks.families.magma.checkpoint import (
     ChatText,
-    LoadedMagma,
-    TokenPrompt,
     load_checkpoint,
     magma_key,
     magma_statistics,
@@ -39,11 +37,21 @@ from probe_kit.hooks.families.magma.checkpoint import (
 from probe_kit.hooks.families.openvla.adapter import ActionTokens
 from probe_kit.hooks.families.shared.action_statistics import GRIPPER_OPEN, ActionStatistics, open_or_closed
 from probe_kit.hooks.families.shared.kinds import MAPS
+from probe_kit.hooks.families.shared.loading import Loaded
 from probe_kit.hooks.families.shared.taps import kept_prompt
-from probe_kit.hooks.families.shared.text import token_ids_of
+from probe_kit.hooks.families.shared.text import TokenPrompt, token_ids_of
 from probe_kit.hooks.families.shared.token_decoder import CHECKPOINT, TOP, TokenDecoder, chooser, top_of
 from probe_kit.hooks.families.shared.vlm import Prefill, SpeakingModel
-from probe_kit.hooks.outputs import Arrays, Outputs, Produce, forward_outputs, generation_outputs, numpy_of, watch
+from probe_kit.hooks.outputs import (
+    Arrays,
+    Outputs,
+    Produce,
+    forward_outputs,
+    generation_outputs,
+    numpy_of,
+    pass_outputs,
+    watch,
+)
 from probe_kit.models.decoding import Choose, Decoded, greedy
 from probe_kit.models.magma import (
     ACTION_QUESTION,
@@ -75,9 +83,10 @@ class Magma(TokenDecoder, Policy, SpeakingModel):
 
     def __init__(
         self,
-        loaded: LoadedMagma,
+        loaded: Loaded[MagmaNetwork],
         statistics: ActionStatistics | str,
         *,
+        layer_scale: str,
         shrink: int = _SHRINK,
         prompt: str = "magma",
         temperature: float = 0.0,
@@ -111,7 +120,7 @@ class Magma(TokenDecoder, Policy, SpeakingModel):
             "temperature": repr(temperature),
             **({} if self.top == TOP else {"top_k": str(self.top)}),
             "tokenizer": tokenizer or "the checkpoint's",
-            "layer_scale": loaded.layer_scale,
+            "layer_scale": layer_scale,
         }
         self.card = loaded.card(
             "magma",
@@ -359,13 +368,8 @@ def load_magma(
 ) -> Magma:
     """Load Magma or one of its fine-tunes, from a folder or hub id.
 
-    unnorm_key: data set whose units the actions get; default the only one of the checkpoint's file, without which
-    it answers and does not act. statistics: file with action statistics. shrink: side to which pictures are shrunk
-    first, 0 for whole pictures. prompt: `magma`, or
-    `act2answer` for the order of turns of that release. temperature: 0 for the likeliest token. tokenizer: folder
-    of another tokenizer. layer_scale: see `load_checkpoint`. steps: tokens per
-    inference, for comparisons with other than seven; only seven are an action.
-    Raises UsageError, and what `load_checkpoint` raises.
+    Options: see the family. steps: tokens per inference, for comparisons with other than seven; only seven are
+    an action. Raises UsageError, and what `load_checkpoint` raises.
     """
     for name, value, choices in (
         ("prompt", prompt, PROMPTS),
@@ -377,12 +381,13 @@ def load_magma(
         raise UsageError(f"shrink is {shrink}; expected a side in pixels, or 0 for whole pictures")
     chooser(temperature, ())
     name = checkpoint or DEFAULT_CHECKPOINT
-    loaded = load_checkpoint(
+    loaded, stored_name = load_checkpoint(
         name, device, dtype, random_weights, weights_seed=weights_seed, layer_scale=layer_scale
     )
     return Magma(
         loaded,
         _units(*magma_statistics(loaded.folder, statistics), unnorm_key),
+        layer_scale=stored_name,
         shrink=shrink,
         prompt=prompt,
         temperature=temperature,
@@ -509,18 +514,13 @@ class _Reference:
         forced = [*self.prompt, *decoded.ids[0].tolist()]
         network = self.model.network
 
-        def text() -> list[int]:
-            ids: list[int] = self.recorded["text_input_ids"].ravel().tolist()
-            return ids
-
         return {
             "teacher_forced_ids": lambda: np.array([forced]),
-            "teacher_forced_hidden_states": lambda: forward_outputs(network, [forced], [picture])[0],
-            "teacher_forced_logits": lambda: forward_outputs(network, [forced], [picture])[1],
-            "text_hidden_states": lambda: forward_outputs(network, [text()], None)[0],
-            "text_logits": lambda: forward_outputs(network, [text()], None)[1],
-            "batch_hidden_states": lambda: self._batch[0],
-            "batch_logits": lambda: self._batch[1],
+            **pass_outputs(
+                teacher_forced=lambda: forward_outputs(network, [forced], [picture]),
+                text=lambda: forward_outputs(network, [self.recorded["text_input_ids"].ravel().tolist()], None),
+                batch=self._batch,
+            ),
         }
 
     @cached_property
@@ -546,7 +546,6 @@ class _Reference:
             for ids, picture in zip(self._batch_prompts, self._batch_pictures, strict=True)
         ]
 
-    @cached_property
     def _batch(self) -> tuple[NDArray[Any], NDArray[Any]]:
         """The pass over the recorded batch, packed by the adapter, reordered to padding in front of every row."""
         states, logits = forward_outputs(self.model.network, self._batch_prompts, self._batch_pictures)

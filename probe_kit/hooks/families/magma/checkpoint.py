@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,14 @@ from probe_kit.hooks.checkpoints.checkpoint import GENERATION_FILE, chosen_dtype
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.checkpoints.weights import Weights, read_weights
 from probe_kit.hooks.families.shared.loading import DTYPES, Loaded, load_network
-from probe_kit.hooks.families.shared.text import TokenizerFile, first_behind, positions_of, token_ids_of, values_of
+from probe_kit.hooks.families.shared.text import (
+    TokenizerFile,
+    TokenPrompt,
+    first_behind,
+    positions_of,
+    token_ids_of,
+    values_of,
+)
 from probe_kit.models.building import initialise
 from probe_kit.models.checkpoint_files import STATISTICS_FILE, chosen_name, read_statistics, stored_statistics
 from probe_kit.models.magma import (
@@ -29,14 +36,6 @@ from probe_kit.models.magma import (
     picture_question,
     shipped_statistics,
 )
-
-
-@dataclass(frozen=True)
-class TokenPrompt:
-    """A whole prompt as ids, and which of them are the question, not the frames around it."""
-
-    ids: tuple[int, ...]
-    question: tuple[bool, ...]
 
 
 @dataclass(frozen=True)
@@ -108,7 +107,7 @@ class ChatText(TokenizerFile):
         start, stop = self._question_span(turn, frames)
         start += len(before)
         encoding = self.tokenizer.encode(frames + begun)
-        return TokenPrompt(tuple(encoding.ids), positions_of(encoding, start, stop))
+        return TokenPrompt(frames + begun, tuple(encoding.ids), positions_of(encoding, start, stop))
 
     def _question_span(self, turn: str, frames: str) -> tuple[int, int]:
         """The beginning and end of the user's words in `frames`."""
@@ -134,13 +133,6 @@ class ChatText(TokenizerFile):
 _BLOCK = re.compile(r"(?P<block>vision_tower\..*\.blocks\.\d+)\.(?P<name>gamma|weight)")
 
 
-@dataclass(frozen=True, kw_only=True)
-class LoadedMagma(Loaded[MagmaNetwork]):
-    """A loaded network. layer_scale: under which name the file holds the layer scales, `gamma` or `weight`."""
-
-    layer_scale: str
-
-
 def load_checkpoint(
     checkpoint: str,
     device: str,
@@ -149,8 +141,8 @@ def load_checkpoint(
     *,
     weights_seed: int = 0,
     layer_scale: str | None = None,
-) -> LoadedMagma:
-    """Load a folder or hub id.
+) -> tuple[Loaded[MagmaNetwork], str]:
+    """Load a folder or hub id; also return the name the file has for layer scales, `gamma` or `weight`.
 
     dtype: float32 or bfloat16; default what the checkpoint says. layer_scale: `gamma` refuses a file that names
     them otherwise; None and `weight` accept both names.
@@ -179,9 +171,7 @@ def load_checkpoint(
         tensors_of=tensors_of,
         draw=_draw,
     )
-    return LoadedMagma(
-        **{**vars(loaded), "notes": (*loaded.notes, *notes)}, layer_scale=layer_scale or stored_name
-    )
+    return replace(loaded, notes=(*loaded.notes, *notes)), layer_scale or stored_name
 
 
 def _draw(network: MagmaNetwork, seed: int) -> None:

@@ -15,14 +15,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from probe_kit.errors import CheckpointError, InstructionError, UsageError
+from probe_kit.errors import CheckpointError, InstructionError
 from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES
 from probe_kit.hooks.contract.card import ARM
 from probe_kit.hooks.contract.model import Policy
 from probe_kit.hooks.contract.observation import Observation, checked_picture
-from probe_kit.hooks.families.prismatic.adapter import BYTES, PrismaticModel, find_tokenizer
+from probe_kit.hooks.families.prismatic.adapter import BYTES, SLOT, PrismaticModel, find_tokenizer, template_of
 from probe_kit.hooks.families.prismatic.checkpoint import (
-    LoadedPrismatic,
     checkpoint_folders,
     load_checkpoint,
     prismatic_statistics,
@@ -30,10 +29,11 @@ from probe_kit.hooks.families.prismatic.checkpoint import (
 from probe_kit.hooks.families.prismatic.outputs import INPUTS, Reference
 from probe_kit.hooks.families.shared.action_statistics import DIMENSIONS, ActionStatistics, open_or_closed
 from probe_kit.hooks.families.shared.kinds import TOKENS
+from probe_kit.hooks.families.shared.loading import Loaded
 from probe_kit.hooks.families.shared.taps import kept_prompt
 from probe_kit.hooks.families.shared.token_decoder import ALL, chooser, top_of, warn_of_unknown
 from probe_kit.hooks.outputs import Arrays, Outputs, Produce
-from probe_kit.models.prismatic import CROP_AREA, PrismaticConfig, centre_crop, prepare_tensor
+from probe_kit.models.prismatic import CROP_AREA, PrismaticConfig, PrismaticNetwork, centre_crop, prepare_tensor
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,6 @@ class ActionTokens:
 
 
 DEFAULT_CHECKPOINT = "openvla/openvla-7b"
-_SLOT = "{instruction}"
 PROMPTS = {
     "openvla": "In: What action should the robot take to {instruction}?\nOut:",
     "openvla-v01": "A chat between a curious user and an artificial intelligence assistant. The assistant gives "
@@ -84,7 +83,7 @@ class OpenVLA(PrismaticModel, Policy):
 
     def __init__(
         self,
-        loaded: LoadedPrismatic,
+        loaded: Loaded[PrismaticNetwork],
         statistics: ActionStatistics,
         prompt: str,
         crop: bool,
@@ -178,7 +177,7 @@ class OpenVLA(PrismaticModel, Policy):
 
     def prompt(self, instruction: str) -> list[int]:
         """Ids of the whole prompt, the empty token last. Raises CheckpointError for another tokenizer's ids."""
-        ids = self.tokenizer.encode(self.template.replace(_SLOT, instruction.lower()))
+        ids = self.tokenizer.encode(self.template.replace(SLOT, instruction.lower()))
         self._check_other_ids(ids)
         return self.with_empty_token(ids)
 
@@ -215,13 +214,7 @@ def load_openvla(
 ) -> OpenVLA:
     """Load OpenVLA, one of its fine-tunes, or a LoRA adapter that names its base, from a folder or hub id.
 
-    unnorm_key: data set whose units the actions get; default the only one there is.
-    prompt: `openvla`, `openvla-v01` or a template with {instruction}; default the one of the checkpoint's
-    generation. centre_crop: show the middle 0.9 of the picture's area, as fine-tunes with augmentation expect.
-    tokenizer: folder of another tokenizer, or `bytes`. bits: 8 or 4 for a quantised language model.
-    temperature: 0 for the likeliest token; above, drawn among the ids that name actions. resize: `pil`, or
-    `tensor` in bfloat16 as Act2Answer's evaluation. top_k: see `top_of`.
-    Raises UsageError, and what `load_checkpoint` raises.
+    Options: see the family. Raises UsageError, and what `load_checkpoint` raises.
     """
     chooser(temperature, ())
     loaded = load_checkpoint(checkpoint or DEFAULT_CHECKPOINT, device, dtype, random_weights, bits, weights_seed)
@@ -257,7 +250,7 @@ def check_openvla_words(
     template = _template(prompt, config)
     room = int(config.text.max_position_embeddings) - (config.towers[0].image_size // _PATCH) ** 2 - DIMENSIONS
     for instruction in instructions:
-        length = len(text.encode(template.replace(_SLOT, instruction.lower())))
+        length = len(text.encode(template.replace(SLOT, instruction.lower())))
         if length > room:
             raise InstructionError(
                 f"{instruction!r} makes {length} tokens; this model has room for {room}. Shorten it"
@@ -266,11 +259,8 @@ def check_openvla_words(
 
 def _template(prompt: str | None, config: PrismaticConfig) -> str:
     """The first release (openvla-7b-v01) was made of Vicuna, and has Vicuna's prompt."""
-    name = prompt or ("openvla-v01" if config.language_id.startswith("vicuna") else "openvla")
-    template = PROMPTS.get(name, name)
-    if _SLOT not in template:
-        raise UsageError(f"prompt {name!r} is neither one of {', '.join(PROMPTS)} nor a template with {_SLOT}")
-    return template
+    first = config.language_id.startswith("vicuna")
+    return template_of(prompt or ("openvla-v01" if first else "openvla"), PROMPTS)
 
 
 _ACTION = "action_"

@@ -5,8 +5,8 @@ one the positions whose logits choose the output: the prompt's last token, then 
 """
 
 from abc import abstractmethod
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import takewhile
 from pathlib import Path
@@ -24,7 +24,8 @@ from probe_kit.hooks.contract.model import Prompt, Reading, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import IMAGE_ROLE, Site, Stream
-from probe_kit.hooks.families.prismatic.checkpoint import LoadedPrismatic, load_checkpoint
+from probe_kit.hooks.families.prismatic.checkpoint import load_checkpoint
+from probe_kit.hooks.families.shared.loading import Loaded
 from probe_kit.hooks.families.shared.text import (
     SETTINGS_FILE,
     TOKENIZER_FILE,
@@ -194,6 +195,17 @@ def find_tokenizer(
     )
 
 
+SLOT = "{instruction}"
+
+
+def template_of(name: str, prompts: Mapping[str, str]) -> str:
+    """A prompt by its name, or a template as it is. Raises UsageError for one without a place for words."""
+    template = prompts.get(name, name)
+    if SLOT not in template:
+        raise UsageError(f"prompt {name!r} is neither one of {', '.join(prompts)} nor a template with {SLOT}")
+    return template
+
+
 DEFAULT_CHECKPOINT = "TRI-ML/prismatic-vlms/prism-dinosiglip-224px+7b"
 
 
@@ -201,12 +213,19 @@ class PrismaticModel(TokenDecoder):
     """A loaded network of this kind: looks at a picture, reads a prompt, puts out `steps` greedy tokens."""
 
     family: ClassVar[str]
-    loaded: LoadedPrismatic
+    loaded: Loaded[PrismaticNetwork]
     network: PrismaticNetwork
 
-    def __init__(self, loaded: LoadedPrismatic, steps: int, tokenizer: str | None = None) -> None:
+    def __init__(
+        self,
+        loaded: Loaded[PrismaticNetwork],
+        steps: int,
+        tokenizer: str | None = None,
+        text_folder: Path | None = None,
+    ) -> None:
+        """text_folder: of a tokenizer that does not come with the checkpoint."""
         super().__init__(loaded, steps)
-        self._chosen_tokenizer = tokenizer
+        self._chosen_tokenizer, self._text_folder = tokenizer, text_folder
         self.further_streams = {
             name: Stream(name, len(tower.blocks), int(tower.embed_dim), part="vision", quantities=("residual",))
             for name, tower in self._towers.items()
@@ -218,7 +237,7 @@ class PrismaticModel(TokenDecoder):
         files: dict[str, Path] = {}
         for number, folder in enumerate(self.loaded.folders):
             files |= side_files(folder, "" if number == len(self.loaded.folders) - 1 else "adapter/")
-        return files if self.loaded.text is None else files | side_files(self.loaded.text, "tokenizer/")
+        return files if self._text_folder is None else files | side_files(self._text_folder, "tokenizer/")
 
     def _settings(self) -> dict[str, str]:
         """The choices that the numbers depend on."""
@@ -239,10 +258,9 @@ class PrismaticModel(TokenDecoder):
     @cached_property
     def tokenizer(self) -> TextTokenizer:
         """The checkpoint's. Raises CheckpointError naming the files that are missing."""
-        text = self.config.text
-        return find_tokenizer(
-            self.loaded.text_folders, self._chosen_tokenizer, text.bos_token_id, self.config.action_vocabulary
-        )
+        folders = [*self.loaded.folders, *filter(None, [self._text_folder])]
+        beginning = self.config.text.bos_token_id
+        return find_tokenizer(folders, self._chosen_tokenizer, beginning, self.config.action_vocabulary)
 
     @abstractmethod
     def prompt(self, instruction: str) -> list[int]:
@@ -399,15 +417,11 @@ def load_prismatic(
 
     Its layout is that of `PrismaticForConditionalGeneration`, or of a training run as TRI-ML releases it, of which
     a hub id has the form `owner/repo/folder`. Towers and tokenizer of such a run are downloaded where they are.
-    tokenizer: folder of another tokenizer, or `bytes`. bits: 8 or 4, see `load_checkpoint`. steps: greedy tokens
-    per inference. Raises what `load_checkpoint` raises.
+    Options: see the family. Raises what `load_checkpoint` raises.
     """
     loaded = load_checkpoint(checkpoint or DEFAULT_CHECKPOINT, device, dtype, random_weights, bits, weights_seed)
-    elsewhere = loaded.network.config.tokenizer_id
-    if (
-        tokenizer is None
-        and elsewhere
-        and not any((folder / TOKENIZER_FILE).is_file() for folder in loaded.folders)
-    ):
-        loaded = replace(loaded, text=checkpoint_folder(elsewhere, (TOKENIZER_FILE, SETTINGS_FILE)))
-    return Prismatic(loaded, steps, tokenizer)
+    elsewhere, text_folder = loaded.network.config.tokenizer_id, None
+    has_one = any((folder / TOKENIZER_FILE).is_file() for folder in loaded.folders)
+    if tokenizer is None and elsewhere and not has_one:
+        text_folder = checkpoint_folder(elsewhere, (TOKENIZER_FILE, SETTINGS_FILE))
+    return Prismatic(loaded, steps, tokenizer, text_folder)

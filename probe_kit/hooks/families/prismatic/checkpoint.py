@@ -6,7 +6,7 @@ timm's published files.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -168,23 +168,6 @@ FILES = (*PATTERNS, RUN_WEIGHTS)
 _OTHER_HEADS = ("action_head--*", "proprio_projector--*", "noisy_action_projector--*", "vision_backbone--*")
 
 
-@dataclass(frozen=True, kw_only=True)
-class LoadedPrismatic(Loaded[PrismaticNetwork]):
-    """A loaded network and what belongs to it.
-
-    folders: where its other files may lie, an adapter's own before that of its base. text: the folder of a
-    tokenizer that does not come with the checkpoint.
-    """
-
-    folders: tuple[Path, ...]
-    text: Path | None = None
-
-    @property
-    def text_folders(self) -> tuple[Path, ...]:
-        """The folders that may hold the tokenizer."""
-        return self.folders if self.text is None else (*self.folders, self.text)
-
-
 def checkpoint_folders(checkpoint: str, files: Sequence[str] = FILES) -> tuple[Path, ...]:
     """The folders that may hold a checkpoint's files: an adapter's own before that of its base."""
     folder = checkpoint_folder(checkpoint, files)
@@ -199,7 +182,7 @@ def load_checkpoint(
     random_weights: bool,
     bits: int | None = None,
     weights_seed: int = 0,
-) -> LoadedPrismatic:
+) -> Loaded[PrismaticNetwork]:
     """Load a folder or hub id, which may hold a LoRA adapter that names its base, or a training run's files.
 
     dtype: float32 or bfloat16; default what the checkpoint says. bits: quantise the language model after the
@@ -223,14 +206,10 @@ def load_checkpoint(
         weights_seed,
         finish=lambda network: None if bits is None else quantise(network, bits),
     )
-    folders = tuple(dict.fromkeys((folder, base)))
     if bits is not None:
-        notes = (
-            *loaded.notes,
-            f"not exact: language model in {bits} bits",
-        )
+        notes = (*loaded.notes, f"not exact: language model in {bits} bits")
         loaded = replace(loaded, dtype=f"{loaded.dtype}, {bits}-bit", exact=False, notes=notes)
-    return LoadedPrismatic(**vars(loaded), folders=folders)
+    return loaded if base == folder else replace(loaded, adapter=folder)
 
 
 def _check_other_heads(folders: tuple[Path, ...]) -> None:

@@ -20,7 +20,16 @@ from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.hooks.families.prismatic.adapter import Prismatic, PrismaticModel, id_behind
 from probe_kit.hooks.families.shared.vlm import LETTERS, Prefill, answer_outputs, padded_answers, recorded_texts
-from probe_kit.hooks.outputs import Arrays, Outputs, Produce, forward_outputs, generation_outputs, numpy_of, watch
+from probe_kit.hooks.outputs import (
+    Arrays,
+    Outputs,
+    Produce,
+    forward_outputs,
+    generation_outputs,
+    numpy_of,
+    pass_outputs,
+    watch,
+)
 from probe_kit.models.prismatic import prepare_picture
 
 STREAMS = 3e-5
@@ -166,13 +175,12 @@ class Reference:
             **self._vision(),
             **generation_outputs(self.model, self.model.output, self.tape, self.decoded),
             "input_ids": lambda: np.array([self.prompt]),
-            "batch_hidden_states": lambda: self._batch[0],
-            "batch_logits": lambda: self._batch[1],
-            "text_hidden_states": lambda: self._forward(self.prompt, None)[0],
-            "text_logits": lambda: self._forward(self.prompt, None)[1],
             "teacher_forced_ids": lambda: np.array([forced]),
-            "teacher_forced_hidden_states": lambda: self._forward(forced, self.pixels)[0],
-            "teacher_forced_logits": lambda: self._forward(forced, self.pixels)[1],
+            **pass_outputs(
+                batch=self._batch,
+                text=lambda: self._forward(self.prompt, None),
+                teacher_forced=lambda: self._forward(forced, self.pixels),
+            ),
         }
 
     def _vision(self) -> dict[str, Produce]:
@@ -208,7 +216,6 @@ class Reference:
         row = torch.tensor([ids])
         return forward_outputs(self.model.network, row, torch.ones_like(row, dtype=torch.bool), pixels)
 
-    @cached_property
     def _batch(self) -> tuple[NDArray[Any], NDArray[Any]]:
         """Hidden states and logits of the recorded batch, packed as the adapter packs it.
 

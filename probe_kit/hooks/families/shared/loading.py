@@ -27,7 +27,8 @@ class Loaded[Network: nn.Module]:
     """A network with its weights, what loading proved, and where it is from.
 
     dtype: of the weights, as the card has it. checkpoint: as requested. folder: of its other files. weights_seed:
-    of random weights, else None. notes, exact: of the card.
+    of random weights, else None. notes, exact: of the card. adapter: the folder of a LoRA adapter, whose files
+    count before those of `folder`.
     """
 
     network: Network
@@ -39,6 +40,12 @@ class Loaded[Network: nn.Module]:
     weights_seed: int | None = None
     notes: tuple[str, ...] = ()
     exact: bool = True
+    adapter: Path | None = None
+
+    @property
+    def folders(self) -> tuple[Path, ...]:
+        """Where its other files may lie."""
+        return (self.folder,) if self.adapter is None else (self.adapter, self.folder)
 
     def card(
         self,

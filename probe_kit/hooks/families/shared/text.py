@@ -157,13 +157,14 @@ class TokenPrompt:
     """A whole prompt.
 
     text: behind the picture's positions. ids: of everything. question: which of the ids are the question.
-    picture: first position of the picture and the one behind its last; equal where there is none.
+    picture: first position of the picture and the one behind its last; equal where there is none, or where one
+    placeholder stands for it.
     """
 
     text: str
     ids: tuple[int, ...]
     question: tuple[bool, ...]
-    picture: tuple[int, int]
+    picture: tuple[int, int] = (0, 0)
 
 
 @dataclass(frozen=True)

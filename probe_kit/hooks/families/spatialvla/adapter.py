@@ -29,7 +29,7 @@ from probe_kit.hooks.contract.model import Policy, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import IMAGE_ROLE, Site, Stream
-from probe_kit.hooks.families.prismatic.adapter import BYTES, TextTokenizer, find_tokenizer
+from probe_kit.hooks.families.prismatic.adapter import BYTES, SLOT, TextTokenizer, find_tokenizer, template_of
 from probe_kit.hooks.families.shared.action_statistics import ActionStatistics, open_or_closed
 from probe_kit.hooks.families.shared.kinds import TOKENS
 from probe_kit.hooks.families.shared.loading import DTYPES, Loaded, load_network
@@ -43,6 +43,7 @@ from probe_kit.models.spatialvla import (
     SpatialVLAConfig,
     SpatialVLANetwork,
     build_spatialvla,
+    is_camera,
     known_cameras,
     prepare_picture,
 )
@@ -111,7 +112,6 @@ def read_processor(folder: Path) -> dict[str, Any]:
     return dict(load_json(file))
 
 
-SLOT = "{instruction}"
 PROMPTS = {"bare": SLOT, "question": f"What action should the robot take to {SLOT}?"}
 """What training and the released evaluation say, and what the model's page shows."""
 _END = "\n"
@@ -135,12 +135,8 @@ class Speech:
     def of(
         cls, config: SpatialVLAConfig, folder: Path, prompt: str | None, lowercase: bool, tokenizer: str | None
     ) -> "Speech":
-        """Choose a prompt by name or template. Raises UsageError for one without a place for the instruction."""
-        name = prompt or "bare"
-        template = PROMPTS.get(name, name)
-        if SLOT not in template:
-            raise UsageError(f"prompt {name!r} is neither one of {', '.join(PROMPTS)} nor a template with {SLOT}")
-        return cls(config, folder, template, lowercase, tokenizer)
+        """Choose a prompt by name or template; see `template_of`."""
+        return cls(config, folder, template_of(prompt or "bare", PROMPTS), lowercase, tokenizer)
 
     @cached_property
     def tokenizer(self) -> TextTokenizer:
@@ -291,7 +287,7 @@ class SpatialVLA(TokenDecoder, Policy):
         if observation.intrinsics is None:  # only a model without depth gets this far
             return Intrinsics(np.eye(3), width, height)
         matrix = np.asarray(observation.intrinsics)
-        if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or np.linalg.det(matrix) == 0:
+        if not is_camera(matrix):
             raise ObservationError(f"intrinsics are {matrix.tolist()}; expected an invertible 3 × 3 matrix")
         return Intrinsics(matrix, width, height)
 
@@ -417,13 +413,7 @@ def load_spatialvla(
 ) -> SpatialVLA:
     """Load SpatialVLA or one of its fine-tunes from a folder or hub id.
 
-    unnorm_key: data set whose units the actions get; default the only one there is. prompt:
-    `bare`, `question` or a template with {instruction}. lowercase: the instruction as in training. camera: `scene`
-    for the observation's intrinsics, or a data set of the checkpoint whose camera is taken for the scene's.
-    iterations: capture the tokens of the first `step` or of the whole `chunk`. constrained: choose every token
-    within its slot, which the original does not. ensemble: average the plans of overlapping chunks. tokenizer:
-    folder of another tokenizer, or `bytes`.
-    Raises UsageError, and what `load_checkpoint` raises.
+    Options: see the family. Raises UsageError, and what `load_checkpoint` raises.
     """
     if iterations not in ("step", "chunk"):
         raise UsageError(f"iterations is {iterations!r}; expected step or chunk")

@@ -30,6 +30,7 @@ from probe_kit.hooks.outputs import (
     Produce,
     generation_outputs,
     numpy_of,
+    pass_outputs,
     stacked,
     watch,
 )
@@ -135,9 +136,8 @@ class _Reference:
     def _language(self) -> dict[str, Produce]:
         return {
             **self._spoken[0],
-            "logits": lambda: self._prompt_logits(),
-            "batch_hidden_states": lambda: self._batch[0],
-            "batch_logits": lambda: self._batch[1],
+            "logits": self._prompt_logits,
+            **pass_outputs(batch=self._batch),
             "forced_step_logits": lambda: self._forced["generated_step_logits"](),
             "forced_step_hidden": lambda: self._forced["generated_step_hidden"](),
         }
@@ -148,7 +148,6 @@ class _Reference:
         embeddings = self.policy.network.embed(packed.ids, self._sight_of_pictures.features)
         return _numpy(self.policy.network(embeddings, packed.mask).logits)
 
-    @cached_property
     @torch.inference_mode()
     def _batch(self) -> tuple[NDArray[Any], NDArray[Any]]:
         """Hidden states and logits of the recorded batch, packed as the adapter packs it.

@@ -254,9 +254,7 @@ def load_xiaomi(
 ) -> Xiaomi:
     """Load Xiaomi-Robotics-R0 from a folder or hub id.
 
-    robot: of preprocessor_config.json, or how just one of its names begins; default the only one.
-    steps: Euler steps. tokenizer: folder of another one. openness: the state's last number, see `state_layout`.
-    Raises CheckpointError, WeightsError, and UsageError for a robot or a number of steps that cannot be.
+    Options: see the family. Raises CheckpointError, WeightsError, and UsageError for options that cannot be.
     """
     if steps < 1:
         raise UsageError(f"{steps} Euler steps make no action; expected 1 or more")
