@@ -181,12 +181,11 @@ class Family:
         """
         loader_options = self.check(checkpoint, device, dtype, random_weights, options, weights_seed)
         location = self.location(checkpoint, loader_options.pop(SIZE, None))
-        check_machine(device, dtype)
+        _check_device(device)
         from probe_kit.hooks.capturing.capture_context import switch_off_fused_encoder
 
         switch_off_fused_encoder()
-        with while_loading(self.name, self.loader):
-            load = imported(self.loader)
+        load = self._imported(self.loader)
         if weights_seed:
             if "weights_seed" not in inspect.signature(load).parameters:
                 raise UsageError(f"{self.name} has one untrained network only: its loader takes no weights_seed")
@@ -251,9 +250,7 @@ class Family:
         if location is None and self.needs_checkpoint:
             raise UsageError(f"{self.name} has no default checkpoint; pass a folder or hub id as --checkpoint")
         if self.declared and location is not None and not is_on_hub(location) and not Path(location).exists():
-            checkpoint_folder(
-                location
-            )  # of the hub's families; says that it is not there, or finds the user's home
+            checkpoint_folder(location)  # says that it is not there, or finds the user's home
         if location is not None and self.config_types and (fetch or not is_on_hub(location)):
             with naming_checkpoint(self.name, location):
                 weights = fetch and not random_weights
@@ -262,12 +259,8 @@ class Family:
 
     def _with_defaults(self, loader_options: Mapping[str, Any], location: str | None) -> dict[str, Any]:
         """The options with those that belong to the default checkpoint, where it is the one."""
-        defaults = (
-            self.of_default
-            if location is not None and without_revision(location) == self.default_checkpoint
-            else {}
-        )
-        return {**defaults, **loader_options}
+        is_default = location is not None and without_revision(location) == self.default_checkpoint
+        return {**(self.of_default if is_default else {}), **loader_options}
 
     def declared_streams(self, options: Mapping[str, Any]) -> tuple[DeclaredStream, ...] | None:
         """The streams of the size that `options` choose; None for a family that declares none."""
@@ -305,10 +298,8 @@ class Family:
         """
         if not self.declared:
             return None
-        loader_options = check_options(self.name, self.options, options)
-        location = self.location(checkpoint, loader_options.pop(SIZE, None))
-        with while_loading(self.name, self.loader):
-            load = imported(self.loader)
+        location, loader_options = self._asked(checkpoint, options)
+        load = self._imported(self.loader)
         with naming_checkpoint(self.name, str(location)):
             return outline_of(self.name, load, location, dtype, self._with_defaults(loader_options, location))
 
@@ -345,12 +336,10 @@ class Family:
 
         fetch: download small files that are not here; without it, nothing is checked then.
         """
-        loader_options = check_options(self.name, self.options, options)
-        location = self.location(checkpoint, loader_options.pop(SIZE, None))
+        location, loader_options = self._asked(checkpoint, options)
         if self.words is None or (not fetch and location is not None and is_on_hub(location)):
             return
-        with while_loading(self.name, self.words):
-            check = imported(self.words)
+        check = self._imported(self.words)
         with naming_checkpoint(self.name, str(location or "what it brings")):
             check(location, instructions, **loader_options)
 
@@ -362,12 +351,10 @@ class Family:
         fetch: download small files that are not here; without it, nothing is said of a checkpoint on the hub.
         Raises UsageError where several are there and none was chosen.
         """
-        loader_options = check_options(self.name, self.options, options)
-        location = self.location(checkpoint, loader_options.pop(SIZE, None))
+        location, loader_options = self._asked(checkpoint, options)
         if self.units is None or location is None or (not fetch and is_on_hub(location)):
             return ""
-        with while_loading(self.name, self.units):
-            describe_units = imported(self.units)
+        describe_units = self._imported(self.units)
         with naming_checkpoint(self.name, location):
             return with_adapters_named(
                 str(describe_units(location, **self._with_defaults(loader_options, location)))
@@ -418,10 +405,17 @@ class Family:
     def function(self, purpose: Literal["outputs", "full_size"]) -> Callable[..., Any]:
         """The family's function for `purpose`. Raises UsageError if it has none."""
         self.check_purpose(purpose)
-        path = getattr(self, purpose)
+        return self._imported(getattr(self, purpose))
+
+    def _imported(self, path: str) -> Callable[..., Any]:
         with while_loading(self.name, path):
             function: Callable[..., Any] = imported(path)
         return function
+
+    def _asked(self, checkpoint: str | None, options: Mapping[str, Any]) -> tuple[str | None, dict[str, Any]]:
+        """The checkpoint, and the options as the loader gets them."""
+        loader_options = check_options(self.name, self.options, options)
+        return self.location(checkpoint, loader_options.pop(SIZE, None)), loader_options
 
     def renames(self) -> tuple[tuple[str, str], ...]:
         """Pairs that turn names of tensors in released files into the network's; empty if they are the same."""
@@ -487,11 +481,8 @@ def _check_streams(model: "Model", location: str) -> None:
             )
 
 
-def check_machine(device: str, dtype: str | None) -> None:
-    """Raise UsageError for a dtype that is not offered or a device that this machine does not have."""
-    if dtype not in (None, *DTYPES):
-        raise UsageError(f"dtype is {dtype!r}; expected one of {', '.join(DTYPES)}")
-    check_device_name(device)
+def _check_device(device: str) -> None:
+    """Raise UsageError for a device that this machine does not have."""
     import torch
 
     try:

@@ -205,8 +205,8 @@ def test_counts_without_bound_are_refused_before_anything_is_built(family: str, 
 
 @pytest.mark.parametrize("name", ["../elsewhere.safetensors", "/etc/passwd", "", 7, None, ["a"], "a/b"])
 def test_an_index_may_only_name_files_beside_it(tmp_path: Path, name: Any) -> None:
-    from probe_kit.hooks.checkpoints.checkpoint import missing_weights
-    from probe_kit.hooks.checkpoints.weights import INDEX_FILE, read_weights
+    from probe_kit.hooks.checkpoints.checkpoint import INDEX_FILE, missing_weights
+    from probe_kit.hooks.checkpoints.weights import read_weights
 
     (tmp_path / INDEX_FILE).write_text(json.dumps({"weight_map": {"a": name}}), encoding="utf-8")
     assert "damaged" in missing_weights(tmp_path)

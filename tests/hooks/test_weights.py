@@ -15,8 +15,9 @@ from torch import nn
 
 from probe_kit.errors import CheckpointError, WeightsError
 from probe_kit.hooks import Observation, load_model, load_policy
+from probe_kit.hooks.checkpoints.checkpoint import INDEX_FILE, WEIGHTS_FILE
 from probe_kit.hooks.checkpoints.folders import adapter_in
-from probe_kit.hooks.checkpoints.weights import INDEX_FILE, SINGLE_FILE, read_weights
+from probe_kit.hooks.checkpoints.weights import read_weights
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.hooks.registry import find_family
 from probe_kit.models.embedded import embedded_checkpoint
@@ -34,12 +35,12 @@ def checkpoint(tmp_path: Path) -> Path:
 
 
 def rewrite(checkpoint: Path, change: dict[str, torch.Tensor | None]) -> None:
-    tensors = load_file(checkpoint / SINGLE_FILE)
+    tensors = load_file(checkpoint / WEIGHTS_FILE)
     for name, tensor in change.items():
         tensors.pop(name, None)
         if tensor is not None:
             tensors[name] = tensor
-    save_file(tensors, checkpoint / SINGLE_FILE, metadata=RANDOM)
+    save_file(tensors, checkpoint / WEIGHTS_FILE, metadata=RANDOM)
 
 
 @pytest.mark.parametrize(
@@ -61,13 +62,13 @@ def test_a_changed_file_is_refused_by_tensor_name(checkpoint: Path, change, comp
 
 
 def test_missing_weights_are_refused_and_not_replaced_by_random_ones(checkpoint: Path) -> None:
-    (checkpoint / SINGLE_FILE).unlink()
+    (checkpoint / WEIGHTS_FILE).unlink()
     with pytest.raises(WeightsError, match="no weights in"):
         Pi0.load(str(checkpoint))
 
 
 def test_a_truncated_file_is_refused(checkpoint: Path) -> None:
-    file = checkpoint / SINGLE_FILE
+    file = checkpoint / WEIGHTS_FILE
     file.write_bytes(file.read_bytes()[:-1000])
     with pytest.raises(WeightsError, match="cannot be read"):
         Pi0.load(str(checkpoint))
@@ -103,30 +104,30 @@ def test_an_index_that_contradicts_its_shards_is_refused(checkpoint: Path) -> No
 
 def test_the_hash_names_every_bit(checkpoint: Path) -> None:
     before = read_weights(checkpoint).sha256()
-    tensor = load_file(checkpoint / SINGLE_FILE)[NAME]
+    tensor = load_file(checkpoint / WEIGHTS_FILE)[NAME]
     tensor[0, 0] = torch.nextafter(tensor[0, 0], torch.tensor(torch.inf))
     rewrite(checkpoint, {NAME: tensor})
     assert read_weights(checkpoint).sha256() != before
 
 
 def test_the_random_mark_travels_in_the_weights_file(checkpoint: Path) -> None:
-    save_file(load_file(checkpoint / SINGLE_FILE), checkpoint / SINGLE_FILE, metadata=RANDOM)
+    save_file(load_file(checkpoint / WEIGHTS_FILE), checkpoint / WEIGHTS_FILE, metadata=RANDOM)
     assert Pi0.load(str(checkpoint)).card.random_weights
-    save_file(load_file(checkpoint / SINGLE_FILE), checkpoint / SINGLE_FILE)
+    save_file(load_file(checkpoint / WEIGHTS_FILE), checkpoint / WEIGHTS_FILE)
     assert not Pi0.load(str(checkpoint)).card.random_weights
     assert Pi0.load(str(checkpoint), random_weights=True).card.random_weights
 
 
 def shard(checkpoint: Path) -> None:
     """Split the single file in two, as large checkpoints are."""
-    tensors = load_file(checkpoint / SINGLE_FILE)
+    tensors = load_file(checkpoint / WEIGHTS_FILE)
     names = sorted(tensors)
     halves = {"model-00001-of-00002.safetensors": names[::2], "model-00002-of-00002.safetensors": names[1::2]}
     for file, half in halves.items():
         save_file({name: tensors[name] for name in half}, checkpoint / file, metadata=RANDOM)
     weight_map = {name: file for file, half in halves.items() for name in half}
     (checkpoint / INDEX_FILE).write_text(json.dumps({"weight_map": weight_map}), encoding="utf-8")
-    (checkpoint / SINGLE_FILE).unlink()
+    (checkpoint / WEIGHTS_FILE).unlink()
 
 
 def test_a_checkpoint_in_the_layout_of_early_2025_acts_like_todays(
@@ -134,7 +135,7 @@ def test_a_checkpoint_in_the_layout_of_early_2025_acts_like_todays(
 ) -> None:
     """lerobot's own loader returns a random backbone for such a file."""
     vlm = "model.paligemma_with_expert.paligemma"
-    tensors = load_file(checkpoint / SINGLE_FILE)
+    tensors = load_file(checkpoint / WEIGHTS_FILE)
     old = {
         name.replace(f"{vlm}.model.language_model.", f"{vlm}.language_model.model.").replace(
             f"{vlm}.model.vision_tower.", f"{vlm}.vision_tower."
@@ -142,7 +143,7 @@ def test_a_checkpoint_in_the_layout_of_early_2025_acts_like_todays(
         for name, tensor in tensors.items()
     }
     assert old.keys() != tensors.keys()
-    save_file(old, checkpoint / SINGLE_FILE, metadata=RANDOM)
+    save_file(old, checkpoint / WEIGHTS_FILE, metadata=RANDOM)
     np.testing.assert_array_equal(
         Pi0.load(str(checkpoint)).act([observation], [1]), pi0_tiny.act([observation], [1])
     )
@@ -151,7 +152,7 @@ def test_a_checkpoint_in_the_layout_of_early_2025_acts_like_todays(
 def test_a_file_that_holds_the_embedding_only_as_lm_head_loads_it_from_there(checkpoint: Path) -> None:
     vlm = "model.paligemma_with_expert.paligemma"
     embedding = f"{vlm}.model.language_model.embed_tokens.weight"
-    head = load_file(checkpoint / SINGLE_FILE)[f"{vlm}.lm_head.weight"]
+    head = load_file(checkpoint / WEIGHTS_FILE)[f"{vlm}.lm_head.weight"]
     rewrite(checkpoint, {embedding: None})
     assert torch.equal(Pi0.load(str(checkpoint)).network.state_dict()[embedding], head)
 
@@ -162,8 +163,8 @@ def test_a_loaded_policy_is_in_eval_mode(checkpoint: Path) -> None:
 
 def test_a_pickled_state_dict_is_read_without_running_code(checkpoint: Path, tmp_path: Path) -> None:
     whole = Pi0.load(str(checkpoint)).card.weights_sha256
-    tensors = load_file(checkpoint / SINGLE_FILE)
-    (checkpoint / SINGLE_FILE).unlink()
+    tensors = load_file(checkpoint / WEIGHTS_FILE)
+    (checkpoint / WEIGHTS_FILE).unlink()
     torch.save(tensors, checkpoint / "model.pt")
     assert Pi0.load(str(checkpoint)).card.weights_sha256 == whole
     torch.save({"trap": Path(tmp_path)}, checkpoint / "model.pt")
@@ -182,8 +183,8 @@ def test_a_pickled_state_dict_is_read_without_running_code(checkpoint: Path, tmp
     ],
 )
 def test_a_name_in_front_of_all_tensors_is_told(checkpoint: Path, before: str, told: str) -> None:
-    tensors = {before + name: tensor for name, tensor in load_file(checkpoint / SINGLE_FILE).items()}
-    save_file(tensors, checkpoint / SINGLE_FILE)
+    tensors = {before + name: tensor for name, tensor in load_file(checkpoint / WEIGHTS_FILE).items()}
+    save_file(tensors, checkpoint / WEIGHTS_FILE)
     with pytest.raises(WeightsError, match=f"names hold '{told}'.*save its tensors again without") as caught:
         Pi0.load(str(checkpoint))
     assert "missing" not in str(caught.value)
@@ -191,27 +192,27 @@ def test_a_name_in_front_of_all_tensors_is_told(checkpoint: Path, before: str, t
 
 def test_a_wrapper_inside_the_names_is_told(checkpoint: Path) -> None:
     tensors = {name.replace("layers.0.", "layers.0._checkpoint_wrapped_module."): tensor
-               for name, tensor in load_file(checkpoint / SINGLE_FILE).items()}  # fmt: skip
-    save_file(tensors, checkpoint / SINGLE_FILE)
+               for name, tensor in load_file(checkpoint / WEIGHTS_FILE).items()}  # fmt: skip
+    save_file(tensors, checkpoint / WEIGHTS_FILE)
     with pytest.raises(WeightsError, match="_checkpoint_wrapped_module"):
         Pi0.load(str(checkpoint))
 
 
 def write_index(checkpoint: Path, shard: str) -> None:
-    names = dict.fromkeys(load_file(checkpoint / SINGLE_FILE), shard)
+    names = dict.fromkeys(load_file(checkpoint / WEIGHTS_FILE), shard)
     (checkpoint / INDEX_FILE).write_text(json.dumps({"weight_map": names}), encoding="utf-8")
 
 
 def test_two_sets_of_weights_are_refused_because_nothing_says_which_is_meant(checkpoint: Path) -> None:
     write_index(checkpoint, "model-00001-of-00001.safetensors")
-    shutil.copy(checkpoint / SINGLE_FILE, checkpoint / "model-00001-of-00001.safetensors")
+    shutil.copy(checkpoint / WEIGHTS_FILE, checkpoint / "model-00001-of-00001.safetensors")
     for load in (read_weights, lambda folder: Pi0.load(str(folder))):
         with pytest.raises(WeightsError, match="two sets of weights"):
             load(checkpoint)
 
 
 def test_an_index_that_lists_the_one_file_is_no_second_set(checkpoint: Path) -> None:
-    write_index(checkpoint, SINGLE_FILE)
+    write_index(checkpoint, WEIGHTS_FILE)
     assert read_weights(checkpoint).tensors
 
 

@@ -68,11 +68,6 @@ _JOINED: dict[str, Path] = {}
 """Folders in which the files of an adapter and its base are joined, with the adapter's own."""
 
 
-def remember_joined(joined: Path, folder: Path) -> None:
-    """Note that a folder holds links to the files of the adapter in `folder`, and of its base."""
-    _JOINED[str(joined)] = folder
-
-
 def with_adapters_named(text: str) -> str:
     """Return a text in which every joined folder has the name of its adapter's own."""
     for joined, folder in _JOINED.items():
@@ -264,7 +259,7 @@ def _join(folder: Path, base: Path) -> Path:
     for name in _BESIDE:
         if (base.parent / name).exists() and not (root / name).exists():
             (root / name).symlink_to((base.parent / name).resolve())
-    remember_joined(joined, folder)
+    _JOINED[str(joined)] = folder
     return joined
 
 

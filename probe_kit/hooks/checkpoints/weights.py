@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from probe_kit._system.bounded_files import load_json
 from probe_kit._system.imports import require
 from probe_kit.errors import WeightsError
-from probe_kit.hooks.checkpoints.checkpoint import check_unambiguous, shard_name
+from probe_kit.hooks.checkpoints.checkpoint import INDEX_FILE, WEIGHTS_FILE, check_unambiguous, shard_name
 from probe_kit.hooks.checkpoints.folders import SCALING, AdapterFiles, adapter_in
 from probe_kit.models.building import builds_sizes_only
 
@@ -155,8 +155,6 @@ def _few(names: list[str], most: int = 8) -> str:
     return ", ".join(names[:most]) + more
 
 
-SINGLE_FILE = "model.safetensors"
-INDEX_FILE = "model.safetensors.index.json"
 RANDOM_MARK = "probe_kit.weights"
 _WRAPPERS = (
     "_orig_mod", "_fsdp_wrapped_module", "_checkpoint_wrapped_module", "_forward_module", "_ddp_module", "module",
@@ -243,22 +241,22 @@ def with_adapter(base: Weights, files: AdapterFiles) -> Weights:
 def _read_folder(folder: Path, unlisted: Iterable[str]) -> Weights:
     check_unambiguous(folder)
     index, pickles = folder / INDEX_FILE, sorted(folder.glob("*.pt"))
-    if (folder / SINGLE_FILE).is_file():
-        shards: dict[str, set[str] | None] = {SINGLE_FILE: None}
+    if (folder / WEIGHTS_FILE).is_file():
+        shards: dict[str, set[str] | None] = {WEIGHTS_FILE: None}
     elif index.is_file():
         shards = _shards(index)
     elif len(pickles) == 1:
         return read_pickle(pickles[0])
     else:
         raise WeightsError(
-            f"no weights in {folder}: neither {SINGLE_FILE} nor {INDEX_FILE} nor one .pt file is there"
+            f"no weights in {folder}: neither {WEIGHTS_FILE} nor {INDEX_FILE} nor one .pt file is there"
         )
     tensors: dict[str, Tensor] = {}
     random = False
     for name, expected in shards.items():
         content, metadata = _read_file(folder / name)
         if expected is not None and (difference := sorted((set(content) ^ expected) - (set(unlisted) - expected))):
-            raise WeightsError(f"{folder / name} and {INDEX_FILE} disagree about {_names(difference)}")
+            raise WeightsError(f"{folder / name} and {INDEX_FILE} disagree about {_few(difference)}")
         tensors |= content
         random = random or metadata.get(RANDOM_MARK, "").startswith("random")
     return Weights(tensors, str(folder), random)
@@ -301,7 +299,7 @@ def check_kinds(tensors: Mapping[str, Tensor], path: Path) -> None:
     strange = [f"{name} ({tensor.dtype})" for name, tensor in tensors.items() if tensor.dtype not in _KINDS]
     if strange:
         raise WeightsError(
-            f"{path} holds {len(strange)} tensors of a kind that no model declares: {_names(strange)}. Take the "
+            f"{path} holds {len(strange)} tensors of a kind that no model declares: {_few(strange)}. Take the "
             "checkpoint that is not quantised"
         )
 
@@ -401,7 +399,7 @@ def _refuse_wrapped(weights: Weights, tensors: Mapping[str, Tensor], state: Mapp
     if factors := [name for name in strange if ".lora_A." in name or ".lora_B." in name]:
         raise WeightsError(
             f"weights in {weights.source} hold {len(factors)} low-rank factors that were not merged: "
-            f"{_names(factors, 2)}. Merge them with the tool that trained the model, and save it again"
+            f"{_few(factors, 2)}. Merge them with the tool that trained the model, and save it again"
         )
     wrapper = _wrapper(list(weights.tensors), list(state)) if missing and strange else ""
     if wrapper:
@@ -440,11 +438,6 @@ def _common_path(names: Sequence[str]) -> str:
 def _refuse(source: str, what: str, names: list[str]) -> None:
     if names:
         raise WeightsError(
-            f"weights in {source}: {len(names)} tensors {what}: {_names(names)}. "
+            f"weights in {source}: {len(names)} tensors {what}: {_few(names)}. "
             "The file does not belong to this model and configuration; nothing was run"
         )
-
-
-def _names(names: list[str], most: int = 8) -> str:
-    more = f" and {len(names) - most} more" if len(names) > most else ""
-    return ", ".join(names[:most]) + more

@@ -18,11 +18,9 @@ from safetensors.torch import save_file
 from probe_kit._system.bounded_files import load_json
 from probe_kit._system.drafts import draft_of
 from probe_kit.errors import CheckpointError, ProbeKitError, UsageError
-from probe_kit.hooks.checkpoints.checkpoint import PATTERNS, hub_files, side_files
+from probe_kit.hooks.checkpoints.checkpoint import INDEX_FILE, PATTERNS, WEIGHTS_FILE, hub_files, side_files
 from probe_kit.hooks.checkpoints.folders import adapter_in, checkpoint_folder
 from probe_kit.hooks.checkpoints.weights import (
-    INDEX_FILE,
-    SINGLE_FILE,
     Weights,
     read_pickle,
     read_weights,
@@ -99,7 +97,7 @@ def _weights(folder: Path, file_name: str | None, hub: str | None) -> Path:
     if file_name is None and hub is None and adapter_in(folder) is not None and not any(folder.glob("**/*.pt")):
         return folder
     for candidate in (folder, folder / WEIGHTS_FOLDER):
-        if file_name is None and ((candidate / SINGLE_FILE).is_file() or (candidate / INDEX_FILE).is_file()):
+        if file_name is None and ((candidate / WEIGHTS_FILE).is_file() or (candidate / INDEX_FILE).is_file()):
             return candidate
     if hub is not None:
         name = _select_file([name for name in hub_files(hub) if name.endswith(".pt")], file_name, hub)
@@ -115,7 +113,7 @@ def _select_file(files: Sequence[str], name: str | None, location: str) -> str:
     listed = ", ".join(sorted(by_name))
     if not files:
         raise CheckpointError(
-            f"no weights in {location} or its {WEIGHTS_FOLDER}/: expected {SINGLE_FILE} or a .pt file"
+            f"no weights in {location} or its {WEIGHTS_FOLDER}/: expected {WEIGHTS_FILE} or a .pt file"
         )
     if name is not None:
         if name not in by_name:
@@ -195,7 +193,7 @@ def convert(checkpoint: str, out: Path, vlm: str | None = None) -> str:
 
 def _write(parts: Parts, weights: Weights, folder: Path) -> None:
     # Tied tensors share their memory in a pickle, which safetensors does not allow.
-    save_file({name: value.clone().contiguous() for name, value in weights.tensors.items()}, folder / SINGLE_FILE)
+    save_file({name: value.clone().contiguous() for name, value in weights.tensors.items()}, folder / WEIGHTS_FILE)
     for name, file in side_files(parts.vlm).items():
         shutil.copyfile(file, folder / name)
     for name in _RUN_FILES:

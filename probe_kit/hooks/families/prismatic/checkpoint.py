@@ -16,10 +16,9 @@ from torch import Tensor, nn
 
 from probe_kit._system.imports import require
 from probe_kit.errors import CheckpointError, UsageError, WeightsError
-from probe_kit.hooks.checkpoints.checkpoint import PATTERNS, RUN_WEIGHTS, chosen_dtype
+from probe_kit.hooks.checkpoints.checkpoint import PATTERNS, RUN_WEIGHTS, WEIGHTS_FILE, chosen_dtype
 from probe_kit.hooks.checkpoints.folders import AdapterFiles, adapter_in, checkpoint_folder
 from probe_kit.hooks.checkpoints.weights import (
-    SINGLE_FILE,
     Weights,
     check_kinds,
     read_weights,
@@ -134,8 +133,8 @@ def _published(tower: TowerConfig) -> dict[str, Tensor]:
     """The state dict of timm's published weights, at the side of the model's pictures."""
     timm = require("timm", "openvla")
     name = published_name(tower)
-    folder = checkpoint_folder(name, (SINGLE_FILE, "config.json"))
-    file = folder / SINGLE_FILE
+    folder = checkpoint_folder(name, (WEIGHTS_FILE, "config.json"))
+    file = folder / WEIGHTS_FILE
     if not file.is_file():
         raise WeightsError(f"{file} is missing; download {name} again")
     network = timm.create_model(
