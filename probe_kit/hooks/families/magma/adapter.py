@@ -24,7 +24,7 @@ from probe_kit.hooks.capturing.capture_context import ActivationCache
 from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.contract.card import ARM
-from probe_kit.hooks.contract.model import Policy, Prompt, Reading, Tap
+from probe_kit.hooks.contract.model import Policy, Prompt, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import IMAGE_ROLE, Site, Stream
@@ -241,22 +241,18 @@ class Magma(TokenDecoder, Policy, SpeakingModel):
 
     # -- answering ---------------------------------------------------------------------------------------
 
-    def read(self, questions: Sequence[Prompt]) -> Reading:
+    def option_ids(self, question: Prompt) -> list[int]:
+        """The first id of every option."""
+        text, begun = question.text, question.begun
+        return [self.text.option(text, begun, option, question.pictured) for option in question.options]
+
+    def prefill(self, questions: Sequence[Prompt]) -> Prefill:
         """One inference: the prefill, whose logits compare the options, and six steps into the answer."""
         self.check([question.observation for question in questions])
         prompts = [self._question(question).ids for question in questions]
-        options = [
-            [
-                self.text.option(question.text, question.begun, option, question.pictured)
-                for option in question.options
-            ]
-            for question in questions
-        ]
         pictured = self.shows_pictures(questions)
         pictures = [self.picture(question.observation.image) for question in questions] if pictured else None
-        decoded = self.generate(prompts, pictures)
-        prefill = Prefill.of_decoded(self.speaker, decoded)
-        return Reading.of(prefill.logits.float().cpu().numpy(), options, prefill)
+        return Prefill.of_decoded(self.speaker, self.generate(prompts, pictures))
 
     def _question(self, question: Prompt) -> TokenPrompt:
         return self.text.prompt(question.text, question.begun, question.pictured)

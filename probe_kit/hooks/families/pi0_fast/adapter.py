@@ -241,35 +241,28 @@ def sized(size: Pi0FastSize | None, config: PI0FastConfig) -> Iterator[None]:
         yield
 
 
-@dataclass(frozen=True)
-class TokenPrompt:
-    """The inputs before the first action token. bos: id that begins the actions; end: id that ends them.
-
-    images: (B, 3, H, W) in [-1, 1] of every camera. image_masks: (B,) of every camera. tokens, mask: (B, T).
-    """
-
-    images: list[Tensor]
-    image_masks: list[Tensor]
-    tokens: Tensor
-    mask: Tensor
-    bos: int
-    end: int
-
-
 def decode_tokens(
-    model: Any, prompt: TokenPrompt, least: int, most: int, choose: Callable[[Tensor], Tensor]
+    model: Any,
+    pictures: tuple[list[Tensor], list[Tensor]],
+    text: tuple[Tensor, Tensor],
+    bounds: tuple[int, int],
+    least: int,
+    most: int,
+    choose: Callable[[Tensor], Tensor],
 ) -> Tensor:
-    """(B, n) ids of `least` to `most` tokens: until every row has put out `end`.
+    """(B, n) ids of `least` to `most` tokens: until every row has put out the end.
 
-    model: lerobot's `PI0FastPytorch`. choose: (B,) ids of logits (B, V). A row that has ended is decoded
-    with the others, so that no row depends on another one; what it puts out behind its `end` means nothing.
+    model: lerobot's `PI0FastPytorch`. pictures: (B, 3, H, W) in [-1, 1], and (B,) masks, of every camera. text:
+    tokens and mask (B, T). bounds: ids that begin and end the actions. choose: (B,) ids of logits (B, V). A row
+    that has ended is decoded with the others, so that no row depends on another one; what it puts out behind its
+    end means nothing.
     """
     joint = model.paligemma_with_expert
-    rows, device = len(prompt.tokens), prompt.tokens.device
+    rows, device = len(text[0]), text[0].device
     always = torch.ones((rows, 1), dtype=torch.bool, device=device)
-    begin = torch.full((rows, 1), prompt.bos, dtype=torch.long, device=device)
-    tokens, mask = torch.cat([prompt.tokens, begin], dim=1), torch.cat([prompt.mask, always], dim=1)
-    entering, valid, attends, _, _ = model.embed_prefix_fast(prompt.images, prompt.image_masks, tokens, mask)
+    begin = torch.full((rows, 1), bounds[0], dtype=torch.long, device=device)
+    tokens, mask = torch.cat([text[0], begin], dim=1), torch.cat([text[1], always], dim=1)
+    entering, valid, attends, _, _ = model.embed_prefix_fast(*pictures, tokens, mask)
     entering = entering.to(_dtype(joint, entering))
     places, past = torch.cumsum(valid, dim=1) - 1, None
     ids: list[Tensor] = []
@@ -286,7 +279,7 @@ def decode_tokens(
         if not ids:  # what follows reads what is kept of the prompt
             joint.prompt_kv(past.layers)
         ids.append(choose(joint.paligemma.lm_head(states[:, -1:])[:, -1]))
-        ended |= ids[-1] == prompt.end
+        ended |= ids[-1] == bounds[1]
         if len(ids) >= most or (len(ids) >= least and bool(ended.all())):
             return torch.stack(ids, dim=1)
         entering = joint.embed_language_tokens(ids[-1][:, None])
@@ -414,14 +407,12 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
     def tokens(self, batch: dict[str, Tensor], seeds: Sequence[int]) -> Tensor:
         """(B, n) ids that the network puts out for a batch in lerobot's keys; one inference."""
         self.check_pictures(batch)
-        text = self.action_text
+        bounds = int(self.tokenizer.bos_token_id), self.action_text.end
+        least, most = self.evaluation.captured_tokens, int(self.config.max_decoding_steps)
         choose = chooser(self.temperature, seeds, top=None)
         with torch.inference_mode():
-            pictures, masks = self.network._preprocess_images(batch)
-            begin = int(self.tokenizer.bos_token_id)
-            prompt = TokenPrompt(pictures, masks, batch[TOKENS], batch[MASK], begin, text.end)
-            most = int(self.config.max_decoding_steps)
-            return decode_tokens(self.network.model, prompt, self.evaluation.captured_tokens, most, choose)
+            pictures, text = self.network._preprocess_images(batch), (batch[TOKENS], batch[MASK])
+            return decode_tokens(self.network.model, pictures, text, bounds, least, most, choose)
 
     def chunks(self, ids: Tensor) -> list[DecodedChunk]:
         """The normalised chunk in every row of (B, n) ids.

@@ -352,13 +352,11 @@ class Prismatic(PrismaticModel, SpeakingModel):
             raise UsageError(
                 f"a question is one prefill; this model takes {self.steps} steps. Load it with steps=1"
             )
-        texts = [self._framed(question) for question in questions]
-        options = [
-            [id_behind(self.tokenizer, text, option) for option in question.options]
-            for text, question in zip(texts, questions, strict=True)
-        ]
-        prefill = self.prefill(questions)
-        return Reading.of(prefill.logits.float().cpu().numpy(), options, prefill)
+        return super().read(questions)
+
+    def option_ids(self, question: Prompt) -> list[int]:
+        """The first id of every option."""
+        return [id_behind(self.tokenizer, self._framed(question), option) for option in question.options]
 
     def prefill(self, questions: Sequence[Prompt]) -> Prefill:
         """One pass over all questions."""

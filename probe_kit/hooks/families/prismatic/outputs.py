@@ -18,7 +18,7 @@ from probe_kit.hooks.capturing.capture_context import ActivationCache
 from probe_kit.hooks.contract.model import Prompt
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.sites import Site
-from probe_kit.hooks.families.prismatic.adapter import Prismatic, PrismaticModel, id_behind
+from probe_kit.hooks.families.prismatic.adapter import Prismatic, PrismaticModel
 from probe_kit.hooks.families.shared.vlm import LETTERS, Prefill, answer_outputs, padded_answers, recorded_texts
 from probe_kit.hooks.outputs import (
     Arrays,
@@ -81,10 +81,6 @@ class _Asked:
         def behind(rows: Sequence[Sequence[int]], value: int) -> NDArray[np.int64]:
             return np.array([[*row, *[value] * (max(lengths) - len(row))] for row in rows])
 
-        def options() -> NDArray[Any]:
-            text = model.frame.around(self.questions[0].text)
-            return np.array([id_behind(model.tokenizer, text, option) for option in self.questions[0].options])
-
         return {
             "input_ids": lambda: behind(self.prompts, padding),
             "input_mask": lambda: behind([[1] * length for length in lengths], 0),
@@ -95,7 +91,7 @@ class _Asked:
             "backbone_final_norm": lambda: self._streams([model.streams["backbone"].layers - 1], "final_norm")[0],
             "logits_last": lambda: numpy_of(torch.cat([prefill.logits for _, prefill in self.captured])),
             "batch_logits_last": lambda: numpy_of(model.prefill(self.questions).logits),
-            "option_ids": options,
+            "option_ids": lambda: np.array(model.option_ids(self.questions[0])),
             "option_logits": lambda: model.read(self.questions).option_logits,
             "textonly_input_ids": lambda: np.array([self.prompts[0]]),
             "textonly_logits_last": lambda: numpy_of(model.prefill([bare]).logits),

@@ -121,6 +121,21 @@ class SpeakingModel(AnswerModel):
     def words(self, ids: Sequence[int]) -> str:
         """The text of an answer's ids, up to its end."""
 
+    @abstractmethod
+    def option_ids(self, question: Prompt) -> list[int]:
+        """The first id of every option. Raises UsageError for one that changes the prompt's own ids."""
+
+    @abstractmethod
+    def prefill(self, questions: Sequence[Prompt]) -> Prefill:
+        """One pass over all questions."""
+
+    def read(self, questions: Sequence[Prompt]) -> Reading:
+        """One prefill; see the contract."""
+        self.shows_pictures(questions)
+        options = [self.option_ids(question) for question in questions]
+        prefill = self.prefill(questions)
+        return Reading.of(prefill.logits.float().cpu().numpy(), options, prefill)
+
     def speak(self, reading: Reading, tokens: int) -> list[str]:
         """Greedy text from the keys and values of the prompt on; see the contract. Raises UsageError."""
         if not isinstance(reading.state, Prefill) or reading.state.network is not self.speaker:
@@ -281,16 +296,10 @@ class VisionLanguageModel(SpeakingModel):
         """Prompts as one batch on the model's device."""
         return LeftPacked.of([prompt.ids for prompt in prompts], self.text.padding, self.loaded.device)
 
-    def read(self, questions: Sequence[Prompt]) -> Reading:
-        """One prefill; see the contract."""
-        self.shows_pictures(questions)
-        options = [
-            [self.text.option(prompt, option) for option in question.options]
-            for question in questions
-            for prompt in [self.text.prompt(question.text, question.begun, [] if question.pictured else None)]
-        ]
-        prefill = self.prefill(questions)
-        return Reading.of(prefill.logits.float().cpu().numpy(), options, prefill)
+    def option_ids(self, question: Prompt) -> list[int]:
+        """The first id of every option."""
+        prompt = self.text.prompt(question.text, question.begun, [] if question.pictured else None)
+        return [self.text.option(prompt, option) for option in question.options]
 
     @property
     def speaker(self) -> Any:
@@ -508,16 +517,11 @@ class Reference:
 
     def _answers(self) -> dict[str, Produce]:
         model = self.model
-
-        def options() -> NDArray[Any]:
-            prompt = model.prompt(self.questions[0])
-            return np.array([model.text.option(prompt, option) for option in self.questions[0].options])
-
         return {
             "logits_last": lambda: numpy_of(self.captured[1].logits),
             "single_logits_last": lambda: numpy_of(torch.cat([prefill.logits for prefill in self.alone])),
             "textonly_logits_last": lambda: numpy_of(model.prefill([self.bare]).logits),
-            "option_ids": options,
+            "option_ids": lambda: np.array(model.option_ids(self.questions[0])),
             "option_logits": lambda: model.read(self.questions).option_logits,
             "greedy_ids": self._greedy,
         }
