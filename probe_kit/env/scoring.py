@@ -15,7 +15,7 @@ start).
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from difflib import get_close_matches
 from types import MappingProxyType
@@ -451,27 +451,6 @@ def _zone(correct: bool, wrong: bool) -> Zone:
 _DEFAULT = SceneSpec.__dataclass_fields__
 
 
-def _disc(scene: Mapping[str, Any]) -> OutcomeRule:
-    return Disc(scene["epsilon"])
-
-
-def _box(scene: Mapping[str, Any]) -> OutcomeRule:
-    """Scoring side and margins are newer than some scenes that are still read."""
-    side, margin, height = (
-        scene.get(name, _DEFAULT[name].default) for name in ("scoring_side", "box_margin", "box_height")
-    )
-    return Box(side / 2 + margin, height)
-
-
-def _released(scene: Mapping[str, Any]) -> OutcomeRule:
-    return ReleasedOnTile(scene["tile_side"] / 2)
-
-
-_MAKERS: dict[str, Callable[[Mapping[str, Any]], OutcomeRule]] = {
-    Disc.name: _disc,
-    Box.name: _box,
-    ReleasedOnTile.name: _released,
-}
 DEFAULT_RULE = Disc.name
 RULES: Mapping[str, str] = MappingProxyType(
     {
@@ -494,13 +473,25 @@ def check_rule(name: str) -> str:
 
 def rule_of(name: str, scene: Mapping[str, Any]) -> OutcomeRule:
     """The rule of this name with the sizes of a scene, `SceneSpec.to_json()`. Raises UsageError."""
-    return _MAKERS[check_rule(name)](scene)
+    if check_rule(name) == Disc.name:
+        return Disc(scene["epsilon"])
+    if name == ReleasedOnTile.name:
+        return ReleasedOnTile(scene["tile_side"] / 2)
+    # Scoring side and margins are newer than some scenes that are still read.
+    side, margin, height = (
+        scene.get(field, _DEFAULT[field].default) for field in ("scoring_side", "box_margin", "box_height")
+    )
+    return Box(side / 2 + margin, height)
 
 
 Choice = Literal["correct", "wrong", "none"]
 
 HAND_ABOVE = 0.02
 """How far above the middle of a tile the tool must be to count as over it, metres (the released evaluation's)."""
+
+
+TIE = 1e-3
+"""Metres by which a gain has to be the larger one."""
 
 
 @dataclass(frozen=True)
@@ -550,10 +541,17 @@ def behaviour_of(trajectory: Trajectory, side_correct: Side, box_half: float, mo
         over_picture & ~_left_where_it_began(over_picture, away, moved)
         for over_picture, away in zip(over, distances, strict=True)
     )
-    start, least = [float(away[0]) for away in distances], [_least(away) for away in distances]
-    furthest = _furthest(trajectory)
-    released_at = _first_release(trajectory.held)
+    # The smallest that is a number: the simulator may break in mid-episode, not before.
+    start, least = [float(away[0]) for away in distances], [float(np.nanmin(away)) for away in distances]
+    gains = [first - nearest for first, nearest in zip(start, least, strict=True)]
+    furthest = float(np.nanmax(np.hypot(*(trajectory.cube[:, :2] - trajectory.cube[0, :2]).T)))
+    last_held, entered = _first(trajectory.held[:-1] & ~trajectory.held[1:]), _first(correct | wrong)
+    released_at = None if last_held is None else last_held + 1
     towards_correct = _offset_to_correct_side(trajectory, side_correct)
+
+    def at(frame: int) -> Choice:
+        return _choice(bool(correct[frame]), bool(wrong[frame]))
+
     return Behaviour(
         grasped=bool(trajectory.held.any()),
         released=released_at is not None,
@@ -562,14 +560,14 @@ def behaviour_of(trajectory: Trajectory, side_correct: Side, box_half: float, mo
         furthest=furthest,
         hand_starts_over=_choice(bool(over[0][0]), bool(over[1][0])),
         hand_starts_nearer=_choice(start[0] < start[1], start[1] < start[0]),
-        first_choice=_first_choice(correct, wrong),
+        first_choice="none" if entered is None else at(entered),
         dwell_correct=int(correct[1:].sum()),
         dwell_wrong=int(wrong[1:].sum()),
         dwell_start=int(((over[0] | over[1]) & ~correct & ~wrong)[1:].sum()),
         min_distance_correct=least[0],
         min_distance_wrong=least[1],
-        closer_to=_larger(start[0] - least[0], start[1] - least[1]),
-        release_near=_release_near(correct, wrong, released_at),
+        closer_to=_choice(gains[0] > gains[1] + TIE, gains[1] > gains[0] + TIE),
+        release_near=None if released_at is None else at(released_at),
         correct_side_share=float((towards_correct[1:] > 0).mean()),
         start_side_correct=bool(towards_correct[0] > 0),
     )
@@ -586,36 +584,8 @@ def _left_where_it_began(over: Flags, away: NDArray[np.float32], moved: float) -
     return np.asarray(np.logical_and.accumulate(over) & (away[0] - away < moved))
 
 
-def _first_choice(correct: Flags, wrong: Flags) -> Choice:
-    entered = np.flatnonzero(correct | wrong)
-    return "none" if entered.size == 0 else _choice(bool(correct[entered[0]]), bool(wrong[entered[0]]))
-
-
 def _choice(correct: bool, wrong: bool) -> Choice:
     return "correct" if correct else "wrong" if wrong else "none"
-
-
-def _larger(correct: float, wrong: float, tie: float = 1e-3) -> Choice:
-    """Gains within a millimetre of each other are none."""
-    return _choice(correct > wrong + tie, wrong > correct + tie)
-
-
-def _first_release(grasped: Flags) -> int | None:
-    let_go = np.flatnonzero(grasped[:-1] & ~grasped[1:])
-    return None if let_go.size == 0 else int(let_go[0]) + 1
-
-
-def _release_near(correct: Flags, wrong: Flags, at: int | None) -> Choice | None:
-    return None if at is None else _choice(bool(correct[at]), bool(wrong[at]))
-
-
-def _least(distance: NDArray[np.float32]) -> float:
-    """The smallest that is a number: the simulator may break in mid-episode, not before."""
-    return float(np.nanmin(distance))
-
-
-def _furthest(trajectory: Trajectory) -> float:
-    return float(np.nanmax(np.hypot(*(trajectory.cube[:, :2] - trajectory.cube[0, :2]).T)))
 
 
 def _offset_to_correct_side(trajectory: Trajectory, side_correct: Side) -> NDArray[np.float32]:
