@@ -298,7 +298,7 @@ class Family:
         """
         if not self.declared:
             return None
-        location, loader_options = self._asked(checkpoint, options)
+        location, loader_options = self._located(checkpoint, options)
         load = self._imported(self.loader)
         with naming_checkpoint(self.name, str(location)):
             return outline_of(self.name, load, location, dtype, self._with_defaults(loader_options, location))
@@ -336,7 +336,7 @@ class Family:
 
         fetch: download small files that are not here; without it, nothing is checked then.
         """
-        location, loader_options = self._asked(checkpoint, options)
+        location, loader_options = self._located(checkpoint, options)
         if self.words is None or (not fetch and location is not None and is_on_hub(location)):
             return
         check = self._imported(self.words)
@@ -351,7 +351,7 @@ class Family:
         fetch: download small files that are not here; without it, nothing is said of a checkpoint on the hub.
         Raises UsageError where several are there and none was chosen.
         """
-        location, loader_options = self._asked(checkpoint, options)
+        location, loader_options = self._located(checkpoint, options)
         if self.units is None or location is None or (not fetch and is_on_hub(location)):
             return ""
         describe_units = self._imported(self.units)
@@ -412,7 +412,7 @@ class Family:
             function: Callable[..., Any] = imported(path)
         return function
 
-    def _asked(self, checkpoint: str | None, options: Mapping[str, Any]) -> tuple[str | None, dict[str, Any]]:
+    def _located(self, checkpoint: str | None, options: Mapping[str, Any]) -> tuple[str | None, dict[str, Any]]:
         """The checkpoint, and the options as the loader gets them."""
         loader_options = check_options(self.name, self.options, options)
         return self.location(checkpoint, loader_options.pop(SIZE, None)), loader_options

@@ -44,7 +44,7 @@ class Loaded[Network: nn.Module]:
 
     @property
     def folders(self) -> tuple[Path, ...]:
-        """Where its other files may lie."""
+        """The folders that may hold its other files."""
         return (self.folder,) if self.adapter is None else (self.adapter, self.folder)
 
     def card(
