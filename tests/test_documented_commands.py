@@ -266,7 +266,7 @@ NOT_TYPED = {
     r"with-uv pytest": "is what runs this",
     r"^probe-kit view \S+$": "serves until Ctrl-C; tests/view/test_server.py has the server",
     r"^python -m probe_kit.hooks.families.internvla.checkpoint RUN OUT": "RUN is a training of InternVLA's",
-    r"^export AWS_|s3://": "needs keys of an object store; tests/runs/test_remote.py has a server of its own",
+    r"^export AWS_|s3://": "needs keys of an object store; tests/runs/test_locations.py has a server of its own",
     r"--model (pi0|magma|openvla|spatialvla|xiaomi-r0|internvla-m1)( |$)": "needs released weights (8 to 18 GB)",
     r"^probe-kit diagnose (pi0|runs/mine) ": "needs released weights, or minutes; tests/diagnose has both",
     r"suite convert vl-think --root BlindVLA|train runs/pi0 --untrained|retention runs/pi0 runs/pi0-random":

@@ -1,14 +1,28 @@
 """What needs no weights is refused before torch is imported: all such mistakes, in one light process."""
 
 import json
+import os
+import re
+import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from probe_kit._terminal.console import out
+from probe_kit.cli import app
+from probe_kit.demo.commands import print_demo
+from probe_kit.demo.pipeline import Demo
+from probe_kit.intervene import load_effects
+from probe_kit.intervene.commands import print_result
+from probe_kit.retention import retention_table
+from probe_kit.runs import Run, open_run
 from probe_kit.suite import Suite
+from tests.support.distributions import install
 
 ONE_AFTER_THE_OTHER = """
 import contextlib, io, json, sys
@@ -144,3 +158,135 @@ def test_a_family_without_its_extra_is_refused_with_how_to_get_it(monkeypatch: p
     monkeypatch.setattr(family, "find_spec", lambda _: None)
     with pytest.raises(MissingExtraError, match=r"needs timm.*install.*openvla"):
         families()["openvla"].check("somewhere")
+
+
+WIDTHS = (80, 100, 120, 200)
+LAST = 40
+Capture = pytest.CaptureFixture[str]
+
+
+@pytest.fixture(scope="module")
+def run(little_runs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return shutil.copytree(little_runs / "run", tmp_path_factory.mktemp("printed") / "run")
+
+
+def command(*arguments: str) -> str:
+    answer = CliRunner().invoke(app, list(arguments))
+    assert answer.exit_code == 0, answer.output
+    return answer.stdout
+
+
+def demo(run: Path) -> None:
+    opened = open_run(run)
+    print_demo(Demo(run.parent, opened, opened, retention_table([opened])))
+
+
+PRINTED: dict[str, Callable[[Path], str | None]] = {
+    "demo": demo,
+    "train": lambda run: command("train", str(run), "--permutations", "2", "--views", "mean,last"),
+    "train every call": lambda run: command("train", str(run), "--permutations", "2", "--call", "all"),
+    "retention": lambda run: command("retention", str(run)),
+    "intervene": lambda run: print_result(load_effects(open_run(run))),
+}
+
+
+def printed(name: str, run: Path, width: int, capsys: Capture, monkeypatch: pytest.MonkeyPatch) -> str:
+    monkeypatch.setattr(out, "_width", width)
+    capsys.readouterr()
+    return PRINTED[name](run) or capsys.readouterr().out
+
+
+def tables_in(text: str) -> int:
+    """Tables by the rules under their headings."""
+    return len(re.findall(r"^─{20,} *$", text, re.MULTILINE))
+
+
+@pytest.mark.parametrize("width", WIDTHS)
+@pytest.mark.parametrize("name", PRINTED)
+def test_a_command_prints_one_table_and_ends_on_a_sentence(
+    name: str, width: int, run: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text, opens, viewer = printed(name, run, width, capsys, monkeypatch).partition("\nOpen ")
+    assert bool(opens) == (name == "demo"), "the demo alone adds the command that opens the viewer"
+    assert viewer.strip().startswith("probe-kit view ") or not opens
+    assert tables_in(text) == 1, text
+    assert max(map(len, text.split("category")[1].splitlines())) <= width
+    *_, last = re.split(r"\nColor (?:\(| )", text)
+    assert re.search(r"\.$|\nnext: probe-kit \w+", last.strip()), (
+        "a sentence about the only category is last, then a command"
+    )
+    assert len(last.splitlines()) < LAST
+
+
+@pytest.mark.parametrize("width", [80, 120])
+@pytest.mark.parametrize("name", ["train", "intervene"])
+def test_columns_that_do_not_fit_are_named_and_details_prints_them(
+    name: str, width: int, run: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    short = " ".join(printed(name, run, width, capsys, monkeypatch).split())
+    (left_out,) = re.findall(r"[Ww]ith --details or more room: ([^.]*?)\.? Color ", short) or [""]
+    details: dict[str, Callable[[], str | None]] = {
+        "train": lambda: command("train", str(run), "--permutations", "2", "--views", "mean,last", "--details"),
+        "intervene": lambda: print_result(load_effects(open_run(run)), details=True),
+    }
+    whole = details[name]() or capsys.readouterr().out
+    assert left_out or width > 80, short
+    for heading in filter(None, left_out.split(", ")):
+        assert heading in " ".join(whole.split())
+
+
+def test_the_demo_fits_summary_and_sentences_on_its_last_lines(
+    run: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for width in WIDTHS:
+        lines = printed("demo", run, width, capsys, monkeypatch).splitlines()[-LAST:]
+        assert any(line.startswith("Summary: ") for line in lines)
+        assert any(re.match(r"Color  \w.*: ", line) for line in lines)
+
+
+HEAVY = """
+import torch
+from probe_kit.hooks import Family
+
+FAMILY = Family("heavy-vla", "imports torch", None, "heavy_vla:load", needs_checkpoint=True)
+"""
+BROKEN = "raise SystemExit('not today')\n"
+EACH = """
+import sys
+from typer.testing import CliRunner
+from probe_kit.cli import app
+
+for line in sys.stdin.read().splitlines():
+    done = CliRunner().invoke(app, line.split("\\t"))
+    print(done.exit_code, [name for name in ("torch", "heavy_vla", "broken_vla") if name in sys.modules])
+print(CliRunner().invoke(app, ["models"]).stdout)
+"""
+
+
+@pytest.mark.slow
+def test_no_command_that_needs_no_model_imports_torch_or_a_third_party(
+    recorded_run: Run, small_suite: Suite, tmp_path: Path
+) -> None:
+    """One process runs all commands, as each would be run."""
+    for name, text in (("heavy", HEAVY), ("broken", BROKEN)):
+        folder = install(tmp_path / name, f"{name}-vla", f"{name}_vla:FAMILY")
+        (folder / f"{name}_vla.py").write_text(text, encoding="utf-8")
+    suite, run = str(small_suite.folder), str(recorded_run.path)
+    commands = [
+        ("--help",), ("models",), ("models", "--json"), ("models", "pi0-tiny"), ("extract", "--help"),
+        ("suite", "show", "--counts", suite), ("suite", "show", suite),
+        ("run", "show", run), ("run", "verify", run),
+        ("extract", "--model", "no-such-model", "--dry-run"), ("new-adapter", "heavy-vla"),
+    ]  # fmt: skip
+    paths = [str(tmp_path / "heavy"), str(tmp_path / "broken"), os.environ.get("PYTHONPATH", "")]
+    done = subprocess.run(
+        [sys.executable, "-c", EACH], input="\n".join("\t".join(one) for one in commands), cwd=tmp_path,
+        capture_output=True, encoding="utf-8", check=True, timeout=300,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, paths))},
+    )  # fmt: skip
+    answers = done.stdout.splitlines()
+    expected = [0] * (len(commands) - 2) + [2, 2]
+    assert answers[: len(commands)] == [f"{code} []" for code in expected], done.stdout + done.stderr
+    listed = [line.split()[0] for line in answers[len(commands) :] if line]
+    assert {"heavy-vla", "broken-vla", "pi0-tiny"} <= set(listed)
+    assert "BrokenFamilyWarning" not in done.stderr

@@ -1,4 +1,8 @@
+"""Reading of a run: episodes, columns, rows, trajectories, inputs of recordings, and the runs of a folder."""
+
+import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -6,18 +10,37 @@ import numpy as np
 import pytest
 import torch
 import xarray as xr
+import zarr
+from numpy.typing import NDArray
+from sklearn.metrics import r2_score
+from typer.testing import CliRunner
 
+from probe_kit._terminal import console
+from probe_kit.cli import app
 from probe_kit.errors import (
+    ActivationsLeftOutError,
     NoProbesError,
     ProbeKitError,
     RunDamagedError,
     RunNotFoundError,
     UnknownSiteError,
+    UsageError,
 )
+from probe_kit.extract.sources.player import SIDE
 from probe_kit.hooks.contract.sites import Site
-from probe_kit.runs import Run, open_run
-from probe_kit.runs.arrays import decode_bfloat16
+from probe_kit.hooks.families.pi0.adapter import Pi0
+from probe_kit.retention import retention_table
+from probe_kit.runs import ActionErrors, Run, arrays, compare_actions, copy_run, export_run, open_run, verify_run
+from probe_kit.runs.arrays import Rows, decode_bfloat16, role_mask, token_blocks
+from probe_kit.runs.layout import DATASET, OTHER_ACTIONS
+from probe_kit.runs.run_folders import find_runs, runs_in
+from probe_kit.runs.store import locate
+from probe_kit.runs.writer import RunWriter
 from probe_kit.train import load_results, train_probes
+from probe_kit.train.builtin_columns import label_frame
+from probe_kit.view.commands import _opened
+from tests.support.recorded_run import ACTION, CALLS, CHUNK, EVERY, SHORT, recorded_plan, write_recorded_run
+from tests.support.rehashing import rehash
 
 
 @pytest.fixture
@@ -168,3 +191,342 @@ def test_a_part_of_a_run_has_probes_of_its_own(little_runs: Path, tmp_path: Path
     own = train_probes(part, permutations=0)
     assert (load_results(part).key, load_results(run).key) == (own.key, stored)
     assert len(own.curves["color", "mean"].episodes) == 20
+
+
+TOKENS, WIDTH = 7, 3
+SPANS = [
+    [("image", 0, 2), ("language", 2, 5), ("padding", 5, 7)],
+    [("padding", 0, 1), ("language", 1, 3), ("image", 3, 7)],
+]
+"""Spans of two episodes: role, first position and the one behind the last."""
+
+
+def bfloat16(values: NDArray[np.float32]) -> NDArray[np.uint16]:
+    """The upper half of the bits of float32."""
+    return (values.view(np.uint32) >> 16).astype(np.uint16)
+
+
+@pytest.fixture
+def stored() -> tuple[Rows, NDArray[np.float32]]:
+    """Three planned episodes of one call and two layers, of which 0 and 2 are committed; and their values.
+
+    Whole numbers below 256 have an exact bfloat16. The first position of every episode is NaN, the last infinite.
+    """
+    values = np.arange(3 * 1 * 2 * TOKENS * WIDTH, dtype=np.float32).reshape(3, 1, 2, TOKENS, WIDTH) + 1
+    values[..., 0, :], values[..., -1, :] = np.nan, np.inf
+    array = zarr.create_array(zarr.storage.MemoryStore(), data=bfloat16(values))
+    return Rows(array, [0, 2]), values[[0, 2]]
+
+
+@pytest.mark.parametrize("block", [1, 2, 3, TOKENS, 100])
+@pytest.mark.parametrize("role", ["language", "image", None])
+def test_every_token_of_a_role_comes_once_and_zeros_stand_for_all_others(
+    stored: tuple[Rows, NDArray[np.float32]], role: str | None, block: int
+) -> None:
+    rows, values = stored
+    belongs = np.array(
+        [
+            [next(name for name, start, stop in spans if start <= at < stop) for at in range(TOKENS)]
+            for spans in SPANS
+        ]
+    )
+    expected = belongs != "padding" if role is None else belongs == role
+    mask = role_mask(SPANS, TOKENS, role)
+    np.testing.assert_array_equal(mask, expected)
+    found = np.zeros((2, TOKENS, WIDTH), np.float32)
+    for part in token_blocks(rows, (0, 1), mask, block):
+        np.testing.assert_array_equal(part.mask, expected[:, part.start : part.start + block])
+        found[:, part.start : part.start + block] += part.values
+    np.testing.assert_array_equal(found, np.where(expected[..., None], values[:, 0, 1], 0))
+
+
+@pytest.fixture
+def copy(recorded_run: Run, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(recorded_run.path, tmp_path / "run"))
+
+
+def test_every_episode_keeps_its_trajectory(recorded_run: Run) -> None:
+    episodes = recorded_run.episodes
+    assert len(recorded_run.trajectories) == len(episodes)
+    for position, trajectory in enumerate(recorded_run.trajectories):
+        row = episodes.iloc[position]
+        assert trajectory.steps == row["steps"] == 4
+        np.testing.assert_allclose(trajectory.cube[-1, :2], (row["cube_x"], row["cube_y"]), atol=1e-6)
+        assert trajectory.held[-1] == row["is_grasped"]
+        assert np.isfinite(trajectory.frames[1:]).all()
+    last = str(episodes["episode_id"].iloc[-1])
+    np.testing.assert_array_equal(recorded_run.trajectory(last).frames, recorded_run.trajectory(47).frames)
+
+
+def test_a_trajectory_takes_a_few_kilobytes(recorded_run: Run) -> None:
+    for commit in recorded_run.commits():
+        sizes = [size for key, (size, *_) in commit.objects.items() if key.startswith("trajectory/")]
+        assert len(sizes) == 1
+        assert sizes[0] < 4000
+
+
+def test_the_instruction_is_kept_as_the_policy_was_delivered_it(recorded_run: Run, pi0_tiny: Pi0) -> None:
+    for position, instruction in enumerate(recorded_run.episodes["instruction"]):
+        tokens, mask = pi0_tiny.tokenise([instruction])
+        assert recorded_run.instruction_ids(position) == tuple(tokens[0][mask[0]].tolist())
+
+
+def test_an_episode_that_is_not_there_is_named(recorded_run: Run) -> None:
+    for episode in ("color-9999:o", 48, -1):
+        with pytest.raises(UsageError, match="48, from 'a2a"):
+            recorded_run.trajectory(episode)
+
+
+def test_a_changed_bit_is_found_on_reading_and_by_verification(copy: Path) -> None:
+    chunk = copy / "data.zarr/trajectory/c/3/0/0"
+    content = bytearray(chunk.read_bytes())
+    content[len(content) // 2] ^= 1
+    chunk.write_bytes(content)
+    run = open_run(copy)
+    run.trajectory(2)
+    with pytest.raises(RunDamagedError, match=r"trajectory/c/3/0/0 has other bytes"):
+        run.trajectory(3)
+    problems = verify_run(copy, deep=True).problems
+    assert any("trajectory/c/3/0/0" in problem for problem in problems)
+
+
+@pytest.mark.parametrize("together", [1, 5, 99])
+def test_trajectories_that_are_read_together_are_those_that_are_read_alone(
+    recorded_run: Run, copy: Path, monkeypatch: pytest.MonkeyPatch, together: int
+) -> None:
+    array = zarr.open_array(str(copy / "data.zarr"), path="trajectory", mode="r")
+    monkeypatch.setattr(arrays, "_BLOCK_BYTES", together * array[0].nbytes)
+    assert len(list(recorded_run.trajectories)) == 48
+    for position, trajectory in enumerate(recorded_run.trajectories):
+        np.testing.assert_array_equal(trajectory.frames, recorded_run.trajectories[position].frames)
+    chunk = copy / "data.zarr/trajectory/c/17/0/0"
+    chunk.write_bytes(chunk.read_bytes()[:-1] + b"x")
+    reading = iter(open_run(copy).trajectories)
+    assert [next(reading).steps for _ in range(17)] == [4] * 17
+    with pytest.raises(RunDamagedError, match="trajectory/c/17/0/0"):
+        next(reading)
+
+
+def test_channels_of_another_version_are_refused(copy: Path) -> None:
+    array = zarr.open_array(copy / "data.zarr/trajectory", mode="r+")
+    array.attrs["channels"] = [str(name).replace("held", "grip") for name in array.attrs["channels"]]
+    with pytest.raises(RunDamagedError, match=r"trajectory/zarr\.json has"):
+        open_run(copy)
+    rehash(copy)
+    with pytest.raises(RunDamagedError, match=r"lack held\.bool"):
+        _ = open_run(copy).trajectories
+
+
+@pytest.fixture
+def folder(labelled_run: Path, tmp_path: Path) -> Path:
+    for name in ("b", "deep/a"):
+        shutil.copytree(labelled_run, tmp_path / "runs" / name)
+    return tmp_path / "runs"
+
+
+def test_runs_are_found_at_any_depth_in_the_order_of_their_paths(folder: Path) -> None:
+    assert find_runs(folder) == [folder / "b", folder / "deep" / "a"]
+    assert find_runs(folder / "b") == [folder / "b"], "a run is the only one of its own folder"
+    assert runs_in(folder, deep=False) == [folder / "b"]
+
+
+def test_a_folder_that_holds_no_run_is_refused(folder: Path) -> None:
+    (folder / "empty").mkdir()
+    with pytest.raises(UsageError, match="there is no run below"):
+        find_runs(folder / "empty")
+    with pytest.raises(UsageError, match="is no folder of this machine"):
+        find_runs(folder / "none")
+
+
+def test_the_list_names_every_run_and_the_one_that_cannot_be_read(folder: Path) -> None:
+    (folder / "broken").mkdir()
+    (folder / "broken" / "run.json").write_text("{", encoding="utf-8")
+    done = CliRunner().invoke(app, ["run", "list", str(folder), "--format", "json"])
+    assert done.exit_code == 0, done.output
+    lines = json.loads(done.stdout)
+    assert [line["run"] for line in lines] == ["b", "broken", "deep/a"]
+    assert "error" in lines[1]
+    assert lines[0]["episodes"] == lines[2]["episodes"] > 0
+    printed = CliRunner().invoke(app, ["run", "list", str(folder)])
+    assert "deep/a" in printed.stdout
+    assert "broken cannot be read" in printed.stderr
+
+
+def test_names_of_runs_can_be_copied_from_a_narrow_terminal(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    name = "light/base/plain-0123456789"
+    (folder / name).parent.mkdir(parents=True)
+    (folder / "b").rename(folder / name)
+    monkeypatch.setattr(console.out, "_width", 60)
+    assert name in CliRunner().invoke(app, ["run", "list", str(folder)]).stdout
+
+
+def test_the_viewer_opens_all_runs_of_a_folder(folder: Path) -> None:
+    assert [run.location.name for run in _opened([str(folder)], True)] == ["b", "a"]
+
+
+def test_inputs_are_read_as_they_were_shown_and_nan_behind_the_last_frame(shown_run: Run) -> None:
+    assert shown_run.inputs is not None
+    state, pixels = shown_run.inputs.read("state"), shown_run.inputs.read("pixels")
+    assert state.shape == (12, CALLS, 3)
+    assert pixels.shape == (12, CALLS, 1, SIDE, SIDE, 3)
+    assert pixels.dtype == np.uint8
+    assert np.isfinite(state[:-1]).all()
+    assert np.isnan(state[-1, -1]).all(), "the last episode has one frame less"
+    np.testing.assert_allclose(shown_run.inputs.column("timestamp")[0], np.arange(CALLS) * EVERY / 5.0)
+    np.testing.assert_array_equal(shown_run.control_steps[0], np.arange(CALLS) * EVERY)
+
+
+def test_a_run_on_recordings_is_verified_to_the_last_byte(shown_run: Run, tmp_path: Path) -> None:
+    audit = verify_run(shown_run.path, deep=True)
+    assert audit.ok
+    assert not audit.strays
+    run = write_recorded_run(tmp_path / "run", 3)
+    damaged = tmp_path / "run" / "data.zarr" / "inputs" / "state" / "c" / "0" / "0" / "0"
+    raw = bytearray(damaged.read_bytes())
+    raw[len(raw) // 2] ^= 1
+    damaged.write_bytes(raw)
+    assert not verify_run(run.path, deep=True).ok
+    assert run.inputs is not None
+    with pytest.raises(RunDamagedError, match="inputs/state"):
+        run.inputs.read("state")
+
+
+def test_a_copy_leaves_the_recorded_pictures_and_states_out(shown_run: Run, tmp_path: Path) -> None:
+    copied = copy_run(shown_run.path, tmp_path / "copy")
+    assert not list((tmp_path / "copy" / "data.zarr" / "inputs").rglob("c/*"))
+    with pytest.raises(ActivationsLeftOutError, match="no inputs"):
+        _ = copied.inputs
+
+
+def test_the_run_says_what_it_is_of(shown_run: Run) -> None:
+    assert shown_run.recorded
+    assert shown_run.suite == "kitchen#000000000000"
+    assert "CAPTURE ONLY" in repr(shown_run)
+    assert list(shown_run.episodes["source_episode"]) == list(range(12))
+    assert shown_run.xarray()["backbone_pooled"].sizes["episode"] == 12
+    assert not [column for column in ("layout", "side_correct", "side_placed") if column in shown_run.episodes]
+
+
+def test_it_grows_by_further_episodes_and_keeps_those_it_has(tmp_path: Path) -> None:
+    few = write_recorded_run(tmp_path / "run", 3)
+    stored = few.root.own_settings
+    more = RunWriter(locate(tmp_path / "run"), recorded_plan(5), stored)
+    assert len(more.root.plan) == 5
+
+
+@pytest.mark.parametrize(
+    ("wanted", "refused"),
+    [
+        ("retention table", lambda run: retention_table([run])),
+        ("probe of the side .side.correct.", train_probes),
+    ],
+)
+def test_what_needs_a_scene_or_an_outcome_is_refused_by_name(shown_run: Run, wanted: str, refused: object) -> None:
+    assert callable(refused)
+    with pytest.raises(UsageError, match=rf"shows recordings \(kitchen#.*{wanted} is not possible"):
+        refused(shown_run)
+
+
+def test_an_export_has_the_columns_that_the_run_has(shown_run: Run, tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    table = parquet.read_table(export_run(shown_run.path, "parquet", tmp_path / "run.parquet"))
+    assert {"episode_id", "category", "outcome", "inference", "frame", "site", "vector"} <= set(table.column_names)
+    assert "layout" not in table.column_names
+
+
+@pytest.fixture(scope="module")
+def errors(shown_run: Run) -> ActionErrors:
+    return compare_actions(shown_run)
+
+
+def actions(run: Run) -> tuple[np.ndarray, np.ndarray]:
+    """(n, chunk, D) recorded and predicted, of the shown frames."""
+    assert run.inputs is not None
+    recorded, predicted = (run.inputs.read(kind).astype(np.float64) for kind in ("action", "prediction"))
+    shown = np.isfinite(recorded[:, :, 0, 0])
+    return recorded[shown], predicted[shown]
+
+
+def test_the_error_of_a_number_is_what_its_r2_says(shown_run: Run, errors: ActionErrors) -> None:
+    """In deviations of what was recorded, the squared error is 1 − R²: the mean recorded action has 1."""
+    recorded, predicted = actions(shown_run)
+    table = errors.by_number.set_index("number")
+    assert list(table.index) == ["dx", "grip"]
+    for place, name in enumerate(table.index):
+        expected = 1 - r2_score(recorded[:, 0, place], predicted[:, 0, place])
+        assert table.loc[name, "first"] ** 2 == pytest.approx(expected)
+        assert table.loc[name, "deviation"] == pytest.approx(recorded[:, 0, place].std())
+        squares = ((predicted - recorded)[:, :, place] / recorded[:, 0, place].std()) ** 2
+        assert table.loc[name, "chunk"] == pytest.approx(np.sqrt(squares.mean()))
+
+
+def test_frames_and_episodes_have_errors_of_their_own(shown_run: Run, errors: ActionErrors) -> None:
+    frames, episodes = errors.by_frame, errors.by_episode
+    assert len(frames) == 12 * CALLS - 1
+    assert list(frames["frame"][:CALLS]) == [EVERY * call for call in range(CALLS)]
+    recorded, predicted = actions(shown_run)
+    scaled = (predicted - recorded) / recorded[:, 0].std(axis=0)
+    np.testing.assert_allclose(frames["first"], np.sqrt((scaled[:, 0] ** 2).mean(axis=1)))
+    np.testing.assert_allclose(frames["chunk"], np.sqrt((scaled**2).mean(axis=(1, 2))))
+    assert episodes["frames"].tolist() == [CALLS - (number == SHORT) for number in range(12)]
+    own = frames[frames["source_episode"] == 3]["first"]
+    assert episodes["first"][3] == pytest.approx(np.sqrt((own**2).mean()))
+
+
+def test_the_error_of_a_frame_is_a_label(shown_run: Run, errors: ActionErrors) -> None:
+    np.testing.assert_allclose(label_frame(shown_run)["dataset.action_error"], errors.by_frame["first"])
+
+
+def test_steps_behind_the_end_of_a_recording_and_constant_numbers_count_nowhere(errors: ActionErrors) -> None:
+    cut = errors.errors.copy()
+    cut[0, 0, 1:] = np.nan
+    found = replace(errors, errors=cut, deviations=np.array([errors.deviations[0], 0.0]))
+    assert found.by_frame["chunk"][0] == pytest.approx(found.by_frame["first"][0])
+    assert np.isnan(found.by_number["first"][1])
+    assert np.isfinite(found.by_frame["first"]).all()
+
+
+@pytest.mark.parametrize(
+    ("inputs", "reason", "message"),
+    [
+        ({"action": [CHUNK, ACTION + 1]}, None, "the policy predicts 2 numbers, the data set has 3"),
+        ({}, "recorded actions lie outside the statistics", "not compared: recorded actions lie outside"),
+        ({"action": None}, None, "the data set has no actions"),
+    ],
+)
+def test_actions_that_are_not_the_same_numbers_are_not_compared(
+    tmp_path: Path, inputs: dict[str, list[int] | None], reason: str | None, message: str
+) -> None:
+    plan = recorded_plan(3)
+    data_set, chosen = plan.identity[DATASET], plan.selection["recording"]
+    shapes = {name: shape for name, shape in {**data_set["inputs"], **inputs}.items() if shape is not None}
+    plan = replace(
+        plan,
+        identity={DATASET: {**data_set, "inputs": shapes}},
+        selection={"recording": {**chosen, OTHER_ACTIONS: reason}},
+    )
+    settings = {
+        "model": "shown", "weights_sha256": "0" * 64, "random_weights": False, "captured_calls": CALLS,
+        "tokens": "pooled", "codec": "zstd", "seed": 0, "capture_only": True, **plan.identity,
+    }  # fmt: skip
+    RunWriter(locate(tmp_path / "run"), plan, settings)
+    with pytest.raises(UsageError, match=message):
+        compare_actions(open_run(tmp_path / "run", allow_partial=True))
+
+
+def test_a_run_of_scenes_has_no_recorded_actions(labelled_run: Path) -> None:
+    with pytest.raises(UsageError, match="no recorded actions"):
+        compare_actions(open_run(labelled_run))
+
+
+def test_the_command_prints_a_line_per_number_and_json_every_episode(
+    tmp_path: Path,
+) -> None:
+    run = write_recorded_run(tmp_path / "run", 3)
+    command = ["run", "show", str(run.path), "--action-errors"]
+    shown = CliRunner().invoke(app, command).stdout
+    assert "dx" in shown
+    assert "12 frames" in shown
+    found = json.loads(CliRunner().invoke(app, [*command, "--json"]).stdout)
+    assert [row["number"] for row in found["numbers"]] == ["dx", "grip"]
+    assert [row["source_episode"] for row in found["episodes"]] == [0, 1, 2]

@@ -9,25 +9,35 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from probe_kit.cli import app
+from probe_kit.diagnose.diagnosis import FILE, FORMAT
+from probe_kit.diagnose.results import Diagnosis, InputDiagnosis
 from probe_kit.env.scoring import EVENTS, RULES, Events, Trajectory
 from probe_kit.errors import RunDamagedError, UsageError
+from probe_kit.hashing import sha256_json
 from probe_kit.hooks.contract.sites import Site
-from probe_kit.intervene.kinds.image_swap import stored_image_swaps
-from probe_kit.intervene.outcomes import stored_interventions
+from probe_kit.intervene.kinds.image_swap import ImageSwap, stored_image_swaps
+from probe_kit.intervene.outcomes import ConditionOutcomes, key_of, save, settings_of, stored_interventions
 from probe_kit.retention import retention_table
 from probe_kit.runs import Run, open_run
+from probe_kit.runs.layout import DIAGNOSES
+from probe_kit.runs.records import as_json
+from probe_kit.runs.results import write_bundle
 from probe_kit.runs.store import locate
-from probe_kit.runs.thumbnails import as_thumbnail, thumbnail_key
+from probe_kit.runs.thumbnails import as_thumbnail, decode_frames, thumbnail_key
 from probe_kit.runs.writer import RunWriter
 from probe_kit.suite import Suite
-from probe_kit.train import load_results
+from probe_kit.train import Target, load_results, train_probes
 from probe_kit.train.results.probe_results import read_directions
 from probe_kit.train.results.store import load_results_by_call
+from probe_kit.view import write_viewer
 from probe_kit.view.catalogue import Catalogue
 from probe_kit.view.run_payloads import pack_floats, pack_log_odds, payload_script
 from tests.retention.asked_runs import ASK
 from tests.support.little_run import certify, episode, little_plan, little_settings, little_writer
+from tests.support.recorded_run import CALLS, EVERY, write_recorded_run
 from tests.view.payload_reader import floats, log_odds, read_payload, words
 
 
@@ -323,3 +333,195 @@ def test_a_model_that_was_asked_is_shown_with_question_and_answers_in_words(
         "outcome, text": "unread", "outcome, logits": "correct", "outcome, order-balanced": "wrong",
     }  # fmt: skip
     assert words(payload(catalogue, "run/episodes")["outcome"]) == ["unread", "unread"]
+
+
+WRITTEN = (0, 1, 5)
+
+
+@pytest.fixture(scope="module")
+def unfinished(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """Three episodes with other activations than those of the small run."""
+    where = tmp_path_factory.mktemp("unfinished") / "now"
+    plan = little_plan(small_suite)
+    writer = little_writer(locate(where), plan, seed=2)
+    for number in WRITTEN:
+        writer.write(episode(plan, number, seed=2))
+    return open_run(where, allow_partial=True)
+
+
+@pytest.fixture(scope="module")
+def lent_catalogue(unfinished: Run, little: Run) -> Catalogue:
+    return Catalogue([unfinished], little)
+
+
+def read(lent_catalogue: Catalogue, name: str):
+    return read_payload(lent_catalogue.script(name))[1]
+
+
+def test_log_odds_are_of_the_runs_own_activations_and_held_out_by_item(
+    lent_catalogue: Catalogue, unfinished: Run, little: Run
+) -> None:
+    results = load_results(little)
+    curve = results.curves["color", "mean"]
+    fold_of = dict(zip(curve.items.tolist(), curve.fold_of.tolist(), strict=True))
+    for position, row in enumerate(unfinished.episodes.to_dict("records")):
+        side = 1 if row["side_correct"] == "left" else -1
+        expected = []
+        for site in curve.sites:
+            probe, fold = results.direction("color", "mean", site), fold_of[row["item_id"]]
+            features = unfinished.rows(site.stream)[position][0][unfinished.stored(site.stream).at(site)][0]
+            expected.append(side * (probe.weights[fold].astype(np.float64) @ features + probe.intercepts[fold]))
+        payload = read(lent_catalogue, f"now/e/{row['episode']:05d}")
+        assert payload["held_out"]
+        np.testing.assert_allclose(log_odds(payload["log_odds"]), expected, atol=1 / 256)
+        best = read(lent_catalogue, "now/run")["categories"][0]["best"]["backbone"]["site"]
+        shown = read(lent_catalogue, "now/episodes")["log_odds"]["backbone"]
+        np.testing.assert_allclose(log_odds(shown)[position], expected[best], atol=1 / 256)
+
+
+def test_the_page_says_whose_probes_they_are_and_shows_their_scores(
+    lent_catalogue: Catalogue, little: Run
+) -> None:
+    run = read(lent_catalogue, "now/run")
+    assert run["probes_of"] == little.label
+    assert [column["key"] for column in run["table"]["columns"]] == ["success.sr"], "no rate of lent probes"
+    own = read(Catalogue([little]), "run/map/color")
+    lent = read(lent_catalogue, "now/map/color")
+    assert lent["cells"] == own["cells"]
+    assert lent["rows"] == [0, 1, 2]
+    assert read(Catalogue([little], little), "run/run")["probes_of"] is None
+
+
+def test_probes_of_another_model_are_refused(small_suite: Suite, little: Run, tmp_path: Path) -> None:
+    plan = little_plan(small_suite, episodes=2)
+    writer = RunWriter(locate(tmp_path / "run"), plan, {**little_settings(), "weights_sha256": "1" * 64})
+    certify(writer)
+    writer.write(episode(plan, 0))
+    other = open_run(tmp_path / "run", allow_partial=True)
+    with pytest.raises(UsageError, match="other weights, 111111111111 instead of 000000000000"):
+        Catalogue([other], little)
+    with pytest.raises(UsageError, match="has no probes"):
+        Catalogue([little], other)
+
+
+def test_a_study_without_stored_runs_says_how_to_play_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    answer = CliRunner().invoke(app, ["view", "embedded", "--export", "page"])
+    assert answer.exit_code != 0
+    assert "probe-kit study run embedded" in " ".join(answer.stderr.split())
+
+
+CONDITIONS = ("clean", "image_swap", "frame_swap", "control_input")
+
+
+def swap_inputs(run: Run) -> str:
+    """Store an exchange of pictures that does half of the exchange of all inputs."""
+    settings = settings_of(ImageSwap(), run)
+    episodes = run.episodes
+    sizes = np.array([0.0, 0.5, 1.0, 0.01])[:, None] + np.linspace(0, 0.001, len(episodes))
+    outcomes = ConditionOutcomes(
+        CONDITIONS, *(episodes[name].to_numpy(str) for name in ("episode_id", "item_id", "group_id", "category")),
+        np.full(len(episodes), ""), sizes, sizes, np.zeros((4, len(episodes), 5)), np.zeros(len(episodes)),
+        toward=sizes, size=sizes,
+    )  # fmt: skip
+    check = {"replay": {"compared": 1, "equal": 1}}
+    save(run.location, settings, key_of(settings), outcomes, "", check)
+    return key_of(settings)
+
+
+def diagnose(run: Run, version: str = FORMAT) -> str:
+    """Store a diagnosis of one input that decides, and of one that does not arrive."""
+    measured = InputDiagnosis("picture", "decides", "", 0.8, (0.6, 0.9), 0.01, 0.9, 0.001, 36, 6, 36)
+    settings = {"format": version, "stamp": run.stamp}
+    key = sha256_json(settings)[:12]
+    diagnosis = Diagnosis(key, run.label, 12, 6, (measured,))
+    write_bundle(run.location, DIAGNOSES, key, {"settings": settings}, {FILE: as_json(diagnosis.to_json())}, {})
+    return key
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """Twelve recorded episodes of four inferences, with probes, an intervention and a diagnosis."""
+    run = write_recorded_run(tmp_path_factory.mktemp("recorded") / "run")
+    train_probes(run, target=Target.of_run(run, "dataset.state.x"), permutations=20)
+    swap_inputs(run)
+    diagnose(run)
+    return open_run(run.path)
+
+
+@pytest.fixture(scope="module")
+def catalogue(recorded: Run) -> Catalogue:
+    return Catalogue([recorded])
+
+
+def test_a_run_of_recordings_opens_with_the_views_that_need_no_side(catalogue: Catalogue) -> None:
+    _, run = read_payload(catalogue.script("run/run"))
+    assert (run["sides"], run["views"]) == (False, ["overview", "map", "episodes"])
+    assert (run["table"]["rows"], run["scene"], run["committed"]) == ([], None, 12)
+    assert run["targets"] == [{"target": "dataset.state.x", "category": "all"}]
+    for name in catalogue.names():
+        assert read_payload(catalogue.script(name))[0] == name
+
+
+def test_what_is_stored_is_shown_as_the_tables_of_the_commands(catalogue: Catalogue) -> None:
+    _, results = read_payload(catalogue.script("run/results"))
+    kinds = {table["kind"]: table for table in results["tables"]}
+    assert list(kinds) == [
+        "diagnosis of the inputs", "intervention image-swap", "probes of dataset.state.x", "predicted actions"
+    ]  # fmt: skip
+    swap = kinds["intervention image-swap"]
+    assert [cell["text"] for cell in swap["rows"][0]][:2] == ["All", "picture"]
+    assert swap["findings"] == ["All  decides: the action follows the picture, by 0.50 of what all inputs do."]
+    assert kinds["diagnosis of the inputs"]["rows"][0][2]["text"] == "decides"
+    assert [row[0]["text"] for row in kinds["predicted actions"]["rows"]] == ["dx", "grip"]
+
+
+def test_a_diagnosis_of_another_version_is_refused_and_the_other_results_are_shown(tmp_path: Path) -> None:
+    run = write_recorded_run(tmp_path / "run")
+    keys = diagnose(run), diagnose(run, "probe_kit diagnosis 1")
+    _, results = read_payload(Catalogue([open_run(run.path)]).script("run/results"))
+    assert [(table["kind"], table["key"]) for table in results["tables"]] == [
+        ("diagnosis of the inputs", keys[0]), ("predicted actions", "")
+    ]  # fmt: skip
+    (reason,) = results["refused"]
+    assert f"{keys[1]}/settings.json has format probe_kit diagnosis 1; this version of probe_kit reads" in reason
+    assert f"Remove diagnoses/{keys[1]} and run the same `probe-kit diagnose` again" in reason
+    assert str(tmp_path) not in reason
+
+
+def test_a_target_has_a_map_with_the_scores_of_its_probes(catalogue: Catalogue) -> None:
+    _, target = read_payload(catalogue.script("run/target/0"))
+    assert target["metric"] == "R²"
+    assert target["score"].index(max(target["score"])) == 1, "the state was planted in the second layer"
+    assert len(target["sites"]) == len(target["cells"]) == len(target["signal"])
+    with pytest.raises(KeyError):
+        catalogue.script("run/target/1")
+
+
+def test_an_episode_shows_every_inference_and_predicted_beside_recorded_actions(
+    recorded: Run, catalogue: Catalogue
+) -> None:
+    _, episode = read_payload(catalogue.script("run/e/00003"))
+    steps = [EVERY * call for call in range(CALLS)]
+    assert episode["inferences"] == episode["frames"]["steps"] == steps
+    assert recorded.inputs is not None
+    actions = episode["inputs"][0]
+    assert [series["name"] for series in actions["series"]] == ["dx", "grip"]
+    for number, series in enumerate(actions["series"]):
+        for line, kind in zip(series["lines"], ("action", "prediction"), strict=True):
+            np.testing.assert_array_equal(floats(line["values"]), recorded.inputs.read(kind)[3, :, 0, number])
+    picture = catalogue.picture("run", 3)
+    assert picture is not None
+    decoded = np.stack(list(decode_frames(picture, CALLS))).astype(float)
+    pixels = recorded.inputs.read("pixels")[3, :, 0]
+    np.testing.assert_allclose(decoded.mean(axis=(1, 2)), pixels.mean(axis=(1, 2)), atol=8)
+
+
+def test_an_export_of_recordings_is_the_same_bytes_again(recorded: Run, tmp_path: Path) -> None:
+    contents = []
+    for name in ("a", "b"):
+        folder = write_viewer([recorded], tmp_path / name).parent
+        files = [path for path in folder.rglob("*") if path.is_file()]
+        contents.append({path.relative_to(folder): path.read_bytes() for path in files})
+    assert contents[0] == contents[1]
+    assert len([name for name in contents[0] if name.suffix == ".webp"]) == 12
