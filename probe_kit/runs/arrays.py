@@ -52,6 +52,9 @@ ROOM = 1_000_000
 """Episodes that an array has room for; one chunk holds one episode, and no chunk exists before its episode."""
 NOT_A_NUMBER = 0x7FC0
 """Bits of bfloat16 where nothing was captured."""
+# Zarr's default leaves out chunks that equal the fill value (and compares every chunk with it to find out), but
+# a reader must be able to tell an empty chunk from a lost one. Not stored in the array, so asked for each time.
+WRITE_ALL: ArrayConfigLike = {"write_empty_chunks": True}
 
 
 def create_arrays(
@@ -70,44 +73,46 @@ def create_arrays(
     for stream in streams:
         group = root.create_group(stream.name)
         pooled = (*stream.lead, len(stream.views), stream.width)
-        group.create_array(
-            "pooled",
-            shape=(ROOM, full, *pooled),
-            chunks=(1, full, *pooled),  # one object per episode, which its commit can name and hash
-            dtype="float32",
-            fill_value=np.nan,
-            compressors=codecs(codec, typesize=4),
-            dimension_names=("episode", "call", *stream.dimensions, "view", "feature"),
-            attributes={"views": list(stream.views)},
-            config={"write_empty_chunks": True},
-        )
+        create_array(  # one object per episode, which its commit can name and hash
+            group, "pooled", (ROOM, full, *pooled), (1, full, *pooled), "float32", np.nan, codec,
+            ("episode", "call", *stream.dimensions, "view", "feature"), {"views": list(stream.views)},
+        )  # fmt: skip
         if later_views == MEAN_VIEW:
-            later = (*stream.lead, stream.width)
-            group.create_array(
-                LATER,
-                shape=(ROOM, calls - 1, *later),
-                chunks=(1, calls - 1, *later),
-                dtype="uint16",
-                fill_value=NOT_A_NUMBER,
-                compressors=codecs(codec, typesize=2),
-                dimension_names=("episode", "call", *stream.dimensions, "feature"),
-                attributes={"probe_kit:dtype": "bfloat16", "view": MEAN_VIEW},
-                config={"write_empty_chunks": True},
-            )
+            later = (calls - 1, *stream.lead, stream.width)
+            create_array(
+                group, LATER, (ROOM, *later), (1, *later), "uint16", NOT_A_NUMBER, codec,
+                ("episode", "call", *stream.dimensions, "feature"),
+                {"probe_kit:dtype": "bfloat16", "view": MEAN_VIEW},
+            )  # fmt: skip
         if with_tokens:
-            tokens = (*stream.lead, stream.stored_tokens, stream.width)
-            group.create_array(
-                "tokens",
-                shape=(ROOM, calls, *tokens),
-                shards=(1, calls, *tokens),
-                chunks=(1, 1, *(1 for _ in stream.lead), stream.token_block, stream.width),
-                dtype="uint16",
-                fill_value=0,
-                compressors=codecs(codec, typesize=2),
-                dimension_names=("episode", "call", *stream.dimensions, "token", "feature"),
-                attributes={"probe_kit:dtype": "bfloat16", "tokens": stream.tokens},
-                config={"write_empty_chunks": True},
-            )
+            tokens = (calls, *stream.lead, stream.stored_tokens, stream.width)
+            block = (1, 1, *(1 for _ in stream.lead), stream.token_block, stream.width)
+            create_array(
+                group, "tokens", (ROOM, *tokens), block, "uint16", 0, codec,
+                ("episode", "call", *stream.dimensions, "token", "feature"),
+                {"probe_kit:dtype": "bfloat16", "tokens": stream.tokens}, shards=(1, *tokens),
+            )  # fmt: skip
+
+
+def create_array(
+    group: zarr.Group, name: str, shape: tuple[int, ...], chunks: tuple[int, ...], dtype: Any, fill_value: Any,
+    codec: str, dimensions: Sequence[str] | None = None, attributes: dict[str, Any] | None = None,
+    shards: tuple[int, ...] | None = None,
+) -> zarr.Array[Any]:  # fmt: skip
+    """Create one array of a run. codec: its name, see `codecs`."""
+    return group.create_array(
+        name, shape=shape, chunks=chunks, shards=shards, dtype=dtype, fill_value=fill_value,
+        compressors=codecs(codec, np.dtype(dtype).itemsize), dimension_names=dimensions, attributes=attributes,
+        config=WRITE_ALL,
+    )  # fmt: skip
+
+
+def write_row(store: Store, name: str, number: int, values: NDArray[Any]) -> None:
+    """Store the values (n, …) of episode `number`, and the fill value behind the last one."""
+    array: zarr.Array[Any] = zarr.open_array(store, path=name, mode="r+", zarr_format=3, config=WRITE_ALL)
+    row = np.full(array.shape[1:], array.fill_value, array.dtype)
+    row[: len(values)] = values
+    array[number] = row
 
 
 def codecs(name: str, typesize: int) -> list[BytesBytesCodec]:
@@ -319,30 +324,11 @@ _TYPES = {"columns": "float64", "pixels": "uint8"}
 
 def create_inputs(store: Store, calls: int, shapes: Mapping[str, list[int]], codec: str) -> None:
     """Create the arrays. shapes: by kind, of one inference."""
-    root = zarr.open_group(store, mode="a", zarr_format=3)
-    group = root.create_group(INPUTS)
+    group = zarr.open_group(store, mode="a", zarr_format=3).create_group(INPUTS)
     for name, shape in shapes.items():
         dtype = np.dtype(_TYPES.get(name, "float32"))
-        group.create_array(
-            name,
-            shape=(ROOM, calls, *shape),
-            chunks=(1, calls, *shape),
-            dtype=dtype,
-            fill_value=0 if dtype.kind == "u" else np.nan,
-            compressors=codecs(codec, typesize=dtype.itemsize),
-            config={"write_empty_chunks": True},
-        )
-
-
-def write_inputs(store: Store, number: int, inputs: Mapping[str, NDArray[Any]], config: ArrayConfigLike) -> None:
-    """Store the inputs (n, …) by kind of the row `number`, n at most its calls."""
-    for name, values in inputs.items():
-        array: zarr.Array[Any] = zarr.open_array(
-            store, path=f"{INPUTS}/{name}", mode="r+", zarr_format=3, config=config
-        )
-        row = np.full(array.shape[1:], array.fill_value, array.dtype)
-        row[: len(values)] = values
-        array[number] = row
+        fill_value = 0 if dtype.kind == "u" else np.nan
+        create_array(group, name, (ROOM, calls, *shape), (1, calls, *shape), dtype, fill_value, codec)
 
 
 class StoredInputs:

@@ -15,38 +15,23 @@ import pandas as pd
 import zarr
 from numpy.typing import NDArray
 from zarr.abc.store import Store
-from zarr.core.array_spec import ArrayConfigLike
 
 from probe_kit.env.scoring import CHANNELS, RULES, Trajectory, behaviour_of, judge, rule_of
 from probe_kit.env.spec import SceneSpec
 from probe_kit.errors import RunDamagedError
-from probe_kit.runs.arrays import ROOM, Rows, codecs
+from probe_kit.runs.arrays import ROOM, Rows, create_array
 from probe_kit.runs.layout import TRAJECTORY
 from probe_kit.suite.items import Side, other_side
 
 
 def create_trajectories(store: Store, frames: int, codec: str) -> None:
     """Create the array: `frames` is one more than an episode has actions at most."""
-    zarr.create_array(
-        store,
-        name=TRAJECTORY,
-        shape=(ROOM, frames, len(CHANNELS)),
-        chunks=(1, frames, len(CHANNELS)),
-        dtype="float32",
-        fill_value=np.nan,
-        compressors=codecs(codec, typesize=4),
-        dimension_names=("episode", "frame", "channel"),
-        attributes={"channels": list(CHANNELS)},
-        config={"write_empty_chunks": True},
-    )
-
-
-def write_trajectory(store: Store, number: int, frames: NDArray[np.float32], config: ArrayConfigLike) -> None:
-    """Store the frames (T + 1, C) of episode `number`."""
-    array: zarr.Array[Any] = zarr.open_array(store, path=TRAJECTORY, mode="r+", zarr_format=3, config=config)
-    row = np.full(array.shape[1:], np.nan, np.float32)
-    row[: len(frames)] = frames
-    array[number] = row
+    group = zarr.open_group(store, mode="a", zarr_format=3)
+    length, names = len(CHANNELS), ("episode", "frame", "channel")
+    create_array(
+        group, TRAJECTORY, (ROOM, frames, length), (1, frames, length), "float32", np.nan, codec, names,
+        {"channels": list(CHANNELS)},
+    )  # fmt: skip
 
 
 class Trajectories:

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from probe_kit.errors import MissingExtraError, ProbeKitError, RunDamagedError
 from probe_kit.hooks.contract.sites import PADDING
 from probe_kit.hooks.family import imported
-from probe_kit.runs.arrays import Rows, codecs, open_array
+from probe_kit.runs.arrays import Rows, create_array, open_array
 from probe_kit.runs.checking import BlankStore
 from probe_kit.runs.columns import columns_folder, find_columns, seal_key, write_seal
 from probe_kit.runs.commits import Commit, numbered, read_commit, read_failures, seconds_and_problems
@@ -88,18 +88,13 @@ def _remove_former(run: Run) -> None:
 def _write_vectors(run: "Run", name: str, kind: VectorKind, group: zarr.Group) -> None:
     stored, rows = run.stored(name), run.rows(name, kind)
     episodes = len(rows)
-    block, lead = _block(episodes), _lead(stored, rows, kind)
-    array = group.create_array(
-        f"{name}/{kind}",
-        shape=(*lead, episodes, stored.width),
-        chunks=(*(1 for _ in lead), block, stored.width),
-        dtype=rows.array.dtype,
-        fill_value=rows.array.fill_value,
-        compressors=codecs(run.settings["codec"], typesize=rows.array.dtype.itemsize),
-        dimension_names=("call", *(["view"] * (kind == "pooled")), *stored.dimensions, "episode", "feature"),
-        attributes=dict(rows.array.attrs),
-        config={"write_empty_chunks": True},
-    )
+    block, lead = min(episodes, EPISODES_PER_CHUNK), _lead(stored, rows, kind)
+    array = create_array(
+        group, f"{name}/{kind}", (*lead, episodes, stored.width), (*(1 for _ in lead), block, stored.width),
+        rows.array.dtype, rows.array.fill_value, run.settings["codec"],
+        ("call", *(["view"] * (kind == "pooled")), *stored.dimensions, "episode", "feature"),
+        dict(rows.array.attrs),
+    )  # fmt: skip
     for index, column in columns_of_rows(run, name, kind):
         array[index] = column
 
@@ -117,26 +112,15 @@ def columns_of_rows(
     stored, rows = run.stored(name), run.rows(name, kind)
     episodes, size = len(rows), rows.array.dtype.itemsize
     cells = list(np.ndindex(_lead(stored, rows, kind)))
-    for start in range(0, episodes, _block(episodes)):
-        stop = min(start + _block(episodes), episodes)
-        for slab in _slabs(cells, (stop - start) * stored.width * size):
+    for start in range(0, episodes, EPISODES_PER_CHUNK):
+        stop = min(start + EPISODES_PER_CHUNK, episodes)
+        for slab in batched(cells, max(1, SLAB_BYTES // ((stop - start) * stored.width * size))):
             values = np.empty((len(slab), stop - start, stored.width), rows.array.dtype)
             for position, stored_row in enumerate(rows.between(start, stop)):
                 row = np.moveaxis(stored_row, -2, 1) if kind == "pooled" else stored_row
                 values[:, position] = row[tuple(np.transpose(slab))]
             for cell, column in zip(slab, values, strict=True):
                 yield (*cell, slice(start, stop)), column
-
-
-def _block(episodes: int) -> int:
-    """Episodes per chunk."""
-    return min(episodes, EPISODES_PER_CHUNK)
-
-
-def _slabs(cells: list[tuple[int, ...]], bytes_per_cell: int) -> Iterator[list[tuple[int, ...]]]:
-    count = max(1, SLAB_BYTES // bytes_per_cell)
-    for start in range(0, len(cells), count):
-        yield cells[start : start + count]
 
 
 def _write_roles(run: "Run", name: str, group: zarr.Group) -> None:
@@ -147,17 +131,11 @@ def _write_roles(run: "Run", name: str, group: zarr.Group) -> None:
         for number, call in enumerate(calls):
             for role, start, stop in call:
                 codes[number, episode, start:stop] = names.index(role)
-    array: zarr.Array[Any] = group.create_array(
-        f"{name}/role",
-        shape=codes.shape,
-        chunks=(1, min(len(spans), EPISODES_PER_CHUNK), codes.shape[2]),
-        dtype="uint8",
-        fill_value=0,
-        compressors=codecs(run.settings["codec"], typesize=1),
-        dimension_names=("call", "episode", "token"),
-        attributes={"roles": names},
-        config={"write_empty_chunks": True},
-    )
+    chunks = (1, min(len(spans), EPISODES_PER_CHUNK), codes.shape[2])
+    array = create_array(
+        group, f"{name}/role", codes.shape, chunks, "uint8", 0, run.settings["codec"],
+        ("call", "episode", "token"), {"roles": names},
+    )  # fmt: skip
     array[:] = codes
 
 

@@ -11,13 +11,12 @@ from typing import Any, Protocol, Self
 import numpy as np
 import zarr
 from numpy.typing import NDArray
-from zarr.core.array_spec import ArrayConfigLike
 from zarr.core.buffer import Buffer
 from zarr.storage import MemoryStore
 
 from probe_kit.errors import SettingsMismatchError
 from probe_kit.hashing import canonical_json
-from probe_kit.runs.arrays import ROOM, create_arrays, create_inputs, write_inputs
+from probe_kit.runs.arrays import ROOM, WRITE_ALL, create_arrays, create_inputs, write_row
 from probe_kit.runs.checking import RecordingStore
 from probe_kit.runs.commits import (
     Commit,
@@ -33,9 +32,11 @@ from probe_kit.runs.layout import (
     COMMITS,
     DATA,
     FAILED,
+    INPUTS,
     LABEL_FILE,
     PLANS,
     RUN_FILE,
+    TRAJECTORY,
     StoredStream,
     stored_inputs_of,
 )
@@ -52,7 +53,7 @@ from probe_kit.runs.records import Sum
 from probe_kit.runs.results import BUNDLES, bundle_keys
 from probe_kit.runs.root import Label, PlanRecord, Root, grown_record, new_card, plan_key, read_root, while_growing
 from probe_kit.runs.store import Location
-from probe_kit.runs.trajectories import create_trajectories, write_trajectory
+from probe_kit.runs.trajectories import create_trajectories
 
 Row = Mapping[str, Any]
 _NUMBER = "episode"
@@ -172,11 +173,6 @@ def flat_settings(value: Any, prefix: str = "") -> dict[str, Any]:
         for name, child in value.items()
         for key, leaf in flat_settings(child, f"{prefix}.{name}" if prefix else str(name)).items()
     }
-
-
-# Zarr's default leaves out chunks that equal the fill value (and compares every chunk with it to find out), but
-# a reader must be able to tell an empty chunk from a lost one. Not stored in the array, so asked for here.
-_WRITE_ALL: ArrayConfigLike = {"write_empty_chunks": True}
 
 
 class WrittenRow(Protocol):
@@ -419,15 +415,14 @@ class RunWriter[PlanT: WrittenPlan]:
         store = RecordingStore(self.location.store(DATA))
         for kind, by_stream in episode.arrays.items():
             for stream, values in by_stream.items():
-                array = zarr.open_array(
-                    store, path=f"{stream}/{kind}", mode="r+", zarr_format=3, config=_WRITE_ALL
-                )
+                array = zarr.open_array(store, path=f"{stream}/{kind}", mode="r+", zarr_format=3, config=WRITE_ALL)
                 if array.shards:
                     store.shards[f"{stream}/{kind}"] = prod(array.shards) // prod(array.chunks)
                 array[planned.index] = values
         if episode.trajectory is not None and self.root.has_trajectories:
-            write_trajectory(store, planned.index, episode.trajectory, _WRITE_ALL)
-        write_inputs(store, planned.index, episode.inputs, _WRITE_ALL)
+            write_row(store, TRAJECTORY, planned.index, episode.trajectory)
+        for name, values in episode.inputs.items():
+            write_row(store, f"{INPUTS}/{name}", planned.index, values)
         for key, content in episode.pictures.items():
             self.location.write(key, content)
         self.location.flush(f"{DATA}/{key}" for key in store.sums)

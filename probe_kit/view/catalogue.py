@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from probe_kit.hashing import sha256_json
@@ -43,10 +43,24 @@ class Catalogue:
 
     def __init__(self, runs: Sequence[Run], probes_of: Run | None = None) -> None:
         self.runs = {viewed.key: viewed for viewed in view_runs(runs, probes_of)}
+        self.growing = [key for key in self.runs if not self._is_finished(key)]
+        """The keys of the runs that were unfinished."""
 
-    def replace(self, key: str, run: Run) -> None:
-        """Show a run as it is now. Raises KeyError."""
-        self.runs[key] = replace(self.runs[key], run=run)
+    def poll(self) -> list[dict[str, Any]]:
+        """Return the progress of every run of `growing`; of commits and failures, only new ones are read."""
+        return [self._poll(key) for key in self.growing]
+
+    def _poll(self, key: str) -> dict[str, Any]:
+        run = self.runs[key].run
+        counts = {COMMITS: len(run.commits()), FAILED: len(run.failed)}
+        if not self._is_finished(key) and any(len(run.location.keys(where)) != n for where, n in counts.items()):
+            run = run.grown()
+            self.runs[key] = replace(self.runs[key], run=run)
+        return {"run": key, "committed": len(run.commits()), "planned": run.planned, "failed": len(run.failed)}
+
+    def _is_finished(self, key: str) -> bool:
+        run = self.runs[key].run
+        return len(run.commits()) >= run.planned
 
     def names(self, categories: Collection[str] | None = None) -> Iterator[str]:
         """All names in the order of export. categories: whose episodes and maps are named, all by default."""
@@ -121,42 +135,3 @@ class Catalogue:
             for key, viewed in self.runs.items()
         ]
         return {"schema": SCHEMA, "runs": runs, "words": list(VIEWER_WORDS.items())}
-
-
-@dataclass(frozen=True)
-class Growth:
-    """The progress of a run. run: its key. failed: episodes that were given up."""
-
-    run: str
-    committed: int
-    planned: int
-    failed: int
-
-
-class Follower:
-    """The runs of a catalogue that were unfinished; `poll` puts their new episodes into the catalogue."""
-
-    def __init__(self, catalogue: Catalogue) -> None:
-        self._catalogue = catalogue
-        self._keys = [key for key in catalogue.runs if not self._is_finished(key)]
-
-    @property
-    def is_growing(self) -> bool:
-        """Whether any run was unfinished."""
-        return bool(self._keys)
-
-    def poll(self) -> list[Growth]:
-        """List commits and failures of every unfinished run, and read new commits only."""
-        return [self._poll(key) for key in self._keys]
-
-    def _poll(self, key: str) -> Growth:
-        run = self._catalogue.runs[key].run
-        counts = {COMMITS: len(run.commits()), FAILED: len(run.failed)}
-        if not self._is_finished(key) and any(len(run.location.keys(where)) != n for where, n in counts.items()):
-            run = run.grown()
-            self._catalogue.replace(key, run)
-        return Growth(key, len(run.commits()), run.planned, len(run.failed))
-
-    def _is_finished(self, key: str) -> bool:
-        run = self._catalogue.runs[key].run
-        return len(run.commits()) >= run.planned

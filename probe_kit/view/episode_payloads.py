@@ -39,7 +39,7 @@ def episode_payload(viewed: ViewedRun, number: int) -> dict[str, Any]:
     run, position = viewed.run, viewed.position_of[number]
     row = {str(name): value for name, value in run.episodes.iloc[position].to_dict().items()}
     probes = viewed.probes.get(str(row["category"]))
-    probed = None if probes is None else probes.log_odds(position)
+    log_odds, held_out = (None, True) if probes is None else probes.log_odds(position)
     calls = int(viewed.captured_inferences[position])
     trajectory = run.trajectory(position) if run.has_trajectories else None
     frames = episode_frames(run, position)
@@ -47,13 +47,14 @@ def episode_payload(viewed: ViewedRun, number: int) -> dict[str, Any]:
         "number": number,
         "frames": None if frames is None else _frames(viewed, number, frames),
         "inferences": viewed.inference_steps(position),
-        "log_odds": None if probed is None else pack_log_odds(probed.values),
-        "refitted": None if probed is None else _refitted(viewed, row, calls),
-        "held_out": probed is None or probed.held_out,
+        "log_odds": None if log_odds is None else pack_log_odds(log_odds),
+        "refitted": None if log_odds is None else _refitted(viewed, row, calls),
+        "held_out": held_out,
         "trajectory": None if trajectory is None else _trajectory(trajectory),
         "events": {} if trajectory is None else _events(trajectory),
         "outcomes": {} if trajectory is None else _outcomes(viewed, trajectory, row),
-        "lost_words": _lost_words(row),
+        # Words at the end of the instruction that did not reach the network.
+        "lost_words": int(rounded(row.get("lost_words"), 0) or 0),
         "instruction_tokens": len(run.instruction_ids(position) or ()),
         "words": _answers(viewed, row) | _label_words(viewed, row, position),
         "inputs": _inputs(viewed, position),
@@ -76,12 +77,6 @@ def _label_words(viewed: ViewedRun, row: dict[str, Any], position: int) -> dict[
     cells = {name: inputs.cell(name, first[name]) for name in inputs.classes}
     texts = {name: str(cell) for name, cell in cells.items() if cell is not None}
     return {name: str(row[name]) for name in ("picture",) if name in row} | texts
-
-
-def _lost_words(row: dict[str, Any]) -> int:
-    """Return the number of words at the end of the instruction that did not reach the network."""
-    lost = row.get("lost_words")
-    return 0 if lost is None or lost != lost else int(lost)
 
 
 def _refitted(viewed: ViewedRun, row: dict[str, Any], calls: int) -> Any:
@@ -244,7 +239,9 @@ def episodes_payload(viewed: ViewedRun) -> dict[str, Any]:
             sha256_json([int(scene), int(policy)])[:_SHORT]
             for scene, policy in zip(episodes.get("scene_seed", zeros), episodes["policy_seed"], strict=True)
         ],
-        "first_frame": [None if value is None else str(value)[:_SHORT] for value in _first_frames(viewed)],
+        "first_frame": [
+            None if value is None else str(value)[:_SHORT] for value in episodes.get(FIRST_FRAME, none)
+        ],
         "swap": _swap_responses(viewed),
         "log_odds": {part: _best_log_odds(viewed, part) for part in ("backbone", "action")},
     }
@@ -257,11 +254,6 @@ def _swap_responses(viewed: ViewedRun) -> list[int | None]:
 
 def _word(value: Any) -> str | None:
     return None if value is None or value != value else str(value)
-
-
-def _first_frames(viewed: ViewedRun) -> list[Any]:
-    episodes = viewed.run.episodes
-    return list(episodes[FIRST_FRAME]) if FIRST_FRAME in episodes else [None] * len(episodes)
 
 
 def _best_log_odds(viewed: ViewedRun, part: str) -> Packed | None:

@@ -17,6 +17,7 @@ from probe_kit.diagnose.diagnosis import load_diagnosis
 from probe_kit.diagnose.results import diagnosis_table
 from probe_kit.env.scoring import RULES
 from probe_kit.errors import RunDamagedError
+from probe_kit.hooks.contract.sites import Site
 from probe_kit.intervene.outcomes import stored_interventions
 from probe_kit.intervene.results import effects_of, listed_interventions
 from probe_kit.retention import RetentionRow
@@ -153,10 +154,7 @@ def run_payload(viewed: ViewedRun, page_runs: Sequence[ViewedRun] = ()) -> dict[
         "streams": [
             {"name": name, "label": stream.label, "part": stream.part} for name, stream in run.streams.items()
         ],
-        "sites": [
-            {"name": str(site), "stream": site.stream, "layer": site.layer, "iteration": site.iteration}
-            for site in viewed.sites
-        ],
+        "sites": _site_entries(viewed.sites),
         "categories": [
             {"name": name, "title": category_of(name).title, "best": best_places(viewed, name)}
             for name in viewed.categories
@@ -172,6 +170,13 @@ def run_payload(viewed: ViewedRun, page_runs: Sequence[ViewedRun] = ()) -> dict[
         "settings": {name: str(value) for name, value in flat_settings(run.settings).items()},
         "stamp": run.stamp,
     }
+
+
+def _site_entries(sites: Sequence[Site]) -> list[dict[str, Any]]:
+    return [
+        {"name": str(site), "stream": site.stream, "layer": site.layer, "iteration": site.iteration}
+        for site in sites
+    ]
 
 
 def best_places(viewed: ViewedRun, category: str) -> dict[str, Any]:
@@ -304,10 +309,7 @@ def target_map_payload(viewed: ViewedRun, number: int) -> dict[str, Any]:
         "metric": metric,
         "n": int(scores["n"].iloc[0]),
         "groups": int(scores["groups"].iloc[0]),
-        "sites": [
-            {"name": str(site), "stream": site.stream, "layer": site.layer, "iteration": site.iteration}
-            for site in results.curves[category, view].sites
-        ],
+        "sites": _site_entries(results.curves[category, view].sites),
         "headings": (f"{metric} [95 %]", "chance", "p of this site", "p, family-wise", "verdict"),
         "cells": [_target_cells(row) for row in scores.to_dict("records")],
         "score": [rounded(value) for value in scores["score"]],

@@ -16,6 +16,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Lock, Thread
+from typing import Any
 from urllib.parse import parse_qs
 
 import uvicorn
@@ -29,7 +30,7 @@ from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from probe_kit.errors import ProbeKitError, UsageError
-from probe_kit.view.catalogue import INDEX_PAYLOAD, Catalogue, Follower, Growth
+from probe_kit.view.catalogue import INDEX_PAYLOAD, Catalogue
 from probe_kit.view.export import INDEX, page_files
 
 HOST = "127.0.0.1"
@@ -117,21 +118,16 @@ class _Pages:
         self._catalogue, self._tick_s, self._lock = catalogue, tick_s, Lock()
         self._session = secrets.token_hex(8)
         self._files = page_files()
-        self._follower = Follower(catalogue)
 
     def file(self, request: Request) -> Response:
-        """The page, or a file of it."""
-        name = request.path_params.get("name")
-        content = self._files.get(INDEX if name is None else f"app/{name}")
+        """The page, a file of it, or the picture in the tab of the page that leads to it, which names none."""
+        names = {"/": INDEX, _ICON: "app/icon.svg"}
+        name = names.get(request.url.path) or f"app/{request.path_params['name']}"
+        content = self._files.get(name)
         if content is None:
             return _missing()
-        kind = _KINDS.get((name or INDEX).rpartition(".")[2], "text/plain")
+        kind = _KINDS.get(name.rpartition(".")[2], "text/plain")
         return _tagged(request, content, hashlib.sha256(content).hexdigest(), kind)
-
-    def icon(self, request: Request) -> Response:
-        """The picture in the tab of the page that leads to this one, which names none."""
-        content = self._files["app/icon.svg"]
-        return _tagged(request, content, hashlib.sha256(content).hexdigest(), _KINDS["svg"])
 
     def data(self, request: Request) -> Response:
         """A payload or a picture."""
@@ -174,23 +170,23 @@ class _Pages:
 
     async def follow(self, request: Request) -> Response:
         """Events of runs that grow: how many episodes are committed. Nothing where every run is finished."""
-        if not self._follower.is_growing:
+        if not self._catalogue.growing:
             return Response(status_code=204)
         return StreamingResponse(self._events(request), media_type="text/event-stream")
 
     async def _events(self, request: Request) -> AsyncIterator[str]:
-        sent: dict[str, Growth] = {}
+        sent: dict[str, dict[str, Any]] = {}
         yield ": following\n\n"
         while not await request.is_disconnected():
             for growth in await run_in_threadpool(self._poll):
-                if sent.get(growth.run) != growth:
-                    sent[growth.run] = growth
-                    yield f"data: {json.dumps(vars(growth))}\n\n"
+                if sent.get(growth["run"]) != growth:
+                    sent[growth["run"]] = growth
+                    yield f"data: {json.dumps(growth)}\n\n"
             await asyncio.sleep(self._tick_s)
 
-    def _poll(self) -> list[Growth]:
+    def _poll(self) -> list[dict[str, Any]]:
         with self._lock:
-            return self._follower.poll()
+            return self._catalogue.poll()
 
 
 def _missing() -> Response:
@@ -211,7 +207,7 @@ def _application(pages: _Pages, port: int, token: str) -> Starlette:
         routes=[
             Route("/", pages.file),
             Route("/app/{name}", pages.file),
-            Route(_ICON, pages.icon),
+            Route(_ICON, pages.file),
             Route("/data/{name:path}", pages.data),
             Route("/follow", pages.follow),
         ],

@@ -21,24 +21,13 @@ from probe_kit.retention.behaviour import ask_of
 from probe_kit.runs import Run
 from probe_kit.runs.arrays import Rows, decode_bfloat16
 from probe_kit.runs.layout import MEAN_VIEW
+from probe_kit.runs.reader import reached_calls
 from probe_kit.train.results.probe_curve import ProbeCurve
-from probe_kit.train.results.probe_results import Direction, ProbeResults, read_directions
+from probe_kit.train.results.probe_results import ProbeResults, read_directions
 from probe_kit.train.results.store import how_to_probe, load_results, load_results_by_call, stored_targets
 from probe_kit.train.samples import is_token_view
 
 Values = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class EpisodeLogOdds:
-    """values: (K, S) log-odds that the correct side is the answer, by captured inference and site.
-
-    held_out: whether no probe that gave them was trained on the episode's item. NaN where the inference is a later
-    one, and its activations are left out, or lack the view of the probe.
-    """
-
-    values: Values
-    held_out: bool
 
 
 @dataclass(frozen=True)
@@ -85,7 +74,7 @@ class FrozenProbes:
             return self._stored(str(row["episode_id"]), str(row["side_correct"]))
         number = int(row["episode"])
         if number not in self._kept:
-            values = self.log_odds(position).values
+            values, _ = self.log_odds(position)
             self._kept[number] = values[0] if len(values) else np.full(len(self.sites), np.nan)
         return self._kept[number]
 
@@ -95,8 +84,12 @@ class FrozenProbes:
             return np.full(len(self.sites), np.nan)
         return np.asarray(self.curve.decisions[:, column] * toward(side_correct))
 
-    def log_odds(self, position: int) -> EpisodeLogOdds:
-        """Return the log-odds of the episode in row `position`, at every captured inference that it reached."""
+    def log_odds(self, position: int) -> tuple[Values, bool]:
+        """(K, S) log-odds of the episode in row `position`, by captured inference that it reached and site.
+
+        Toward the correct side; NaN where the inference is a later one, and its activations are left out, or lack
+        the view of the probe. The flag says whether no probe that gave them was trained on the episode's item.
+        """
         row = self.run.episodes.iloc[position]
         side, item = str(row["side_correct"]), str(row["item_id"])
         calls = int(self._calls[position])
@@ -105,7 +98,7 @@ class FrozenProbes:
         if not self._reads_activations:
             if self._kept is None:
                 log_odds[:1] = self._stored(str(row["episode_id"]), side)
-            return EpisodeLogOdds(log_odds, fold is not None)
+            return log_odds, fold is not None
         for stream, probes in self._streams.items():
             features = self._features(stream, probes, position, calls)
             if fold is None:
@@ -113,7 +106,7 @@ class FrozenProbes:
             else:
                 values = np.einsum("ksd,sd->ks", features, probes.weights[:, fold]) + probes.intercepts[:, fold]
             log_odds[:, probes.places] = values * toward(side)
-        return EpisodeLogOdds(log_odds, fold is not None)
+        return log_odds, fold is not None
 
     def _features(self, stream: str, probes: _StreamProbes, position: int, calls: int) -> Values:
         """(K, S, D) of the view at every captured inference; NaN where the view is not stored of it."""
@@ -134,7 +127,7 @@ class FrozenProbes:
 
     @cached_property
     def _calls(self) -> NDArray[np.intp]:
-        return count_inferences(self.run)
+        return np.asarray(reached_calls(self.run).sum(axis=1))
 
     @cached_property
     def _rows(self) -> dict[str, Rows]:
@@ -146,29 +139,18 @@ class FrozenProbes:
         directions = read_directions(self._results.directions, names)
         streams = {}
         for stream in dict.fromkeys(site.stream for site in self.sites):
+            stored = self.run.stored(stream)
             places = [index for index, site in enumerate(self.sites) if site.stream == stream]
-            stream_directions = [directions[names[index]] for index in places]
-            streams[stream] = self._stacked(stream, places, stream_directions)
+            indices = [stored.at(self.sites[index]) for index in places]
+            probes = [directions[names[index]] for index in places]
+            streams[stream] = _StreamProbes(
+                places,
+                tuple(list(axis) for axis in zip(*indices, strict=True)),
+                stored.views.index(resolve_view(self._view, stored.views)),
+                np.stack([probe.weights.astype(np.float64) for probe in probes]),
+                np.stack([np.asarray(probe.intercepts, np.float64) for probe in probes]),
+            )
         return streams
-
-    def _stacked(self, stream: str, places: list[int], directions: list[Direction]) -> _StreamProbes:
-        stored = self.run.stored(stream)
-        indices = [stored.at(self.sites[index]) for index in places]
-        return _StreamProbes(
-            places,
-            tuple(list(axis) for axis in zip(*indices, strict=True)),
-            stored.views.index(resolve_view(self._view, stored.views)),
-            np.stack([direction.weights.astype(np.float64) for direction in directions]),
-            np.stack([np.asarray(direction.intercepts, np.float64) for direction in directions]),
-        )
-
-
-def count_inferences(run: Run) -> NDArray[np.intp]:
-    """(E,) how many captured inferences every episode reached."""
-    counts = np.zeros(len(run.episodes), np.intp)
-    for call in range(run.captured_calls):
-        counts += run.reached(call)
-    return counts
 
 
 def toward(side_correct: str) -> float:
@@ -241,7 +223,7 @@ class ViewedRun:
     @cached_property
     def captured_inferences(self) -> NDArray[np.intp]:
         """(E,) how many captured inferences every episode reached."""
-        return count_inferences(self.run)
+        return np.asarray(reached_calls(self.run).sum(axis=1))
 
     @property
     def answers(self) -> bool:

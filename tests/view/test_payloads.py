@@ -52,10 +52,10 @@ def test_log_odds_at_inference_0_are_the_stored_out_of_fold_decisions(catalogue:
     curve = load_results(viewed.run).curves["color", "mean"]
     for place, (name, label) in enumerate(zip(curve.episodes, curve.labels, strict=True)):
         position = viewed.run.episodes["episode_id"].tolist().index(name)
-        found = viewed.probes["color"].log_odds(position)
+        values, held_out = viewed.probes["color"].log_odds(position)
         expected = curve.decisions[:, place] * (1 if label else -1)
-        assert found.held_out
-        np.testing.assert_allclose(found.values, [expected], rtol=1e-6, atol=1e-6)
+        assert held_out
+        np.testing.assert_allclose(values, [expected], rtol=1e-6, atol=1e-6)
 
 
 def test_an_episode_says_how_its_sheet_is_divided_and_what_its_prompt_lost(
@@ -112,13 +112,13 @@ def test_an_item_that_no_fold_tests_takes_the_mean_of_the_folds_and_is_marked(li
     probes, results = viewed.probes["color"], viewed.results
     assert results is not None
     probes._fold_of.clear()
-    found = probes.log_odds(0)
-    assert not found.held_out
+    values, held_out = probes.log_odds(0)
+    assert not held_out
     side = 1 if little.episodes["side_correct"].iloc[0] == "left" else -1
     for place, site in enumerate(probes.sites):
         own = results.direction("color", "mean", site)
         by_fold = own.weights.astype(np.float64) @ little.column(site)[0] + own.intercepts
-        assert found.values[0, place] == pytest.approx(side * by_fold.mean(), rel=1e-6, abs=1e-6)
+        assert values[0, place] == pytest.approx(side * by_fold.mean(), rel=1e-6, abs=1e-6)
 
 
 def test_directions_read_at_once_are_those_read_one_by_one(little: Run) -> None:
@@ -450,21 +450,21 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 
 @pytest.fixture(scope="module")
-def catalogue(recorded: Run) -> Catalogue:
+def source_catalogue(recorded: Run) -> Catalogue:
     return Catalogue([recorded])
 
 
-def test_a_run_of_recordings_opens_with_the_views_that_need_no_side(catalogue: Catalogue) -> None:
-    _, run = read_payload(catalogue.script("run/run"))
+def test_a_run_of_recordings_opens_with_the_views_that_need_no_side(source_catalogue: Catalogue) -> None:
+    _, run = read_payload(source_catalogue.script("run/run"))
     assert (run["sides"], run["views"]) == (False, ["overview", "map", "episodes"])
     assert (run["table"]["rows"], run["scene"], run["committed"]) == ([], None, 12)
     assert run["targets"] == [{"target": "dataset.state.x", "category": "all"}]
-    for name in catalogue.names():
-        assert read_payload(catalogue.script(name))[0] == name
+    for name in source_catalogue.names():
+        assert read_payload(source_catalogue.script(name))[0] == name
 
 
-def test_what_is_stored_is_shown_as_the_tables_of_the_commands(catalogue: Catalogue) -> None:
-    _, results = read_payload(catalogue.script("run/results"))
+def test_what_is_stored_is_shown_as_the_tables_of_the_commands(source_catalogue: Catalogue) -> None:
+    _, results = read_payload(source_catalogue.script("run/results"))
     kinds = {table["kind"]: table for table in results["tables"]}
     assert list(kinds) == [
         "diagnosis of the inputs", "intervention image-swap", "probes of dataset.state.x", "predicted actions"
@@ -489,19 +489,19 @@ def test_a_diagnosis_of_another_version_is_refused_and_the_other_results_are_sho
     assert str(tmp_path) not in reason
 
 
-def test_a_target_has_a_map_with_the_scores_of_its_probes(catalogue: Catalogue) -> None:
-    _, target = read_payload(catalogue.script("run/target/0"))
+def test_a_target_has_a_map_with_the_scores_of_its_probes(source_catalogue: Catalogue) -> None:
+    _, target = read_payload(source_catalogue.script("run/target/0"))
     assert target["metric"] == "R²"
     assert target["score"].index(max(target["score"])) == 1, "the state was planted in the second layer"
     assert len(target["sites"]) == len(target["cells"]) == len(target["signal"])
     with pytest.raises(KeyError):
-        catalogue.script("run/target/1")
+        source_catalogue.script("run/target/1")
 
 
 def test_an_episode_shows_every_inference_and_predicted_beside_recorded_actions(
-    recorded: Run, catalogue: Catalogue
+    recorded: Run, source_catalogue: Catalogue
 ) -> None:
-    _, episode = read_payload(catalogue.script("run/e/00003"))
+    _, episode = read_payload(source_catalogue.script("run/e/00003"))
     steps = [EVERY * call for call in range(CALLS)]
     assert episode["inferences"] == episode["frames"]["steps"] == steps
     assert recorded.inputs is not None
@@ -510,7 +510,7 @@ def test_an_episode_shows_every_inference_and_predicted_beside_recorded_actions(
     for number, series in enumerate(actions["series"]):
         for line, kind in zip(series["lines"], ("action", "prediction"), strict=True):
             np.testing.assert_array_equal(floats(line["values"]), recorded.inputs.read(kind)[3, :, 0, number])
-    picture = catalogue.picture("run", 3)
+    picture = source_catalogue.picture("run", 3)
     assert picture is not None
     decoded = np.stack(list(decode_frames(picture, CALLS))).astype(float)
     pixels = recorded.inputs.read("pixels")[3, :, 0]
