@@ -90,15 +90,6 @@ def _is_news(record: logging.LogRecord) -> bool:
     return "processor_kwargs" not in record.getMessage()
 
 
-def flow_actions(policy: Any, batch: Mapping[str, Any], noise: Tensor) -> Tensor:
-    """(B, chunk, D) normalised actions: lerobot's `predict_action_chunk`, which draws its noise itself."""
-    policy.model.sample_noise = lambda *_: noise
-    try:
-        return cast(Tensor, policy.predict_action_chunk(dict(batch)))
-    finally:
-        del policy.model.sample_noise
-
-
 TEMPLATE, PROCESSOR = "eo1_conversation_template_processor", "eo1_qwen_processor"
 _VLM = "model.vlm_backbone."
 _HEAD, _EMBEDDING = f"{_VLM}lm_head.weight", f"{_VLM}model.language_model.embed_tokens.weight"
@@ -113,9 +104,6 @@ class Eo1(PackedPolicy):
     interventions = INTERVENTIONS
     unread = (_HEAD,)
     tied: ClassVar[Mapping[str, str]] = {_EMBEDDING: _HEAD}
-
-    other_roles: ClassVar[tuple[str, ...]] = ("language", "state", "special")
-    suffix_roles = ("action",)
 
     def __init__(self, network: Any, folder: Path, checkpoint: str) -> None:
         super().__init__(network, folder, checkpoint)
@@ -146,13 +134,12 @@ class Eo1(PackedPolicy):
         return config
 
     @classmethod
-    def build(cls, config: Any, folder: Path) -> nn.Module:
+    def build(cls, config: Any, folder: Path) -> Any:
         """lerobot's policy of the size that the configuration has."""
         del folder
         if config.dtype == "auto":
             config.dtype = str(config.vlm_backbone_config.dtype or "float32").removeprefix("torch.")
-        network: nn.Module = build_eo1(config)
-        return network
+        return build_eo1(config)
 
     def parts(self) -> dict[str, Path]:
         """The processor's folder."""
@@ -200,9 +187,13 @@ class Eo1(PackedPolicy):
         return rows
 
     def denoise(self, batch: Mapping[str, Tensor], noise: Tensor) -> Tensor:
-        """See the base; lerobot's own sampling makes no graph."""
+        """Return what lerobot's sampling, which makes no graph, puts out from the noise it would draw."""
         marks = {name: int(batch[name]) for name in ("state_token_id", "action_token_id")}
-        return flow_actions(self.network, {**batch, **marks}, noise)
+        self.network.model.sample_noise = lambda *_: noise
+        try:
+            return cast(Tensor, self.network.predict_action_chunk({**batch, **marks}))
+        finally:
+            del self.network.model.sample_noise
 
     def _stacks(self) -> dict[str, Stack]:
         decoder = self.network.model.vlm_backbone.model.language_model

@@ -99,7 +99,7 @@ class Groot(PackedPolicy):
         return config
 
     @classmethod
-    def build(cls, config: Any, folder: Path) -> nn.Module:
+    def build(cls, config: Any, folder: Path) -> Any:
         """lerobot's policy of the size that the base model's configuration has. Raises CheckpointError."""
         if (dtype := getattr(config, "dtype", None)) is not None:
             config.use_bf16 = dtype == "bfloat16"
@@ -107,10 +107,7 @@ class Groot(PackedPolicy):
         config.dtype = "bfloat16" if config.use_bf16 else "float32"
         if (folder / config.base_model_path).is_dir():
             config.base_model_path = str(config.places.base)
-        network: nn.Module = build_groot(
-            config, network_config(config.places.network, config, config.places.model_name)
-        )
-        return network
+        return build_groot(config, network_config(config.places.network, config, config.places.model_name))
 
     def parts(self) -> dict[str, Path]:
         """The base model and the vision-language model."""

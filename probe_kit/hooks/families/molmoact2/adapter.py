@@ -246,9 +246,6 @@ class MolmoAct2(PackedPolicy):
     interventions = LAYERWISE
     unread = ("model.lm_head.weight",)
 
-    other_roles: ClassVar[tuple[str, ...]] = ("language", "state", "special")
-    suffix_roles = ("action",)
-
     def __init__(self, network: Any, folder: Path, checkpoint: str) -> None:
         super().__init__(network, folder, checkpoint)
         text = network.model.config.text_config
@@ -285,7 +282,7 @@ class MolmoAct2(PackedPolicy):
         return config
 
     @classmethod
-    def build(cls, config: Any, folder: Path) -> nn.Module:
+    def build(cls, config: Any, folder: Path) -> Any:
         """lerobot's policy of the size that the VLM's configuration has. Raises CheckpointError."""
         if config.enable_lora_vlm:
             raise CheckpointError(f"{folder} holds LoRA adapters; merge them into its weights with lerobot first")
@@ -295,7 +292,7 @@ class MolmoAct2(PackedPolicy):
         config.inference_action_mode = "continuous"
         vlm_folder = Path(config.checkpoint_path)
         try:
-            network: nn.Module = build_molmoact2(config, network_config(vlm_folder), vlm_folder)
+            return build_molmoact2(config, network_config(vlm_folder), vlm_folder)
         except (FileNotFoundError, ValueError) as error:
             if not config.norm_tag:
                 raise
@@ -303,7 +300,6 @@ class MolmoAct2(PackedPolicy):
                 f"{folder} names the statistics {config.norm_tag!r}, which {vlm_folder} does not have ({error}). "
                 "Put its norm_stats.json there"
             ) from error
-        return network
 
     def parts(self) -> dict[str, Path]:
         """The VLM's configuration and tokenizer."""

@@ -19,7 +19,7 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 
 from probe_kit._system.bounded_files import load_json
 from probe_kit.errors import CheckpointError
@@ -185,16 +185,15 @@ class Pi0(PaliGemmaPolicy, LerobotFlow):
     # -- the network -----------------------------------------------------------------------------------------
 
     @classmethod
-    def build(cls, config: Any, folder: Path) -> nn.Module:
+    def build(cls, config: Any, folder: Path) -> Any:
         """lerobot's policy at the size `dims.json` gives, or at the released size."""
         sizes = sizes_file(folder)
         return cls.network_of(config, None if sizes is None else Pi0Size.from_file(sizes))
 
     @classmethod
-    def network_of(cls, config: Any, size: Pi0Size | None) -> nn.Module:
+    def network_of(cls, config: Any, size: Pi0Size | None) -> Any:
         """lerobot's policy of this size; None for the released one."""
-        network: nn.Module = build_pi0(config, size)
-        return network
+        return build_pi0(config, size)
 
     def _stacks(self) -> dict[str, Stack]:
         joint = self._joint
@@ -274,10 +273,9 @@ class Pi05(StatePrompt, Pi0):
     suffix_roles = ("action",)
 
     @classmethod
-    def network_of(cls, config: Any, size: Pi0Size | None) -> nn.Module:
+    def network_of(cls, config: Any, size: Pi0Size | None) -> Any:
         """lerobot's policy of this size."""
-        network: nn.Module = build_pi05(config, size)
-        return network
+        return build_pi05(config, size)
 
     def _stacks(self) -> dict[str, Stack]:
         stacks = super()._stacks()

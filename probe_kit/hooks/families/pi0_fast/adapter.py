@@ -324,7 +324,6 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
     current_names = current_pi0_fast_keys
 
     acting_stream = "action"
-    suffix_roles = ("action",)
     prompt_tokens = ALL_BUT_LAST
 
     def __init__(self, network: Any, folder: Path, checkpoint: str) -> None:
@@ -334,7 +333,7 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
         self.prompt_kv: Stream | None = kept_prompt(self._decoder.config)
 
     @classmethod
-    def build(cls, config: Any, folder: Path) -> nn.Module:
+    def build(cls, config: Any, folder: Path) -> Any:
         """lerobot's policy at the size `dims.json` gives, or at the released size.
 
         Raises UsageError for a number of captured tokens that an inference cannot put out, and for a temperature.
@@ -344,8 +343,7 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
             raise UsageError(f"captured_tokens is {captured}; expected 1 to {most}")
         chooser(config.evaluation.temperature or 0, ())
         sizes = sizes_file(folder)
-        network: nn.Module = build_pi0_fast(config, None if sizes is None else Pi0FastSize.from_file(sizes))
-        return network
+        return build_pi0_fast(config, None if sizes is None else Pi0FastSize.from_file(sizes))
 
     @property
     def temperature(self) -> float:

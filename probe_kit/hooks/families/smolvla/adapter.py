@@ -20,7 +20,7 @@ from lerobot.policies.smolvla import smolvlm_with_expert
 from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
 from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy
 from numpy.typing import NDArray
-from torch import Tensor, nn
+from torch import Tensor
 from transformers import SmolVLMConfig
 
 from probe_kit.errors import CheckpointError
@@ -131,11 +131,8 @@ class SmolVLA(LerobotFlow):
     unread = ("model.vlm_with_expert.vlm.lm_head.weight",)
     current_names = current_smolvla_keys
 
-    other_roles = ("language", "state", "special")
-    suffix_roles = ("action",)
-
     @classmethod
-    def build(cls, config: Any, folder: Path) -> nn.Module:
+    def build(cls, config: Any, folder: Path) -> Any:
         """lerobot's policy in float32, without a second download of the VLM's weights."""
         if getattr(config, "dtype", "float32") != "float32":
             raise CheckpointError(
@@ -144,8 +141,7 @@ class SmolVLA(LerobotFlow):
             )
         config.vlm_named = locate_vlm(config, folder)
         config.vlm_model_name = str(_folder_of(config.vlm_named))
-        network: nn.Module = build_smolvla(config, folder)
-        return network
+        return build_smolvla(config, folder)
 
     def _stacks(self) -> dict[str, Stack]:
         joint = self._joint

@@ -221,7 +221,7 @@ class Xvla(DenoisingPolicy):
         return config
 
     @classmethod
-    def build(cls, config: Any, folder: Path) -> nn.Module:
+    def build(cls, config: Any, folder: Path) -> Any:
         """lerobot's policy. Raises CheckpointError for a state that it would cut, UsageError for no such robot."""
         numbers = config.robot_state_feature.shape[0] if config.robot_state_feature else 0
         if config.use_proprio and numbers > config.max_state_dim:
@@ -233,8 +233,7 @@ class Xvla(DenoisingPolicy):
             raise UsageError(
                 f"-M domain={config.steps.domain}: {folder} has the robots 0 to {config.num_domains - 1}"
             )
-        network: nn.Module = build_xvla(config)
-        return network
+        return build_xvla(config)
 
     @property
     def steps(self) -> XvlaSteps:

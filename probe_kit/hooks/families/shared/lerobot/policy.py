@@ -95,14 +95,14 @@ class LerobotPolicy(Policy):
     """Whether users can say with -M unread which fields change nothing."""
     known_steps: ClassVar[tuple[str, ...] | None] = (CROP,)
     """Steps of lerobot's processors that only this family has; None where it reads the pipelines itself."""
-    other_roles: ClassVar[tuple[str, ...]]
+    other_roles: ClassVar[tuple[str, ...]] = ("language", "state", "special")
     """What positions of the backbone hold besides pictures and padding."""
     passages: PromptKV
     """Where keys and values of the prompt pass, in families that have `prompt_kv`."""
     prompt_tokens: ClassVar[slice] = ALL_TOKENS
     """Of the prompt's keys and values, those of the backbone."""
     acting_stream: ClassVar[str]
-    suffix_roles: ClassVar[tuple[str, ...]]
+    suffix_roles: ClassVar[tuple[str, ...]] = ("action",)
     """What positions of the acting stream hold."""
 
     def __init__(self, network: Any, folder: Path, checkpoint: str) -> None:
@@ -149,7 +149,7 @@ class LerobotPolicy(Policy):
 
     @classmethod
     @abstractmethod
-    def build(cls, config: Any, folder: Path) -> nn.Module:
+    def build(cls, config: Any, folder: Path) -> Any:
         """The network with uninitialised weights."""
 
     @classmethod
