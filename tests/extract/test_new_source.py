@@ -19,10 +19,9 @@ PAGE = Path(__file__).parents[2] / "CONTRIBUTING.md"
 def package(tmp_path: Path) -> Path:
     """A folder of the import path with the new file and what an installer makes of the entry point."""
     page = PAGE.read_text(encoding="utf-8")
-    diff = page.partition("+++ b/noise_source.py\n")[2].partition("\n```")[0].splitlines()
-    assert all(line.startswith("+") for line in diff), "the source is one new file"
-    (tmp_path / "noise_source.py").write_text("\n".join(line[1:] for line in diff), encoding="utf-8")
-    (entry,) = [line[1:] for line in page.splitlines() if line.startswith("+noise = ")]
+    file = page.partition("## To add a source\n")[2].partition("```python\n")[2].partition("```")[0]
+    (tmp_path / "noise_source.py").write_text(file, encoding="utf-8")
+    (entry,) = [line for line in page.splitlines() if line.startswith("noise = ")]
     about = tmp_path / "noise_source-1.dist-info"
     about.mkdir()
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: noise-source\nVersion: 1\n", encoding="utf-8")

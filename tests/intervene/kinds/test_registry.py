@@ -29,10 +29,8 @@ NAME = "dimmed-images"
 def with_entry(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[ModuleType]:
     """The command with the file that CONTRIBUTING adds, registered as a package of its own does it."""
     page = (Path(__file__).parents[3] / "CONTRIBUTING.md").read_text(encoding="utf-8")
-    diff = page.partition("+++ b/probe_kit/intervene/kinds/dimmed_images.py\n")[2].partition("\n```")[0]
-    lines = diff.splitlines()
-    assert all(line.startswith("+") for line in lines), "the whole kind is one new file"
-    (tmp_path / "dimmed_images.py").write_text("\n".join(line[1:] for line in lines), encoding="utf-8")
+    file = page.partition("## To add a kind of intervention\n")[2].partition("```python\n")[2].partition("```")[0]
+    (tmp_path / "dimmed_images.py").write_text(file, encoding="utf-8")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setattr(kinds, "_HOMES", dict(kinds._HOMES))
     kinds.register(NAME, "dimmed_images")
