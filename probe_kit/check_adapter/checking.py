@@ -3,7 +3,7 @@
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -20,7 +20,6 @@ from probe_kit.hooks.contract.declared import read_pairs
 from probe_kit.hooks.contract.model import Policy
 from probe_kit.hooks.registry import entry_module, find_family
 from probe_kit.hooks.testing import CONTRACTS
-from probe_kit.runs import Run
 from probe_kit.suite import Terms, suite_from_csv
 
 _HEAVY = 3
@@ -96,15 +95,33 @@ def outcomes(subjects: Sequence[Subject]) -> Iterator[Outcome]:
 
 
 def _run(subject: Subject, mismatch: bool) -> None:
-    settings: dict[str, Any] = {
+    """Extract or ask about two episodes, in the folder of the subject, and load every site again.
+
+    mismatch: do not act, as actions do not fit the arm. Raises what `extract_run` and `ask_run` raise, and
+    CheckFailedError for a run that is not whole.
+    """
+    common: dict[str, Any] = {
         "checkpoint": subject.given_checkpoint, "options": subject.options, "device": subject.device,
-        "dtype": subject.dtype,
+        "dtype": subject.dtype, "suite": _one_item(subject.instructions[0], subject.folder), "frames": "none",
+        "env_workers": 0,
     }  # fmt: skip
-    words = subject.instructions[0]
     if subject.acting:
-        act_twice(subject.name, settings, words, mismatch, subject.folder)
+        settings = ExtractSettings(
+            subject.name,
+            capture_only=mismatch,
+            accept_units=True,  # a tiny checkpoint may have any statistics
+            accept_ignored_inputs=True,  # and untrained bins that no input moves
+            max_steps=STEPS,
+            **common,
+        )
+        run = extract_run(settings, subject.folder / "run")
     else:
-        answer_twice(subject.name, settings, words, subject.folder)
+        run = ask_run(AskSettings(subject.name, tokens="pooled", **common), subject.folder / "run")
+    require(len(run.episodes) == 2, f"{len(run.episodes)} episodes", "2, the item in both layouts")
+    for stream in run.streams:
+        for site, view in product(run.sites(stream), run.views(stream)):
+            rows = len(run.column(site, view))
+            require(rows == 2, f"{site} has {rows} rows of {view}", "2, one per episode")
 
 
 def _require_light(module: str) -> None:
@@ -126,36 +143,6 @@ _SIDE = 224
 _COLOURS = ("red", "blue")
 
 
-def act_twice(
-    model: str, load_options: Mapping[str, Any], instruction: str, capture_only: bool, folder: Path
-) -> None:
-    """Extract two episodes, and load every site again.
-
-    load_options: checkpoint, options, device and dtype. capture_only: do not act, for actions that do not fit
-    the arm. Raises what `extract_run` raises, and CheckFailedError for a run that is not whole.
-    """
-    settings = ExtractSettings(
-        model,
-        suite=_one_item(instruction, folder),
-        frames="none",
-        env_workers=0,
-        capture_only=capture_only,
-        accept_units=True,  # a tiny checkpoint may have any statistics
-        accept_ignored_inputs=True,  # and untrained bins that no input moves
-        max_steps=STEPS,
-        **load_options,
-    )
-    _read_back(extract_run(settings, folder / "run"))
-
-
-def answer_twice(model: str, load_options: Mapping[str, Any], instruction: str, folder: Path) -> None:
-    """Ask about two episodes, activations included, and load every site again. Raises as `act_twice` does."""
-    settings = AskSettings(
-        model, suite=_one_item(instruction, folder), frames="none", env_workers=0, tokens="pooled", **load_options
-    )
-    _read_back(ask_run(settings, folder / "run"))
-
-
 def _one_item(instruction: str, folder: Path) -> Path:
     """A suite of one item over two discs; played in both layouts it is two episodes."""
     for colour in _COLOURS:
@@ -167,11 +154,3 @@ def _one_item(instruction: str, folder: Path) -> Path:
     (folder / "discs.csv").write_text(csv_of_rows(list(row), [row]), encoding="utf-8")
     terms = Terms("CC0-1.0", "drawn by probe-kit check-adapter")
     return suite_from_csv(folder / "discs.csv", folder / "suite", terms=terms).folder
-
-
-def _read_back(run: Run) -> None:
-    require(len(run.episodes) == 2, f"{len(run.episodes)} episodes", "2, the item in both layouts")
-    for stream in run.streams:
-        for site, view in product(run.sites(stream), run.views(stream)):
-            rows = len(run.column(site, view))
-            require(rows == 2, f"{site} has {rows} rows of {view}", "2, one per episode")

@@ -183,25 +183,6 @@ def answered(organism: Organism, suite: Suite, folder: Path, stage: NamedProgres
     return ask_run(settings, folder / organism.folder, progress=stage(f"questions, {organism.name}"))
 
 
-def compare(suite: Suite, folder: Path, permutations: int, stage: NamedProgress) -> list[Finding]:
-    """Judge the VLM and every organism on `suite`; the first untrained network is a control of all others.
-
-    Arguments as of `probed`.
-    """
-    control, _ = probed(UNTRAINED_NETWORK, suite, folder, permutations, stage)
-    runs = [(VLM, answered(VLM, suite, folder, stage))]
-    runs += [
-        (
-            organism,
-            control
-            if organism == UNTRAINED_NETWORK
-            else probed(organism, suite, folder, permutations, stage, control)[0],
-        )
-        for organism in ORGANISMS
-    ]
-    return findings(runs)
-
-
 def findings(runs: Sequence[tuple[Organism, Run]]) -> list[Finding]:
     """Return the verdicts on every organism's run, and the truth, one for each category."""
     rows = [(organism, row) for organism, run in runs for row in retention_table([run]).rows]
@@ -311,8 +292,17 @@ class Demo:
 
 
 def compare_organisms(folder: Path, stage: NamedProgress) -> list[Finding]:
-    """Put the questions of `FULL` to policies of which the truth is known; see `probe_kit.demo.pipeline`."""
-    return compare(_questions(folder, FULL, stage), folder, FULL.permutations, stage)
+    """Judge the VLM and every organism on the questions of `FULL`. stage: as of `probed`."""
+    suite = _questions(folder, FULL, stage)
+    # The first untrained network is a control of all others.
+    control, _ = probed(UNTRAINED_NETWORK, suite, folder, FULL.permutations, stage)
+    runs = [(VLM, answered(VLM, suite, folder, stage))]
+    for organism in ORGANISMS:
+        run = control
+        if organism != UNTRAINED_NETWORK:
+            run, _ = probed(organism, suite, folder, FULL.permutations, stage, control)
+        runs.append((organism, run))
+    return findings(runs)
 
 
 def _questions(folder: Path, size: Size, stage: NamedProgress) -> Suite:

@@ -24,10 +24,10 @@ from zarr.errors import ChunkNotFoundError
 
 from probe_kit.errors import RunDamagedError
 from probe_kit.hooks.contract.sites import Site
-from probe_kit.runs.arrays import bounded_codecs, decode_bfloat16, open_array
+from probe_kit.runs.arrays import bounded_codecs, open_array
 from probe_kit.runs.checking import CheckedStore
 from probe_kit.runs.commits import Commit, commit_key, stamp_of
-from probe_kit.runs.layout import COLUMNS, LATER, SEALED, StoredStream
+from probe_kit.runs.layout import COLUMNS, LATER, SEALED
 from probe_kit.runs.records import NAME_DIGITS, Record, Sum, Sums, named_by_hash
 from probe_kit.runs.root import Root
 from probe_kit.runs.store import Location
@@ -78,15 +78,8 @@ class Columns:
         """One array, such as `backbone/pooled`."""
         return open_array(self.store, name)
 
-    def column(self, stored: StoredStream, site: Site, view: str, call: int) -> NDArray[np.float32]:
-        """(E, D) float32: one view of one site at one captured inference. Raises RunDamagedError."""
-        return self._read(f"{stored.name}/pooled", (call, stored.views.index(view), *stored.at(site)), site)
-
-    def later_column(self, stored: StoredStream, site: Site, call: int) -> NDArray[np.float32]:
-        """(E, D) float32: the mean of one site at a later inference that keeps no other view."""
-        return decode_bfloat16(self._read(f"{stored.name}/{LATER}", (call - 1, *stored.at(site)), site))
-
-    def _read(self, name: str, index: tuple[int, ...], site: Site) -> NDArray[Any]:
+    def read(self, name: str, index: tuple[int, ...], site: Site) -> NDArray[Any]:
+        """(E, D) one column of the array `name` as stored; site: for the message. Raises RunDamagedError."""
         array = self.array(name)
         try:
             return np.asarray(array[index])

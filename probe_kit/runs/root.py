@@ -94,33 +94,6 @@ def count_plans(location: Location) -> int:
     return next(record for record in count() if not location.exists(plan_key(record)))
 
 
-def grown_record(
-    run: str,
-    before: StoredPlan,
-    rows: Sequence[Row],
-    selection: Mapping[str, Any],
-    suite_parent: str | None,
-    tokens: Mapping[str, int],
-) -> PlanRecord:
-    """The record that adds to a plan those of `rows` that it lacks; `rows` hold all that it has.
-
-    run: identity. rows: of all episodes in their order; numbers of new ones are given here.
-    """
-    numbers = {row["episode_id"]: row["episode"] for row in before.rows}
-    added = [row for row in rows if row["episode_id"] not in numbers]
-    numbers |= {row["episode_id"]: len(before.rows) + position for position, row in enumerate(added)}
-    return PlanRecord(
-        run=run,
-        record=len(before.extents),
-        selection=dict(selection),
-        suite_parent=suite_parent,
-        # A later selection may have shorter instructions only; the arrays of before keep their length.
-        tokens={name: max(length, before.tokens.get(name, 0)) for name, length in tokens.items()},
-        episodes=[{**row, "episode": numbers[row["episode_id"]]} for row in added],
-        order=[numbers[row["episode_id"]] for row in rows],
-    )
-
-
 def read_plans(location: Location, run: str, check_row: Callable[[Row, str], None]) -> StoredPlan:
     """All plan records together; without any rows for a run that has none yet.
 

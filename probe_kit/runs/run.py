@@ -620,6 +620,9 @@ class Run:
         if view not in (views := self.views(site.stream, call)):
             at = f" at inference {call}, with --later-views mean" if self._keeps_mean_of(call) else ""
             raise UnknownSiteError(f"no view {view!r} of {site.stream}{at}; stored: {', '.join(views)}")
+        in_mean, lead = self._keeps_mean_of(call), stored.at(site)
+        kind: VectorKind = "later" if in_mean else "pooled"
+        index: tuple[Any, ...] = (call - 1, *lead)
         if self.columns is None:
             warnings.warn(
                 f"{self.location} is not sealed; columns are put together from rows, which is slow but gives the "
@@ -627,14 +630,12 @@ class Run:
                 NotSealedWarning,
                 stacklevel=2,
             )
-            index: tuple[Any, ...] = (slice(None), call - 1, *stored.at(site))
-            if self._keeps_mean_of(call):
-                return decode_bfloat16(self._committed_rows(site.stream, "later")[index])
-            index = (slice(None), call, *stored.at(site), stored.views.index(view))
-            return np.asarray(self._committed_rows(site.stream, "pooled")[index])
-        if self._keeps_mean_of(call):
-            return self.columns.later_column(stored, site, call)[self._columns_rows]
-        return self.columns.column(stored, site, view, call)[self._columns_rows]
+            index = index if in_mean else (call, *lead, stored.views.index(view))
+            values = np.asarray(self._committed_rows(site.stream, kind)[(slice(None), *index)])
+        else:
+            index = index if in_mean else (call, stored.views.index(view), *lead)
+            values = self.columns.read(f"{stored.name}/{kind}", index, site)[self._columns_rows]
+        return decode_bfloat16(values) if in_mean else values
 
     @property
     def sealed(self) -> bool:

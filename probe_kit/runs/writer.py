@@ -51,7 +51,7 @@ from probe_kit.runs.provenance import (
 )
 from probe_kit.runs.records import Sum
 from probe_kit.runs.results import BUNDLES, bundle_keys
-from probe_kit.runs.root import Label, PlanRecord, Root, grown_record, new_card, plan_key, read_root, while_growing
+from probe_kit.runs.root import Label, PlanRecord, Root, new_card, plan_key, read_root, while_growing
 from probe_kit.runs.store import Location
 from probe_kit.runs.trajectories import create_trajectories
 
@@ -337,12 +337,21 @@ class RunWriter[PlanT: WrittenPlan]:
                 )
 
     def _record(self, root: Root) -> PlanRecord:
-        """The plan record that adds this writer's plan to the one of the run."""
-        plan = self.plan.to_json()
-        tokens = {} if self._with_tokens else {stream.name: stream.tokens for stream in self.plan.streams}
-        selection = json.loads(canonical_json(self.plan.selection))
-        return grown_record(
-            root.identity, root.stored_plan, plan["episodes"], selection, plan["suite_parent"], tokens
+        """The plan record that adds to the run's plan those episodes of this writer's that it lacks."""
+        plan, before = self.plan.to_json(), root.stored_plan
+        numbers = {row["episode_id"]: row["episode"] for row in before.rows}
+        added = [row for row in plan["episodes"] if row["episode_id"] not in numbers]
+        numbers |= {row["episode_id"]: len(before.rows) + position for position, row in enumerate(added)}
+        streams = () if self._with_tokens else self.plan.streams
+        return PlanRecord(
+            run=root.identity,
+            record=len(before.extents),
+            selection=json.loads(canonical_json(self.plan.selection)),
+            suite_parent=plan["suite_parent"],
+            # A later selection may have shorter instructions only; the arrays of before keep their length.
+            tokens={stream.name: max(stream.tokens, before.tokens.get(stream.name, 0)) for stream in streams},
+            episodes=[{**row, "episode": numbers[row["episode_id"]]} for row in added],
+            order=[numbers[row["episode_id"]] for row in plan["episodes"]],
         )
 
     @contextmanager
