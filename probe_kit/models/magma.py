@@ -437,10 +437,8 @@ class MagmaNetwork(TokenNetwork):
 
 
 def build_magma(config: MagmaConfig, dtype: torch.dtype, device: str = "meta") -> MagmaNetwork:
-    """The network in eval mode.
+    """The network in eval mode; see `build_empty`.
 
-    device: `meta` for a network whose parameters have names and shapes but no prompt_kv, to be filled with
-    `load_weights(…, assign=True)`; `cpu` for one with uninitialised weights.
     Raises CheckpointError if the parts do not fit together.
     """
     network = build_empty(lambda: MagmaNetwork(config), dtype, device)

@@ -352,11 +352,7 @@ class PrismaticNetwork(TokenNetwork):
 
 
 def build_prismatic(config: PrismaticConfig, dtype: torch.dtype, device: str = "meta") -> PrismaticNetwork:
-    """The network in eval mode.
-
-    device: `meta` for a network whose parameters have names and shapes but no memory, to be filled with
-    `load_weights(…, assign=True)`; `cpu` for one with uninitialised weights.
-    """
+    """The network in eval mode; see `build_empty`."""
     network = build_empty(lambda: PrismaticNetwork(config), dtype, device)
     fill_decoder_rotary(network.language_model.model)
     network.language_model.tie_weights()

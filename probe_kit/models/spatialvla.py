@@ -383,11 +383,9 @@ def _additive(mask: Tensor, embeddings: Tensor) -> Tensor | None:
 
 
 def build_spatialvla(config: SpatialVLAConfig, dtype: torch.dtype, device: str = "meta") -> SpatialVLANetwork:
-    """The network in eval mode.
+    """The network in eval mode; see `build_empty`. `embed_actions` comes after the weights.
 
-    device: `meta` for a network whose parameters have names and shapes but no memory, to be filled with
-    `load_weights(…, assign=True)`; `cpu` for one with uninitialised weights. `embed_actions` comes after
-    the weights. Raises WeightsError if a part of transformers has a constant that would stay without memory.
+    Raises WeightsError if a part of transformers has a constant that would stay without memory.
     """
     network = build_empty(lambda: SpatialVLANetwork(config), dtype, device)
     if not builds_sizes_only():

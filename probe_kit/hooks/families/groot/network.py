@@ -132,13 +132,7 @@ _AGAIN = "Download the checkpoint again"
 
 @dataclass(frozen=True)
 class GrootChoice(Evaluation):
-    """The choices that GR00T's files leave open.
-
-    embodiment: tag of NVIDIA's layout; None where there is one only. vlm: folder or hub id of the vision-language
-    model's configuration, tokenizer and processor, where not the one that the checkpoint names. resize: `nvidia`
-    or `lerobot`, whose code resizes pictures; None for the layout's own. letterbox: whether black bars make
-    pictures square first; None for what the files say.
-    """
+    """The choices that GR00T's files leave open; see the options of its family."""
 
     embodiment: str | None = None
     vlm: str | None = None

@@ -296,11 +296,7 @@ def _dtype(joint: Any, entering: Tensor) -> torch.dtype:
 
 @dataclass(frozen=True)
 class Decoding(Evaluation):
-    """The decoding of action tokens. captured_tokens: those that are sites.
-
-    temperature: 0 for the likeliest token; above, drawn by each row's seed; None for the checkpoint's. lowercase:
-    the instruction in lower case, as openpi has it; lerobot keeps its case.
-    """
+    """The decoding of action tokens; see the options of its family."""
 
     captured_tokens: int = CAPTURED
     temperature: float | None = None

@@ -179,10 +179,7 @@ SOFT_PROMPT = "soft_prompt"
 
 @dataclass(frozen=True)
 class XvlaChoice(Evaluation):
-    """The choices that X-VLA's files may leave open.
-
-    domain: number of the robot's soft prompts; None for the one that the processor files name.
-    """
+    """The choices that X-VLA's files may leave open; see the options of its family."""
 
     domain: int | None = None
 
