@@ -22,6 +22,7 @@ from probe_kit.env import SceneSpec
 from probe_kit.extract import ExtractSettings, extract_run
 from probe_kit.hooks import Policy, load_policy
 from probe_kit.intervene import ConditionOutcomes, ImageSwap, Interchange, ReplaySession, ReplaySource
+from probe_kit.intervene.kinds.base import Measurement
 from probe_kit.intervene.kinds.image_swap import image_swap_effects
 from probe_kit.intervene.kinds.interchange import patch_effects
 from probe_kit.intervene.places import Pair
@@ -67,9 +68,14 @@ def shuffled(answers: ConditionOutcomes, draw: np.random.Generator) -> Condition
     )
 
 
+def measured(answers: ConditionOutcomes, suite: str) -> Measurement:
+    """Return what effects are computed from."""
+    return Measurement(replace(answers, seed_text=suite), {}, {}, str.encode)
+
+
 def count_outside(answers: ConditionOutcomes, suite: str, counts: dict[str, Count]) -> None:
     """Note every category of a `follow`."""
-    for row in image_swap_effects(answers, suite):
+    for row in image_swap_effects(measured(answers, suite)):
         counts["image swap: p < 0.05"].note(row.follow_p < SIGNIFICANCE)
         use = classify_behaviour(row, None)
         counts["image swap: called used"].note(use.is_used and not use.reversed)
@@ -77,7 +83,9 @@ def count_outside(answers: ConditionOutcomes, suite: str, counts: dict[str, Coun
 
 def count_inside(answers: ConditionOutcomes, suite: str, counts: dict[str, Count]) -> None:
     """Note every place and role of an interchange."""
-    rows = [row for row in patch_effects(answers, suite) if row.p is not None and row.p_fwe is not None]
+    rows = [
+        row for row in measured(answers, suite).rows(patch_effects) if row.p is not None and row.p_fwe is not None
+    ]
     for row in rows:
         counts["interchange: single p < 0.05"].note((row.p or 0.0) < SIGNIFICANCE)
         counts["interchange: located"].note(row.is_localised)

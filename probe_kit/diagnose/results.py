@@ -150,7 +150,11 @@ def describe_passage(passage: Sequence[SitePassage], verdict: Verdict) -> str:
         return f"the difference ends behind {reached[-1].name}; {following.name} is bit-equal"
     if verdict in MATTERS:
         carriers = [site for site in passage if site.carried >= CARRIES]
-        spans = [_span([site for site in carriers if site.stream == stream]) for stream in _streams(carriers)]
+        spans = []  # the first and the last of every stream, such as `backbone.00–02`
+        for stream in dict.fromkeys(site.stream for site in carriers):
+            names = [site.name for site in carriers if site.stream == stream]
+            until = f"–{names[-1].partition('.')[2]}" if len(names) > 1 else ""
+            spans.append(f"{names[0]}{until}")
         return f"carried by {', '.join(spans)}" if spans else "no site alone carries half of it"
     strongest = max(passage, key=lambda site: site.difference)
     last = passage[-1]
@@ -160,16 +164,6 @@ def describe_passage(passage: Sequence[SitePassage], verdict: Verdict) -> str:
     else:
         reach, loss = f" and reaches {last.name} ({last.difference:.2g})", "in the action part itself"
     return f"{largest}{reach}" + f": the loss is {loss}" * (verdict == "no effect")
-
-
-def _streams(sites: Sequence[SitePassage]) -> list[str]:
-    return list(dict.fromkeys(site.stream for site in sites))
-
-
-def _span(sites: Sequence[SitePassage]) -> str:
-    """The first and the last of some sites of one stream, such as `backbone.00–02`."""
-    first, last = sites[0].name, sites[-1].name
-    return first if first == last else f"{first}–{last.partition('.')[2]}"
 
 
 @dataclass(frozen=True)

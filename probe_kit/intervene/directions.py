@@ -43,23 +43,38 @@ DIRECTIONS = (MEAN_DIFFERENCE, PROBE)
 FOLDS = 5
 _ROUNDING = 1e-6
 """Share of a number's size below which a difference of stored float32 means is rounding."""
+EVERY_EPISODE = ""
+"""In place of an episode: directions of a file are the same for all."""
 
 
-class DirectionBasis(Protocol):
-    """Directions by name, each found without the episode that it is used on."""
+@dataclass(frozen=True)
+class Directions:
+    """Directions of one site and role by name, each found without the episode that it is used on.
 
-    @property
-    def control_names(self) -> tuple[str, ...]:
-        """Return the names of the random ones beside the one that was asked for."""
+    bases: by name and episode, (K, D) float32, orthonormal. halves: by episode, (K,) or (T, K), half the
+    differences of the class means along those that were asked for, of a mean over tokens or of the role's T
+    positions. vectors: by name (D,), of a file: the step in place of a half difference. control_names: of the
+    random ones beside the one that was asked for.
+    """
 
-    def basis(self, name: str, episode: str, category: str) -> Vector:
-        """Return (K, D) float32, orthonormal."""
+    bases: Mapping[tuple[str, str], Vector]
+    halves: Mapping[str, NDArray[np.float64]]
+    control_names: tuple[str, ...] = ()
+    vectors: Mapping[str, Vector] | None = None
 
-    def shift(self, name: str, episode: str, category: str, strength: float) -> Vector:
+    def basis(self, name: str, episode: str) -> Vector:
+        """Return (K, D)."""
+        return self.bases[name, episode if self.vectors is None else EVERY_EPISODE]
+
+    def shift(self, name: str, episode: str, strength: float) -> Vector:
         """Return (D,) or (T, D) float32, so many half differences of the class means, toward `left`.
 
-        (T, D): the t-th row belongs to the role's t-th token. Of a control: as far, along its own directions.
+        (T, D): the t-th row belongs to the role's t-th token; a mark on either tile has its own sign at the
+        positions of each. Of a control: as far, along its own directions.
         """
+        if self.vectors is not None:
+            return np.float32(strength) * self.vectors[name]
+        return np.float32(strength * self.halves[episode]) @ self.bases[name, episode]
 
 
 class Directed(Protocol):
@@ -106,7 +121,7 @@ def control_names(count: int) -> tuple[str, ...]:
 
 def fit_token_directions(
     session: ReplaySession, intervention: Directed, cells: Sequence[Cell], patterns: Sequence[str]
-) -> dict[Cell, DirectionBasis]:
+) -> dict[Cell, Directions]:
     """Return the meaning of an intervention's direction in every cell: of the run's columns, or of all its tokens.
 
     `mean-difference:K`: the K directions along which the differences of class means at all positions lie most, the
@@ -115,74 +130,54 @@ def fit_token_directions(
     stored, NoDirectionError for a named place without a direction, UsageError where there are too few episodes to
     learn from.
     """
-    if intervention.vector is not None:
-        return {cell: _of_file(session, cell, intervention.vector, intervention) for cell in cells}
-    items = items_of(session.run, intervention.categories, None)
     direction, controls, seed = intervention.direction, intervention.controls, intervention.seed
+    if intervention.vector is not None:
+        return {cell: _of_file(session, cell, intervention.vector, controls, seed) for cell in cells}
+    items = items_of(session.run, intervention.categories, None)
     passed_over = PassedOver(session, patterns)
+    fitted: dict[Cell, Directions] = {}
     if ":" not in direction:
         categories = tuple(dict.fromkeys(session.categories_of(items)))
-        pooled: dict[Cell, DirectionBasis] = {}
         for cell in cells:
             with passed_over.fitting(cell):
-                pooled[cell] = fit_directions(
+                fitted[cell] = fit_directions(
                     session.run, cell.site_group.only_site, cell.role, direction, controls, seed, categories
                 )
-        return passed_over.left(pooled)
-    bases: dict[Cell, dict[tuple[str, str], Vector]] = {}
-    halves: dict[Cell, dict[str, NDArray[np.float64]]] = {}
+        return passed_over.left(fitted)
     for cell, category, features in collect_token_features(session, items, cells):
         with passed_over.fitting(cell):
             fits = fit_by_fold(features, cell, Method.of(direction), controls, seed, category)
-            by_name = bases.setdefault(cell, {})
-            for name, of_episode in by_episode(features, fits).items():
-                by_name |= {
-                    (name, episode): eraser.removed[0].astype(np.float32) for episode, eraser in of_episode.items()
-                }
-            halves.setdefault(cell, {}).update(half_differences_of(features, fits, direction))
-    return {
-        cell: TokenDirections(by_name, halves[cell], control_names(controls))
-        for cell, by_name in passed_over.left(bases).items()
-    }
+            before = fitted.get(cell, Directions({}, {}))
+            bases = {
+                (name, episode): eraser.removed[0].astype(np.float32)
+                for name, of_episode in by_episode(features, fits).items()
+                for episode, eraser in of_episode.items()
+            }
+            halves = half_differences_of(features, fits, direction)
+            fitted[cell] = Directions(
+                {**before.bases, **bases}, {**before.halves, **halves}, control_names(controls)
+            )
+    return passed_over.left(fitted)
 
 
-@dataclass(frozen=True)
-class FixedDirections:
-    """Directions of a file and its controls, the same for every episode. bases, vectors: by name."""
-
-    bases: Mapping[str, Vector]
-    vectors: Mapping[str, Vector]
-    control_names: tuple[str, ...]
-
-    def basis(self, name: str, episode: str, category: str) -> Vector:
-        """Return (K, D) orthonormal rows."""
-        del episode, category
-        return self.bases[name]
-
-    def shift(self, name: str, episode: str, category: str, strength: float) -> Vector:
-        """Return (D,) so many vectors of the file; of a control one of the same length."""
-        del episode, category
-        return np.float32(strength) * self.vectors[name]
-
-
-def _of_file(session: ReplaySession, cell: Cell, vector: FileDirection, intervention: Directed) -> FixedDirections:
+def _of_file(session: ReplaySession, cell: Cell, vector: FileDirection, controls: int, seed: int) -> Directions:
     """Return a file's direction in a cell. Raises UsageError for another site, width or model."""
     run, site = session.run, cell.site_group.only_site
     vector.check(cell.site_group.name, run.streams[site.stream].width, run.weights_sha256)
     basis, total = vector.basis.astype(np.float64), vector.vectors.sum(axis=0)
-    bases, vectors = {vector.name: vector.basis}, {vector.name: total.astype(np.float32)}
-    names = control_names(intervention.controls)
+    bases, vectors = {(vector.name, EVERY_EPISODE): vector.basis}, {vector.name: total.astype(np.float32)}
+    names = control_names(controls)
     if names:
         view = resolve_view(view_of(cell.role), run.views(site.stream))
         features = run.column(site, view).astype(np.float64)
     for name in names:
-        draw = np.random.default_rng(derive_seed("control", intervention.seed, str(site), cell.role, name))
+        draw = np.random.default_rng(derive_seed("control", seed, str(site), cell.role, name))
         rows = list[NDArray[np.float64]]()
         for _ in basis:
             rows.append(_control(features, [*basis, *rows], draw))
-        bases[name] = np.array(rows, np.float32)
+        bases[name, EVERY_EPISODE] = np.array(rows, np.float32)
         vectors[name] = (np.linalg.norm(total) * rows[0]).astype(np.float32)
-    return FixedDirections(bases, vectors, names)
+    return Directions(bases, {}, names, vectors)
 
 
 class PassedOver:
@@ -220,36 +215,6 @@ class PassedOver:
 # -- of a mean over tokens -----------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class PooledDirections:
-    """Unit directions of one site and role, per category and fold.
-
-    units: by name and category (F, D) float32. half_differences: by category (F,), half the distance of the class
-    means along the first of them. fold_of: by episode.
-    """
-
-    units: Mapping[tuple[str, str], Vector]
-    half_differences: Mapping[str, NDArray[np.float64]]
-    fold_of: Mapping[str, int]
-    control_names: tuple[str, ...] = ()
-
-    def basis(self, name: str, episode: str, category: str) -> Vector:
-        """Return (1, D) the direction that never saw this episode."""
-        return self.of(name, episode, category)[None]
-
-    def of(self, name: str, episode: str, category: str) -> Vector:
-        """Return (D,) the direction that never saw this episode."""
-        return np.asarray(self.units[name, category][self.fold_of[episode]])
-
-    def half_difference(self, episode: str, category: str) -> float:
-        """Return half the distance of the class means, for this episode."""
-        return float(self.half_differences[category][self.fold_of[episode]])
-
-    def shift(self, name: str, episode: str, category: str, strength: float) -> Vector:
-        """Return (D,) so many half differences of the class means, toward `left`."""
-        return np.float32(strength * self.half_difference(episode, category)) * self.of(name, episode, category)
-
-
 def view_of(role: str) -> str:
     """Return the pooled view in which a role's tokens are averaged."""
     return "mean" if role == "all" else f"mean:{role}"
@@ -263,7 +228,7 @@ def fit_directions(
     controls: int,
     seed: int,
     categories: Sequence[str] | None = None,
-) -> PooledDirections:
+) -> Directions:
     """Directions of these categories, by default of all, from the pooled tokens of `role` at `site`.
 
     Raises UsageError for an unknown direction, NoDirectionError for equal class means, UnknownSiteError for a site
@@ -274,9 +239,8 @@ def fit_directions(
     episodes = run.episodes
     features = run.column(site, resolve_view(view_of(role), run.views(site.stream))).astype(np.float64)
     names = control_names(controls)
-    units: dict[tuple[str, str], Vector] = {}
-    gaps: dict[str, NDArray[np.float64]] = {}
-    fold_of: dict[str, int] = {}
+    bases: dict[tuple[str, str], Vector] = {}
+    halves: dict[str, NDArray[np.float64]] = {}
     for category in categories or dict.fromkeys(episodes["category"].astype(str)):
         rows = np.flatnonzero((episodes["category"] == category).to_numpy())
         is_left = (episodes["side_correct"].to_numpy()[rows] == "left").astype(int)
@@ -284,10 +248,7 @@ def fit_directions(
         folds = grouped_folds(
             is_left, groups, min(FOLDS, np.unique(groups).size), derive_seed("axes", seed, category)
         )
-        of_fold: dict[str, list[NDArray[np.float64]]] = {name: [] for name in (direction, *names)}
-        widths = []
         for number, fold in enumerate(folds):
-            fold_of |= {str(name): number for name in episodes["episode_id"].to_numpy()[rows[fold.test]]}
             training, labels = features[rows[fold.train]], is_left[fold.train].astype(bool)
             difference = training[labels].mean(axis=0) - training[~labels].mean(axis=0)
             if (np.abs(difference) <= _ROUNDING * np.abs(training).max(axis=0)).all():
@@ -295,14 +256,16 @@ def fit_directions(
                     f"{category}, {site}, role {role}: no direction for {direction}: {NO_DIRECTION}"
                 )
             unit = _direction(training, labels, direction)
-            widths.append(abs(float(difference @ unit)) / 2)
-            of_fold[direction].append(unit)
             draw = np.random.default_rng(derive_seed("control", seed, category, str(site), role, number))
-            for name in names:
-                of_fold[name].append(_control(training, [unit, _unit(difference)], draw))
-        units |= {(name, category): np.array(vectors, np.float32) for name, vectors in of_fold.items()}
-        gaps[category] = np.array(widths)
-    return PooledDirections(units, gaps, fold_of, names)
+            drawn = {name: _control(training, [unit, _unit(difference)], draw) for name in names}
+            of_fold = {
+                name: np.array(vector, np.float32)[None] for name, vector in {direction: unit, **drawn}.items()
+            }
+            half = np.array([abs(float(difference @ unit)) / 2])
+            for episode in map(str, episodes["episode_id"].to_numpy()[rows[fold.test]]):
+                bases |= {(name, episode): basis for name, basis in of_fold.items()}
+                halves[episode] = half
+    return Directions(bases, halves, names)
 
 
 def _direction(training: NDArray[np.float64], is_left: NDArray[np.bool_], direction: str) -> NDArray[np.float64]:
@@ -338,29 +301,6 @@ Fits = Sequence[tuple[Fold, Mapping[str, Eraser]]]
 """Every fold, and by name the eraser fitted on its training episodes."""
 _Row = tuple[Pair, NDArray[np.float64]]
 """The pair of one episode, and (T, D) its tokens."""
-
-
-@dataclass(frozen=True)
-class TokenDirections:
-    """The directions of one site and role, found in its tokens.
-
-    bases: by name and episode, (K, D) float32. half_differences: by episode (T, K), half the differences of the
-    class means at the role's positions along the directions that were asked for.
-    """
-
-    bases: Mapping[tuple[str, str], Vector]
-    half_differences: Mapping[str, NDArray[np.float64]]
-    control_names: tuple[str, ...] = ()
-
-    def basis(self, name: str, episode: str, category: str) -> Vector:
-        """(K, D) the directions that never saw this episode."""
-        del category  # an episode has one
-        return self.bases[name, episode]
-
-    def shift(self, name: str, episode: str, category: str, strength: float) -> Vector:
-        """(T, D) of all positions; a mark on either tile has its own sign at the positions of each."""
-        del category
-        return np.float32(strength * self.half_differences[episode]) @ self.bases[name, episode]
 
 
 @dataclass(frozen=True)
@@ -445,10 +385,17 @@ def fit_by_fold(
     seeds = derive_seed("erase", seed, category), derive_seed("control", seed, category, str(site), cell.role)
     folds = grouped_folds(features.is_left.astype(int), features.groups, groups, seeds[0])
     draw = np.random.default_rng(seeds[1])
+    fits = []
     try:
-        return [(fold, _fitted(features, fold, method, controls, draw)) for fold in folds]
+        for fold in folds:
+            training, is_left = features.tokens.only(fold.train), features.is_left[fold.train]
+            eraser = fit_eraser(training, is_left, method)
+            names = control_names(controls)
+            drawn = {name: fit_control(training, is_left, method, eraser, draw) for name in names}
+            fits.append((fold, {str(method): eraser, **drawn}))
     except UsageError as error:
         raise type(error)(f"{category}, {site}, role {cell.role}: {error}") from error
+    return fits
 
 
 def by_episode(features: TokenFeatures, fits: Fits) -> dict[str, dict[str, Eraser]]:
@@ -458,15 +405,6 @@ def by_episode(features: TokenFeatures, fits: Fits) -> dict[str, dict[str, Erase
         for name, eraser in fitted.items():
             erasers.setdefault(name, {}).update({features.episodes[row]: eraser for row in fold.test})
     return erasers
-
-
-def _fitted(
-    features: TokenFeatures, fold: Fold, method: Method, controls: int, draw: np.random.Generator
-) -> dict[str, Eraser]:
-    training, is_left = features.tokens.only(fold.train), features.is_left[fold.train]
-    eraser = fit_eraser(training, is_left, method)
-    drawn = {name: fit_control(training, is_left, method, eraser, draw) for name in control_names(controls)}
-    return {str(method): eraser, **drawn}
 
 
 def half_differences_of(features: TokenFeatures, fits: Fits, direction: str) -> dict[str, NDArray[np.float64]]:

@@ -1,6 +1,6 @@
 """The places at which stored interventions found that the answer passes and is read. Needs no model."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from itertools import starmap
 from typing import TYPE_CHECKING, Literal
@@ -15,7 +15,6 @@ from probe_kit.intervene.kinds.interchange import (
     best_cell,
     carrying_directions,
     is_backbone_layer,
-    is_upstream,
     localised_by_category,
     stored_site_effects,
     stored_subspace_effects,
@@ -31,7 +30,7 @@ from probe_kit.intervene.kinds.joint import (
 from probe_kit.intervene.outcomes import FIRST_CHUNK, PER_STEP
 from probe_kit.intervene.patching.attribution import LOCALISATION_SHARE
 from probe_kit.intervene.patching.sweep import NOTHING, carries_nothing
-from probe_kit.intervene.places import ALL, list_places, unread_places
+from probe_kit.intervene.places import ALL, PlaceName, list_places, unread_places
 from probe_kit.intervene.verdict import Places, UseVerdict, classify_behaviour, control_for
 from probe_kit.runs.reader import RunReader
 
@@ -70,19 +69,18 @@ def stored_places(evidence: StoredEvidence) -> dict[str, Places]:
     Raises RunDamagedError.
     """
     located, carried = localised_by_category(evidence.maps), carrying_directions(evidence.along)
-    searched = {name: rows for name, rows in evidence.joint.items() if _says_where(rows)}
+    searched = {}
+    for name, rows in evidence.joint.items():
+        (every,) = (row for row in rows if row.part == EVERY)
+        # A search of a part that carries nothing does not rule out the others.
+        if every.finding != "past it" or every.cells == KV_STREAM:
+            searched[name] = rows
     jointly = {name: describe_joint_places(rows) for name, rows in searched.items()}
     remainders = {name: describe_remainder(rows) for name, rows in searched.items()}
     return {
         name: Places(located.get(name), carried.get(name, ()), jointly.get(name, ""), remainders.get(name, ""))
         for name in dict.fromkeys((*located, *carried, *jointly))
     }
-
-
-def _says_where(rows: Sequence[JointEffect]) -> bool:
-    """Whether a search belongs into a verdict: one of a part that carries nothing does not rule out the others."""
-    (every,) = (row for row in rows if row.part == EVERY)
-    return every.finding != "past it" or every.cells == KV_STREAM
 
 
 def stored_other_readouts(run: RunReader, swaps: Mapping[str, ImageSwapEffect]) -> dict[str, UseVerdict]:
@@ -127,26 +125,31 @@ def tie_at_site(
     if full is None or full.effect_ci is None:
         return "not tested"
     if carries_nothing(*full.effect_ci):
-        return "unread" if full.role == ALL else _without_others(full, layer)
+        other_roles = [row for row in layer if row.role not in (ALL, full.role)]
+        if full.role == ALL or any(row.is_localised for row in other_roles):
+            return "unread"
+        every_token = next((row.effect_ci for row in layer if row.role == ALL and row.effect_ci is not None), None)
+        return "not tested" if every_token is None else "unread" if carries_nothing(*every_token) else "in part"
     tested = [row.effect_ci for row in along if row.effect_ci is not None]
-    if not tested:
-        return "not tested"
-    if not all(starmap(carries_nothing, tested)):
+    if tested and not all(starmap(carries_nothing, tested)):
         return "in part"
-    if not any(row.direction.startswith(MEAN_DIFFERENCE) for row in along):
+    if not tested or not any(row.direction.startswith(MEAN_DIFFERENCE) for row in along):
         return "not tested"
     carries = full.effect is not None and full.effect >= LOCALISATION_SHARE
     return "another code" if carries else "in part"
 
 
-def _without_others(full: PatchEffect, layer: Sequence[PatchEffect]) -> TieAtSite:
-    """The tie of a role that carries nothing alone."""
-    if any(row.is_localised and row.role not in (ALL, full.role) for row in layer):
-        return "unread"
-    every = next((row for row in layer if row.role == ALL and row.effect_ci is not None), None)
-    if every is None or every.effect_ci is None:
-        return "not tested"
-    return "unread" if carries_nothing(*every.effect_ci) else "in part"
+def _is_read_along(row: PatchEffect) -> bool:
+    """Whether a direction carries the effect, beyond its controls."""
+    is_beyond = row.effect_ci is not None and row.effect_ci[0] > NOTHING
+    return row.is_localised and row.control_displacement is not None and is_beyond
+
+
+def _tie(rows: Sequence[PatchEffect], along: Sequence[PatchEffect], site: str, role: str) -> TieAtSite:
+    """Return `tie_at_site` of one place and role. rows, along: of one category."""
+    full = next((row for row in rows if (row.place, row.role) == (site, role)), None)
+    within = [row for row in along if (row.place, row.role) == (site, role) and not row.is_control]
+    return tie_at_site(full, within, [row for row in rows if row.place == site])
 
 
 def describe_tie(sites: Sites, is_joint: bool = False) -> str:
@@ -180,75 +183,40 @@ def stored_ties(
 
     view: None for the first that was probed. Empty without probes, and for views that are no mean over a role.
     """
-    role = None if results is None else role_of_view(view or results.settings.views[0])
-    if results is None or role is None:
+    if results is None or (role := role_of_view(view or results.settings.views[0])) is None:
         return {}
     scores = results.scores
-    backbone_scores = scores[
-        (scores["stream"] == BACKBONE) & (scores["view"] == (view or results.settings.views[0]))
-    ]
-    in_full, along, jointly = evidence.maps, _of_answers(evidence.along), evidence.joint
+    in_view = (scores["stream"] == BACKBONE) & (scores["view"] == (view or results.settings.views[0]))
     ties = {}
-    for category, rows in backbone_scores.groupby("category", sort=False):
+    for category, rows in scores[in_view].groupby("category", sort=False):
         name = str(category)
-        patched, within = in_full.get(name, ()), along.get(name, ())
+        patched = evidence.maps.get(name, ())
+        along = [  # one of a file need not be the answer's
+            row
+            for row in evidence.along.get(name, ())
+            if row.is_control or row.direction in DIRECTIONS or row.direction.startswith(f"{MEAN_DIFFERENCE}:")
+        ]
         significant = [f"{BACKBONE}.{int(layer):02d}" for layer in rows.loc[rows["signal"], "layer"]]
-        pooled = [row.place for row in within if row.role == role and _is_pooled_carrier(row)]
+        # A direction of the mean over a role's tokens that carries the effect.
+        is_pooled = [_is_read_along(row) and ":" not in row.direction and is_backbone_layer(row) for row in along]
+        pooled = [row.place for row, is_mean in zip(along, is_pooled, strict=True) if is_mean and row.role == role]
         if pooled and not significant:
             ties[name] = f"{UNPROBED} ({list_places([f'{site} {role}' for site in pooled])})"
             continue
-        places = sorted({*significant, *pooled})
-        sites = {
-            (site, role): tie_at_site(
-                next(iter(_at(patched, site, role)), None),
-                [row for row in _at(within, site, role) if not row.is_control],
-                [row for row in patched if row.place == site],
-            )
-            for site in places
-        }
-        inside = {at: tie for at, tie in sites.items() if tie != "not tested" or not is_upstream(at[0])}
-        ties[name] = describe_tie(inside, is_read_jointly(jointly.get(name, ())))
+        sites = {(site, role): _tie(patched, along, site, role) for site in sorted({*significant, *pooled})}
+        inside = {at: tie for at, tie in sites.items() if tie != "not tested" or PlaceName.parse(at[0]).layer}
+        ties[name] = describe_tie(inside, is_read_jointly(evidence.joint.get(name, ())))
     return ties
-
-
-def _of_answers(along: Mapping[str, Sequence[PatchEffect]]) -> dict[str, list[PatchEffect]]:
-    """Return rows along directions of the answer and their controls; one of a file need not be the answer's."""
-    return {
-        name: [row for row in rows if row.is_control or _is_of_answer(row.direction)]
-        for name, rows in along.items()
-    }
-
-
-def _is_of_answer(direction: str) -> bool:
-    return direction in DIRECTIONS or direction.startswith(f"{MEAN_DIFFERENCE}:")
-
-
-def _is_pooled_carrier(row: PatchEffect) -> bool:
-    """Whether a direction of the mean over a role's tokens carries the effect, beyond its controls."""
-    return _is_read_along(row) and ":" not in row.direction and is_backbone_layer(row)
-
-
-def _is_read_along(row: PatchEffect) -> bool:
-    return row.is_localised and row.control_displacement is not None and _low(row) > NOTHING
-
-
-def _at(rows: Iterable[PatchEffect], site: str, role: str) -> list[PatchEffect]:
-    return [row for row in rows if (row.place, row.role) == (site, role)]
-
-
-def _low(row: PatchEffect) -> float:
-    return -1.0 if row.effect_ci is None else row.effect_ci[0]
 
 
 ALONG = f"{MEAN_DIFFERENCE}:1"
 """Direction that moves an answer in every token alike, and one that lies in which tokens are marked."""
-_NOT_PATCHED = "was not patched"
 _TIES: dict[TieAtSite, str] = {
     "read": "is read",
     "unread": "is unread",
     "another code": "holds another code than the one that is used",
     "in part": "carries a part of the effect",
-    "not tested": _NOT_PATCHED,
+    "not tested": "was not patched",
 }
 
 
@@ -266,38 +234,23 @@ def which_layer(
     results: the newest probes, None without any. places: as `stored_places` gives them. Of stored interchanges and
     joint places; what was not tested is named with the command that tests it.
     """
-    maps, along = evidence.maps, evidence.along
+    family = get_family(run.model)
+    has_kv = family is not None and family.interventions.supports("kv")
     lines = {}
     for name in categories:
-        rows, category_places = maps.get(name, []), places.get(name)
-        cell = best_cell(rows)
-        passes = _passes(
-            rows, () if category_places is None or category_places.located is None else category_places.located
-        )
+        rows, category_places = evidence.maps.get(name, []), places.get(name) or Places()
+        passes, cell = "--kind interchange tests where the answer passes", best_cell(rows)
+        if any(row.role == ALL and is_backbone_layer(row) for row in rows):
+            located = [site for site in category_places.located or () if site.partition(".")[0] == BACKBONE]
+            none = "no layer of the backbone carries half of it"
+            passes = f"passes at {list_places(located)}" if located else none
         if cell is not None and is_backbone_layer(cell):
             passes += f"; steer at {cell.place} {cell.role} with --direction {ALONG}"
-        parts = [
-            passes,
-            _read(run, "" if category_places is None else str(category_places)),
-            _best_site(run, results, name, rows, along.get(name, [])),
-        ]
-        lines[name] = [part for part in parts if part]
+        read = [part for part in str(category_places).split("; ") if part.startswith("read ") or KV_STREAM in part]
+        reads = ("; ".join(read) or "--kind joint tests where it is read") * has_kv
+        best = _best_site(run, results, name, rows, evidence.along.get(name, []))
+        lines[name] = [part for part in (passes, reads, best) if part]
     return lines
-
-
-def _passes(rows: Sequence[PatchEffect], located: Sequence[str]) -> str:
-    if not any(row.role == ALL and is_backbone_layer(row) for row in rows):
-        return "--kind interchange tests where the answer passes"
-    passes = [site for site in located if site.partition(".")[0] == BACKBONE]
-    return f"passes at {list_places(passes)}" if passes else "no layer of the backbone carries half of it"
-
-
-def _read(run: RunReader, places: str) -> str:
-    family = get_family(run.model)
-    if family is None or not family.interventions.supports("kv"):
-        return ""
-    read = [part for part in places.split("; ") if part.startswith("read ") or KV_STREAM in part]
-    return "; ".join(read) or "--kind joint tests where it is read"
 
 
 def _best_site(
@@ -316,20 +269,14 @@ def _best_site(
     if site_scores.empty:
         return ""
     best = site_scores.loc[site_scores["accuracy"].idxmax()]
-    site = f"{BACKBONE}.{int(best['layer']):02d}"
-    signal = "" if best["signal"] else " (no signal)"
-    return f"the probes' best site {site}{signal} {_in_words(run, site, view, rows, along)}"
-
-
-def _in_words(
-    run: RunReader, site: str, view: str, rows: Sequence[PatchEffect], along: Sequence[PatchEffect]
-) -> str:
-    family, role = get_family(run.model), role_of_view(view)
+    site, family = f"{BACKBONE}.{int(best['layer']):02d}", get_family(run.model)
+    tie, role = "", role_of_view(view)
     if family is not None and unread_places([site], run.streams, family.interventions):
-        return "is unread: nothing that acts reads the end of the backbone"
-    full = next((row for row in rows if (row.place, row.role) == (site, role)), None)
-    inside = [row for row in along if (row.place, row.role) == (site, role) and not row.is_control]
-    tie = tie_at_site(full, inside, [row for row in rows if row.place == site])
-    if tie == "not tested" and full is not None and full.is_localised:
-        return "carries the effect; --direction mean-difference tests what probes read there"
-    return _TIES[tie]
+        tie = "is unread: nothing that acts reads the end of the backbone"
+    else:
+        at_site = _tie(rows, along, site, role or "")
+        tie = _TIES[at_site]
+        carries = any((row.place, row.role) == (site, role) and row.is_localised for row in rows)
+        if at_site == "not tested" and carries:
+            tie = "carries the effect; --direction mean-difference tests what probes read there"
+    return f"the probes' best site {site}{'' if best['signal'] else ' (no signal)'} {tie}"

@@ -13,11 +13,11 @@ pooled, whichever intervention they came with. Needs no model.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from datetime import UTC, datetime
 from io import BytesIO
 from types import MappingProxyType
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,50 +37,67 @@ FORMAT = 2  # raise when stored numbers would be others
 DONORS = 2  # the rule of `draw_donors`; raise when it gives other donors
 FIRST_CHUNK: Readout = "first-chunk"
 PER_STEP: Readout = "per-step"
-
-
+CLEAN, IMAGE_SWAP, INSTRUCTION_SWAP, NOISE = "clean", "image_swap", "instruction_swap", "noise"
+"""Conditions: as in the run, the two pictures swapped, the counterpart's instruction, the noise drawn anew."""
+ERASE, PROBE_ACCURACY = "erase", "probe_accuracy"
+"""A kind, and what its certificate calls what probes read behind its conditions."""
+ATTENTION, RECORDED, ATTENTION_FILE = "attention", "recorded", "attention.npz"
+"""A kind, its condition with recorded weights, and the file in which they are."""
+PATCHES_FILE = "attention_patches.npz"
+"""The attention on single patches of the first camera's picture, and where they lie in it."""
+DONOR, CONTROL_INPUT = "frame_swap", "control_input"
+"""Conditions without sides: all inputs of the donor, and a change of the input that means nothing."""
+UNCHANGED = frozenset({CLEAN, IMAGE_SWAP, INSTRUCTION_SWAP, NOISE, RECORDED, DONOR, CONTROL_INPUT})
+"""Conditions in which nothing inside the network is changed."""
+EPISODES, EFFECTS, CERTIFICATE = "episodes.npz", "effects.csv", "certificate.json"
 PairRow = tuple[str, int, str, int]
 """Episode and frame of the clean inference, and of its donor."""
 
 
-class PairChoice(Protocol):
-    """The pairs that an intervention takes of a run without sides."""
+# -- settings ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Choice:
+    """The part of a run that an intervention is made on, as settings; see `kinds.base.Intervention`.
+
+    Fields are those of every intervention. kind, usual_vary: of the class.
+    """
+
+    kind: ClassVar[str]
+    usual_vary: ClassVar[str] = "picture"
+
+    categories: tuple[str, ...] | None = None
+    items: int | None = None
+    readout: Readout = FIRST_CHUNK
+    vary: str = ""
+    frames: int | None = None
+    pairs: tuple[PairRow, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.items is not None and self.items < 1:
+            raise UsageError(f"items is {self.items}; expected at least 1")
+        if self.readout not in get_args(Readout):
+            raise UsageError(f"readout is {self.readout!r}; expected one of {', '.join(get_args(Readout))}")
 
     @property
     def varied(self) -> str:
         """Return the input that the source has of its donor."""
-
-    @property
-    def frames(self) -> int | None:
-        """Return the number of frames of each episode, evenly spaced; None for the default."""
-
-    @property
-    def pairs(self) -> tuple[PairRow, ...]:
-        """Return pairs of the user's own; empty for donors that are drawn."""
+        return self.vary or self.usual_vary
 
     def items_in(self, run: Run) -> list[str]:
         """Return the items of a run that are replayed."""
-
-
-class Asked(PairChoice, Protocol):
-    """The settings of an intervention, of whichever kind; see `kinds.base.Intervention`."""
-
-    kind: ClassVar[str]
-
-    @property
-    def categories(self) -> tuple[str, ...] | None:
-        """Return the categories of the run; None for all."""
-
-    @property
-    def items(self) -> int | None:
-        """Return the number of items of each category, the first ones; None for all."""
-
-    @property
-    def readout(self) -> Readout:
-        """Return the part of the policy's answer that is read."""
+        return items_of(run, self.categories, self.items)
 
     def parameters(self) -> dict[str, Any]:
-        """Return all else that decides its numbers, as plain JSON."""
+        """Return its own settings as plain JSON; with the run they decide its numbers."""
+        common = {setting.name for setting in fields(Choice)}
+        values = {
+            setting.name: getattr(self, setting.name)
+            for setting in fields(self)
+            if setting.init and setting.name not in common
+        }
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
 
 def categories_in(run: Run, categories: Sequence[str] | None) -> tuple[str, ...]:
@@ -107,8 +124,13 @@ def items_of(run: Run, categories: Sequence[str] | None, items: int | None) -> l
     return selected
 
 
-def settings_of(intervention: Asked, run: Run) -> dict[str, Any]:
+def settings_of(intervention: Choice, run: Run) -> dict[str, Any]:
     """Return everything that decides the numbers, as plain JSON; its hash is the key."""
+    pairs: dict[str, Any] = {}
+    if not has_sides(run):
+        pairs = {"vary": intervention.varied, "frames": intervention.frames}
+        pairs["pairs"] = [list(row) for row in intervention.pairs]
+        pairs |= {} if intervention.pairs else {"donors": DONORS}
     return {
         "format": FORMAT,
         "kind": intervention.kind,
@@ -119,14 +141,9 @@ def settings_of(intervention: Asked, run: Run) -> dict[str, Any]:
         "categories": list(categories_in(run, intervention.categories)),
         "items": intervention.items,
         "readout": intervention.readout,
-        **({} if has_sides(run) else _pairs_of(intervention)),
+        **pairs,
         **intervention.parameters(),
     }
-
-
-def _pairs_of(choice: PairChoice) -> dict[str, Any]:
-    drawn = {} if choice.pairs else {"donors": DONORS}
-    return {"vary": choice.varied, "frames": choice.frames, "pairs": [list(row) for row in choice.pairs], **drawn}
 
 
 def has_sides(run: Run) -> bool:
@@ -160,19 +177,26 @@ def check_run_fits(run: Run) -> None:
         raise UsageError(f"{run.location}: {why}")
 
 
-CLEAN, IMAGE_SWAP, INSTRUCTION_SWAP, NOISE = "clean", "image_swap", "instruction_swap", "noise"
-"""Conditions: as in the run, the two pictures swapped, the counterpart's instruction, the noise drawn anew."""
-ERASE, PROBE_ACCURACY = "erase", "probe_accuracy"
-"""A kind, and what its certificate calls what probes read behind its conditions."""
-ATTENTION, RECORDED, ATTENTION_FILE = "attention", "recorded", "attention.npz"
-"""A kind, its condition with recorded weights, and the file in which they are."""
-PATCHES_FILE = "attention_patches.npz"
-"""The attention on single patches of the first camera's picture, and where they lie in it."""
-DONOR, CONTROL_INPUT = "frame_swap", "control_input"
-"""Conditions without sides: all inputs of the donor, and a change of the input that means nothing."""
-UNCHANGED = frozenset({CLEAN, IMAGE_SWAP, INSTRUCTION_SWAP, NOISE, RECORDED, DONOR, CONTROL_INPUT})
-"""Conditions in which nothing inside the network is changed."""
-EPISODES, EFFECTS, CERTIFICATE = "episodes.npz", "effects.csv", "certificate.json"
+# -- outcomes ------------------------------------------------------------------------------------------------
+
+
+def arrays_to_bytes(record: object, without: Sequence[str] = ()) -> bytes:
+    """Return the attributes of an object as a `.npz`; the same numbers give the same bytes."""
+    file = BytesIO()
+    arrays = {
+        name: np.array(value) if isinstance(value, tuple) else value
+        for name, value in vars(record).items()
+        if value is not None and name not in without
+    }
+    np.savez_compressed(file, allow_pickle=False, **arrays)
+    return file.getvalue()
+
+
+def arrays_from_bytes(content: bytes, texts: str = "") -> dict[str, Any]:
+    """Return the arrays of a `.npz` by name. texts: the one that becomes a tuple of strings."""
+    with open_arrays(content) as arrays:
+        values: dict[str, Any] = dict(arrays)
+    return {name: tuple(map(str, value)) if name == texts else value for name, value in values.items()}
 
 
 BY_CONDITION = ("displacement", "max_action_change", "edit_log", "episode_outcomes", "toward", "size")
@@ -188,7 +212,8 @@ class ConditionOutcomes:
     (K, E) largest difference of any action from the clean one's. edit_log: (K, E, 5), see `LOG_FIELDS`.
     replay_error: (E,) of the clean one from the stored one. toward, size: (K, E) displacement toward the source's
     action and size of the change, in spreads of clean actions; None where whole episodes were played.
-    episode_outcomes: (K, E) correct, wrong or oob, where episodes were played to their end; else None.
+    episode_outcomes: (K, E) correct, wrong or oob, where episodes were played to their end; else None. seed_text:
+    of the run, by which random draws are made; it is not stored.
     """
 
     conditions: tuple[str, ...]
@@ -204,6 +229,7 @@ class ConditionOutcomes:
     episode_outcomes: NDArray[np.str_] | None = None
     toward: NDArray[np.float64] | None = None
     size: NDArray[np.float64] | None = None
+    seed_text: str = ""
 
     @property
     def has_sides(self) -> bool:
@@ -219,38 +245,34 @@ class ConditionOutcomes:
         """(E,) +1 where the correct picture lies left, −1 where it lies right, or where nothing has a side."""
         return np.where(self.sides == "left", 1.0, -1.0)
 
-    def only(self, category: str) -> "ConditionOutcomes":
-        """The episodes of one category."""
-        return self.of_episodes(self.categories == category)
+    @property
+    def counts(self) -> dict[str, Any]:
+        """Return category, and numbers of episodes, items and groups, as columns of a row; of one category."""
+        sizes = {"n_items": np.unique(self.items).size, "n_groups": np.unique(self.groups).size}
+        return {"category": str(self.categories[0]), "n_episodes": self.episodes.size, **sizes}
 
     def of_episodes(self, selected: NDArray[np.bool_]) -> "ConditionOutcomes":
         """Some of the episodes. selected: (E,)."""
-        axes = dict.fromkeys(BY_CONDITION, 1)
         cut: dict[str, Any] = {
-            name: np.compress(selected, value, axes.get(name, 0))
+            name: np.compress(selected, value, int(name in BY_CONDITION))
             for name, value in vars(self).items()
-            if name != "conditions" and value is not None
+            if isinstance(value, np.ndarray)
         }
-        return ConditionOutcomes(self.conditions, **cut)
+        return replace(self, **cut)
 
     def by_category(self) -> "list[tuple[str, ConditionOutcomes]]":
         """Every category with its episodes, in the order of the episodes."""
-        return [(name, self.only(name)) for name in dict.fromkeys(map(str, self.categories))]
+        names = dict.fromkeys(map(str, self.categories))
+        return [(name, self.of_episodes(self.categories == name)) for name in names]
 
     def to_bytes(self) -> bytes:
         """Return a `.npz`; the same numbers give the same bytes."""
-        file = BytesIO()
-        arrays = {name: value for name, value in vars(self).items() if value is not None}
-        arrays["conditions"] = np.array(self.conditions)
-        np.savez_compressed(file, allow_pickle=False, **arrays)
-        return file.getvalue()
+        return arrays_to_bytes(self, ("seed_text",))
 
     @classmethod
-    def from_bytes(cls, content: bytes) -> "ConditionOutcomes":
+    def from_bytes(cls, content: bytes, seed_text: str = "") -> "ConditionOutcomes":
         """Load what `to_bytes` gave."""
-        with open_arrays(content) as arrays:
-            values: dict[str, Any] = dict(arrays)
-        return cls(**{**values, "conditions": tuple(map(str, values["conditions"]))})
+        return cls(**arrays_from_bytes(content, "conditions"), seed_text=seed_text)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -264,11 +286,15 @@ class Effect:
         return asdict(self)
 
 
+# -- the store -----------------------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True)
 class StoredIntervention:
-    """One stored intervention. settings: see `settings.settings_of`. created: when it was made."""
+    """One stored intervention. seed_text: of its run."""
 
     bundle: Bundle
+    seed_text: str = field(repr=False)
 
     @property
     def key(self) -> str:
@@ -277,18 +303,23 @@ class StoredIntervention:
 
     @property
     def settings(self) -> Mapping[str, Any]:
-        """Return what decided its numbers."""
+        """Return what decided its numbers, see `settings_of`."""
         settings: Mapping[str, Any] = self.bundle.head["settings"]
         return settings
 
     @property
-    def created(self) -> str:
-        """ISO time, UTC."""
-        return self.bundle.times.get("created", "")
+    def readout(self) -> str:
+        """`first-chunk` or `per-step`."""
+        return str(self.settings.get("readout", FIRST_CHUNK))
+
+    @property
+    def newest(self) -> tuple[str, str]:
+        """Return the ISO time (UTC) at which it was made, and the key, which decide between equals."""
+        return self.bundle.times.get("created", ""), self.key
 
     def outcomes(self) -> ConditionOutcomes:
         """Read what was measured. Raises RunDamagedError if it was changed."""
-        return ConditionOutcomes.from_bytes(self.bundle.read(EPISODES))
+        return ConditionOutcomes.from_bytes(self.bundle.read(EPISODES), self.seed_text)
 
     def certificate(self) -> dict[str, Any]:
         """Read what was loaded and checked. Raises RunDamagedError if it was changed."""
@@ -336,17 +367,16 @@ def stored_interventions(run: RunReader, kind: str | None = None) -> list[Stored
     kind: only these. Raises RunDamagedError if any of the run was changed, lost its settings or has another
     format.
     """
-    interventions = [StoredIntervention(bundle) for bundle in read_interventions(run.location).values()]
     required = {
         "stamp": run.stamp, "run_settings": run.settings_sha256,
         "wording": run.wording, **({} if kind is None else {"kind": kind}),
     }  # fmt: skip
     fitting = [
-        intervention
-        for intervention in interventions
-        if all(intervention.settings.get(name) == value for name, value in required.items())
+        StoredIntervention(bundle, run.seed_text)
+        for bundle in read_interventions(run.location).values()
+        if all(bundle.head["settings"].get(name) == value for name, value in required.items())
     ]
-    return sorted(fitting, key=lambda intervention: (intervention.created, intervention.key))
+    return sorted(fitting, key=lambda intervention: intervention.newest)
 
 
 def find_stored(run: RunReader, key: str | None = None, kind: str | None = None) -> StoredIntervention:
@@ -366,47 +396,24 @@ def find_stored(run: RunReader, key: str | None = None, kind: str | None = None)
     return by_key[complete_key(key, by_key, run.location, "interventions")]
 
 
+# -- the choice among stored ones ----------------------------------------------------------------------------
+
+
 Rank = tuple[bool, int, bool]
+"""The larger, the more a result says: rightly read, of more episodes, as its family says it should be read.
+
+Wrongly read is the first inference of a family in which that says little (`per-step`).
+"""
 
 
 @dataclass(frozen=True)
 class StoredResult:
-    """The part of one stored intervention that is of one category. outcomes: of its episodes alone.
-
-    own_readout: whether it was read as its family says it should be. wrong_readout: whether it was not, and the
-    family is one whose first inference says little (`per-step`).
-    """
+    """The part of one stored intervention that is of one category. outcomes: of its episodes alone."""
 
     stored: StoredIntervention
     category: str
     outcomes: ConditionOutcomes
-    own_readout: bool
-    wrong_readout: bool
-
-    @classmethod
-    def all_of(cls, stored: StoredIntervention) -> "list[StoredResult]":
-        """One per category. Raises RunDamagedError if it was changed."""
-        readout = stored.settings.get("readout", FIRST_CHUNK)
-        family = stored.certificate().get("supported", {}).get("readout", FIRST_CHUNK)
-        return [
-            cls(stored, category, outcomes, readout == family, family == PER_STEP != readout)
-            for category, outcomes in stored.outcomes().by_category()
-        ]
-
-    @property
-    def readout(self) -> str:
-        """`first-chunk` or `per-step`."""
-        return str(self.stored.settings.get("readout", FIRST_CHUNK))
-
-    @property
-    def rank(self) -> Rank:
-        """The larger, the more it says: rightly read, then of more episodes."""
-        return not self.wrong_readout, self.outcomes.episodes.size, self.own_readout
-
-    @property
-    def newest(self) -> tuple[str, str]:
-        """Return the time, which decides between what says as much."""
-        return self.stored.created, self.stored.key
+    rank: Rank
 
 
 def stored_results(run: RunReader, kind: str) -> list[StoredResult]:
@@ -415,11 +422,19 @@ def stored_results(run: RunReader, kind: str) -> list[StoredResult]:
     Of what says as much the newest. Raises RunDamagedError.
     """
     order = {name: at for at, name in enumerate(dict.fromkeys(run.episodes["category"].astype(str)))}
-    every = [result for stored in stored_interventions(run, kind) for result in StoredResult.all_of(stored)]
+    results = []
+    for stored in stored_interventions(run, kind):
+        family = stored.certificate().get("supported", {}).get("readout", FIRST_CHUNK)
+        is_wrong = family == PER_STEP != stored.settings.get("readout", FIRST_CHUNK)
+        for category, outcomes in stored.outcomes().by_category():
+            rank = not is_wrong, outcomes.episodes.size, stored.readout == family
+            results.append(StoredResult(stored, category, outcomes, rank))
     return sorted(
-        every,
-        key=lambda result: (order.get(result.category, len(order)), result.category, result.rank, result.newest),
-    )
+        results,
+        key=lambda result: (
+            order.get(result.category, len(order)), result.category, result.rank, result.stored.newest,
+        ),
+    )  # fmt: skip
 
 
 def preferred_by_category(run: RunReader, kind: str, readout: str | None = None) -> dict[str, StoredResult]:
@@ -428,7 +443,7 @@ def preferred_by_category(run: RunReader, kind: str, readout: str | None = None)
     readout: of those alone; None for any.
     """
     results = stored_results(run, kind)
-    return {result.category: result for result in results if readout in (None, result.readout)}
+    return {result.category: result for result in results if readout in (None, result.stored.readout)}
 
 
 @dataclass(frozen=True)
@@ -446,17 +461,15 @@ class PooledConditions:
         base = self.like.outcomes
         unchanged = [name for name in (CLEAN, IMAGE_SWAP) if name in base.conditions]
         every = [(base, name) for name in unchanged] + [(self.sources[name].outcomes, name) for name in conditions]
-        rows = [(outcomes, outcomes.conditions.index(name)) for outcomes, name in every]
-        stacked = {field: _stacked(field, rows) for field in BY_CONDITION}
+        stacked: dict[str, Any] = {}
+        for array in BY_CONDITION:
+            values = [getattr(outcomes, array) for outcomes, _ in every]
+            rows = (outcomes.conditions.index(name) for outcomes, name in every)
+            has_all = all(value is not None for value in values)  # an older one may be stored without it
+            stacked[array] = (
+                np.stack([value[row] for value, row in zip(values, rows, strict=True)]) if has_all else None
+            )
         return replace(base, conditions=tuple(name for _, name in every), **stacked)
-
-
-def _stacked(field: str, rows: Sequence[tuple[ConditionOutcomes, int]]) -> Any:
-    """A field of the conditions in these rows, (K, …); None where any of them was stored without it."""
-    values = [getattr(outcomes, field) for outcomes, _ in rows]
-    if any(value is None for value in values):
-        return None
-    return np.stack([value[row] for value, (_, row) in zip(values, rows, strict=True)])
 
 
 def pool_conditions(results: Iterable[StoredResult], setting: Sequence[str] = ()) -> list[PooledConditions]:

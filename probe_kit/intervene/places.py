@@ -76,6 +76,8 @@ def groups_and_items(pairs: Sequence[Pair]) -> tuple[list[str], list[str]]:
 
 # -- tables of the user's own --------------------------------------------------------------------------------
 
+MOST_FRAMES = 8
+"""Numbers of frames that a message names."""
 PAIR_COLUMNS = ("episode", "frame", "donor_episode", "donor_frame")
 
 
@@ -107,14 +109,11 @@ def check_pairs(table: Sequence[PairRow], frames: Collection[tuple[str, int]]) -
         if (episode, number) not in frames:
             numbers = sorted(frame for name, frame in frames if name == episode)
             first = next(iter(frames), ("none", 0))[0]
-            its = f"of that episode {_listed(numbers)}" if numbers else f"episodes such as {first!r}"
+            some = ", ".join(map(str, numbers[:MOST_FRAMES])) + ", …" * (len(numbers) > MOST_FRAMES)
+            its = f"of that episode {some}" if numbers else f"episodes such as {first!r}"
             raise UsageError(
                 f"the run has no frame {number} of {episode!r}, which the table of pairs names; it has {its}"
             )
-
-
-def _listed(numbers: Sequence[int], most: int = 8) -> str:
-    return ", ".join(map(str, numbers[:most])) + ", …" * (len(numbers) > most)
 
 
 def _episode(text: str) -> str:
@@ -263,7 +262,9 @@ def resolve_sites(pattern: str, policy: "Model") -> list[SiteGroup]:
     """
     match, streams = _PATTERN.fullmatch(pattern), policy.every_stream()
     if match is not None and match["stream"] == KV_STREAM:
-        _check_kv(policy)
+        interventions = getattr(policy, "interventions", None)
+        if interventions is not None:
+            interventions.check("kv", policy.card.family)
     if match is None or match["stream"] not in streams:
         raise UnknownSiteError(
             f"{pattern!r} names no place; expected STREAM.LAYER such as backbone.*, backbone.02, expert.03@0-4 or "
@@ -300,13 +301,6 @@ def parse_pattern(pattern: str) -> dict[str, str | None] | None:
 def names_one_place(pattern: str) -> bool:
     """Whether a pattern has no wildcard, so that its place was meant by name."""
     return "*" not in pattern
-
-
-def _check_kv(model: "Model") -> None:
-    """Raise UnsupportedInterventionError for a policy without keys and values of the prompt."""
-    interventions = getattr(model, "interventions", None)
-    if interventions is not None:
-        interventions.check("kv", model.card.family)
 
 
 def _site_group(stream: "Stream", name: PlaceName) -> SiteGroup:

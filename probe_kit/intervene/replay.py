@@ -1,8 +1,8 @@
 """Conditions: the ways in which one inference is made again, and the numbers of each. Loads no model."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from probe_kit.intervene.places import Chunk, Given, Pair
 
 if TYPE_CHECKING:
     from probe_kit.hooks import ActivationCache
-    from probe_kit.intervene.directions import DirectionBasis
+    from probe_kit.intervene.directions import Directions
     from probe_kit.intervene.sessions import ReplaySession
 
 
@@ -31,6 +31,10 @@ class ConditionContext:
     pair: Pair
     memo: dict[Any, Any] = field(default_factory=dict)
     clean: Chunk = field(default_factory=lambda: np.zeros((0, 7), np.float32))
+
+    def act(self) -> Chunk:
+        """Return (chunk, D), the action on the clean input."""
+        return self.session.act(self.pair.clean, self.pair.seed)
 
     def source(self, sites: Sequence[Site]) -> "ActivationCache":
         """Return the activations of all these sites in the source's inference; made once."""
@@ -60,81 +64,64 @@ class ConditionResult:
     estimated: float = 0.0
 
 
-class Condition(Protocol):
-    """One way of making an inference again."""
-
-    @property
-    def name(self) -> str:
-        """Return the name that tells it from the others of its intervention."""
-
-    def play(self, context: ConditionContext) -> ConditionResult:
-        """Make the inference."""
-
-
 @dataclass(frozen=True)
-class CleanRun:
-    """The inference as the run made it. inputs: which of the pair's; subclasses take others with the same seed."""
+class Condition:
+    """One way of making an inference again.
 
-    name: str = CLEAN
-    inputs: ClassVar[str] = "clean"
+    name: tells it from the others of its intervention. details: what `Intervention.extra_files` reads of it.
+    """
 
-    def play(self, context: ConditionContext) -> ConditionResult:
-        """Infer with nothing changed inside the network."""
-        inputs: Given | None = getattr(context.pair, self.inputs)
-        assert inputs is not None
-        return ConditionResult(context.session.act(inputs, context.pair.seed))
+    name: str
+    play: Callable[[ConditionContext], ConditionResult] = field(repr=False)
+    details: Any = field(default=None, repr=False)
 
 
-@dataclass(frozen=True)
-class SourceRun(CleanRun):
-    """The source's inference with the same seed: in the scene, the two pictures in each other's place."""
+def _of_input(name: str, which: str) -> Condition:
+    """Return the inference on one of a pair's inputs, with the same seed and nothing changed in the network."""
 
-    name: str = IMAGE_SWAP
-    inputs: ClassVar[str] = "source"
+    def play(context: ConditionContext) -> ConditionResult:
+        model_input: Given | None = getattr(context.pair, which)
+        assert model_input is not None
+        return ConditionResult(context.session.act(model_input, context.pair.seed))
 
-
-@dataclass(frozen=True)
-class DonorRun(CleanRun):
-    """The donor's inference with the same seed: all inputs are its own."""
-
-    name: str = DONOR
-    inputs: ClassVar[str] = "donor"
+    return Condition(name, play)
 
 
-@dataclass(frozen=True)
-class ControlInput(CleanRun):
-    """The clean inference after a change of the varied input that means nothing."""
+CLEAN_RUN = _of_input(CLEAN, "clean")
+"""The inference as the run made it."""
+SOURCE_RUN = _of_input(IMAGE_SWAP, "source")
+"""The source's inference: in the scene, the two pictures in each other's place."""
+DONOR_RUN = _of_input(DONOR, "donor")
+"""The donor's inference: all inputs are its own."""
+CONTROL_RUN = _of_input(CONTROL_INPUT, "control")
+"""The clean inference after a change of the varied input that means nothing."""
 
-    name: str = CONTROL_INPUT
-    inputs: ClassVar[str] = "control"
 
-
-@dataclass(frozen=True)
-class Patched:
-    """The clean inference with activations of cells from the source's.
+def patched_run(
+    name: str,
+    cells: Mapping[str, tuple[Cell, ...]],
+    source_sites: tuple[Site, ...],
+    direction: str = "",
+    bases: "Directions | None" = None,
+) -> Condition:
+    """Return the clean inference with activations of cells from the source's: one inference, however many cells.
 
     cells: by category, and for all other categories under the empty name. source_sites: all sites at which the
     source's inference is captured, once for all conditions. direction: the name of one of `bases`, empty to patch
     tokens in full.
     """
 
-    name: str
-    cells: dict[str, tuple[Cell, ...]] = field(repr=False)
-    source_sites: tuple[Site, ...] = field(repr=False)
-    direction: str = ""
-    bases: "DirectionBasis | None" = field(default=None, repr=False)
+    def play(context: ConditionContext) -> ConditionResult:
+        pair = context.pair
+        patches = cells.get(pair.category, cells.get("", ()))
+        if not patches:
+            return ConditionResult(context.act())
+        along = None if bases is None else bases.basis(direction, pair.episode)
+        source = context.source(source_sites)
+        with patched(context.session.policy, pair, patches, source, along, memo=context.memo) as edit_log:
+            return ConditionResult(context.act(), edit_log)
 
-    def play(self, context: ConditionContext) -> ConditionResult:
-        """Infer once, however many cells."""
-        session, pair = context.session, context.pair
-        cells = self.cells.get(pair.category, self.cells.get("", ()))
-        if not cells:
-            return ConditionResult(session.act(pair.clean, pair.seed))
-        along = None if self.bases is None else self.bases.basis(self.direction, pair.episode, pair.category)
-        source = context.source(self.source_sites)
-        with patched(session.policy, pair, cells, source, along, memo=context.memo) as edit_log:
-            chunk = session.act(pair.clean, pair.seed)
-        return ConditionResult(chunk, edit_log)
+    return Condition(name, play)
 
 
 AttentionRecord = tuple[int, int, NDArray[np.float32], NDArray[np.float32] | None]
@@ -152,8 +139,7 @@ class ReplayBatch:
     that were played to their end; then `displacement` is the cube's, and `max_action_change` and `replay_error`
     are of the trajectory; None where nothing was executed. mass: (N, B, I, H, R) the attention of N inferences,
     inferences: (N, 2) their rows and calls; None where attention was not recorded. patches: (N, B, P) of single
-    patches; None where they are not known. chunks: (K, E, N) all numbers
-    of the actions of first inferences.
+    patches; None where they are not known. chunks: (K, E, N) all numbers of the actions of first inferences.
     """
 
     rows: NDArray[np.int64]
@@ -168,7 +154,7 @@ class ReplayBatch:
     patches: NDArray[np.float32] | None = None
     chunks: NDArray[np.float32] | None = None
 
-    def with_mass(self, attention_records: "Sequence[AttentionRecord]") -> "ReplayBatch":
+    def with_mass(self, attention_records: Sequence[AttentionRecord]) -> "ReplayBatch":
         """Return the same with the attention of its inferences, if any was recorded."""
         if not attention_records:
             return self
@@ -197,12 +183,11 @@ class ReplayBatch:
     def joined(cls, parts: Sequence["ReplayBatch"]) -> "ReplayBatch":
         """Return one after the other."""
         by_condition = (*BY_CONDITION, "chunks")
-        return cls(
-            **{
-                name: np.concatenate([getattr(part, name) for part in parts], axis=int(name in by_condition))
-                for name in parts[0].arrays
-            }
-        )
+        joined = {
+            name: np.concatenate([getattr(part, name) for part in parts], axis=int(name in by_condition))
+            for name in parts[0].arrays
+        }
+        return cls(**joined)
 
 
 def replay(session: "ReplaySession", pairs: Sequence[Pair], conditions: Sequence[Condition]) -> ReplayBatch:
@@ -222,8 +207,7 @@ def replay(session: "ReplaySession", pairs: Sequence[Pair], conditions: Sequence
             chunks[-1].append(played.chunk.ravel())
             if played.edit_log is not None:
                 batch.edit_log[number, column] = played.edit_log.row()
-            attention_records += (
-                [] if played.mass is None else [(pair.row, pair.step, played.mass, played.patches)]
-            )
+            if played.mass is not None:
+                attention_records.append((pair.row, pair.step, played.mass, played.patches))
     by_condition = np.array(chunks, np.float32).swapaxes(0, 1) if chunks else None
     return replace(batch.with_mass(attention_records), chunks=by_condition)

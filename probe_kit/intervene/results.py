@@ -40,7 +40,6 @@ from probe_kit.intervene.verdict import (
     size_of_groups,
 )
 from probe_kit.runs.reader import RunReader, full_name
-from probe_kit.runs.results import Bundle
 from probe_kit.runs.run import Run
 from probe_kit.statistics.paired_tests import smallest_flip_p
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -116,27 +115,30 @@ class InterventionResult:
     @property
     def notes(self) -> tuple[str, ...]:
         """Return what a reader must know, a sentence each."""
-        kind_notes = self._kind.notes(self.effects, self.measurement)
+        certificate, notes = self.certificate, list[str]()
+        check = certificate["replay"]
+        what = "clean inferences" if self.outcomes.episode_outcomes is None else "unedited trajectories"
+        if check["compared"] == 0:
+            notes.append(f"The run does not store what was executed, so that {what} were not compared with it.")
+        elif check["equal"] != check["compared"]:
+            notes.append(
+                f"{check['equal']} of {check['compared']} {what} are the run's bit for bit; the others differ by "
+                f"at most {check['largest_difference']:.2g}: a larger batch, or another device."
+            )
+        counts = certificate.get("items", {"asked": 0, "played": 0})
+        if left_out := counts["asked"] - counts["played"]:
+            notes.append(f"{left_out} of {counts['asked']} items have no counterpart and were skipped.")
+        if unread := certificate.get("unread", ()):
+            notes.append(f"{unread_note(unread)}.")
+        if passed := certificate.get("passed_over", {}):
+            reason = next(iter(passed.values()))
+            notes.append(f"passed over, because an answer has no direction there: {', '.join(passed)} ({reason}).")
         tests = () if self._kind.is_descriptive else (*self._few_groups(), *self._one_step())
-        return *self._replayed(), *self._skipped_items(), *self._places(), *tests, *kind_notes
+        return *notes, *tests, *self._kind.notes(self.effects)
 
     @property
     def _kind(self) -> type[Intervention]:
         return kind_of(self.kind)
-
-    def _places(self) -> list[str]:
-        """Places that nothing reads, and places of a wildcard without a direction."""
-        unread, passed = self.certificate.get("unread", ()), self.certificate.get("passed_over", {})
-        notes = [f"{unread_note(unread)}."] if unread else []
-        if passed:
-            reason = next(iter(passed.values()))
-            notes.append(f"passed over, because an answer has no direction there: {', '.join(passed)} ({reason}).")
-        return notes
-
-    def _skipped_items(self) -> list[str]:
-        counts = self.certificate.get("items", {"asked": 0, "played": 0})
-        left_out = counts["asked"] - counts["played"]
-        return [f"{left_out} of {counts['asked']} items have no counterpart and were skipped."] if left_out else []
 
     def _few_groups(self) -> list[str]:
         counts = {category: np.unique(part.groups).size for category, part in self.outcomes.by_category()}
@@ -150,29 +152,17 @@ class InterventionResult:
     def _one_step(self) -> list[str]:
         if not self.outcomes.has_sides:
             return []
-        is_per_step = self.certificate.get("supported", {}).get("readout") == PER_STEP
-        if self.settings.get("readout") == PER_STEP:
+        if self.measurement.readout == PER_STEP:
             return [
                 "Per step: every condition was evaluated at every inference of the unedited episode "
                 "(teacher-forced), and the lateral displacements of its actions are summed; none was executed."
             ]
+        is_per_step = self.certificate.get("supported", {}).get("readout") == PER_STEP
         if not is_per_step or self.outcomes.episode_outcomes is not None:
             return []
         return [
             "This family's inference is one action in greedy bins: the first one says little of where the hand "
             "will go, and small effects stay within a bin. Use --readout per-step."
-        ]
-
-    def _replayed(self) -> list[str]:
-        check = self.certificate["replay"]
-        what = "clean inferences" if self.outcomes.episode_outcomes is None else "unedited trajectories"
-        if check["compared"] == 0:
-            return [f"The run does not store what was executed, so that {what} were not compared with it."]
-        if check["equal"] == check["compared"]:
-            return []
-        return [
-            f"{check['equal']} of {check['compared']} {what} are the run's bit for bit; the others differ by at "
-            f"most {check['largest_difference']:.2g}: a larger batch, or another device."
         ]
 
     def to_json(self) -> str:
@@ -241,8 +231,7 @@ def load_effects(run: RunReader, key: str | None = None, kind: str | None = None
 def effects_of(run: RunReader, stored: StoredIntervention) -> InterventionResult:
     """Read one stored intervention."""
     measurement = Measurement(
-        stored.outcomes(), run.seed_text, stored.settings, stored.certificate(), stored.bundle.read,
-        stored.key, tiles_apart(run),
+        stored.outcomes(), stored.settings, stored.certificate(), stored.bundle.read, stored.key, tiles_apart(run),
     )  # fmt: skip
     result = InterventionResult(run.label, run.random_weights, run.suite, measurement)
     if not result.outcomes.has_sides:
@@ -315,62 +304,46 @@ class ListedIntervention:
     @property
     def words(self) -> str:
         """Return a line about it."""
-        settings = [
-            f"{name} {_plain(value)}" for name, value in self.parameters.items() if value not in (None, [])
-        ]
-        parts = [self.kind, f"of {', '.join(self.categories)}"]
+        parts = [f"{self.kind} of {', '.join(self.categories)}"]
         parts += [] if self.items is None else [f"{counted(self.items, 'item')} each"]
         parts += [f"wording {self.wording}"] * bool(self.wording)
-        if self.state == "other":
-            settings.append("another one stands in its place in tables")
-        if self.state == "other episodes":
-            settings.append("of other episodes than the run has now")
-        return "; ".join([" ".join(parts[:2]), *parts[2:], *settings, self._when])
-
-    @property
-    def _when(self) -> str:
-        return f"made {self.created[:16].replace('T', ' ')} UTC"
+        for name, value in self.parameters.items():
+            if value not in (None, []):
+                parts.append(f"{name} {', '.join(map(str, value)) if isinstance(value, list) else value}")
+        parts += ["another one stands in its place in tables"] * (self.state == "other")
+        parts += ["of other episodes than the run has now"] * (self.state == "other episodes")
+        return "; ".join([*parts, f"made {self.created[:16].replace('T', ' ')} UTC"])
 
 
 def listed_interventions(run: Any) -> list[ListedIntervention]:
     """All of a run, oldest first. Raises RunDamagedError if one was changed."""
-    wordings = run.wordings
-    readers: list[RunReader] = [run.in_wording(name) for name in wordings] or [run]
-    current = {intervention.key for reader in readers for intervention in stored_interventions(reader)}
-    used = {key for reader in readers for key in _used(reader)}
-    listed = [_listed(bundle, current, used) for bundle in read_interventions(run.location).values()]
-    return sorted(listed, key=lambda intervention: (intervention.created, intervention.key))
-
-
-def _used(run: RunReader) -> set[str]:
-    """Keys of what is read, and of the kinds of which nothing takes another's place."""
-    by_kind: dict[str, list[str]] = {}
-    for intervention in stored_interventions(run):
-        by_kind.setdefault(str(intervention.settings["kind"]), []).append(intervention.key)
+    readers: list[RunReader] = [run.in_wording(name) for name in run.wordings] or [run]
+    current: set[str] = set()
     used: set[str] = set()
-    for name, keys in by_kind.items():
-        preferred = kind_of(name).keys_in_use(run) if name in kind_names() else None
-        used |= set(keys) if preferred is None else preferred
-    return used
-
-
-def _listed(bundle: Bundle, current: set[str], used: set[str]) -> ListedIntervention:
-    settings, created = bundle.head["settings"], bundle.times.get("created", "")
-    state = "used" if bundle.key in used else "other" if bundle.key in current else "other episodes"
-    return ListedIntervention(
-        key=bundle.key,
-        state=state,
-        created=created,
-        kind=str(settings["kind"]),
-        categories=tuple(map(str, settings["categories"])),
-        items=settings.get("items"),
-        wording=str(settings.get("wording") or ""),
-        parameters={name: value for name, value in settings.items() if name not in COMMON},
-    )
-
-
-def _plain(value: Any) -> str:
-    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+    for reader in readers:
+        by_kind: dict[str, set[str]] = {}
+        for stored in stored_interventions(reader):
+            by_kind.setdefault(str(stored.settings["kind"]), set()).add(stored.key)
+        for name, keys in by_kind.items():
+            # Keys of what is read, and of the kinds of which nothing takes another's place.
+            preferred = kind_of(name).keys_in_use(reader) if name in kind_names() else None
+            used |= keys if preferred is None else preferred
+            current |= keys
+    listed = []
+    for key, bundle in read_interventions(run.location).items():
+        settings = bundle.head["settings"]
+        intervention = ListedIntervention(
+            key=key,
+            state="used" if key in used else "other" if key in current else "other episodes",
+            created=bundle.times.get("created", ""),
+            kind=str(settings["kind"]),
+            categories=tuple(map(str, settings["categories"])),
+            items=settings.get("items"),
+            wording=str(settings.get("wording") or ""),
+            parameters={name: value for name, value in settings.items() if name not in COMMON},
+        )
+        listed.append(intervention)
+    return sorted(listed, key=lambda intervention: (intervention.created, intervention.key))
 
 
 def readers_of_results(run: Run) -> Iterator[Callable[[], object]]:
@@ -382,8 +355,4 @@ def readers_of_results(run: Run) -> Iterator[Callable[[], object]]:
     for wording in run.wordings or (None,):
         reader = run if wording is None else run.in_wording(wording)
         for stored in stored_interventions(reader):
-            yield partial(_read, reader, stored)
-
-
-def _read(run: Run, stored: StoredIntervention) -> object:
-    return effects_of(run, stored).to_json()
+            yield partial(lambda *result: effects_of(*result).to_json(), reader, stored)

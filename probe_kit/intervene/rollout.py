@@ -42,15 +42,15 @@ def play_episodes(session: ReplaySession, pairs: Sequence[Pair], conditions: Seq
     `replay_error` that of the first condition's from the stored one's. Raises CaptureChangedActionError if an
     outcome is not the stored one.
     """
-    scene = _scene_of(session)
+    assert isinstance(session, SceneSession), "only the scene is played again; other runs are refused before"
     outcomes = np.zeros((len(conditions), len(pairs)), "U7")
     batch = replace(ReplayBatch.empty(pairs, conditions), episode_outcomes=outcomes)
     for column, pair in enumerate(pairs):
-        clean = roll_out(scene, pair, conditions[0], swapping=False)
-        batch.replay_error[column] = apart_from_stored(scene, pair, clean)
+        clean = roll_out(session, pair, conditions[0], swapping=False)
+        batch.replay_error[column] = apart_from_stored(session, pair, clean)
         for number, condition in enumerate(conditions):
-            played = roll_out(scene, pair, condition) if number else clean
-            batch.displacement[number, column] = scene.lateral_offset(np.array(played.cube))
+            played = roll_out(session, pair, condition) if number else clean
+            batch.displacement[number, column] = session.lateral_offset(np.array(played.cube))
             batch.max_action_change[number, column] = _largest(played.frames, clean.frames)
             batch.edit_log[number, column] = played.edit_log.row()
             outcomes[number, column] = played.outcome
@@ -81,11 +81,11 @@ def evaluate_per_step(
     `displacement` is where the hand began plus what the actions of all calls would add laterally, in metres from
     the middle, left positive. Raises CaptureChangedActionError if an outcome is not the stored one.
     """
-    scene = _scene_of(session)
+    assert isinstance(session, SceneSession), "only the scene is played again; other runs are refused before"
     batch = ReplayBatch.empty(pairs, conditions)
     attention_records: list[AttentionRecord] = []
     for column, pair in enumerate(pairs):
-        _evaluate(scene, pair, conditions, batch, column, attention_records)
+        _evaluate(session, pair, conditions, batch, column, attention_records)
     return batch.with_mass(attention_records)
 
 
@@ -99,24 +99,20 @@ def _evaluate(
 ) -> None:
     """Fill one column of a batch."""
     edit_logs: list[list[EditLog]] = [[] for _ in conditions]
-    start = _offset(session, pair.clean)
-    batch.displacement[:, column] = start
+    batch.displacement[:, column] = _offset(session, pair.clean)
 
     def act(current: Pair, past: Sequence[Chunk]) -> Chunk:
-        context = ConditionContext(session, current)
+        context, start = ConditionContext(session, current), _offset(session, current.clean)
         clean = conditions[0].play(context)
         for number, condition in enumerate(conditions):
             played = condition.play(context) if number else clean
             actions = executed(session, [*past, played.chunk])
-            batch.displacement[number, column] += session.displacement(actions, current) - _offset(
-                session, current.clean
-            )
+            batch.displacement[number, column] += session.displacement(actions, current) - start
             change = float(np.abs(played.chunk - clean.chunk).max())
             batch.max_action_change[number, column] = max(batch.max_action_change[number, column], change)
             edit_logs[number] += [] if played.edit_log is None else [played.edit_log]
-            attention_records.extend(
-                [] if played.mass is None else [(current.row, current.step, played.mass, played.patches)]
-            )
+            if played.mass is not None:
+                attention_records.append((current.row, current.step, played.mass, played.patches))
         return clean.chunk
 
     batch.replay_error[column] = apart_from_stored(session, pair, _step_through(session, pair, act, True))
@@ -144,11 +140,6 @@ def _step_through(
     outcome = answer.outcome
     cube = float(outcome["cube_x"]), float(outcome["cube_y"])
     return RolloutResult(str(outcome["outcome"]), cube, answer.trajectory, EditLog())
-
-
-def _scene_of(session: ReplaySession) -> SceneSession:
-    assert isinstance(session, SceneSession), "only the scene is played again; other runs are refused before"
-    return session
 
 
 def _offset(session: SceneSession, observation: object) -> float:

@@ -38,6 +38,7 @@ from probe_kit.intervene.sessions import (
     sizes,
 )
 from probe_kit.runs.layout import INTERVENTIONS
+from probe_kit.runs.provenance import provenance_here
 from probe_kit.runs.results import Pieces, tidy_bundle
 from probe_kit.runs.run import Run
 from probe_kit.statistics.sufficiency import groups_for_not_used
@@ -70,50 +71,36 @@ def run_intervention(
     key = key_of(settings)
     if is_stored(run.location, key):
         tidy_bundle(run.location, INTERVENTIONS, key)
-    else:
-        _execute(run, intervention, settings, key, source or ReplaySource(), load, progress, on_fit_progress)
-    return load_effects(run, key)
-
-
-def _execute(
-    run: Run,
-    intervention: Intervention,
-    settings: Mapping[str, Any],
-    key: str,
-    source: ReplaySource,
-    load: LoadPolicy | None,
-    progress: Progress | None,
-    on_fit_progress: Progress | None,
-) -> None:
+        return load_effects(run, key)
     pieces = Pieces.of(run.location, INTERVENTIONS, key, run.stamp, REDO)
     requested, patterns = intervention.items_in(run), _patterns(settings)
-    with open_session(run, source, load, intervention) as session, session.ready():
+    with open_session(run, source or ReplaySource(), load, intervention) as session, session.ready():
+        policy = session.policy
         session.on_fit_progress = on_fit_progress or notebook_progress("items learnt from")
         _check_roles(session, settings, getattr(type(intervention), "roles", Interchange.roles))
         items = intervention.eligible_items(session, requested)
         conditions = intervention.conditions(session)
-        parts = _replay_items(
-            session, intervention, items, conditions, pieces, progress or notebook_progress("items replayed")
-        )
+        progress = progress or notebook_progress("items replayed")
+        batch = _replay_items(session, intervention, items, conditions, pieces, progress)
+        extra_files = intervention.extra_files(session, conditions, batch)
         certificate = {
-            "policy": session.policy.card.to_json(),
-            "provenance": _provenance(session),
-            "replay": _replay_check(parts),
+            "policy": policy.card.to_json(),
+            "provenance": provenance_here(policy.card.device, policy.card.dtype),
+            "replay": _replay_check(batch),
             "items": {"asked": len(requested), "played": len(items)},
-            "supported": session.policy.interventions.to_json(),
-            "edits": _ledgers(conditions, parts),
-            "unread": list(unread_places(patterns, session.policy.every_stream(), session.policy.interventions)),
+            "supported": policy.interventions.to_json(),
+            "edits": _ledgers(conditions, batch),
+            "unread": list(unread_places(patterns, policy.every_stream(), policy.interventions)),
             "passed_over": session.passed_over,
-            **intervention.certificate_entries(conditions, parts),
+            **session.certificate,
         }
-    outcomes = outcomes_of(run, [condition.name for condition in conditions], parts)
-    extra_files = intervention.extra_files(run, conditions, parts)
+    outcomes = outcomes_of(run, [condition.name for condition in conditions], batch)
     measurement = Measurement(
-        outcomes, run.seed_text, settings, certificate, extra_files.__getitem__, tiles_apart=tiles_apart(run)
+        outcomes, settings, certificate, extra_files.__getitem__, tiles_apart=tiles_apart(run)
     )
-    effects = effects_csv(measurement)
-    save(run.location, settings, key, outcomes, effects, certificate, extra_files)
+    save(run.location, settings, key, outcomes, effects_csv(measurement), certificate, extra_files)
     pieces.discard()
+    return load_effects(run, key)
 
 
 def _check_roles(session: ReplaySession, settings: Mapping[str, Any], usual: Sequence[str]) -> None:
@@ -123,13 +110,10 @@ def _check_roles(session: ReplaySession, settings: Mapping[str, Any], usual: Seq
     """
     roles, sites = settings.get("roles"), settings.get("sites")
     sites_and_roles = [(sites, roles)] if roles and sites else []
-    sites_and_roles += [
-        ([name.site], [name.role]) for name in map(ConditionName.parse, settings.get("targets", ()))
-    ]
+    targets = map(ConditionName.parse, settings.get("targets", ()))
+    sites_and_roles += [([target.site], [target.role]) for target in targets]
     for patterns, requested in sites_and_roles:
-        streams = [
-            site_group.stream for pattern in patterns for site_group in resolve_sites(pattern, session.policy)
-        ]
+        streams = [group.stream for pattern in patterns for group in resolve_sites(pattern, session.policy)]
         check_roles_have_tokens(session.policy, tuple(dict.fromkeys(streams)), requested, usual)
 
 
@@ -179,23 +163,18 @@ def _replay_items(
     for number, item in enumerate(items):
         name = f"{number:06d}"
         stored = pieces.read(name)
-        if stored is None:
-            part = _replay_item(session, intervention, item, conditions)
-            pieces.keep(name, part.arrays)
-        else:
+        if stored is not None:
             part = ReplayBatch(**stored)
+        elif intervention.readout == PER_STEP:
+            part = evaluate_per_step(session, session.pairs(item), conditions)
+        else:
+            part = intervention.play(session, item, conditions)
+        if stored is None:
+            pieces.keep(name, part.arrays)
         parts.append(part)
         if progress is not None:
             progress(number + 1, len(items), item)
     return ReplayBatch.joined(parts)
-
-
-def _replay_item(
-    session: ReplaySession, intervention: Intervention, item: str, conditions: Sequence[Condition]
-) -> ReplayBatch:
-    if intervention.readout == PER_STEP:
-        return evaluate_per_step(session, session.pairs(item), conditions)
-    return intervention.play(session, item, conditions)
 
 
 def outcomes_of(run: Run, conditions: Sequence[str], batch: ReplayBatch) -> ConditionOutcomes:
@@ -211,27 +190,22 @@ def outcomes_of(run: Run, conditions: Sequence[str], batch: ReplayBatch) -> Cond
     if run.recorded:
         names = zip(columns["episodes"], batch.steps, strict=True)
         columns["episodes"] = np.array([f"{episode}@{frame}" for episode, frame in names])
-    toward, size = _toward(conditions, batch)
-    lateral = has_sides(run) or toward is None  # else toward the action of the source
+    # Toward the source's action, of all its inputs if they were played.
+    toward, references = None, [name for name in (DONOR, IMAGE_SWAP) if name in conditions]
+    if batch.chunks is not None and references:
+        toward = displacements_toward(batch.chunks, list(conditions).index(references[0]))
     return ConditionOutcomes(
         conditions=tuple(conditions),
         **columns,
-        displacement=batch.displacement if lateral else toward,
+        displacement=batch.displacement if has_sides(run) or toward is None else toward,
         toward=toward,
-        size=size,
+        size=None if batch.chunks is None else sizes(batch.chunks),
         max_action_change=batch.max_action_change,
         edit_log=batch.edit_log,
         replay_error=batch.replay_error,
         episode_outcomes=batch.episode_outcomes,
+        seed_text=run.seed_text,
     )
-
-
-def _toward(conditions: Sequence[str], batch: ReplayBatch) -> tuple[Any, Any]:
-    """Return (K, E) displacements toward the source's action, of all its inputs if they were played, and sizes."""
-    references = [name for name in (DONOR, IMAGE_SWAP) if name in conditions]
-    if batch.chunks is None or not references:
-        return None, None if batch.chunks is None else sizes(batch.chunks)
-    return displacements_toward(batch.chunks, list(conditions).index(references[0])), sizes(batch.chunks)
 
 
 def _replay_check(batch: ReplayBatch) -> dict[str, Any]:
@@ -272,9 +246,3 @@ def _ledgers(conditions: Sequence[Condition], batch: ReplayBatch) -> dict[str, d
                 "not deterministic"
             )
     return ledgers
-
-
-def _provenance(session: ReplaySession) -> dict[str, Any]:
-    from probe_kit.runs.provenance import provenance_here
-
-    return provenance_here(session.policy.card.device, session.policy.card.dtype)

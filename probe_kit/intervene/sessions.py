@@ -43,7 +43,7 @@ from probe_kit.hooks.checkpoints.third_party import copied, while_acting
 from probe_kit.hooks.contract.card import EMBEDDED
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.family import SIZE
-from probe_kit.intervene.outcomes import PairChoice, PairRow, has_sides, items_of
+from probe_kit.intervene.outcomes import Choice, PairRow, has_sides, items_of
 from probe_kit.intervene.places import Chunk, Given, Pair, check_pairs
 from probe_kit.runs.layout import FIRST_FRAME, stored_inputs_of
 from probe_kit.runs.reader import OF_SCENE, origin_of
@@ -98,12 +98,14 @@ class ReplaySession(ABC):
 
     on_fit_progress: called after every item that is inferred beforehand, for directions and erasers. passed_over:
     places of a wildcard, each with its role, at which an answer has no direction, and why.
+    certificate: entries of the kind's own.
     """
 
     def __init__(self, run: Run, policy: "Policy") -> None:
         self.run, self.policy = run, policy
         self.on_fit_progress: Progress | None = None
         self.passed_over: dict[str, str] = {}
+        self.certificate: dict[str, Any] = {}
 
     def __enter__(self) -> Self:
         return self
@@ -150,8 +152,9 @@ class ReplaySession(ABC):
 
     def act(self, model_input: Given, seed: int) -> Chunk:
         """Return (chunk, D): one inference, alone in its batch. Raises PolicyFailedError if the policy raises."""
+        assert isinstance(model_input, Observation), "pairs of runs are of observations"
         with while_acting(self.run.model, self.policy.card.checkpoint):
-            return np.asarray(self.policy.act(copied([_observation(model_input)]), [seed])[0], np.float32)
+            return np.asarray(self.policy.act(copied([model_input]), [seed])[0], np.float32)
 
     def replay_error(self, pair: Pair, chunk: Chunk) -> float:
         """Return by how much a clean inference differs from the stored actions; NaN where there are none.
@@ -171,11 +174,6 @@ class ReplaySession(ABC):
         return largest
 
 
-def _observation(model_input: Given) -> Observation:
-    assert isinstance(model_input, Observation), "pairs of runs are of observations"
-    return model_input
-
-
 def load_policy_of(run: Run, source: ReplaySource) -> "Policy":
     """Return the policy that a run names, loaded as its own process loaded it.
 
@@ -184,7 +182,13 @@ def load_policy_of(run: Run, source: ReplaySource) -> "Policy":
     from probe_kit.hooks import load_policy
 
     origin = origin_of(run)
-    checkpoint = source.checkpoint or _folder_of(run)
+    checkpoint = source.checkpoint
+    if (
+        checkpoint is None
+    ):  # where the run had it, if its folder, or its commit of the hub, is here; none is fetched
+        before = origin.checkpoint
+        is_folder = before not in ("", EMBEDDED) and Path(before).expanduser().is_dir()
+        checkpoint = before if is_folder or cached_folder(before) is not None else None
     options = {name: value for name, value in origin.options.items() if checkpoint is None or name != SIZE}
     # Branches of its vision-language model or tokenizer may have gone on since the run was made.
     with pinned_commits(origin.repositories):
@@ -197,18 +201,6 @@ def load_policy_of(run: Run, source: ReplaySource) -> "Policy":
             origin.weights_seed if source.weights_seed is None else source.weights_seed,
             **{**options, **source.options},
         )
-
-
-def _folder_of(run: Run) -> str | None:
-    """Return the checkpoint from which the run was made, if its folder, or its commit of the hub, is here.
-
-    A hub id of a run is never fetched.
-    """
-    checkpoint = origin_of(run).checkpoint
-    if cached_folder(checkpoint) is not None:
-        return checkpoint
-    is_folder = checkpoint not in ("", EMBEDDED) and Path(checkpoint).expanduser().is_dir()
-    return checkpoint if is_folder else None
 
 
 def check_policy(run: Run, policy: "Policy") -> None:
@@ -273,9 +265,16 @@ class SceneSession(ReplaySession):
             worded = replace(self.items[item], instruction=str(record["instruction"]))
             layout = _layout_of(record)
             if layout not in frames:
-                frames[layout] = self._look(worded, layout, int(record["scene_seed"]))
+                planned = scene_row(0, Episode(worded, layout), int(record["scene_seed"]), 0)
+                frames[layout] = self.stage.look(planned)
                 frames[_OTHER[layout]], tiles = self.stage.look_swapped(), self.stage.tile_masks()
-            self._check_frame(record, frames[layout])
+            stored, drawn = record.get(FIRST_FRAME), frames[layout].facts[FIRST_FRAME]
+            if stored is not None and stored != drawn:
+                raise OtherFramesError(
+                    f"the first frame of {record['episode_id']}, drawn again, is {drawn[:12]}; "
+                    f"{self.run.location} began with {str(stored)[:12]}. Its pictures, its scene or the renderer "
+                    "are others here; use the machine and versions that its provenance names"
+                )
             pairs.append(
                 Pair(
                     clean=frames[layout].observation,
@@ -301,18 +300,6 @@ class SceneSession(ReplaySession):
         item = replace(self.items[pair.item], instruction=pair.clean.instruction)
         seeds = int(record["scene_seed"]), int(record["policy_seed"])
         return scene_row(0, Episode(item, _layout_of(record)), *seeds)
-
-    def _look(self, item: Item, layout: Layout, scene_seed: int) -> Seen:
-        return self.stage.look(scene_row(0, Episode(item, layout), scene_seed, 0))
-
-    def _check_frame(self, record: Any, look: Seen) -> None:
-        stored, drawn = record.get(FIRST_FRAME), look.facts[FIRST_FRAME]
-        if stored is not None and stored != drawn:
-            raise OtherFramesError(
-                f"the first frame of {record['episode_id']}, drawn again, is {drawn[:12]}; {self.run.location} "
-                f"began with {str(stored)[:12]}. Its pictures, its scene or the renderer are others here; use the "
-                "machine and versions that its provenance names"
-            )
 
     def _stored(self, row: int) -> Chunk | None:
         try:
@@ -525,7 +512,7 @@ class ObservedSession(ReplaySession):
     by which donors are chosen. items: those whose clean actions are the unit of displacements.
     """
 
-    def __init__(self, run: Run, policy: "Policy", frames: Frames, choice: PairChoice | None = None) -> None:
+    def __init__(self, run: Run, policy: "Policy", frames: Frames, choice: Choice | None = None) -> None:
         """Raises UsageError for a varied input that no other group varies; see also `Frames.check_varied`."""
         super().__init__(run, policy)
         self.frames = frames
@@ -657,7 +644,7 @@ def open_session(
     run: Run,
     source: ReplaySource,
     load: LoadPolicy | None = None,
-    choice: PairChoice | None = None,
+    choice: Choice | None = None,
     table: Sequence[PairRow] = (),
 ) -> ReplaySession:
     """Load the run's policy and set up its observations.

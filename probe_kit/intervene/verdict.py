@@ -8,10 +8,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import ceil, inf
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
+from probe_kit._tables.numbers import whole_percent
 from probe_kit.hooks.contract.sites import KV_STREAM
-from probe_kit.intervene.kinds.image_swap import SMALLEST_SHARE_OF_INTEREST, ImageSwapEffect, Swapped, percent
+from probe_kit.intervene.kinds.image_swap import SMALLEST_SHARE_OF_INTEREST, ImageSwapEffect
 from probe_kit.intervene.outcomes import FIRST_CHUNK, PER_STEP
 from probe_kit.intervene.places import list_places
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -158,7 +159,7 @@ class UseVerdict:
             return "use undecided", "the action follows neither this answer nor that of another category"
         return "use undecided", "the items do not tell"
 
-    def describe(self, swap: Swapped) -> str:
+    def describe(self, swap: Any) -> str:
         """Return what an image swap showed, in sentences."""
         return f"{describe_swap(swap, self)}. {self.sentence}"
 
@@ -192,7 +193,7 @@ def describe_readouts(uses: Iterable[UseVerdict | None]) -> str:
 # -- behaviour -------------------------------------------------------------------------------------------------
 
 
-class _Seen(NamedTuple):
+class _Numbers(NamedTuple):
     """The numbers of an effect toward the correct picture, or of its mirror. ends: of the intervals."""
 
     p: float
@@ -203,20 +204,15 @@ class _Seen(NamedTuple):
     reached: Mapping[Side, float]
 
     @classmethod
-    def of(cls, effect: ImageSwapEffect, mirrored: bool) -> "_Seen":
-        reached: dict[Side, float] = {"left": effect.left_reached, "right": effect.right_reached}
-        toward = cls(
-            effect.follow_p, effect.net_follow_rate, effect.net_follow_rate_ci, effect.reach_share,
-            effect.reach_share_ci, reached,
-        )  # fmt: skip
-        if not mirrored:
-            return toward
-        low, high = effect.net_follow_rate_ci
-        least, most = effect.reach_share_ci
-        return cls(
-            effect.reversal_p, -toward.follow, (-high, -low), -toward.share, (-most, -least),
-            {side: -value for side, value in reached.items()},
-        )  # fmt: skip
+    def of(cls, effect: ImageSwapEffect, mirrored: bool) -> "_Numbers":
+        sign = -1 if mirrored else 1
+        reached: dict[Side, float] = {"left": sign * effect.left_reached, "right": sign * effect.right_reached}
+        (low, high), (least, most) = (
+            limits if not mirrored else (-limits[1], -limits[0])
+            for limits in (effect.net_follow_rate_ci, effect.reach_share_ci)
+        )
+        p, follow = effect.reversal_p if mirrored else effect.follow_p, sign * effect.net_follow_rate
+        return cls(p, follow, (low, high), sign * effect.reach_share, (least, most), reached)
 
     @property
     def only_side(self) -> Side | None:
@@ -252,7 +248,7 @@ def classify_behaviour(effect: ImageSwapEffect, control: str | None) -> UseVerdi
     none, and then nothing is *not used*.
     """
     for mirrored in (False, True):
-        numbers = _Seen.of(effect, mirrored)
+        numbers = _Numbers.of(effect, mirrored)
         behaviour = numbers.behaviour()
         if behaviour is not None:
             side = numbers.only_side if behaviour == "partly used, one-sided" else None
@@ -268,7 +264,9 @@ def classify_behaviour(effect: ImageSwapEffect, control: str | None) -> UseVerdi
     if control is None:
         reason = f"{bound}, and no other category of the run is used, so that use is not known to show"
         return UseVerdict(behaviour="undecided", reason=reason, readout=effect.readout, lacks_control=True)
-    reason = f"{_trace(effect)}{bound}; positive control: {control}"
+    is_trace = min(effect.follow_p, effect.reversal_p) < SIGNIFICANCE and abs(effect.reach_share) > TRACE
+    trace = f"but for a trace of {100 * effect.reach_share * effect.reach:.1f} cm: " * is_trace
+    reason = f"{trace}{bound}; positive control: {control}"
     return UseVerdict(behaviour="not used", reason=reason, readout=effect.readout)
 
 
@@ -289,12 +287,9 @@ def _measured(effect: ImageSwapEffect) -> str:
 
 def _open(effect: ImageSwapEffect) -> str:
     """Why it is undecided."""
-    is_other = (
-        effect.moved_share >= SMALLEST_EFFECT_OF_INTEREST
-        and abs(effect.reach_share) < effect.moved_share / 2
-        and min(effect.follow_p, effect.reversal_p) >= SIGNIFICANCE
-    )
-    if is_other:
+    is_graded = min(effect.follow_p, effect.reversal_p) < SIGNIFICANCE
+    is_other = effect.moved_share >= SMALLEST_EFFECT_OF_INTEREST and not is_graded
+    if is_other and abs(effect.reach_share) < effect.moved_share / 2:
         return (
             f"the images move it by {effect.moved_share:.2f} of its reach, the answer by {effect.reach_share:.2f} "
             f"{_ends(effect.reach_share_ci)}: it depends on something else in the images, or on the answer in "
@@ -303,7 +298,7 @@ def _open(effect: ImageSwapEffect) -> str:
     return f"{_measured(effect)}; {more_groups(effect, effect.n_groups)}, there are {effect.n_groups}"
 
 
-def more_groups(swap: Swapped, groups: int) -> str:
+def more_groups(swap: Any, groups: int) -> str:
     """Return about how many groups of items would decide an effect that is undecided with so many."""
     effects = (
         (swap.net_follow_rate or 0.0, _width(swap.net_follow_rate_ci), SMALLEST_EFFECT_OF_INTEREST),
@@ -332,12 +327,6 @@ def size_of_groups(texts: Iterable[str], counts: Iterable[tuple[int, int]]) -> s
 def _width(limits: tuple[float | None, float | None] | None) -> float:
     low, high = limits or (None, None)
     return inf if low is None or high is None else high - low
-
-
-def _trace(effect: ImageSwapEffect) -> str:
-    if min(effect.follow_p, effect.reversal_p) >= SIGNIFICANCE or abs(effect.reach_share) <= TRACE:
-        return ""
-    return f"but for a trace of {100 * effect.reach_share * effect.reach:.1f} cm: "
 
 
 def _ends(limits: tuple[float, float]) -> str:
@@ -462,19 +451,19 @@ def encoded_in(results: "ProbeResults | None", view: str | None = None) -> dict[
     return {str(row["category"]): bool(row["signal"]) for _, row in best.iterrows()}
 
 
-def describe_swap(swap: Swapped, use: UseVerdict) -> str:
+def describe_swap(swap: Any, use: UseVerdict) -> str:
     """Return what a swap of the pictures does to the action, with the numbers that the verdict's sentence lacks.
 
     Numbers and words are of the verdict's own readout.
     """
     use = replace(use, other=None)
-    low, high = (percent(limit) for limit in swap.net_follow_rate_ci or (None, None))
-    followed, net = f"in {percent(swap.follow_rate)} % of episodes", f"net of reversals {low} to {high} %"
+    low, high = (whole_percent(limit) for limit in swap.net_follow_rate_ci or (None, None))
+    followed, net = f"in {whole_percent(swap.follow_rate)} % of episodes", f"net of reversals {low} to {high} %"
     moved = "" if swap.reach_share is None else f", moved by {swap.reach_share:.2f} of its reach"
     if use.behaviour == "used" and not use.reversed:
         return f"the action follows a swap of the pictures {followed} ({net})"
     if use.behaviour == "used":
-        against = f"in {percent(swap.reversal_rate)} % of episodes"
+        against = f"in {whole_percent(swap.reversal_rate)} % of episodes"
         return f"the action goes against the pictures, swapped or not, {against}"
     if use.is_bounded:
         return f"the action does not follow a swap of the pictures ({followed})"

@@ -1,6 +1,8 @@
 """Answers made by hand: where the action goes, per episode of items in two layouts."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -8,7 +10,9 @@ from numpy.typing import NDArray
 
 from probe_kit.intervene import ConditionOutcomes
 from probe_kit.intervene.kinds.base import Measurement
-from probe_kit.intervene.outcomes import key_of, save
+from probe_kit.intervene.kinds.image_swap import ImageSwapEffect, image_swap_effects
+from probe_kit.intervene.kinds.interchange import PatchEffect, patch_effects
+from probe_kit.intervene.outcomes import FIRST_CHUNK, IMAGE_SWAP, key_of, save
 from probe_kit.intervene.results import effects_csv
 from probe_kit.runs import Location
 
@@ -65,6 +69,24 @@ def store_outcomes(
     """Stored as if they had been measured, with the effects of their kind; gives the key."""
     check = {"replay": {"episodes": 0, "compared": 0, "equal": 0, "largest_difference": 0.0}}
     said, files, key = certificate or check, further or {}, key_of(settings)
-    effects = effects_csv(Measurement(outcomes, seed_text, settings, said, files.__getitem__))
+    effects = effects_csv(measured(outcomes, seed_text, settings, said, files.__getitem__))
     save(location, settings, key, outcomes, effects, said, files)
     return key
+
+
+def measured(
+    outcomes: ConditionOutcomes,
+    seed_text: str,
+    settings: Mapping[str, Any] = MappingProxyType({}),
+    certificate: Mapping[str, Any] = MappingProxyType({}),
+    read: Callable[[str], bytes] = str.encode,
+) -> Measurement:
+    return Measurement(replace(outcomes, seed_text=seed_text), settings, certificate, read)
+
+
+def swaps_of(outcomes: ConditionOutcomes, seed_text: str, readout: str = FIRST_CHUNK) -> list[ImageSwapEffect]:
+    return image_swap_effects(measured(outcomes, seed_text, {"readout": readout}))
+
+
+def patches_of(outcomes: ConditionOutcomes, seed_text: str, target_side: str = IMAGE_SWAP) -> list[PatchEffect]:
+    return measured(outcomes, seed_text).rows(lambda part: patch_effects(part, target_side))

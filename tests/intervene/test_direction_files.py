@@ -14,8 +14,10 @@ from probe_kit.cli import app
 from probe_kit.errors import UsageError
 from probe_kit.hooks import Site
 from probe_kit.intervene import Interchange, Steering
-from probe_kit.intervene.kinds.steer import Steered
+from probe_kit.intervene.directions import Directions, fit_token_directions
 from probe_kit.intervene.patching import run_with_hooks
+from probe_kit.intervene.patching.patch import Cell
+from probe_kit.intervene.places import resolve_sites
 from probe_kit.intervene.replay import ConditionContext, replay
 from probe_kit.intervene.sessions import SceneSession
 from probe_kit.runs import export_run
@@ -114,8 +116,8 @@ def test_an_export_has_half_the_difference_of_the_class_means_and_steers_by_it(
     name = f"{file}#color.mean:image.base.{SITE}"
     np.testing.assert_allclose(read_direction(name).vectors[0], half, rtol=1e-5, atol=1e-7)
     asked = Steering(sites=(SITE,), role="image", direction=name, coefficients=(1.0,), controls=0)
-    (steered,) = (one for one in asked.conditions(session) if isinstance(one, Steered) and one.coefficient)
-    np.testing.assert_allclose(steered.axes.shift(steered.direction, "", "", 1.0), half, rtol=1e-5, atol=1e-7)
+    (bases,) = directions_of(session, asked).values()
+    np.testing.assert_allclose(bases.shift(asked.direction, "", 1.0), half, rtol=1e-5, atol=1e-7)
     with pytest.raises(UsageError, match=r"ending \.safetensors or \.npz"):
         export_run(run.location, "directions", tmp_path / "means.txt")
 
@@ -203,7 +205,7 @@ def test_steering_adds_so_many_vectors_of_the_file(session: SceneSession, tmp_pa
     path = written(tmp_path / "one.safetensors", {"one": vector}, site=SITE)
     asked = Steering(sites=(SITE,), role="image", direction=f"{path}#one", coefficients=(2.0,), controls=1)
     conditions = asked.conditions(session)
-    steered = next(one for one in conditions if isinstance(one, Steered) and one.coefficient == 2.0)
+    steered = next(one for one in conditions if one.name.endswith(f"|{asked.direction}|2"))
     pair = replace(session.pairs(str(session.run.episodes["item_id"][0]))[0], side=None)
     chunk = steered.play(ConditionContext(session, pair)).chunk
 
@@ -214,6 +216,12 @@ def test_steering_adds_so_many_vectors_of_the_file(session: SceneSession, tmp_pa
     np.testing.assert_allclose(
         chunk, run_with_hooks(session.policy, pair.clean, {SITE: add}, pair.seed), atol=1e-5
     )
-    control = steered.axes.shift("control-1", pair.episode, pair.category, 1.0)
+    (bases,) = directions_of(session, asked).values()
+    control = bases.shift("control-1", pair.episode, 1.0)
     assert np.linalg.norm(control) == pytest.approx(np.linalg.norm(vector), rel=1e-5)
     assert abs(float(control @ vector)) < 1e-3 * np.linalg.norm(vector) ** 2
+
+
+def directions_of(session: SceneSession, asked: Steering) -> dict[Cell, Directions]:
+    cells = [Cell(place, asked.role) for place in resolve_sites(SITE, session.policy)]
+    return fit_token_directions(session, asked, cells, asked.sites)

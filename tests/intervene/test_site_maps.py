@@ -28,15 +28,14 @@ from probe_kit.intervene import (
 )
 from probe_kit.intervene.directions import fit_directions
 from probe_kit.intervene.kinds.base import ConditionName, Measurement
-from probe_kit.intervene.kinds.image_swap import image_swap_effects
-from probe_kit.intervene.kinds.interchange import keys_in_use, localised_sites, patch_effects, target_sign
+from probe_kit.intervene.kinds.interchange import localised_sites, target_sign
 from probe_kit.intervene.outcomes import FORMAT
 from probe_kit.intervene.places import resolve_sites, token_mask
 from probe_kit.intervene.sessions import ReplaySession
 from probe_kit.intervene.verdict import Places
 from probe_kit.runs import Run
 from probe_kit.train import ArrayRun, train_probes
-from tests.intervene.answers import follower, habit, outcomes_of, store_outcomes
+from tests.intervene.answers import follower, habit, outcomes_of, patches_of, store_outcomes, swaps_of
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
@@ -97,7 +96,7 @@ def test_an_expert_is_changed_at_every_iteration_that_is_named(whole: Interventi
 def test_a_role_that_nothing_plays_there_is_refused_and_nothing_is_stored(
     copy: Run, source: ReplaySource, twin: "Policy", sites: tuple[str, ...], roles: tuple[str, ...], role: str
 ) -> None:
-    before = keys_in_use(copy)
+    before = Interchange.keys_in_use(copy)
     for intervention in (
         Interchange(categories=("color",), items=1, sites=sites, roles=roles),
         ConceptErasure(categories=("color",), items=1, sites=sites[:1], roles=roles),
@@ -105,7 +104,7 @@ def test_a_role_that_nothing_plays_there_is_refused_and_nothing_is_stored(
     ):
         with pytest.raises(UsageError, match=f"has the role '{role}'; expected one of all, "):
             run_intervention(copy, intervention, source, load=lambda *_: twin)
-    assert keys_in_use(copy) == before
+    assert Interchange.keys_in_use(copy) == before
 
 
 def test_it_is_read_back_beside_what_else_is_stored(copy: Run, whole: InterventionResult) -> None:
@@ -151,23 +150,21 @@ def test_the_mean_difference_is_found_without_the_episode_it_is_used_on(copy: Ru
     """Where it lies is planted; a probe's weights and controls are of length 1 as well."""
     axes = fit_directions(copy, Site("backbone", 2), "image", "mean-difference", 3, seed=0)
     episodes = copy.episodes
-    assert set(axes.fold_of) == set(episodes["episode_id"])
+    assert set(axes.halves) == set(episodes["episode_id"])
     name, category = str(episodes["episode_id"][0]), str(episodes["category"][0])
     features = copy.column(Site("backbone", 2), "mean:image").astype(float)
-    fold = axes.fold_of[name]
+    unit = axes.basis("mean-difference", name)[0]
+    in_fold = {one for one in axes.halves if np.array_equal(axes.basis("mean-difference", one)[0], unit)}
     own = (episodes["category"] == category).to_numpy()
-    others = own & np.array([axes.fold_of[str(one)] != fold for one in episodes["episode_id"]])
+    others = own & ~episodes["episode_id"].isin(in_fold).to_numpy()
     left = (episodes["side_correct"] == "left").to_numpy()
     expected = features[others & left].mean(axis=0) - features[others & ~left].mean(axis=0)
-    unit = axes.of("mean-difference", name, category)
     np.testing.assert_allclose(unit, expected / np.linalg.norm(expected), atol=1e-5)
-    assert axes.half_difference(name, category) == pytest.approx(np.linalg.norm(expected) / 2, rel=1e-5)
+    assert axes.halves[name].item() == pytest.approx(np.linalg.norm(expected) / 2, rel=1e-5)
     groups = dict(zip(episodes["episode_id"].astype(str), episodes["group_id"].astype(str), strict=True))
-    assert not {groups[one] for one, of in axes.fold_of.items() if of == fold and one.startswith(category)} & {
-        str(group) for group in episodes["group_id"][others]
-    }
+    assert not {groups[one] for one in in_fold} & {str(group) for group in episodes["group_id"][others]}
     for control in axes.control_names:
-        vector = axes.of(control, name, category)
+        vector = axes.basis(control, name)[0]
         assert np.linalg.norm(vector) == pytest.approx(1.0, rel=1e-5)
         assert abs(float(vector @ unit)) < 1e-5
 
@@ -186,9 +183,9 @@ def test_the_networks_input_has_no_direction(copy: Run, direction: str, role: st
 
 
 def test_the_probes_direction_is_another_one(copy: Run) -> None:
-    episode, category = str(copy.episodes["episode_id"][0]), str(copy.episodes["category"][0])
+    episode = str(copy.episodes["episode_id"][0])
     mean, probe = (
-        fit_directions(copy, Site("backbone", 2), "image", name, 0, seed=0).of(name, episode, category)
+        fit_directions(copy, Site("backbone", 2), "image", name, 0, seed=0).basis(name, episode)[0]
         for name in ("mean-difference", "probe")
     )
     assert 0 < float(mean @ probe) < 0.999
@@ -404,7 +401,7 @@ def with_changes(signs: tuple[np.ndarray, np.ndarray], **changes: np.ndarray) ->
 
 
 def rows_of(outcomes: ConditionOutcomes) -> dict[str, PatchEffect]:
-    return {f"{row.place}|{row.role}|{row.direction}".rstrip("|"): row for row in patch_effects(outcomes, SUITE)}
+    return {f"{row.place}|{row.role}|{row.direction}".rstrip("|"): row for row in patches_of(outcomes, SUITE)}
 
 
 def test_what_carries_all_has_the_effect_one_and_is_located() -> None:
@@ -433,7 +430,7 @@ def test_a_steering_is_a_share_of_the_swap_whichever_side_it_pushes_to(target_si
     # Every action moves by half of the swap's 0.2 m, toward the side that is pushed to.
     pushed = made.of("clean") + 0.1 * target_sign(made, target_side)
     displacement = np.vstack([made.displacement[:2], pushed])
-    (row,) = patch_effects(replace(made, displacement=displacement), SUITE, target_side)
+    (row,) = patches_of(replace(made, displacement=displacement), SUITE, target_side)
     assert row.effect == pytest.approx(0.5)
     assert row.mean_displacement == pytest.approx(0.1)
 
@@ -441,9 +438,9 @@ def test_a_steering_is_a_share_of_the_swap_whichever_side_it_pushes_to(target_si
 def test_the_note_about_one_vector_is_of_steering_along_one_and_not_of_its_controls() -> None:
     plain, exchanged = follower(48)
     still = {f"a__image__{name}__2": plain for name in ("mean_difference:1", "control_1")}
-    along_tokens = patch_effects(with_changes((plain, exchanged), **still), SUITE)
+    along_tokens = patches_of(with_changes((plain, exchanged), **still), SUITE)
     assert Steering.notes(along_tokens, cast("Measurement", None)) == []
-    in_all = patch_effects(with_changes((plain, exchanged), a__image__mean_difference__2=plain), SUITE)
+    in_all = patches_of(with_changes((plain, exchanged), a__image__mean_difference__2=plain), SUITE)
     (note,) = Steering.notes(in_all, cast("Measurement", None))
     assert note.startswith("color: one vector that is added to every token moves no action")
 
@@ -496,7 +493,7 @@ def test_names_are_taken_apart() -> None:
 
 
 def test_the_place_is_said_beside_the_behaviour_and_does_not_change_it() -> None:
-    (found,) = image_swap_effects(outcomes_of({"color": follower(48)}), SUITE)
+    (found,) = swaps_of(outcomes_of({"color": follower(48)}), SUITE)
     places = {
         None: "",
         (): "no place that was tried carries half of it",

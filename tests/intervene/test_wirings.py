@@ -12,9 +12,7 @@ from probe_kit.errors import UsageError
 from probe_kit.hooks import Site, capture
 from probe_kit.intervene import ConditionOutcomes, ImageSwapEffect, UseVerdict, classify_all
 from probe_kit.intervene.evidence import describe_tie, tie_at_site
-from probe_kit.intervene.kinds.base import Measurement
-from probe_kit.intervene.kinds.image_swap import image_swap_effects
-from probe_kit.intervene.kinds.interchange import localised_sites, patch_effects, patch_of, patches_within
+from probe_kit.intervene.kinds.interchange import localised_sites, patch_of, patches_within
 from probe_kit.intervene.kinds.joint import (
     JointEffect,
     JointPlaces,
@@ -25,6 +23,7 @@ from probe_kit.intervene.outcomes import PER_STEP
 from probe_kit.intervene.patching import Cell
 from probe_kit.intervene.places import resolve_sites
 from probe_kit.intervene.replay import Condition
+from tests.intervene.answers import measured, patches_of, swaps_of
 from tests.intervene.wirings import WIRINGS, WORDS, WiredSession, outcomes_of, replay_inputs
 
 pytestmark = pytest.mark.slow  # `tests/acceptance` holds what a user sees of it
@@ -76,7 +75,7 @@ def wired() -> WiredSession:
 @pytest.fixture(scope="module")
 def effects(wired: WiredSession) -> dict[str, ImageSwapEffect]:
     """Of the first chunk, all wirings as categories of one run."""
-    return {row.category: row for row in image_swap_effects(outcomes_of(wired, list(WIRINGS)), SUITE)}
+    return {row.category: row for row in swaps_of(outcomes_of(wired, list(WIRINGS)), SUITE)}
 
 
 @pytest.fixture(scope="module")
@@ -113,12 +112,12 @@ def test_what_is_decided_after_the_first_chunk_shows_in_the_episode(wired: Wired
     """The first chunk approaches; *not used* of it was said of the policy."""
     names = ["late", "constant", "copied"]
     outcomes = outcomes_of(wired, names, calls=3)
-    rows = {row.category: row for row in image_swap_effects(outcomes, SUITE, readout=PER_STEP)}
+    rows = {row.category: row for row in swaps_of(outcomes, SUITE, readout=PER_STEP)}
     found = classify_all(rows, {})
     assert {name: one.verdict for name, one in found.items()} == {
         "late": "used", "constant": "not used", "copied": "used",
     }  # fmt: skip
-    first = {row.category: row for row in image_swap_effects(outcomes_of(wired, names), SUITE)}
+    first = {row.category: row for row in swaps_of(outcomes_of(wired, names), SUITE)}
     both = classify_all(first, {}, other_readouts=found)
     assert {name: one.verdict for name, one in both.items()} == {
         "late": "first chunk not used; episode used", "constant": "not used", "copied": "used",
@@ -153,7 +152,7 @@ def test_a_place_is_named_where_the_answer_is_read(
     wired: WiredSession, name: str, located: tuple[str, ...]
 ) -> None:
     outcomes = patched(wired, name, "backbone.01", "backbone.02", "kv.*", "expert.01")
-    rows = patch_effects(outcomes, SUITE)
+    rows = patches_of(outcomes, SUITE)
     assert next(row for row in rows if row.place == "expert.01").is_localised
     assert localised_sites(rows) == located
 
@@ -168,8 +167,8 @@ def joint(
     asked = JointPlaces(categories=(name,), sites=(sites,), roles=roles)
     conditions = asked.conditions(session)
     outcomes = outcomes_of(session, [name], conditions[2:])
-    entries = asked.certificate_entries(conditions, None)  # type: ignore[arg-type]
-    measurement = Measurement(outcomes, SUITE, asked.parameters(), entries, lambda _: b"")
+    entries = dict(session.certificate)
+    measurement = measured(outcomes, SUITE, asked.parameters(), entries, lambda _: b"")
     rows = JointPlaces.effects(measurement)
     return {row.cells if row.part == "cell" else row.part: row for row in rows}
 
@@ -299,7 +298,7 @@ def tie_of(session: WiredSession, name: str, layer: int, called: str = "mean-dif
     roles = ("language", "all", "image", "state")
     conditions: list[Condition] = [patch_of(Cell(place, role), place.sites) for role in roles]
     conditions += patches_within(called, direction, Cell(place, "language"), place.sites)
-    rows = patch_effects(outcomes_of(session, [name], conditions), SUITE)
+    rows = patches_of(outcomes_of(session, [name], conditions), SUITE)
     layer, along = rows[: len(roles)], rows[len(roles) :]
     return tie_at_site(layer[0], [row for row in along if not row.is_control], layer)
 

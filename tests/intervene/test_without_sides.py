@@ -15,7 +15,6 @@ from probe_kit.errors import OtherFramesError, UsageError
 from probe_kit.extract import ExtractSettings, LeRobotSource, extract_run
 from probe_kit.hooks import Observation
 from probe_kit.intervene import ImageSwap, Interchange, ReplaySource, run_intervention
-from probe_kit.intervene.kinds.interchange import patch_effects
 from probe_kit.intervene.places import Pair, read_pairs
 from probe_kit.intervene.replay import replay
 from probe_kit.intervene.runner import outcomes_of
@@ -28,6 +27,7 @@ from probe_kit.intervene.sessions import (
     spread_of,
 )
 from probe_kit.runs import Run, open_run
+from tests.intervene.answers import patches_of
 from tests.support.lerobot_recordings import CAMERA, write_recording
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ def test_recordings_of_scene_frames_give_the_numbers_of_the_scene_bit_for_bit(
     assert not np.array_equal(scene.displacement, scene.toward), "in the scene also metres"
     groups = np.arange(len(seeded)).astype(str)
     rows = [
-        patch_effects(replace(one, groups=groups, categories=np.full(len(seeded), "all")), "seed")
+        patches_of(replace(one, groups=groups, categories=np.full(len(seeded), "all")), "seed")
         for one in (scene, frames)
     ]
     assert [row.action_share for row in rows[0]] == [row.action_share for row in rows[1]]

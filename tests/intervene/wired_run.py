@@ -46,7 +46,7 @@ def intervene(session: WiredSession, run: ArrayRun, asked: Intervention) -> None
     names = list(dict.fromkeys(run.episodes["category"]))
     conditions = asked.conditions(session)
     outcomes = outcomes_of(session, names, conditions[2:])
-    entries = asked.certificate_entries(conditions, None)  # type: ignore[arg-type]
+    entries = dict(session.certificate)
     settings = {
         "format": FORMAT, "kind": asked.kind, "run_settings": run.settings_sha256, "stamp": "", "wording": None,
         "categories": names, "readout": asked.readout, **asked.parameters(),

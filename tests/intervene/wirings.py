@@ -24,7 +24,7 @@ from probe_kit.hooks.contract.sites import kv_stream
 from probe_kit.hooks.families.shared.taps import kv_tap
 from probe_kit.intervene import ConditionOutcomes
 from probe_kit.intervene.places import Pair
-from probe_kit.intervene.replay import CleanRun, Condition, ReplayBatch, SourceRun, replay
+from probe_kit.intervene.replay import CLEAN_RUN, SOURCE_RUN, Condition, ReplayBatch, replay
 from probe_kit.intervene.sessions import SceneSession
 from probe_kit.models.decoding import PromptKV
 
@@ -317,7 +317,7 @@ class WiredSession(SceneSession):
     """A replay session without a simulator: the tiles lie left and right of zero."""
 
     def __init__(self, iterations: int = 2) -> None:
-        self.policy, self.on_fit_progress = WiredPolicy(iterations), None
+        self.policy, self.on_fit_progress, self.certificate = WiredPolicy(iterations), None, {}
         inputs = [one for name in WIRINGS for one in replay_inputs(name)]
         columns = {"category": [one.category for one in inputs], "item_id": [one.item for one in inputs]}
         self.run = SimpleNamespace(model="wired", episodes=pd.DataFrame(columns))  # type: ignore[assignment]
@@ -369,7 +369,7 @@ def outcomes_of(
 
     calls: inferences of an episode, whose displacements are summed; the hand leaves its place after the first.
     """
-    conditions: list[Condition] = [CleanRun(), SourceRun(), *further]
+    conditions: list[Condition] = [CLEAN_RUN, SOURCE_RUN, *further]
     inputs = [one for name in names for one in replay_inputs(name)]
     found = replay(session, inputs, conditions)
     for _ in range(calls - 1):

@@ -9,7 +9,7 @@ import pytest
 from probe_kit.errors import NoInterventionsError
 from probe_kit.intervene import AttentionShares
 from probe_kit.intervene.kinds.attention import PatchAttention
-from probe_kit.intervene.outcomes import ATTENTION_FILE, FORMAT, PATCHES_FILE
+from probe_kit.intervene.outcomes import ATTENTION_FILE, FORMAT, PATCHES_FILE, arrays_to_bytes
 from probe_kit.retention import retention_table
 from probe_kit.retention.displays import AttentionDisplay, attention_curve, attention_on_picture, collect_figures
 from probe_kit.runs.thumbnails import as_thumbnail, thumbnail_key
@@ -44,7 +44,7 @@ def noted(run: ArrayRun) -> AttentionShares:
     weights[:, [0, 2]] = [[0.3, 0.1], [0.1, 0.2]]
     episodes = run.episodes["episode_id"].to_numpy(str)[:4]
     patches = PatchAttention(episodes, np.zeros(4, int), weights, np.array(["top"] * 2), boxes)
-    further = {ATTENTION_FILE: weighed.to_bytes(), PATCHES_FILE: patches.to_bytes()}
+    further = {ATTENTION_FILE: arrays_to_bytes(weighed), PATCHES_FILE: arrays_to_bytes(patches)}
     store_outcomes(run.location, run.suite, settings, answers, further=further)
     return weighed
 

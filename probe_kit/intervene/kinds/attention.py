@@ -5,14 +5,13 @@ is edited. Every inference runs twice, with and without recording, and both acti
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
-from io import BytesIO
+from dataclasses import asdict, dataclass, fields, replace
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit._system.bounded_files import open_arrays
 from probe_kit.errors import CaptureChangedActionError, CaptureError, EmptyRoleError, UsageError
 from probe_kit.hooks.contract.declared import InterventionKind
 from probe_kit.hooks.contract.observation import Observation
@@ -25,6 +24,8 @@ from probe_kit.intervene.outcomes import (
     RECORDED,
     Effect,
     StoredResult,
+    arrays_from_bytes,
+    arrays_to_bytes,
     has_sides,
     stored_results,
 )
@@ -37,9 +38,8 @@ from probe_kit.intervene.places import (
     shown_cameras,
     token_boxes,
 )
-from probe_kit.intervene.replay import CleanRun, Condition, ConditionContext, ConditionResult, ReplayBatch
+from probe_kit.intervene.replay import CLEAN_RUN, Condition, ConditionContext, ConditionResult, ReplayBatch
 from probe_kit.runs.reader import RunReader
-from probe_kit.runs.run import Run
 from probe_kit.statistics.bootstrap import GAINS, student_interval, units_seed
 
 if TYPE_CHECKING:
@@ -66,6 +66,7 @@ class AttentionReadout(Intervention):
     summary: ClassVar[str] = "Shares of the acting stream's attention (descriptive)."
     position: ClassVar[int] = 9
     options: ClassVar[Mapping[str, str]] = {"roles": "of the backbone's tokens; default all that the family has"}
+    needs: ClassVar[tuple[InterventionKind, ...]] = ("attention",)
     is_descriptive: ClassVar[bool] = True
 
     roles: tuple[str, ...] = ()
@@ -74,11 +75,6 @@ class AttentionReadout(Intervention):
         super().__post_init__()
         if len(set(self.roles)) != len(self.roles):
             raise UsageError(f"roles are {', '.join(self.roles)}; give each once")
-
-    @property
-    def required_capabilities(self) -> tuple[InterventionKind, ...]:
-        """Return attention; and which tokens see a tile, where that is asked by name."""
-        return ("attention", *(("tiles",) if set(self.roles) & set(TILES) else ()))
 
     def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
         """Clean, and the same with its attention recorded. Raises UsageError for a role it lacks."""
@@ -89,67 +85,58 @@ class AttentionReadout(Intervention):
             first = next(observations, None)
             if isinstance(first, Observation):
                 boxes = {camera: token_boxes(policy, first, camera) for camera in shown_cameras(policy, stream)}
-        return CleanRun(), AttentionRecorded(stream, self._roles(policy), boxes=boxes)
+        roles = self._roles(policy)
+        session.certificate[ATTENTION] = {"stream": stream, "roles": list(roles)}
+        return CLEAN_RUN, attention_recorded(stream, roles, boxes)
 
-    def certificate_entries(self, conditions: Sequence[Condition], batch: ReplayBatch) -> dict[str, Any]:
-        """Return the axes of the stored array. Raises CaptureChangedActionError if recording changed an action."""
-        (recording,) = (condition for condition in conditions if isinstance(condition, AttentionRecorded))
+    def extra_files(
+        self, session: "ReplaySession", conditions: Sequence[Condition], batch: ReplayBatch
+    ) -> dict[str, bytes]:
+        """The attention of every inference; the certificate gets the axes of the array.
+
+        Raises CaptureChangedActionError if recording changed an action.
+        """
         largest = float(batch.max_action_change.max(initial=0.0))
         if largest:
             raise CaptureChangedActionError(
                 f"with its attention recorded an action differs by {largest:.3g}; expected the same bit for bit. "
                 "The adapter's `record_attention` changes the inference, or the model is not deterministic"
             )
-        assert batch.mass is not None
-        inferences, blocks, iterations, heads, _ = batch.mass.shape
-        return {
-            ATTENTION: {
-                "stream": recording.stream, "roles": list(recording.roles), "inferences": inferences,
-                "blocks": blocks, "iterations": iterations, "heads": heads, "max_action_change": largest,
-            }
-        }  # fmt: skip
-
-    def extra_files(self, run: Run, conditions: Sequence[Condition], batch: ReplayBatch) -> dict[str, bytes]:
-        """The attention of every inference."""
-        (recording,) = (condition for condition in conditions if isinstance(condition, AttentionRecorded))
+        run, entries = session.run, session.certificate[ATTENTION]
         assert batch.mass is not None
         assert batch.inferences is not None
-        rows = run.episodes.iloc[batch.inferences[:, 0]]
-        columns = {
-            field: rows[name].to_numpy(dtype=str)
-            for field, name in (
-                ("episodes", "episode_id"), ("groups", "group_id"), ("categories", "category"),
-            )
-        }  # fmt: skip
-        sides = rows["side_correct"].to_numpy(dtype=str) if has_sides(run) else np.full(len(rows), "")
-        attention_records = AttentionShares(
-            recording.roles, **columns, sides=sides, calls=batch.inferences[:, 1], mass=batch.mass
+        axes = zip(("inferences", "blocks", "iterations", "heads"), batch.mass.shape, strict=False)
+        entries |= {**dict(axes), "max_action_change": largest}
+        rows, calls = run.episodes.iloc[batch.inferences[:, 0]], batch.inferences[:, 1]
+        episodes, groups, categories = (
+            rows[name].to_numpy(dtype=str) for name in ("episode_id", "group_id", "category")
         )
-        files = {ATTENTION_FILE: attention_records.to_bytes()}
+        sides = rows["side_correct"].to_numpy(dtype=str) if has_sides(run) else np.full(len(rows), "")
+        shares = AttentionShares(tuple(entries["roles"]), episodes, groups, categories, sides, calls, batch.mass)
+        files = {ATTENTION_FILE: arrays_to_bytes(shares)}
         if batch.patches is not None:
-            boxes = recording.boxes
-            files[PATCHES_FILE] = PatchAttention(
-                columns["episodes"], batch.inferences[:, 1], batch.patches.astype(np.float16),
-                np.repeat(list(boxes), [len(places) for places in boxes.values()]),
-                np.concatenate(list(boxes.values())),
-            ).to_bytes()  # fmt: skip
+            by_camera: Mapping[str, NDArray[np.float32]] = conditions[-1].details
+            names = np.repeat(list(by_camera), [len(places) for places in by_camera.values()])
+            boxes = np.concatenate(list(by_camera.values()))
+            patches = PatchAttention(episodes, calls, batch.patches.astype(np.float16), names, boxes)
+            files[PATCHES_FILE] = arrays_to_bytes(patches)
         return files
 
     @staticmethod
     def effects(measurement: Measurement) -> "list[AttentionRow]":
         """Return shares by block, iteration, head and role. Raises RunDamagedError."""
-        return AttentionShares.of(measurement).rows()
+        return AttentionShares.from_bytes(measurement.read(ATTENTION_FILE)).rows()
 
     @staticmethod
     def table(rows: "Sequence[AttentionRow]", context: TableContext) -> "Table":
         """Return one line per category and block of the backbone that is read."""
         del rows
-        attention = AttentionShares.of(context.measurement)
+        attention = AttentionShares.from_bytes(context.measurement.read(ATTENTION_FILE))
         means = attention.rows(("block",))
         roles = [role for role in dict.fromkeys(row.role for row in means) if role not in (CORRECT, OTHER)]
         lines: list[tuple[tuple[str, ...], tuple[dict[str, float], str]]] = []
         for category, part in attention.by_category():
-            apart = part.correct_minus_other(context.measurement.seed_text)
+            apart = part.correct_minus_other(context.measurement.outcomes.seed_text)
             for block in dict.fromkeys(row.block for row in means if row.category == category):
                 shares = {row.role: row.share for row in means if (row.category, row.block) == (category, block)}
                 lines.append(((category, f"block {block:02d}"), (shares, _difference(apart.get(block or 0)))))
@@ -160,9 +147,9 @@ class AttentionReadout(Intervention):
         return effect_table(title, _LEGEND, ("category", "read"), lines, parts)
 
     @staticmethod
-    def notes(rows: "Sequence[AttentionRow]", measurement: Measurement) -> list[str]:
+    def notes(rows: "Sequence[AttentionRow]") -> list[str]:
         """Return that it is descriptive, and what tests more."""
-        del rows, measurement
+        del rows
         return [
             "Attention is descriptive, not causal, and does not enter the verdict. To test what is read, run "
             "--kind interchange --sites kv.*"
@@ -186,51 +173,43 @@ class AttentionReadout(Intervention):
         return tuple(dict.fromkeys((ALL, *present)))
 
 
-@dataclass(frozen=True)
-class AttentionRecorded:
-    """The clean inference with attention weights recorded. stream: whose tokens are attended to.
+def attention_recorded(
+    stream: str, roles: Sequence[str], boxes: Mapping[str, NDArray[np.float32]] = MappingProxyType({})
+) -> Condition:
+    """Return the clean inference with attention weights recorded; nothing is changed.
 
-    boxes: by camera (patches, 4) where its patches lie; empty where the family does not say.
+    stream: whose tokens are attended to. boxes: by camera (patches, 4) where its patches lie; empty where the
+    family does not say.
     """
 
-    stream: str
-    roles: tuple[str, ...]
-    name: str = RECORDED
-    boxes: Mapping[str, NDArray[np.float32]] = field(default_factory=dict, repr=False)
+    def mask_of(context: ConditionContext, role: str) -> NDArray[np.bool_]:
+        return role_token_mask(context.session.policy, context.pair, stream, role, context.memo)
 
-    def play(self, context: ConditionContext) -> ConditionResult:
-        """Nothing is changed."""
+    def play(context: ConditionContext) -> ConditionResult:
         from probe_kit.hooks.capturing.attention import capture_attention
 
-        session, pair = context.session, context.pair
-        masks = [self._mask(context, role) for role in self.roles]
-        with capture_attention(session.policy) as mass:
-            chunk = session.act(pair.clean, pair.seed)
-        return ConditionResult(chunk, mass=shares_by_role(mass, masks), patches=self._patches(context, mass))
+        masks: list[NDArray[np.bool_] | None] = []
+        for role in roles:
+            try:
+                masks.append(mask_of(context, role))
+            except EmptyRoleError:  # a family may have the role, and a tile be hidden by the arm
+                masks.append(None)
+        with capture_attention(context.session.policy) as mass:
+            chunk = context.act()
+        patches = _on_patches(mass, [mask_of(context, f"image.{camera}") for camera in boxes]) if boxes else None
+        return ConditionResult(chunk, mass=shares_by_role(mass, masks), patches=patches)
 
-    def _patches(self, context: ConditionContext, mass: "AttentionMass") -> NDArray[np.float32] | None:
-        """Return (B, P) shares on the patches of all cameras in turn, means over iterations and heads."""
-        if not self.boxes:
-            return None
-        masks = [
-            role_token_mask(context.session.policy, context.pair, self.stream, f"image.{camera}", context.memo)
-            for camera in self.boxes
-        ]
-        tokens = np.concatenate([np.flatnonzero(mask) for mask in masks])
-        blocks = max(block for block, _ in mass.by_head) + 1
-        shares = [
-            [weights[0][:, tokens].mean(axis=0) for (at, _), weights in mass.by_head.items() if at == block]
-            for block in range(blocks)
-        ]
-        empty = np.full((1, tokens.size), np.nan)
-        return np.array([np.mean(block or empty, axis=0) for block in shares], np.float32)
+    return Condition(RECORDED, play, boxes)
 
-    def _mask(self, context: ConditionContext, role: str) -> NDArray[np.bool_] | None:
-        """None where no token plays it now: a family may have the role, and a tile be hidden by the arm."""
-        try:
-            return role_token_mask(context.session.policy, context.pair, self.stream, role, context.memo)
-        except EmptyRoleError:
-            return None
+
+def _on_patches(mass: "AttentionMass", masks: Sequence[NDArray[np.bool_]]) -> NDArray[np.float32]:
+    """Return (B, P) shares on the patches of all cameras in turn, means over iterations and heads."""
+    tokens = np.concatenate([np.flatnonzero(mask) for mask in masks])
+    shares: list[list[NDArray[np.floating]]] = [[] for _ in range(max(block for block, _ in mass.by_head) + 1)]
+    for (block, _), weights in mass.by_head.items():
+        shares[block].append(weights[0][:, tokens].mean(axis=0))
+    empty = np.full((1, tokens.size), np.nan)
+    return np.array([np.mean(block or empty, axis=0) for block in shares], np.float32)
 
 
 @dataclass(frozen=True)
@@ -264,18 +243,6 @@ class PatchAttention:
             self, weights=self.weights[..., visible], cameras=self.cameras[visible], boxes=boxes.astype(np.float32)
         )
 
-    def to_bytes(self) -> bytes:
-        """Return a `.npz`; the same numbers give the same bytes."""
-        file = BytesIO()
-        np.savez_compressed(file, allow_pickle=False, **vars(self))
-        return file.getvalue()
-
-    @classmethod
-    def from_bytes(cls, content: bytes) -> Self:
-        """Load what `to_bytes` made."""
-        with open_arrays(content) as arrays:
-            return cls(**{part.name: arrays[part.name] for part in fields(cls)})
-
 
 def stored_patch_attention(run: RunReader) -> dict[str, PatchAttention]:
     """Return by category the patches of the attention that tables read; without those stored without patches.
@@ -284,7 +251,7 @@ def stored_patch_attention(run: RunReader) -> dict[str, PatchAttention]:
     """
     bundles = {category: result.stored.bundle for category, (result, _) in preferred_attention(run).items()}
     read = {
-        bundle.key: PatchAttention.from_bytes(bundle.read(PATCHES_FILE))
+        bundle.key: PatchAttention(**arrays_from_bytes(bundle.read(PATCHES_FILE)))
         for bundle in bundles.values()
         if bundle.has(PATCHES_FILE)
     }
@@ -341,29 +308,14 @@ class AttentionShares:
     calls: NDArray[np.int64]
     mass: NDArray[np.float32]
 
-    def to_bytes(self) -> bytes:
-        """Return a `.npz`; the same numbers give the same bytes."""
-        file = BytesIO()
-        np.savez_compressed(file, allow_pickle=False, **{**vars(self), "roles": np.array(self.roles)})
-        return file.getvalue()
-
     @classmethod
     def from_bytes(cls, content: bytes) -> Self:
-        """Load what `to_bytes` made."""
-        with open_arrays(content) as arrays:
-            values: dict[str, Any] = {field.name: arrays[field.name] for field in fields(cls)}
-        return cls(**{**values, "roles": tuple(map(str, values["roles"]))})
-
-    @classmethod
-    def of(cls, measurement: Measurement) -> Self:
-        """Read those of a stored intervention of this kind. Raises RunDamagedError if it was changed."""
-        return cls.from_bytes(measurement.read(ATTENTION_FILE))
+        """Load what `arrays_to_bytes` made of one."""
+        return cls(**arrays_from_bytes(content, "roles"))
 
     def only(self, selected: NDArray[np.bool_]) -> Self:
         """Some of the inferences. selected: (N,)."""
-        return type(self)(
-            self.roles, *(getattr(self, field.name)[selected] for field in fields(self) if field.name != "roles")
-        )
+        return replace(self, **{name: value[selected] for name, value in vars(self).items() if name != "roles"})
 
     def by_category(self) -> list[tuple[str, Self]]:
         """Every category with its inferences, in the order of the episodes."""

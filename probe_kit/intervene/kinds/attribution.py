@@ -1,7 +1,7 @@
 """Attribution patching: gradients order cells, exact patches check the order and anchor it. Enters no verdict."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Self, get_args
 
 import numpy as np
@@ -15,12 +15,12 @@ from probe_kit.intervene.kinds.base import (
     Intervention,
     Measurement,
     TableContext,
-    by_category,
+    edits_by_category,
     effect_table,
     flips_seed,
     interval_text,
     lines_of,
-    text_of,
+    p_of,
 )
 from probe_kit.intervene.kinds.image_swap import share_of_swap, swap_sign
 from probe_kit.intervene.kinds.interchange import cells_at, check_sites_and_roles, patch_of
@@ -40,14 +40,7 @@ from probe_kit.intervene.patching.attribution import (
 from probe_kit.intervene.patching.patch import Cell, sites_of_cells
 from probe_kit.intervene.patching.sweep import pooled_share, share_fields
 from probe_kit.intervene.places import ALL, resolve_all
-from probe_kit.intervene.replay import (
-    CleanRun,
-    Condition,
-    ConditionContext,
-    ConditionResult,
-    ReplayBatch,
-    SourceRun,
-)
+from probe_kit.intervene.replay import CLEAN_RUN, SOURCE_RUN, Condition, ConditionContext, ConditionResult
 from probe_kit.runs.run import Run
 from probe_kit.statistics.paired_tests import max_t
 
@@ -69,20 +62,16 @@ _LEGEND = (
 )
 
 
-@dataclass(frozen=True)
-class Estimated:
-    """No inference: the clean action, and by how much an estimate says that patching a cell moves it.
+def _estimated(cell: Cell, by_row: Mapping[tuple[int, int], float]) -> Condition:
+    """Return no inference: the clean action, and by how much an estimate says that patching a cell moves it.
 
-    by_row: displacement by row and step of the run. is_drawn: whether the cell was drawn for an exact patch.
+    by_row: displacement by row and step of the run.
     """
 
-    name: str
-    by_row: Mapping[tuple[int, int], float] = field(repr=False)
-    is_drawn: bool = False
+    def play(context: ConditionContext) -> ConditionResult:
+        return ConditionResult(context.clean, estimated=by_row[context.pair.row, context.pair.step])
 
-    def play(self, context: ConditionContext) -> ConditionResult:
-        """Return the clean action with the estimate; nothing is played."""
-        return ConditionResult(context.clean, estimated=self.by_row[context.pair.row, context.pair.step])
+    return Condition(f"{ESTIMATE}|{cell.site_group.name}|{cell.role}", play)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,6 +86,8 @@ class AttributionPatching(Intervention):
     kind: ClassVar[str] = NAME
     summary: ClassVar[str] = "Screen by gradients: which places to patch exactly?"
     position: ClassVar[int] = 5
+    needs: ClassVar[tuple[InterventionKind, ...]] = ("edit", "gradients")
+    fits_always: ClassVar[bool] = True
     options: ClassVar[Mapping[str, str]] = {
         "sites": "of the screened cells; default kv.*,backbone.*",
         "roles": "of the cells' tokens; default image,language,state",
@@ -131,16 +122,6 @@ class AttributionPatching(Intervention):
             options["sites"] = SITES[1:]
         return super().from_options(run, **options)
 
-    @property
-    def required_capabilities(self) -> tuple[InterventionKind, ...]:
-        """Return those of an interchange, and gradients."""
-        return (*super().required_capabilities, "gradients")
-
-    @property
-    def fits_first(self) -> bool:
-        """Whether the estimates come first: always."""
-        return True
-
     def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
         """Return clean, images swapped, exact patches of anchors and chosen cells, and the estimates of all."""
         places = list(resolve_all(self.sites, session.policy).values())
@@ -149,49 +130,38 @@ class AttributionPatching(Intervention):
         every = [*anchors, *cells]
         rows, shares = self._estimates(session, every)
         top, drawn = self._select(cells, [values[len(anchors) :] for values in shares])
-        patched = {*anchors, *top, *drawn}
-        sites = sites_of_cells(every)
+        patched, sites = {*anchors, *top, *drawn}, sites_of_cells(every)
         exact = [patch_of(cell, sites, f"{EXACT}|") for cell in every if cell in patched]
         estimated = [
-            Estimated(
-                f"{ESTIMATE}|{cell.site_group.name}|{cell.role}",
-                {at_row: float(by_cell[at]) for at_row, by_cell in rows.items()},
-                cell in drawn,
-            )
+            _estimated(cell, {at_row: float(by_cell[at]) for at_row, by_cell in rows.items()})
             for at, cell in enumerate(every)
         ]
-        return [CleanRun(), SourceRun(), *exact, *estimated]
-
-    def certificate_entries(self, conditions: Sequence[Condition], batch: ReplayBatch) -> dict[str, Any]:
-        """Return the cells that were drawn."""
-        del batch
-        drawn = [
-            condition.name for condition in conditions if isinstance(condition, Estimated) and condition.is_drawn
-        ]
-        return {NAME: {"drawn": [f"{EXACT}{name.removeprefix(ESTIMATE)}" for name in drawn]}}
+        names = [f"{EXACT}|{cell.site_group.name}|{cell.role}" for cell in every if cell in drawn]
+        session.certificate[NAME] = {"drawn": names}
+        return [CLEAN_RUN, SOURCE_RUN, *exact, *estimated]
 
     def _estimates(
         self, session: "ReplaySession", cells: Sequence[Cell]
     ) -> tuple[dict[tuple[int, int], NDArray[np.float64]], list[NDArray[np.float64]]]:
         """Return (C,) estimates by row and step of the run, and by category (C,) shares of the image swap."""
         rows: dict[tuple[int, int], NDArray[np.float64]] = {}
-        wholes: dict[str, list[tuple[float, tuple[int, int]]]] = {}
+        swaps: dict[str, list[tuple[float, tuple[int, int]]]] = {}
         items = self.items_in(session.run)
         for number, item in enumerate(items):
             for pair in session.pairs(item):
-                estimates = estimate_patches(
+                clean, moved, by_cell = estimate_patches(
                     session.policy, pair, cells, session.slope(pair), self.ends, session.act
                 )
-                clean, moved = (session.displacement(chunk, pair) for chunk in estimates[:2])
-                rows[pair.row, pair.step] = estimates.by_cell
-                wholes.setdefault(pair.category, []).append((moved - clean, (pair.row, pair.step)))
+                before, after = (session.displacement(chunk, pair) for chunk in (clean, moved))
+                rows[pair.row, pair.step] = by_cell
+                swaps.setdefault(pair.category, []).append((after - before, (pair.row, pair.step)))
             if session.on_fit_progress is not None:
                 session.on_fit_progress(number + 1, len(items), item)
         shares = []
-        for part in wholes.values():
+        for part in swaps.values():
             swap = np.array([moved for moved, _ in part])
-            by_cell = np.array([rows[row] for _, row in part])
-            shares.append(np.array([pooled_share(moved, swap) for moved in by_cell.T]))
+            estimates = np.array([rows[row] for _, row in part])
+            shares.append(np.array([pooled_share(moved, swap) for moved in estimates.T]))
         return rows, shares
 
     def _select(self, cells: Sequence[Cell], shares: Sequence[NDArray[np.float64]]) -> tuple[set[Cell], set[Cell]]:
@@ -212,18 +182,14 @@ class AttributionPatching(Intervention):
     def effects(measurement: Measurement) -> list[AttributionEffect]:
         """Return by category the anchors, then the cells of each kind: by rank, or in their order."""
         drawn = frozenset(measurement.certificate.get(NAME, {}).get("drawn", []))
-        return [
-            row
-            for category, part in measurement.outcomes.by_category()
-            for row in order_cells(_rows(part, category, measurement, drawn))
-        ]
+        return measurement.rows(lambda part: order_cells(_rows(part, drawn)))
 
     @staticmethod
     def table(rows: Sequence[AttributionEffect], context: TableContext) -> "Table":
         """Return one line per category and cell."""
         void = [
             f"{name}: {describe_void(part)}"
-            for name, part in by_category(rows).items()
+            for name, part in edits_by_category(rows).items()
             if part[0].finding == "void"
         ]
         return effect_table(
@@ -256,45 +222,39 @@ _COLUMNS: Mapping[str, Any] = {
     "rank": lambda row: "–" if row.rank is None else str(row.rank),
     "estimate [95 %]": lambda row: interval_text(row.estimate, row.estimate_ci),
     "exact [95 %]": lambda row: interval_text(row.exact, row.exact_ci),
-    "p": lambda row: text_of(row.p_fwe, ".2g"),
+    "p": lambda row: p_of(row.p_fwe),
     "chosen": lambda row: (
         "anchor" if row.is_anchor else "drawn" if row.is_drawn else "top" if row.p_fwe is not None else ""
     ),
 }
 
 
-def _rows(
-    outcomes: ConditionOutcomes, category: str, measurement: Measurement, drawn: frozenset[str]
-) -> list[AttributionEffect]:
+def _rows(outcomes: ConditionOutcomes, drawn: frozenset[str]) -> list[AttributionEffect]:
     """Return the rows of one category, without rank and finding."""
     names = [name.partition("|")[2] for name in outcomes.conditions if name.startswith(f"{ESTIMATE}|")]
     exact = [name for name in outcomes.conditions if name.startswith(f"{EXACT}|")]
-    clean = outcomes.of(CLEAN)
-    leads = -swap_sign(outcomes) * outcomes.correct_sign
+    clean, leads = outcomes.of(CLEAN), -swap_sign(outcomes) * outcomes.correct_sign
     toward = np.array([leads * (outcomes.of(name) - clean) for name in exact])
-    seed = flips_seed(outcomes, measurement.seed_text)
-    p_fwe = dict(zip(exact, max_t(toward, outcomes.items, outcomes.groups, seed)[2], strict=True))
+    _, _, numbers = max_t(toward, outcomes.items, outcomes.groups, flips_seed(outcomes))
+    p_fwe = dict(zip(exact, map(float, numbers), strict=True))
+    counts = {name: value for name, value in outcomes.counts.items() if name != "n_items"}
     rows = []
     for name in names:
         site, _, role = name.partition("|")
         shares: dict[str, Any] = {}
         for part in (ESTIMATE, EXACT):
-            condition = f"{part}|{name}"
-            moved = outcomes.of(condition) - clean if condition in outcomes.conditions else None
-            share = None if moved is None else share_of_swap(outcomes, moved, measurement.seed_text)
-            shares |= share_fields(part, share)
+            has_part = f"{part}|{name}" in outcomes.conditions
+            moved = outcomes.of(f"{part}|{name}") - clean if has_part else None
+            shares |= share_fields(part, None if moved is None else share_of_swap(outcomes, moved))
         rows.append(
             AttributionEffect(
-                category=category,
+                **counts,
                 place=site,
                 role=role,
                 is_anchor=role == ALL,
                 is_drawn=f"{EXACT}|{name}" in drawn,
-                n_episodes=outcomes.items.size,
-                n_groups=np.unique(outcomes.groups).size,
                 **shares,
-                p_fwe=float(p_fwe[f"{EXACT}|{name}"]) if f"{EXACT}|{name}" in p_fwe else None,
-                key=measurement.key,
+                p_fwe=p_fwe.get(f"{EXACT}|{name}"),
             )
         )
     return rows

@@ -5,32 +5,26 @@ Loads neither torch nor a simulator, and neither do the kinds: tables read them 
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol, Self, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._tables.numbers import number, signed
 from probe_kit.errors import UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.capturing.edits import LOG_FIELDS
-from probe_kit.hooks.contract.declared import InterventionKind, Readout
+from probe_kit.hooks.contract.declared import InterventionKind
 from probe_kit.hooks.contract.sites import KV_STREAM
-from probe_kit.intervene.outcomes import (
-    FIRST_CHUNK,
-    ConditionOutcomes,
-    Effect,
-    PairRow,
-    categories_in,
-    has_sides,
-    items_of,
-)
+from probe_kit.intervene.outcomes import FIRST_CHUNK, Choice, ConditionOutcomes, Effect, categories_in, has_sides
 from probe_kit.intervene.places import SEPARATOR, TILES
 from probe_kit.intervene.replay import Condition, ReplayBatch, replay
 from probe_kit.runs.direction_files import FileDirection, names_file, read_direction
 from probe_kit.runs.reader import RunReader
 from probe_kit.runs.run import Run
+from probe_kit.statistics.bootstrap import GAINS, group_bootstrap, units_seed
 from probe_kit.statistics.paired_tests import max_t
 from probe_kit.suite.categories import category_of
 
@@ -53,12 +47,11 @@ TILES_APART = 0.31
 class Measurement:
     """The stored numbers that effects are computed from.
 
-    seed_text: of the run, by which random draws are made. read: a further stored file by its name. key: of the
-    intervention. tiles_apart: metres between the tiles of the run's scene.
+    read: a further stored file by its name. key: of the intervention. tiles_apart: metres between the tiles of the
+    run's scene.
     """
 
     outcomes: ConditionOutcomes
-    seed_text: str
     settings: Mapping[str, Any]
     certificate: Mapping[str, Any]
     read: Callable[[str], bytes]
@@ -70,29 +63,16 @@ class Measurement:
         """Return `first-chunk` or `per-step`."""
         return str(self.settings.get("readout", FIRST_CHUNK))
 
-
-class CategoryVerdict(Protocol):
-    """The verdict of a category, and the numbers it rests on."""
-
-    @property
-    def verdict(self) -> str:
-        """Return it in a few words."""
-
-    @property
-    def explanation(self) -> str:
-        """Return the numbers it rests on, or why there is none."""
-
-    @property
-    def finding(self) -> tuple[str, str]:
-        """Return it in a word or two, and what the action does."""
-
-    def describe(self, swap: Any) -> str:
-        """Return what an image swap showed, in sentences."""
+    def rows[Row: Effect](self, of_category: Callable[[ConditionOutcomes], Iterable[Row]]) -> list[Row]:
+        """Return the rows of all categories, in the order of the episodes, each with the key."""
+        parts = (of_category(part) for _, part in self.outcomes.by_category())
+        key: dict[str, Any] = {"key": self.key}  # every kind's rows have it, as their last column
+        return [replace(row, **key) for rows in parts for row in rows]
 
 
 @dataclass(frozen=True)
 class TableContext:
-    """The words of a table besides its rows. subject: model and suite. verdicts: by category.
+    """The words of a table besides its rows. subject: model and suite. verdicts: by category, `UseVerdict`.
 
     legend: of the verdicts. explains: whether the caption says what each verdict rests on, as sentences do.
     exchange: the change of inputs that effects are shares of.
@@ -100,7 +80,7 @@ class TableContext:
 
     measurement: Measurement
     subject: str
-    verdicts: Mapping[str, CategoryVerdict] = MappingProxyType({})
+    verdicts: Mapping[str, Any] = MappingProxyType({})
     legend: str = ""
     explains: bool = True
     exchange: str = "image swap"
@@ -116,7 +96,7 @@ class TableContext:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Intervention(ABC):
+class Intervention(Choice, ABC):
     """One kind of intervention: its settings as fields, its conditions, and how their numbers are read.
 
     categories: of the run; None for all. items: so many of each category, the first ones; None for all. readout:
@@ -125,34 +105,22 @@ class Intervention(ABC):
     the user's own, episode and frame of the clean inference and of its donor.
 
     Of the class. kind: its name on the command line. summary: a line of help. position: in help. options: those of
-    sites, roles, direction, controls, coefficients, target_side and seed that it takes, and their meaning.
-    has_verdict: whether `classify_use` classifies its rows. is_descriptive: whether it edits and tests nothing.
-    asks_where: whether it edits places of the network, so that a line says which layer matters. needs_sides:
-    whether it applies to runs of the scene alone.
+    sites, roles, direction, controls, coefficients, target_side and seed that it takes, and their meaning. needs:
+    the interventions that a family must support, besides those of the fields `sites` and `roles`. fits_always:
+    whether items are inferred beforehand. has_verdict: whether `classify_use` classifies its rows. is_descriptive:
+    whether it edits and tests nothing. asks_where: whether it edits places of the network, so that a line says
+    which layer matters. needs_sides: whether it applies to runs of the scene alone.
     """
 
-    kind: ClassVar[str]
     summary: ClassVar[str]
     position: ClassVar[int] = 100
     options: ClassVar[Mapping[str, str]] = MappingProxyType({})
+    needs: ClassVar[tuple[InterventionKind, ...]] = ("edit",)
+    fits_always: ClassVar[bool] = False
     has_verdict: ClassVar[bool] = False
     is_descriptive: ClassVar[bool] = False
     asks_where: ClassVar[bool] = False
     needs_sides: ClassVar[bool] = False
-    usual_vary: ClassVar[str] = "picture"
-
-    categories: tuple[str, ...] | None = None
-    items: int | None = None
-    readout: Readout = FIRST_CHUNK
-    vary: str = ""
-    frames: int | None = None
-    pairs: tuple[PairRow, ...] = ()
-
-    def __post_init__(self) -> None:
-        if self.items is not None and self.items < 1:
-            raise UsageError(f"items is {self.items}; expected at least 1")
-        if self.readout not in get_args(Readout):
-            raise UsageError(f"readout is {self.readout!r}; expected one of {', '.join(get_args(Readout))}")
 
     @classmethod
     def from_options(cls, run: Run, **options: Any) -> Self:
@@ -162,23 +130,16 @@ class Intervention(ABC):
 
     @property
     def required_capabilities(self) -> tuple[InterventionKind, ...]:
-        """Return the interventions that a family must support for it."""
-        return capabilities_for(getattr(self, "sites", ()), getattr(self, "roles", ()))
+        """Return the interventions that a family must support for it, at its sites and roles."""
+        reads_kv = any(str(site).partition(".")[0] == KV_STREAM for site in getattr(self, "sites", ()))
+        sees_tiles = not TILES.keys().isdisjoint(getattr(self, "roles", ()))
+        needed: dict[InterventionKind, bool] = {"kv": reads_kv, "tiles": sees_tiles}
+        return (*self.needs, *(kind for kind, is_needed in needed.items() if is_needed))
 
     @property
     def fits_first(self) -> bool:
-        """Whether items are inferred beforehand, for directions, erasers or a search."""
-        return False
-
-    def parameters(self) -> dict[str, Any]:
-        """Return its own settings as plain JSON; with the run they decide its numbers."""
-        common = {setting.name for setting in fields(Intervention)}
-        values = {
-            setting.name: getattr(self, setting.name)
-            for setting in fields(self)
-            if setting.init and setting.name not in common
-        }
-        return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
+        """Whether items are inferred beforehand, for directions of tokens, erasers or a search."""
+        return self.fits_always or ":" in getattr(self, "direction", "")
 
     def check_run(self, run: Run) -> None:
         """Raise UnknownCategoryError for a category that the run lacks, UsageError for a run that does not fit."""
@@ -196,15 +157,6 @@ class Intervention(ABC):
                 "or a run of the scene"
             )
 
-    @property
-    def varied(self) -> str:
-        """Return the input that the source has of its donor."""
-        return self.vary or self.usual_vary
-
-    def items_in(self, run: Run) -> list[str]:
-        """Return the items of a run that are replayed."""
-        return items_of(run, self.categories, self.items)
-
     def eligible_items(self, session: "ReplaySession", items: Sequence[str]) -> list[str]:
         """Return those of the items that it can be asked of; the others are passed over, and counted."""
         del session
@@ -212,20 +164,20 @@ class Intervention(ABC):
 
     @abstractmethod
     def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
-        """Return all conditions, in the order in which they are stored; the first is `CleanRun`."""
+        """Return all conditions, in the order in which they are stored; the first one changes nothing.
+
+        What the certificate shall say of them is put in `session.certificate`.
+        """
 
     def play(self, session: "ReplaySession", item: str, conditions: Sequence[Condition]) -> ReplayBatch:
         """Play the conditions on the pairs of one item."""
         return replay(session, session.pairs(item), conditions)
 
-    def certificate_entries(self, conditions: Sequence[Condition], batch: ReplayBatch) -> dict[str, Any]:
-        """Return further entries of its certificate, as plain JSON."""
-        del conditions, batch
-        return {}
-
-    def extra_files(self, run: Run, conditions: Sequence[Condition], batch: ReplayBatch) -> dict[str, bytes]:
-        """Return further files to store, by name."""
-        del run, conditions, batch
+    def extra_files(
+        self, session: "ReplaySession", conditions: Sequence[Condition], batch: ReplayBatch
+    ) -> dict[str, bytes]:
+        """Return further files to store, by name; further entries go into `session.certificate`."""
+        del session, conditions, batch
         return {}
 
     @staticmethod
@@ -266,9 +218,9 @@ class Intervention(ABC):
         return ""
 
     @staticmethod
-    def notes(rows: Sequence[Any], measurement: Measurement) -> list[str]:
+    def notes(rows: Sequence[Any]) -> list[str]:
         """Return sentences that a reader must know."""
-        del rows, measurement
+        del rows
         return []
 
     @staticmethod
@@ -304,11 +256,6 @@ class AlongDirection(Intervention):
             object.__setattr__(self, "vector", vector)
             object.__setattr__(self, "direction", vector.name)
 
-    @property
-    def fits_first(self) -> bool:
-        """Whether its direction is of tokens."""
-        return ":" in self.direction
-
     def check_run(self, run: Run) -> None:
         """Raise UsageError also for a direction of an answer in a run without sides."""
         super().check_run(run)
@@ -317,13 +264,6 @@ class AlongDirection(Intervention):
                 f"{run.location} has no correct picture on a side, so that {self.direction} is no direction "
                 "there. Give one of a file: --direction FILE#NAME"
             )
-
-
-def capabilities_for(sites: Sequence[str], roles: Sequence[str]) -> tuple[InterventionKind, ...]:
-    """Return the interventions that a family must support for edits at such places and roles."""
-    reads_kv = any(pattern.partition(".")[0] == KV_STREAM for pattern in sites)
-    needs: dict[InterventionKind, bool] = {"kv": reads_kv, "tiles": bool(set(roles) & set(TILES))}
-    return ("edit", *(kind for kind, is_needed in needs.items() if is_needed))
 
 
 # -- names of conditions -------------------------------------------------------------------------------------
@@ -391,22 +331,31 @@ class EffectRow(Effect):
         return " ".join(filter(None, (self.place, self.role, self.direction)))
 
 
-def common_columns(outcomes: ConditionOutcomes, row: int, name: ConditionName) -> dict[str, Any]:
-    """Return the columns of `EffectRow` that need no statistics, of one condition. outcomes: of one category."""
+def common_columns(outcomes: ConditionOutcomes, row: int, name: ConditionName, net: Values) -> dict[str, Any]:
+    """Return the columns of `EffectRow` of one condition. outcomes: of one category. net: (E,) its gains."""
     logged = dict(zip(LOG_FIELDS, outcomes.edit_log[row].T, strict=True))
     norm = float((logged["norm"] * logged["fires"]).sum())
+    counts = {column: value for column, value in outcomes.counts.items() if column != "n_groups"}
     return {
+        **counts,
         "place": name.site,
         "role": name.role,
         "direction": name.direction,
         "is_control": name.is_control,
-        "n_episodes": outcomes.episodes.size,
-        "n_items": np.unique(outcomes.items).size,
+        "net": float(net.mean()),
+        "net_ci": net_interval(net, outcomes),
         "max_action_change": float(outcomes.max_action_change[row].max()),
         "fires": int(logged["fires"].sum()),
         "no_op_fires": int(logged["no_op_fires"].sum()),
         "relative_change": float((logged["change"] * logged["fires"]).sum()) / norm if norm else 0.0,
     }
+
+
+def net_interval(net: Values, outcomes: ConditionOutcomes) -> tuple[float, float]:
+    """Return the 95 % interval by groups of the mean over episodes of (E,) gains."""
+    drawn = units_seed(outcomes.groups, outcomes.seed_text)
+    low, high = group_bootstrap(net[:, None], outcomes.groups, drawn, bounds=GAINS)
+    return float(low[0]), float(high[0])
 
 
 class ControlTest(NamedTuple):
@@ -427,14 +376,13 @@ def test_against_controls(
     values: Values,
     names: Sequence[ConditionName],
     outcomes: ConditionOutcomes,
-    seed_text: str,
     untested: Collection[int],
     no_controls: Collection[int],
 ) -> list[ControlTest]:
     """Compare every condition that is no control with its own controls, in the order of the conditions.
 
-    values: (K, E) tested to be above zero. outcomes: of one category. seed_text: of the run, by which sign flips
-    are drawn. untested: further rows that are not tested. no_controls: rows that are no controls.
+    values: (K, E) tested to be above zero. outcomes: of one category. untested: further rows that are not tested.
+    no_controls: rows that are no controls.
     """
     controls = [
         [at for at, other in enumerate(names) if other.is_control_of(name) and at not in no_controls]
@@ -447,16 +395,15 @@ def test_against_controls(
     beyond = np.array(
         [values[at] - values[controls[at]].mean(axis=0) if controls[at] else values[at] for at in tested]
     )
-    seed = flips_seed(outcomes, seed_text)
-    numbers = max_t(beyond, outcomes.items, outcomes.groups, seed)
+    numbers = max_t(beyond, outcomes.items, outcomes.groups, flips_seed(outcomes))
     for at, excess, *statistics in zip(tested, beyond, *numbers, strict=True):
         tests[at] = ControlTest(controls[at], excess, *map(float, statistics))
     return tests
 
 
-def flips_seed(outcomes: ConditionOutcomes, seed_text: str) -> int:
+def flips_seed(outcomes: ConditionOutcomes) -> int:
     """Return the seed of the sign flips of one category."""
-    return derive_seed("sign flips", seed_text, str(outcomes.categories[0]))
+    return derive_seed("sign flips", outcomes.seed_text, str(outcomes.categories[0]))
 
 
 def mean_of(values: Values) -> float | None:
@@ -464,17 +411,13 @@ def mean_of(values: Values) -> float | None:
     return float(values.mean()) if values.size else None
 
 
-def by_category[Row: Effect](rows: Iterable[Row]) -> dict[str, list[Row]]:
-    """Return rows by category."""
-    parts: dict[str, list[Row]] = {}
-    for row in rows:
-        parts.setdefault(row.category, []).append(row)
-    return parts
-
-
 def edits_by_category[Row: Effect](rows: Iterable[Row]) -> dict[str, list[Row]]:
     """Return rows by category, without controls of edits."""
-    return by_category(row for row in rows if not (isinstance(row, EffectRow) and row.is_control))
+    parts: dict[str, list[Row]] = {}
+    for row in rows:
+        if not (isinstance(row, EffectRow) and row.is_control):
+            parts.setdefault(row.category, []).append(row)
+    return parts
 
 
 def frame_of(rows: Sequence[Effect]) -> "pd.DataFrame":
@@ -531,21 +474,28 @@ def edit_of(row: EffectRow) -> str:
     return f"{category_of(row.category).title}, {row.name}"
 
 
-def text_of(value: float | None, form: str = ".2f", missing: str = "–") -> str:
-    """Return a number in a format, and zero without a sign unless the format asks for one."""
+def p_of(value: float | None) -> str:
+    """Return a p-value in two digits, and a dash for none."""
     if value is None:
-        return missing
-    text = format(value, form)
-    return text.lstrip("-") if "+" not in form and float(text) == 0 else text
+        return "–"
+    text = format(value, ".2g")
+    return text.lstrip("-") if float(text) == 0 else text
 
 
 def interval_text(
-    value: float | None, limits: tuple[float, float] | None, form: str = ".2f", missing: str = "–"
+    value: float | None,
+    limits: tuple[float, float] | None,
+    write: Callable[[float | None], str] = number,
 ) -> str:
-    """Return `value [low, high]`."""
+    """Return `value [low, high]`, and a dash without an interval."""
     if value is None or limits is None:
-        return missing
-    return f"{text_of(value, form)} [{text_of(limits[0], form)}, {text_of(limits[1], form)}]"
+        return "–"
+    return f"{write(value)} [{write(limits[0])}, {write(limits[1])}]"
+
+
+def signed_interval(value: float | None, limits: tuple[float, float] | None) -> str:
+    """Return `+value [+low, +high]`."""
+    return interval_text(value, limits, signed)
 
 
 def count_edits(names: Sequence[str], tried: int, most: int = 3) -> str:

@@ -7,17 +7,17 @@ Two things are kept apart: which picture the cube was brought to, and whether it
 disrupts the task lowers a success rate as well as one that turns the choice, so that it enters no verdict.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import numpy as np
 
+from probe_kit._tables.numbers import percent, signed
 from probe_kit.env.scoring import DEFAULT_RULE
 from probe_kit.errors import UsageError
 from probe_kit.hooks.capturing.edits import EditLog, Identity, apply_patch
-from probe_kit.hooks.contract.declared import InterventionKind
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.intervene.kinds.base import (
     NONE,
@@ -26,30 +26,22 @@ from probe_kit.intervene.kinds.base import (
     EffectRow,
     Measurement,
     TableContext,
-    capabilities_for,
     common_columns,
     count_edits,
     edit_of,
     effect_table,
-    interval_text,
     lines_of,
     mean_of,
+    p_of,
     share_of_edits,
+    signed_interval,
     test_against_controls,
-    text_of,
 )
-from probe_kit.intervene.kinds.image_swap import net_interval
 from probe_kit.intervene.kinds.interchange import best_patch_targets, patch_of, patches_within
 from probe_kit.intervene.outcomes import CLEAN, FIRST_CHUNK, ConditionOutcomes, categories_in
 from probe_kit.intervene.patching.patch import Cell, sites_of_cells
 from probe_kit.intervene.places import ALL, SEPARATOR, TILES, resolve_sites, role_tokens
-from probe_kit.intervene.replay import (
-    Condition,
-    ConditionContext,
-    ConditionResult,
-    ReplayBatch,
-    SourceRun,
-)
+from probe_kit.intervene.replay import SOURCE_RUN, Condition, ConditionContext, ConditionResult, ReplayBatch
 from probe_kit.runs.run import Run
 from probe_kit.statistics.paired_tests import sign_p
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -72,24 +64,21 @@ _LEGEND = (
 )
 
 
-@dataclass(frozen=True)
-class IdentityPatch:
-    """The inference as the run made it, with every site that any condition changes written back as it was."""
+def identity_patch(sites: Sequence[Site]) -> Condition:
+    """Return the inference as the run made it, with every site that any condition changes written back."""
 
-    sites: tuple[Site, ...]
-    name: str = CLEAN
-
-    def play(self, context: ConditionContext) -> ConditionResult:
-        """Infer while hooks fire and nothing moves."""
+    def play(context: ConditionContext) -> ConditionResult:
         session, pair = context.session, context.pair
         with ExitStack() as stack:
             edit_logs = []
-            for stream in dict.fromkeys(site.stream for site in self.sites):
-                sites = [site for site in self.sites if site.stream == stream]
+            for stream in dict.fromkeys(site.stream for site in sites):
+                of_stream = [site for site in sites if site.stream == stream]
                 tokens = role_tokens(session.policy, pair, stream, ALL, context.memo)
-                edit_logs.append(stack.enter_context(apply_patch(session.policy, sites, tokens, Identity())))
-            chunk = session.act(pair.clean, pair.seed)
+                edit_logs.append(stack.enter_context(apply_patch(session.policy, of_stream, tokens, Identity())))
+            chunk = context.act()
         return ConditionResult(chunk, EditLog.sum(edit_logs))
+
+    return Condition(CLEAN, play)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -148,10 +137,14 @@ class ClosedLoop(AlongDirection):
         return cls(**options, targets=targets)
 
     @property
-    def required_capabilities(self) -> tuple[InterventionKind, ...]:
-        """Return edits; and `kv`, where one of its places is."""
-        sites, roles = zip(*map(self._split, self.targets), strict=True)
-        return capabilities_for(sites, roles)
+    def sites(self) -> tuple[str, ...]:
+        """Return the places of its targets."""
+        return tuple(ConditionName.parse(target).site for target in self.targets)
+
+    @property
+    def roles(self) -> tuple[str, ...]:
+        """Return the role of each."""
+        return tuple(ConditionName.parse(target).role for target in self.targets)
 
     def parameters(self) -> dict[str, Any]:
         """Return where and along what; it is read where the cube ends."""
@@ -170,15 +163,15 @@ class ClosedLoop(AlongDirection):
         """Return the identity patch, the image swap and every target. Raises UnknownSiteError, NoProbesError."""
         from probe_kit.intervene.directions import fit_token_directions
 
-        targets = [self._split(target) for target in self.targets]
         cells = [
-            Cell(site_group, role) for name, role in targets for site_group in resolve_sites(name, session.policy)
+            Cell(site_group, role)
+            for name, role in zip(self.sites, self.roles, strict=True)
+            for site_group in resolve_sites(name, session.policy)
         ]
         source_sites = sites_of_cells(cells)
         within = [cell for cell in cells if len(cell.site_group.sites) == 1 and cell.role not in TILES]
-        patterns = [pattern for pattern, _ in targets]
-        bases = {} if self.direction == NONE else fit_token_directions(session, self, within, patterns)
-        conditions: list[Condition] = [IdentityPatch(source_sites), SourceRun()]
+        bases = {} if self.direction == NONE else fit_token_directions(session, self, within, self.sites)
+        conditions = [identity_patch(source_sites), SOURCE_RUN]
         for cell in cells:
             conditions.append(patch_of(cell, source_sites))
             if cell in bases:
@@ -192,14 +185,9 @@ class ClosedLoop(AlongDirection):
         return play_episodes(session, session.pairs(item), conditions)
 
     @staticmethod
-    def _split(target: str) -> tuple[str, str]:
-        name = ConditionName.parse(target)
-        return name.site, name.role
-
-    @staticmethod
     def effects(measurement: Measurement) -> "list[ClosedLoopEffect]":
         """Return one row per category and condition, the identity patch first."""
-        return closed_loop_effects(measurement.outcomes, measurement.seed_text, measurement.key)
+        return measurement.rows(closed_loop_effects)
 
     @staticmethod
     def table(rows: "Sequence[ClosedLoopEffect]", context: TableContext) -> "Table":
@@ -238,9 +226,8 @@ class ClosedLoop(AlongDirection):
         return f"not confirmed: no edit of {len(edits)} turns the cube to the other picture beyond its controls"
 
     @staticmethod
-    def notes(rows: "Sequence[ClosedLoopEffect]", measurement: Measurement) -> list[str]:
+    def notes(rows: "Sequence[ClosedLoopEffect]") -> list[str]:
         """Return edits that disrupt the task."""
-        del measurement
         return [
             f"{edit_of(row)}: the cube is in a zone in {100 * row.in_zone:.0f} % of episodes; the "
             "task is disrupted, and this enters no verdict."
@@ -299,14 +286,8 @@ class ClosedLoopEffect(EffectRow):
         return {**super().to_json(), "finding": self.finding}
 
 
-def closed_loop_effects(outcomes: ConditionOutcomes, seed_text: str, key: str = "") -> list[ClosedLoopEffect]:
-    """Return one per category and condition, the identity patch first. seed_text: of the run, for intervals."""
-    return [
-        row for category, part in outcomes.by_category() for row in _of_category(part, category, seed_text, key)
-    ]
-
-
-def _of_category(outcomes: ConditionOutcomes, category: str, seed_text: str, key: str) -> list[ClosedLoopEffect]:
+def closed_loop_effects(outcomes: ConditionOutcomes) -> list[ClosedLoopEffect]:
+    """Return one per condition of one category, the identity patch first."""
     assert outcomes.episode_outcomes is not None
     names = [ConditionName.parse(condition) for condition in outcomes.conditions]
     wrong = (outcomes.episode_outcomes == WRONG).astype(float)
@@ -315,21 +296,17 @@ def _of_category(outcomes: ConditionOutcomes, category: str, seed_text: str, key
     net = wrong - wrong[0]
     left_out = set(np.flatnonzero(disrupted).tolist())
     clean = {at for at, name in enumerate(names) if name.site == CLEAN}
-    tests = test_against_controls(net, names, outcomes, seed_text, left_out | clean, left_out)
+    tests = test_against_controls(net, names, outcomes, left_out | clean, left_out)
     rows = []
     for at, (name, test) in enumerate(zip(names, tests, strict=True)):
         gained, lost = int((net[at] > 0).sum()), int((net[at] < 0).sum())
-        columns: dict[str, Any] = common_columns(outcomes, at, name)
         rows.append(
             ClosedLoopEffect(
-                category=category,
-                **columns,
+                **common_columns(outcomes, at, name, net[at]),
                 correct=float((outcomes.episode_outcomes[at] == CORRECT).mean()),
                 wrong=float(wrong[at].mean()),
                 in_zone=float(in_zone[at]),
                 wrong_in_zone=float(wrong[at].mean() / in_zone[at]) if in_zone[at] else None,
-                net=float(net[at].mean()),
-                net_ci=net_interval(net[at], outcomes, seed_text),
                 net_left=mean_of(net[at][outcomes.sides == "right"]),
                 net_right=mean_of(net[at][outcomes.sides == "left"]),
                 control_net=mean_of(net[test.controls]),
@@ -340,33 +317,27 @@ def _of_category(outcomes: ConditionOutcomes, category: str, seed_text: str, key
                 p=test.p,
                 p_fwe=test.p_fwe,
                 disrupted=bool(disrupted[at]),
-                key=key,
             )
         )
     return rows
 
 
-def _edited(row: ClosedLoopEffect, text: str) -> str:
-    return "–" if row.place == CLEAN else text
-
-
-def _percent(share: float | None) -> str:
-    return "–" if share is None else f"{100 * share:.1f}"
+def _of_edits(text: Callable[[ClosedLoopEffect], str]) -> Callable[[ClosedLoopEffect], str]:
+    """Return the text of a cell, but for the identity patch."""
+    return lambda row: "–" if row.place == CLEAN else text(row)
 
 
 _ENDS: Mapping[str, Any] = {
-    "correct %": lambda row: _percent(row.correct),
-    "wrong %": lambda row: _percent(row.wrong),
-    "in a zone %": lambda row: _percent(row.in_zone),
-    "wrong of these %": lambda row: _percent(row.wrong_in_zone),
+    "correct %": lambda row: percent(row.correct),
+    "wrong %": lambda row: percent(row.wrong),
+    "in a zone %": lambda row: percent(row.in_zone),
+    "wrong of these %": lambda row: percent(row.wrong_in_zone),
 }
 _COMPARED: Mapping[str, Any] = {
-    "net flip rate [95 %]": lambda row: _edited(row, interval_text(row.net, row.net_ci, "+.2f")),
-    "left / right": lambda row: _edited(
-        row, f"{text_of(row.net_left, '+.2f')} / {text_of(row.net_right, '+.2f')}"
-    ),
-    "controls": lambda row: _edited(row, text_of(row.control_net, "+.2f")),
-    "only with : only without": lambda row: _edited(row, f"{row.gained} : {row.lost}"),
-    "p": lambda row: _edited(row, text_of(row.p_fwe, ".2g")),
+    "net flip rate [95 %]": _of_edits(lambda row: signed_interval(row.net, row.net_ci)),
+    "left / right": _of_edits(lambda row: f"{signed(row.net_left)} / {signed(row.net_right)}"),
+    "controls": _of_edits(lambda row: signed(row.control_net)),
+    "only with : only without": _of_edits(lambda row: f"{row.gained} : {row.lost}"),
+    "p": _of_edits(lambda row: p_of(row.p_fwe)),
     "finding": lambda row: row.finding,
 }

@@ -8,16 +8,16 @@ is one per position.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from probe_kit._tables.numbers import number, percent
 from probe_kit.errors import UsageError
 from probe_kit.hooks.capturing.edits import Identity, TokenIndex, apply_patch
 from probe_kit.hooks.contract.sites import Site
-from probe_kit.intervene.erasers import Eraser, Method, PaddedTokens
+from probe_kit.intervene.erasers import Eraser, Method
 from probe_kit.intervene.kinds.base import (
     ConditionName,
     EffectRow,
@@ -30,17 +30,16 @@ from probe_kit.intervene.kinds.base import (
     effect_table,
     lines_of,
     mean_of,
+    p_of,
     share_of_edits,
     test_against_controls,
-    text_of,
 )
-from probe_kit.intervene.kinds.image_swap import net_interval
 from probe_kit.intervene.kinds.interchange import cells_at
 from probe_kit.intervene.outcomes import CLEAN, ERASE, FIRST_CHUNK, PROBE_ACCURACY, ConditionOutcomes
 from probe_kit.intervene.patching.attribution import LOCALISATION_SHARE
 from probe_kit.intervene.patching.patch import Cell
 from probe_kit.intervene.places import TILES, resolve_all, role_tokens
-from probe_kit.intervene.replay import CleanRun, Condition, ConditionContext, ConditionResult, ReplayBatch
+from probe_kit.intervene.replay import CLEAN_RUN, Condition, ConditionContext, ConditionResult
 from probe_kit.runs.run import Run
 from probe_kit.statistics.folds import Fold
 from probe_kit.statistics.paired_tests import paired_greater_p
@@ -58,9 +57,6 @@ LEACE = "leace"
 Finding = Literal[
     "identity patch", "control", "no baseline effect", "controls also disrupt", "effect", "no effect"
 ]
-ProbeAccuracies = Mapping[str, Mapping[str, float]]
-"""By condition and category."""
-_NOTHING: ProbeAccuracies = {}
 UNTOUCHED, ZERO = "none", "0"
 """Direction and coefficient of the condition in which tokens are written back as they are."""
 CHANCE_LIKE = 0.6
@@ -88,6 +84,7 @@ class ConceptErasure(Intervention):
     kind: ClassVar[str] = ERASE
     summary: ClassVar[str] = "Remove the decodable answer (weaker than interchange)."
     position: ClassVar[int] = 8
+    fits_always: ClassVar[bool] = True
     needs_sides: ClassVar[bool] = True
     options: ClassVar[Mapping[str, str]] = {
         "sites": "where tokens are erased, one site each; required",
@@ -124,55 +121,45 @@ class ConceptErasure(Intervention):
         method = options.pop("direction", LEACE)
         return super().from_options(run, method=method, **options)
 
-    @property
-    def fits_first(self) -> bool:
-        """Whether erasers are fitted first: always."""
-        return True
-
     def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
-        """Return clean, then every cell untouched, erased and with its controls. Raises UnknownSiteError."""
-        from probe_kit.intervene.directions import PassedOver, collect_token_features
+        """Return clean, then every cell untouched, erased and with its controls. Raises UnknownSiteError.
+
+        The certificate gets, by condition and category, how well a fresh probe reads the answer behind it.
+        """
+        from probe_kit.intervene.directions import PassedOver, by_episode, collect_token_features, fit_by_fold
 
         places = resolve_all(self.sites, session.policy)
         cells = cells_at(session, places.values(), self.roles)
         if not cells:
             raise UsageError(f"no token of {', '.join(places)} has the role {', '.join(self.roles)}")
-        erased: dict[Cell, dict[str, ErasedCondition]] = {}
-        passed_over = PassedOver(session, self.sites)
+        erasers: dict[Cell, dict[str, dict[str, Eraser]]] = {}
+        accuracies: dict[str, dict[str, float]] = {}
+        passed_over, method = PassedOver(session, self.sites), Method.of(self.method)
         for cell, category, features in collect_token_features(session, self.items_in(session.run), cells):
             with passed_over.fitting(cell):
-                self._fit(erased.setdefault(cell, {}), cell, category, features)
-        return [
-            CleanRun(),
-            *(condition for by_name in passed_over.left(erased).values() for condition in by_name.values()),
+                by_name = erasers.setdefault(cell, {})
+                fits = fit_by_fold(features, cell, method, self.controls, self.seed, category)
+                for name, of_episode in {UNTOUCHED: {}, **by_episode(features, fits)}.items():
+                    by_name.setdefault(name, {}).update(of_episode)
+                    # What is readable with each eraser, and without; untouched comes first.
+                    fitted = [(fold, by_fold[name] if of_episode else None) for fold, by_fold in fits]
+                    of_condition = accuracies.setdefault(_name_of(cell, name), {})
+                    of_condition[category] = _probe_accuracy(features, fitted)
+        conditions = [
+            erased(cell, name, of_episode)
+            for cell, by_name in passed_over.left(erasers).items()
+            for name, of_episode in by_name.items()
         ]
-
-    def certificate_entries(self, conditions: Sequence[Condition], batch: ReplayBatch) -> dict[str, Any]:
-        """Return how well a fresh probe reads the answer behind each condition, by category."""
-        del batch
-        erased = [condition for condition in conditions if isinstance(condition, ErasedCondition)]
-        return {PROBE_ACCURACY: {condition.name: dict(condition.probe_accuracy) for condition in erased}}
-
-    def _fit(
-        self, by_name: "dict[str, ErasedCondition]", cell: Cell, category: str, features: "TokenFeatures"
-    ) -> None:
-        """Add one category's erasers, and what is readable with each and without; untouched comes first."""
-        from probe_kit.intervene.directions import by_episode, fit_by_fold
-
-        fits = fit_by_fold(features, cell, Method.of(self.method), self.controls, self.seed, category)
-        folds = [fold for fold, _ in fits]
-        erasers: dict[str, dict[str, Eraser]] = {UNTOUCHED: {}, **by_episode(features, fits)}
-        for name, of_episode in erasers.items():
-            condition = by_name.setdefault(name, ErasedCondition(cell, name, {}, {}))
-            condition.erasers.update(of_episode)
-            fitted = [by_fold[name] for _, by_fold in fits] if of_episode else None
-            condition.probe_accuracy[category] = _probe_accuracy(features, folds, fitted)
+        session.certificate[PROBE_ACCURACY] = {
+            condition.name: accuracies[condition.name] for condition in conditions
+        }
+        return [CLEAN_RUN, *conditions]
 
     @staticmethod
     def effects(measurement: Measurement) -> "list[ErasureEffect]":
         """Return one per category and condition."""
         accuracies = measurement.certificate.get(PROBE_ACCURACY, {})
-        return erasure_effects(measurement.outcomes, measurement.seed_text, measurement.key, accuracies)
+        return measurement.rows(lambda part: erasure_effects(part, accuracies))
 
     @staticmethod
     def table(rows: "Sequence[ErasureEffect]", context: TableContext) -> "Table":
@@ -210,9 +197,8 @@ class ConceptErasure(Intervention):
         return f"lost: the action leaves the answer after {share_of_edits(lost, len(tried), 'erasures')}"
 
     @staticmethod
-    def notes(rows: "Sequence[ErasureEffect]", measurement: Measurement) -> list[str]:
+    def notes(rows: "Sequence[ErasureEffect]") -> list[str]:
         """Return how weak the evidence is, probes at chance, and controls that disrupt."""
-        del measurement
         blind = [row for row in rows if row.finding == "no effect" and (row.probe_accuracy or 1.0) < CHANCE_LIKE]
         broken = [row for row in rows if row.finding == "controls also disrupt"]
         return [
@@ -226,33 +212,25 @@ class ConceptErasure(Intervention):
 KIND = ConceptErasure
 
 
-@dataclass(frozen=True)
-class ErasedCondition:
-    """The tokens of one cell, without what an eraser takes away.
+def _name_of(cell: Cell, name: str) -> str:
+    coefficient = ZERO if name == UNTOUCHED else ""
+    return str(ConditionName(cell.site_group.name, cell.role, name, coefficient))
 
-    erasers: by episode, fitted without it; empty to write back what is there. probe_accuracy: by category, the
-    held-out accuracy of a probe fitted on what is left, of the mean over tokens.
+
+def erased(cell: Cell, name: str, erasers: Mapping[str, Eraser]) -> Condition:
+    """Return the clean inference with the tokens of one cell without what an eraser takes away.
+
+    erasers: by episode, fitted without it; empty to write back what is there.
     """
 
-    cell: Cell
-    direction: str
-    erasers: dict[str, Eraser] = field(repr=False)
-    probe_accuracy: dict[str, float]
-
-    @property
-    def name(self) -> str:
-        """Return place, role and direction, see `ConditionName`."""
-        coefficient = ZERO if self.direction == UNTOUCHED else ""
-        return str(ConditionName(self.cell.site_group.name, self.cell.role, self.direction, coefficient))
-
-    def play(self, context: ConditionContext) -> ConditionResult:
-        """Infer without it."""
-        pair, session, site_group = context.pair, context.session, self.cell.site_group
-        tokens = role_tokens(session.policy, pair, site_group.stream, self.cell.role, context.memo)
-        change = ApplyEraser(self.erasers[pair.episode]) if self.erasers else Identity()
+    def play(context: ConditionContext) -> ConditionResult:
+        pair, session, site_group = context.pair, context.session, cell.site_group
+        tokens = role_tokens(session.policy, pair, site_group.stream, cell.role, context.memo)
+        change = ApplyEraser(erasers[pair.episode]) if erasers else Identity()
         with apply_patch(session.policy, site_group.sites, tokens, change) as edit_log:
-            chunk = session.act(pair.clean, pair.seed)
-        return ConditionResult(chunk, edit_log)
+            return ConditionResult(context.act(), edit_log)
+
+    return Condition(_name_of(cell, name), play)
 
 
 @dataclass(frozen=True)
@@ -268,31 +246,26 @@ class ApplyEraser:
         del site, where
         fitted = min(activation.shape[1], self.eraser.fitted.size)
         after = activation.clone()
-        erased = self.eraser(activation[:, :fitted].double().cpu().numpy())
-        after[:, :fitted] = torch.from_numpy(erased).to(activation)
+        values = self.eraser(activation[:, :fitted].double().cpu().numpy())
+        after[:, :fitted] = torch.from_numpy(values).to(activation)
         return after
 
 
-def _probe_accuracy(features: "TokenFeatures", folds: Sequence[Fold], erasers: Sequence[Eraser] | None) -> float:
-    """Held-out accuracy of a probe on the mean over tokens; chance is one half."""
+def _probe_accuracy(features: "TokenFeatures", fits: Sequence[tuple[Fold, Eraser | None]]) -> float:
+    """Held-out accuracy of a probe on the mean over tokens, of each fold behind its eraser; chance is one half."""
     from sklearn.linear_model import LogisticRegression
     from sklearn.pipeline import make_pipeline
     from sklearn.preprocessing import StandardScaler
 
-    right = 0
-    for number, fold in enumerate(folds):
-        pooled = _pooled(features.tokens, None if erasers is None else erasers[number])
+    right, tokens = 0, features.tokens
+    mask = tokens.present[..., None]
+    for fold, eraser in fits:
+        values = tokens.values if eraser is None else eraser(tokens.values)
+        pooled = np.where(mask, values, 0).sum(axis=1) / mask.sum(axis=1)
         probe = make_pipeline(StandardScaler(), LogisticRegression(C=0.01, max_iter=1000))
         probe.fit(pooled[fold.train], features.is_left[fold.train])
         right += int((probe.predict(pooled[fold.test]) == features.is_left[fold.test]).sum())
     return right / features.is_left.size
-
-
-def _pooled(tokens: PaddedTokens, eraser: Eraser | None) -> NDArray[np.float64]:
-    """(N, D) mean over the tokens that are there."""
-    values = tokens.values if eraser is None else eraser(tokens.values)
-    mask = tokens.present[..., None]
-    return np.asarray(np.where(mask, values, 0).sum(axis=1) / mask.sum(axis=1))
 
 
 # -- effects -----------------------------------------------------------------------------------------------
@@ -336,12 +309,8 @@ class ErasureEffect(EffectRow):
         control_share = 1.0 if self.control_kept is None else self.control_kept
         if control_share < LOCALISATION_SHARE:
             return "controls also disrupt"
-        gone = (
-            self.p is not None
-            and self.p < SIGNIFICANCE
-            and control_share - self.kept >= SMALLEST_EFFECT_OF_INTEREST
-        )
-        return "effect" if gone else "no effect"
+        beyond = self.p is not None and self.p < SIGNIFICANCE
+        return "effect" if beyond and control_share - self.kept >= SMALLEST_EFFECT_OF_INTEREST else "no effect"
 
     @property
     def name(self) -> str:
@@ -355,43 +324,29 @@ class ErasureEffect(EffectRow):
 
 
 def erasure_effects(
-    outcomes: ConditionOutcomes, seed_text: str, key: str = "", probe_accuracy: ProbeAccuracies = _NOTHING
+    outcomes: ConditionOutcomes, probe_accuracy: Mapping[str, Mapping[str, float]]
 ) -> list[ErasureEffect]:
-    """One per category and condition. probe_accuracy: as a certificate has it."""
-    return [
-        row
-        for category, part in outcomes.by_category()
-        for row in _of_category(part, category, seed_text, key, probe_accuracy)
-    ]
-
-
-def _of_category(
-    outcomes: ConditionOutcomes, category: str, seed_text: str, key: str, probe_accuracy: ProbeAccuracies
-) -> list[ErasureEffect]:
-    sign = outcomes.correct_sign
+    """Return one per condition of one category. probe_accuracy: by condition and category, of the certificate."""
+    sign, category = outcomes.correct_sign, str(outcomes.categories[0])
     clean = sign * outcomes.of(CLEAN)
     conditions = [name for name in outcomes.conditions if name != CLEAN]
     names = [ConditionName.parse(condition) for condition in conditions]
     values = np.array([sign * outcomes.of(condition) for condition in conditions])
     away = clean - values
     untouched = [at for at, name in enumerate(names) if name.coefficient]
-    tests = test_against_controls(away, names, outcomes, seed_text, untouched, ())
+    tests = test_against_controls(away, names, outcomes, untouched, ())
     goes_there = paired_greater_p(clean, outcomes.items, outcomes.groups) < SIGNIFICANCE
     share = values.sum(axis=1) / clean.sum() if goes_there else None
     net = (clean > 0).astype(float) - (values > 0)
     rows = []
     for at, (condition, name, test) in enumerate(zip(conditions, names, tests, strict=True)):
-        columns: dict[str, Any] = common_columns(outcomes, outcomes.conditions.index(condition), name)
         before = str(ConditionName(name.site, name.role, UNTOUCHED, ZERO))
         rows.append(
             ErasureEffect(
-                category=category,
-                **columns,
+                **common_columns(outcomes, outcomes.conditions.index(condition), name, net[at]),
                 right_before=float((clean > 0).mean()),
                 right=float((values[at] > 0).mean()),
                 kept=None if share is None else float(share[at]),
-                net=float(net[at].mean()),
-                net_ci=net_interval(net[at], outcomes, seed_text),
                 mean_displacement=float(away[at].mean()),
                 control_kept=None if share is None else mean_of(share[test.controls]),
                 control_net=mean_of(net.mean(axis=1)[test.controls]),
@@ -400,7 +355,6 @@ def _of_category(
                 p_fwe=test.p_fwe,
                 probe_accuracy_before=probe_accuracy.get(before, {}).get(category),
                 probe_accuracy=probe_accuracy.get(condition, {}).get(category),
-                key=key,
             )
         )
     return rows
@@ -412,23 +366,19 @@ def _tried(rows: Sequence[ErasureEffect]) -> tuple[list[ErasureEffect], bool]:
     return tried, not tried or any(row.finding != "no baseline effect" for row in tried)
 
 
-def _percent(share: float | None) -> str:
-    return "–" if share is None else f"{100 * share:.1f}"
-
-
 def _accuracies(row: ErasureEffect) -> str:
     if row.probe_accuracy_before is None or row.probe_accuracy is None:
         return "–"
-    return f"{_percent(row.probe_accuracy_before)} → {_percent(row.probe_accuracy)}"
+    return f"{percent(row.probe_accuracy_before)} → {percent(row.probe_accuracy)}"
 
 
 _ACTION: Mapping[str, Any] = {
-    "goes there %": lambda row: f"{_percent(row.right_before)} → {_percent(row.right)}",
-    "controls %": lambda row: _percent(None if row.control_net is None else row.right_before - row.control_net),
-    "kept": lambda row: text_of(row.kept, missing="n/a"),
-    "controls": lambda row: text_of(row.control_kept),
+    "goes there %": lambda row: f"{percent(row.right_before)} → {percent(row.right)}",
+    "controls %": lambda row: percent(None if row.control_net is None else row.right_before - row.control_net),
+    "kept": lambda row: "n/a" if row.kept is None else number(row.kept),
+    "controls": lambda row: number(row.control_kept),
     "displacement cm": lambda row: f"{-100 * row.mean_displacement:+.2f}",
-    "p": lambda row: text_of(row.p, ".2g"),
+    "p": lambda row: p_of(row.p),
     "relative change": lambda row: f"{row.relative_change:.2f}",
 }
 _PROBE: Mapping[str, Any] = {"probe accuracy %": _accuracies, "finding": lambda row: row.finding}

@@ -1,17 +1,20 @@
 """Image swap: with the two images swapped, and nothing else, does the action change sides?
 
-Two inferences per episode, same state and noise. Displacements are in units of the policy's own reach.
+Two inferences per episode, same state and noise. Displacements are in units of the policy's own reach. Of runs
+without sides one input is exchanged for a donor's, and sizes are in spreads of clean actions.
 """
 
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import hypot
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit._system.counting import counted
+from probe_kit._tables.numbers import number, percent
 from probe_kit.hooks.contract.declared import InterventionKind, Readout
 from probe_kit.intervene.kinds.base import (
     TILES_APART,
@@ -21,7 +24,9 @@ from probe_kit.intervene.kinds.base import (
     effect_table,
     interval_text,
     lines_of,
-    text_of,
+    net_interval,
+    p_of,
+    signed_interval,
 )
 from probe_kit.intervene.outcomes import (
     CLEAN,
@@ -34,10 +39,16 @@ from probe_kit.intervene.outcomes import (
     has_sides,
     preferred_by_category,
 )
-from probe_kit.intervene.patching.sweep import NOTHING, SwapShare, carries_nothing, share_fields, share_of_whole
-from probe_kit.intervene.replay import CleanRun, Condition, ControlInput, DonorRun, SourceRun
+from probe_kit.intervene.patching.sweep import (
+    NOTHING,
+    SwapShare,
+    carries_nothing,
+    share_fields,
+    share_of_whole,
+)
+from probe_kit.intervene.replay import CLEAN_RUN, CONTROL_RUN, DONOR_RUN, SOURCE_RUN, Condition
 from probe_kit.runs.reader import RunReader
-from probe_kit.statistics.bootstrap import GAINS, group_bootstrap, unbounded_student_interval, units_seed
+from probe_kit.statistics.bootstrap import unbounded_student_interval
 from probe_kit.statistics.paired_tests import paired_greater_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.statistics.sufficiency import SMALLEST_EFFECT_OF_INTEREST
@@ -46,6 +57,31 @@ from probe_kit.suite.categories import category_of
 if TYPE_CHECKING:
     from probe_kit._tables.table import Table
     from probe_kit.intervene.sessions import ReplaySession
+
+NAME = "image-swap"
+FEWEST_TO_EITHER_SIDE = 8
+"""Clean inferences that must go to either side before a reach is taken from them."""
+SMALLEST_REACH = 0.02
+"""Metres. Two sides that are nearer to each other are no choice between tiles."""
+REACHED = 0.25
+"""Share of the reach from which a side counts as reached."""
+SMALLEST_SHARE_OF_INTEREST = 0.10
+"""Of the reach. A displacement below it is a trace."""
+FOLLOWS, REVERSES = 1, -1
+_LEGEND = (
+    "moved: displacement toward the correct picture in units of the policy's own reach, "
+    f"{SMALLEST_SHARE_OF_INTEREST} of which count; follow: goes to the correct picture, and to the other side "
+    "once the two are swapped; reversal: the reverse; "
+    f"net: follow − reversal, {SMALLEST_EFFECT_OF_INTEREST} of which count; p: exact, by item and by group, the "
+    "larger one"
+)
+_REACH = {
+    "actions": "reach: {:.1f} cm between the actions that go left and those that go right",
+    "tiles": "reach: {:.1f} cm, the distance between the tiles, since too few actions go to one of the sides",
+}
+
+
+# -- the exchange of an input, without sides -----------------------------------------------------------------
 
 
 Finding = Literal["decides", "moves", "no effect", "open"]
@@ -80,35 +116,20 @@ class InputEffect(Effect):
     key: str = ""
 
 
-def input_effects(
-    outcomes: ConditionOutcomes, swapped: str, vary: str, seed_text: str, key: str = ""
-) -> list[InputEffect]:
-    """Return one per category. swapped: the condition in which the input is the donor's."""
-    return [
-        _input_effect(part, category, swapped, vary, seed_text, key) for category, part in outcomes.by_category()
-    ]
-
-
-def _input_effect(
-    outcomes: ConditionOutcomes, category: str, swapped: str, vary: str, seed_text: str, key: str
-) -> InputEffect:
+def input_effect(outcomes: ConditionOutcomes, swapped: str, vary: str) -> InputEffect:
+    """Return that of one category. swapped: the condition in which the input is the donor's."""
     assert outcomes.size is not None
     at, control, full = (outcomes.conditions.index(name) for name in (swapped, CONTROL_INPUT, DONOR))
     size, control_size, full_size = outcomes.size[[at, control, full]]
-    clean, exchange = outcomes.of(CLEAN), outcomes.of(DONOR) - outcomes.of(CLEAN)
-    share = (
-        share_of_whole(outcomes.of(swapped) - clean, exchange, outcomes.groups, seed_text)
-        if exchange.any()
-        else None
+    clean = outcomes.of(CLEAN)
+    share = share_of_whole(
+        outcomes.of(swapped) - clean, outcomes.of(DONOR) - clean, outcomes.groups, outcomes.seed_text
     )
     p = paired_greater_p(size - control_size, outcomes.items, outcomes.groups)
     ratio = float(size.sum() / full_size.sum()) if full_size.any() else 0.0
     return InputEffect(
-        category=category,
+        **outcomes.counts,
         vary=vary,
-        n_episodes=size.size,
-        n_items=np.unique(outcomes.items).size,
-        n_groups=np.unique(outcomes.groups).size,
         changed=float((outcomes.max_action_change[at] > 0).mean()),
         size=float(size.mean()),
         control_size=float(control_size.mean()),
@@ -116,7 +137,6 @@ def _input_effect(
         **share_fields("share", share),
         p=p,
         finding=_finding(share, p, ratio),
-        key=key,
     )
 
 
@@ -132,7 +152,7 @@ def _finding(share: SwapShare | None, p: float, ratio: float) -> Finding:
     return "moves" if beyond else "open"
 
 
-INPUT_LEGEND = (
+_INPUT_LEGEND = (
     "size: mean change of the action in spreads of clean actions, by the donor's input; control: by a change of "
     "it that means nothing; full: by all of the donor's inputs; share: displacement toward the donor's action, of "
     f"the full exchange; decides: from {DECIDES}; no effect: within ±{NOTHING}; p: exact, that the change is "
@@ -144,10 +164,20 @@ _VERBS: Mapping[str, str] = {
     "no effect": "has no effect",
     "open": "has an effect that remains open",
 }
+_INPUT_COLUMNS: Mapping[str, Any] = {
+    "changed %": lambda row: percent(row.changed),
+    "size": lambda row: number(row.size),
+    "control": lambda row: number(row.control_size),
+    "full": lambda row: number(row.full_size),
+    "share [95 %]": lambda row: interval_text(row.share, row.share_ci),
+    "p": lambda row: p_of(row.p),
+    "n (episodes)": lambda row: f"{row.n_episodes} ({row.n_items})",
+    "finding": lambda row: row.finding,
+}
 
 
-def find_input(row: InputEffect) -> str:
-    """Return the finding of one input, a verdict and what the action does, without brackets."""
+def _find_input(row: InputEffect) -> str:
+    """Return a verdict and what the action does, without brackets."""
     if not row.changed:
         return f"does not arrive: another {row.vary} changes no number of any action"
     share = "" if row.share is None else f", by {row.share:.2f} of what all inputs do"
@@ -159,39 +189,18 @@ def find_input(row: InputEffect) -> str:
     }[row.finding]
 
 
-def describe_input(row: InputEffect) -> str:
-    """Return the finding of one input, as the end of a sentence."""
+def _describe_input(row: InputEffect) -> str:
+    """Return the same as the end of a sentence."""
     if not row.changed:
         return f"the {row.vary} does not arrive: it changes no number of any action"
     share = "n/a" if row.share is None else f"{row.share:.2f}"
     return f"the {row.vary} {_VERBS[row.finding]} ({share} of the full exchange)"
 
 
-NAME = "image-swap"
-FEWEST_TO_EITHER_SIDE = 8
-"""Clean inferences that must go to either side before a reach is taken from them."""
-SMALLEST_REACH = 0.02
-"""Metres. Two sides that are nearer to each other are no choice between tiles."""
-REACHED = 0.25
-"""Share of the reach from which a side counts as reached."""
-SMALLEST_SHARE_OF_INTEREST = 0.10
-"""Of the reach. A displacement below it is a trace."""
-FOLLOWS, REVERSES = 1, -1
-_LEGEND = (
-    "moved: displacement toward the correct picture in units of the policy's own reach, "
-    f"{SMALLEST_SHARE_OF_INTEREST} of which count; follow: goes to the correct picture, and to the other side "
-    "once the two are swapped; reversal: the reverse; "
-    f"net: follow − reversal, {SMALLEST_EFFECT_OF_INTEREST} of which count; p: exact, by item and by group, the "
-    "larger one"
-)
-_REACH = {
-    "actions": "reach: {:.1f} cm between the actions that go left and those that go right",
-    "tiles": "reach: {:.1f} cm, the distance between the tiles, since too few actions go to one of the sides",
-}
+# -- effects of a swap ---------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Reach:
+class Reach(NamedTuple):
     """The lateral distance between a policy's own two choices.
 
     metres: more than zero. source: `actions`, the clean inferences of all categories, or `tiles`, the distance
@@ -222,9 +231,6 @@ def tiles_apart(run: RunReader) -> float:
         return TILES_APART
     (left_x, left_y), (right_x, right_y) = scene["tile_left"], scene["tile_right"]
     return hypot(left_x - right_x, left_y - right_y)
-
-
-# -- effects -------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -264,28 +270,15 @@ class ImageSwapEffect(Effect):
     key: str = ""
 
 
-def image_swap_effects(
-    outcomes: ConditionOutcomes,
-    seed_text: str,
-    key: str = "",
-    readout: str = FIRST_CHUNK,
-    tiles_apart: float = TILES_APART,
-) -> list[ImageSwapEffect]:
-    """Return one per category, in the order of the episodes.
-
-    seed_text: of the run, by which intervals are drawn. readout: of the intervention. tiles_apart: metres, for
-    policies without a reach of their own.
-    """
-    reach = Reach.of(outcomes.of(CLEAN), tiles_apart)
-    return [
-        ImageSwapEffect(**swap_columns(part, category, IMAGE_SWAP, seed_text, reach), readout=readout, key=key)
-        for category, part in outcomes.by_category()
-    ]
+def image_swap_effects(measurement: Measurement) -> list[ImageSwapEffect]:
+    """Return one per category, in the order of the episodes."""
+    reach = Reach.of(measurement.outcomes.of(CLEAN), measurement.tiles_apart)
+    return measurement.rows(
+        lambda part: [ImageSwapEffect(**swap_columns(part, IMAGE_SWAP, reach), readout=measurement.readout)]
+    )
 
 
-def swap_columns(
-    outcomes: ConditionOutcomes, category: str, swapped: str, seed_text: str, reach: Reach
-) -> dict[str, Any]:
+def swap_columns(outcomes: ConditionOutcomes, swapped: str, reach: Reach) -> dict[str, Any]:
     """Return the columns of `ImageSwapEffect` of one category. swapped: compared with the clean condition."""
     clean, other = (outcomes.correct_sign * outcomes.of(name) for name in (CLEAN, swapped))
     responses = swap_responses(outcomes, swapped)
@@ -293,15 +286,17 @@ def swap_columns(
     displacement = clean - other
     shares = displacement / reach.metres
     follow_p, reversal_p = swap_p_values(outcomes, swapped)
+    reached = {}
+    for side in ("left", "right"):
+        near, far = (values[outcomes.sides == side] > REACHED * reach.metres for values in (clean, other))
+        # By how much more often the side of the correct picture is reached; 0 where it never lies there.
+        reached[f"{side}_reached"] = float(near.mean() - far.mean()) if near.size else 0.0
     return {
-        "category": category,
-        "n_episodes": net.size,
-        "n_items": np.unique(outcomes.items).size,
-        "n_groups": np.unique(outcomes.groups).size,
+        **outcomes.counts,
         "follow_rate": float((responses == FOLLOWS).mean()),
         "reversal_rate": float((responses == REVERSES).mean()),
         "net_follow_rate": float(net.mean()),
-        "net_follow_rate_ci": net_interval(net, outcomes, seed_text),
+        "net_follow_rate_ci": net_interval(net, outcomes),
         "follow_p": follow_p,
         "reversal_p": reversal_p,
         "median_displacement": float(np.median(np.abs(displacement))),
@@ -310,7 +305,7 @@ def swap_columns(
         "reach_share": float(shares.mean()),
         "reach_share_ci": unbounded_student_interval(shares, outcomes.groups),
         "moved_share": float(np.abs(shares).mean()),
-        **{f"{side}_reached": _reached(outcomes.sides == side, clean, other, reach) for side in ("left", "right")},
+        **reached,
     }
 
 
@@ -349,7 +344,7 @@ def swap_sign(outcomes: ConditionOutcomes) -> float:
     return -1.0 if is_reversed else 1.0
 
 
-def share_of_swap(outcomes: ConditionOutcomes, moved: NDArray[np.float64], seed_text: str) -> SwapShare | None:
+def share_of_swap(outcomes: ConditionOutcomes, moved: NDArray[np.float64]) -> SwapShare | None:
     """Return `moved` (E,) as a share of the swap's displacement in the same episodes of one category.
 
     None if images were not swapped, or if that moves the action by no more than chance: a share would be a ratio
@@ -357,116 +352,145 @@ def share_of_swap(outcomes: ConditionOutcomes, moved: NDArray[np.float64], seed_
     """
     if IMAGE_SWAP not in outcomes.conditions or min(swap_p_values(outcomes)) >= SIGNIFICANCE:
         return None
-    return share_of_whole(moved, outcomes.of(IMAGE_SWAP) - outcomes.of(CLEAN), outcomes.groups, seed_text)
-
-
-def _reached(
-    rows: NDArray[np.bool_], clean: NDArray[np.float64], other: NDArray[np.float64], reach: Reach
-) -> float:
-    """Return by how much more often the side of the correct picture is reached; 0 where it never lies there."""
-    if not rows.any():
-        return 0.0
-    near, far = (values[rows] > REACHED * reach.metres for values in (clean, other))
-    return float(near.mean() - far.mean())
-
-
-def net_interval(net: NDArray[np.float64], outcomes: ConditionOutcomes, seed_text: str) -> tuple[float, float]:
-    """Return the 95 % interval by groups of the mean over episodes of (E,) gains."""
-    drawn = units_seed(outcomes.groups, seed_text)
-    low, high = group_bootstrap(net[:, None], outcomes.groups, drawn, bounds=GAINS)
-    return float(low[0]), float(high[0])
+    full = outcomes.of(IMAGE_SWAP) - outcomes.of(CLEAN)
+    return share_of_whole(moved, full, outcomes.groups, outcomes.seed_text)
 
 
 def stored_image_swaps(run: RunReader, readout: str | None = None) -> dict[str, ImageSwapEffect]:
     """Return by category the effects of the image swaps that are stored for the episodes the run has now.
 
-    readout: of those alone; None for any. Of several the preferred one, see `selection`; empty if there is none.
+    readout: of those alone; None for any. Of several the preferred one, see `outcomes`; empty if there is none.
     Raises RunDamagedError if any stored intervention was changed.
     """
     preferred = preferred_by_category(run, NAME, readout)
     apart, rows = tiles_apart(run), dict[str, dict[str, ImageSwapEffect]]()
     for stored in {result.stored.key: result.stored for result in preferred.values()}.values():
-        read_as = str(stored.settings.get("readout", FIRST_CHUNK))
-        effects = image_swap_effects(stored.outcomes(), run.seed_text, stored.key, read_as, apart)
-        rows[stored.key] = {row.category: row for row in effects}
+        measurement = Measurement(stored.outcomes(), stored.settings, {}, stored.bundle.read, stored.key, apart)
+        rows[stored.key] = {row.category: row for row in image_swap_effects(measurement)}
     return {category: rows[result.stored.key][category] for category, result in preferred.items()}
 
 
 # -- the kind ------------------------------------------------------------------------------------------------
 
 
+SWAP_COLUMNS: Mapping[str, Any] = {
+    "moved [95 %]": lambda row: signed_interval(row.reach_share, row.reach_share_ci),
+    "follow %": lambda row: percent(row.follow_rate),
+    "reversal %": lambda row: percent(row.reversal_rate),
+    "net [95 %]": lambda row: signed_interval(row.net_follow_rate, row.net_follow_rate_ci),
+    "p": lambda row: p_of(row.follow_p),
+    "median displacement cm": lambda row: f"{100 * row.median_displacement:.2f}",
+    "n (items)": lambda row: f"{row.n_episodes} ({row.n_items})",
+}
+"""The columns that all swaps have."""
+
+
 @dataclass(frozen=True, kw_only=True)
-class ImageSwap(Intervention):
+class Swap(Intervention):
+    """An exchange of one input, in the condition `swapped`; without sides for that of a donor."""
+
+    swapped: ClassVar[str]
+    needs: ClassVar[tuple[InterventionKind, ...]] = ("swap",)
+
+    @classmethod
+    def effects(cls, measurement: Measurement) -> Sequence[Effect]:
+        """Return one row per category."""
+        if measurement.outcomes.has_sides:
+            return cls.swap_effects(measurement)
+        vary = str(measurement.settings.get("vary", ""))
+        return measurement.rows(lambda part: [input_effect(part, cls.swapped, vary)])
+
+    @classmethod
+    def table(cls, rows: Sequence[Any], context: TableContext) -> "Table":
+        """Return one line per category, with its verdict; without sides per category and input."""
+        if not context.lacks_sides:
+            title, caption, parts = cls.swap_table(rows, context)
+            return effect_table(title, caption, ("category",), [((row.category,), row) for row in rows], parts)
+        title = f"Does the input decide? {context.subject}, {context.exchange}"
+        lines = lines_of(rows, lambda row: str(row.vary))
+        parts = {"Does the action follow it?": _INPUT_COLUMNS}
+        return effect_table(title, _INPUT_LEGEND, ("category", "input"), lines, parts)
+
+    @classmethod
+    def sentences(cls, rows: Sequence[Any], context: TableContext) -> list[str]:
+        """Return one per category."""
+        if context.lacks_sides:
+            return [f"{row.n_episodes} frames of {row.n_items} episodes: {_describe_input(row)}." for row in rows]
+        names = [f"{category_of(row.category).title} ({counted(row.n_items, 'item')})" for row in rows]
+        return [f"{name}: {cls.swap_sentence(row, context)}" for name, row in zip(names, rows, strict=True)]
+
+    @classmethod
+    def finding(cls, rows: Sequence[Any], context: TableContext) -> str:
+        """Return the verdict of one category."""
+        (row,) = rows
+        return _find_input(row) if context.lacks_sides else cls.swap_finding(row, context)
+
+    @staticmethod
+    @abstractmethod
+    def swap_effects(measurement: Measurement) -> Sequence[ImageSwapEffect]:
+        """Return the rows of a run with sides."""
+
+    @staticmethod
+    @abstractmethod
+    def swap_table(rows: Sequence[Any], context: TableContext) -> tuple[str, str, Mapping[str, Any]]:
+        """Return title, caption and columns of their table."""
+
+    @staticmethod
+    @abstractmethod
+    def swap_sentence(row: Any, context: TableContext) -> str:
+        """Return the end of the sentence about one of them."""
+
+    @staticmethod
+    @abstractmethod
+    def swap_finding(row: Any, context: TableContext) -> str:
+        """Return a verdict, a colon and what was found."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageSwap(Swap):
     """Two inferences per episode, same state and noise: clean, and with the two images swapped."""
 
     kind: ClassVar[str] = NAME
     summary: ClassVar[str] = "Swap the two images: does the action change sides?"
     position: ClassVar[int] = 1
     has_verdict: ClassVar[bool] = True
-
-    @property
-    def required_capabilities(self) -> tuple[InterventionKind, ...]:
-        """Return two inferences that can be compared."""
-        return ("swap",)
+    swapped: ClassVar[str] = IMAGE_SWAP
 
     def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
         """Return clean, and with swapped images; without sides also all of the donor's inputs, and the control."""
-        if has_sides(session.run):
-            return CleanRun(), SourceRun()
-        return CleanRun(), SourceRun(), DonorRun(), ControlInput()
+        unpaired = () if has_sides(session.run) else (DONOR_RUN, CONTROL_RUN)
+        return CLEAN_RUN, SOURCE_RUN, *unpaired
+
+    swap_effects = staticmethod(image_swap_effects)
 
     @staticmethod
-    def effects(measurement: Measurement) -> "list[ImageSwapEffect] | list[InputEffect]":
-        """Return one row per category."""
-        if not measurement.outcomes.has_sides:
-            return exchanged_effects(measurement, IMAGE_SWAP)
-        readout, apart = measurement.readout, measurement.tiles_apart
-        return image_swap_effects(measurement.outcomes, measurement.seed_text, measurement.key, readout, apart)
-
-    @staticmethod
-    def table(rows: Sequence[ImageSwapEffect], context: TableContext) -> "Table":
-        """Return one line per category, with its verdict."""
-        if context.lacks_sides:
-            return input_table(rows, context)
+    def swap_table(rows: Sequence[ImageSwapEffect], context: TableContext) -> tuple[str, str, Mapping[str, Any]]:
+        """Return them with the verdict."""
         verdicts = context.verdicts
         reasons = [
             f"{category_of(name).title}: {verdict.explanation}"
             for name, verdict in verdicts.items()
-            if verdict.explanation
+            if verdict.explanation and context.explains
         ]
         reaches = [_REACH[row.reach_source].format(100 * row.reach) for row in rows]
-        notes = dict.fromkeys((context.legend, *reaches, *(reasons if context.explains else ())))
-        return effect_table(
-            f"Is it used? {context.subject}, images swapped",
-            "; ".join(filter(None, (_LEGEND, *notes))),
-            ("category",),
-            [((row.category,), row) for row in rows],
-            {
-                "Verdict": {
-                    "verdict": lambda row: verdicts[row.category].verdict if row.category in verdicts else "–"
-                },
-                "Does the action follow the images?": SWAP_COLUMNS,
+        caption = "; ".join(filter(None, (_LEGEND, *dict.fromkeys((context.legend, *reaches, *reasons)))))
+        parts: dict[str, Any] = {
+            "Verdict": {
+                "verdict": lambda row: verdicts[row.category].verdict if row.category in verdicts else "–"
             },
-        )
-
-    @classmethod
-    def sentences(cls, rows: Sequence[ImageSwapEffect], context: TableContext) -> list[str]:
-        """Return one per category, with its verdict."""
-        if context.lacks_sides:
-            return input_sentences(rows)
-        verdicts = context.verdicts
-        return [
-            f"{begin_sentence(row)}: "
-            + (verdicts[row.category].describe(row) if row.category in verdicts else swap_rates(row, "images"))
-            for row in rows
-        ]
+            "Does the action follow the images?": SWAP_COLUMNS,
+        }
+        return f"Is it used? {context.subject}, images swapped", caption, parts
 
     @staticmethod
-    def finding(rows: Sequence[ImageSwapEffect], context: TableContext) -> str:
+    def swap_sentence(row: ImageSwapEffect, context: TableContext) -> str:
+        """Return the verdict with its numbers."""
+        verdict = context.verdicts.get(row.category)
+        return swap_rates(row, "images") if verdict is None else str(verdict.describe(row))
+
+    @staticmethod
+    def swap_finding(row: ImageSwapEffect, context: TableContext) -> str:
         """Return the verdict, and how often a swap turns the action."""
-        if context.lacks_sides:
-            return input_finding(rows)
-        (row,) = rows
         turned = f"a swap turns it in {100 * row.follow_rate:.0f} % of the episodes"
         use = context.verdicts.get(row.category)
         verdict, what = ("swapped", "") if use is None else use.finding
@@ -479,99 +503,12 @@ class ImageSwap(Intervention):
 
 
 KIND = ImageSwap
-SWAP_COLUMNS: Mapping[str, Any] = {
-    "moved [95 %]": lambda row: interval_text(row.reach_share, row.reach_share_ci, "+.2f"),
-    "follow %": lambda row: f"{100 * row.follow_rate:.1f}",
-    "reversal %": lambda row: f"{100 * row.reversal_rate:.1f}",
-    "net [95 %]": lambda row: interval_text(row.net_follow_rate, row.net_follow_rate_ci, "+.2f"),
-    "p": lambda row: text_of(row.follow_p, ".2g"),
-    "median displacement cm": lambda row: f"{100 * row.median_displacement:.2f}",
-    "n (items)": lambda row: f"{row.n_episodes} ({row.n_items})",
-}
-"""The columns that all swaps have."""
-
-
-INPUT_COLUMNS: Mapping[str, Any] = {
-    "changed %": lambda row: f"{100 * row.changed:.1f}",
-    "size": lambda row: text_of(row.size),
-    "control": lambda row: text_of(row.control_size),
-    "full": lambda row: text_of(row.full_size),
-    "share [95 %]": lambda row: interval_text(row.share, row.share_ci),
-    "p": lambda row: text_of(row.p, ".2g"),
-    "n (episodes)": lambda row: f"{row.n_episodes} ({row.n_items})",
-    "finding": lambda row: row.finding,
-}
-"""The columns of an exchanged input without sides."""
-
-
-def exchanged_effects(measurement: Measurement, swapped: str) -> list[InputEffect]:
-    """Return the effects of one input of a run without sides."""
-    vary = str(measurement.settings.get("vary", ""))
-    return input_effects(measurement.outcomes, swapped, vary, measurement.seed_text, measurement.key)
-
-
-def input_table(rows: Sequence[Any], context: TableContext) -> "Table":
-    """Return one line per category and input."""
-    title = f"Does the input decide? {context.subject}, {context.exchange}"
-    lines = lines_of(rows, lambda row: str(row.vary))
-    return effect_table(
-        title, INPUT_LEGEND, ("category", "input"), lines, {"Does the action follow it?": INPUT_COLUMNS}
-    )
-
-
-def input_sentences(rows: Sequence[Any]) -> list[str]:
-    """Return one per category and input."""
-    return [f"{row.n_episodes} frames of {row.n_items} episodes: {describe_input(row)}." for row in rows]
-
-
-def input_finding(rows: Sequence[Any]) -> str:
-    """Return the finding of the input that one category's frames were shown of another."""
-    (row,) = rows
-    return find_input(row)
-
-
-class Swapped(Protocol):
-    """The numbers of a swap: `ImageSwapEffect`, or a part of a row that has them."""
-
-    @property
-    def follow_rate(self) -> float | None:
-        """Share of episodes."""
-
-    @property
-    def reversal_rate(self) -> float | None:
-        """Share of episodes."""
-
-    @property
-    def net_follow_rate(self) -> float | None:
-        """The difference of both."""
-
-    @property
-    def net_follow_rate_ci(self) -> tuple[float | None, float | None] | None:
-        """95 % interval of the difference."""
-
-    @property
-    def reach_share(self) -> float | None:
-        """Displacement in units of the reach."""
-
-    @property
-    def reach_share_ci(self) -> tuple[float | None, float | None] | None:
-        """95 % interval of the displacement."""
 
 
 def swap_rates(row: ImageSwapEffect, inputs: str) -> str:
     """Return how often the action follows a swap of some inputs, as the end of a sentence."""
-    low, high = map(percent, row.net_follow_rate_ci)
+    low, high = (f"{100 * limit:.0f}" for limit in row.net_follow_rate_ci)
     return (
-        f"the action follows a swap of the {inputs} in {percent(row.follow_rate)} % of episodes and does the "
-        f"reverse in {percent(row.reversal_rate)} % (net {low} to {high} %)."
+        f"the action follows a swap of the {inputs} in {100 * row.follow_rate:.0f} % of episodes and does the "
+        f"reverse in {100 * row.reversal_rate:.0f} % (net {low} to {high} %)."
     )
-
-
-def begin_sentence(row: ImageSwapEffect) -> str:
-    """Return the category and its number of items."""
-    return f"{category_of(row.category).title} ({counted(row.n_items, 'item')})"
-
-
-def percent(value: float | None) -> str:
-    """Return a share in percent."""
-    return "–" if value is None else f"{100 * value:.0f}"

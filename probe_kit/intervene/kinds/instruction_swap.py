@@ -5,42 +5,43 @@ and not the other: it can have learnt what to look for, whatever is asked.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from probe_kit._tables.numbers import percent
 from probe_kit.errors import UsageError
 from probe_kit.hashing import derive_seed
-from probe_kit.hooks.contract.declared import InterventionKind
-from probe_kit.intervene.kinds.base import Intervention, Measurement, TableContext, effect_table
+from probe_kit.intervene.kinds.base import Measurement, TableContext
 from probe_kit.intervene.kinds.image_swap import (
     SWAP_COLUMNS,
     ImageSwapEffect,
-    InputEffect,
     Reach,
-    begin_sentence,
-    exchanged_effects,
-    input_finding,
-    input_sentences,
-    input_table,
+    Swap,
     swap_columns,
     swap_rates,
 )
-from probe_kit.intervene.outcomes import CLEAN, IMAGE_SWAP, INSTRUCTION_SWAP, NOISE, ConditionOutcomes, has_sides
+from probe_kit.intervene.outcomes import (
+    CLEAN,
+    IMAGE_SWAP,
+    INSTRUCTION_SWAP,
+    NOISE,
+    ConditionOutcomes,
+    has_sides,
+)
 from probe_kit.intervene.replay import (
-    CleanRun,
+    CLEAN_RUN,
+    CONTROL_RUN,
+    DONOR_RUN,
+    SOURCE_RUN,
     Condition,
     ConditionContext,
     ConditionResult,
-    ControlInput,
-    DonorRun,
-    SourceRun,
 )
 from probe_kit.statistics.significance import SIGNIFICANCE
 
 if TYPE_CHECKING:
-    from probe_kit._tables.table import Table
     from probe_kit.intervene.sessions import ReplaySession
 
 _CONDITIONS = {"instruction": INSTRUCTION_SWAP, "images": IMAGE_SWAP, "noise": NOISE}
@@ -75,7 +76,7 @@ class InstructionSwapEffect(ImageSwapEffect):
 
     def to_json(self) -> dict[str, Any]:
         """Return plain values, the sensitivity's among them."""
-        plain = super().to_json()
+        plain = asdict(self)
         return {**{name: value for name, value in plain.items() if name != "sensitivity"}, **plain["sensitivity"]}
 
 
@@ -92,32 +93,20 @@ def input_sensitivity(outcomes: ConditionOutcomes) -> InputSensitivity:
     return InputSensitivity(**apart, **changed)
 
 
-@dataclass(frozen=True)
-class InstructionSwapped:
-    """The same state, noise and pictures, asked for the other one of the two."""
-
-    name: str = INSTRUCTION_SWAP
-
-    def play(self, context: ConditionContext) -> ConditionResult:
-        """Infer with another instruction."""
-        observation = context.session.with_other_instruction(context.pair)
-        assert observation is not None, "items without a counterpart are skipped"
-        return ConditionResult(context.session.act(observation, context.pair.seed))
+def _ask_for_the_other(context: ConditionContext) -> ConditionResult:
+    """Infer with the same state, noise and pictures, asked for the other one of the two."""
+    observation = context.session.with_other_instruction(context.pair)
+    assert observation is not None, "items without a counterpart are skipped"
+    return ConditionResult(context.session.act(observation, context.pair.seed))
 
 
-@dataclass(frozen=True)
-class NoiseResampled:
-    """The same question with its noise drawn anew; the same action again where a policy draws none."""
-
-    name: str = NOISE
-
-    def play(self, context: ConditionContext) -> ConditionResult:
-        """Infer with another seed."""
-        return ConditionResult(context.session.act(context.pair.clean, derive_seed(context.pair.seed, NOISE, 0)))
+def _resample_noise(context: ConditionContext) -> ConditionResult:
+    """Infer with noise drawn anew; the same action again where a policy draws none."""
+    return ConditionResult(context.session.act(context.pair.clean, derive_seed(context.pair.seed, NOISE, 0)))
 
 
 @dataclass(frozen=True, kw_only=True)
-class InstructionSwap(Intervention):
+class InstructionSwap(Swap):
     """Four inferences per episode: clean, other instruction, swapped images, other noise.
 
     A counterpart shows the same two pictures and asks for the other one; items without one are skipped and
@@ -128,11 +117,7 @@ class InstructionSwap(Intervention):
     summary: ClassVar[str] = "Ask for the other picture: does the action change sides?"
     position: ClassVar[int] = 2
     usual_vary: ClassVar[str] = "instruction"
-
-    @property
-    def required_capabilities(self) -> tuple[InterventionKind, ...]:
-        """Return two inferences that can be compared."""
-        return ("swap",)
+    swapped: ClassVar[str] = INSTRUCTION_SWAP
 
     def eligible_items(self, session: "ReplaySession", items: Sequence[str]) -> list[str]:
         """Return those of `items` with a counterpart in the run's wording. Raises UsageError if there is none."""
@@ -146,52 +131,40 @@ class InstructionSwap(Intervention):
 
     def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
         """Return clean; asked for the other picture; the images swapped; the noise drawn anew."""
+        swapped, noise = Condition(INSTRUCTION_SWAP, _ask_for_the_other), Condition(NOISE, _resample_noise)
         if has_sides(session.run):
-            return CleanRun(), InstructionSwapped(), SourceRun(), NoiseResampled()
-        return CleanRun(), InstructionSwapped(), DonorRun(), ControlInput(), NoiseResampled()
+            return CLEAN_RUN, swapped, SOURCE_RUN, noise
+        return CLEAN_RUN, swapped, DONOR_RUN, CONTROL_RUN, noise
 
     @staticmethod
-    def effects(measurement: Measurement) -> "list[InstructionSwapEffect] | list[InputEffect]":
+    def swap_effects(measurement: Measurement) -> list[InstructionSwapEffect]:
         """Return one per category, in the order of the episodes."""
-        if not measurement.outcomes.has_sides:
-            return exchanged_effects(measurement, INSTRUCTION_SWAP)
         reach = Reach.of(measurement.outcomes.of(CLEAN), measurement.tiles_apart)
-        return [
-            InstructionSwapEffect(
-                **swap_columns(part, category, INSTRUCTION_SWAP, measurement.seed_text, reach),
-                readout=measurement.readout,
-                key=measurement.key,
-                sensitivity=input_sensitivity(part),
-            )
-            for category, part in measurement.outcomes.by_category()
-        ]
+
+        def of_category(part: ConditionOutcomes) -> list[InstructionSwapEffect]:
+            columns = swap_columns(part, INSTRUCTION_SWAP, reach)
+            sensitivity = input_sensitivity(part)
+            return [InstructionSwapEffect(**columns, readout=measurement.readout, sensitivity=sensitivity)]
+
+        return measurement.rows(of_category)
 
     @staticmethod
-    def table(rows: Sequence[InstructionSwapEffect], context: TableContext) -> "Table":
-        """Return one line per category."""
-        if context.lacks_sides:
-            return input_table(rows, context)
-        return effect_table(
-            f"Is the instruction read? {context.subject}",
-            _LEGEND,
-            ("category",),
-            [((row.category,), row) for row in rows],
-            {"Does the action follow the instruction?": SWAP_COLUMNS, "What one step owes to": _STEP_COLUMNS},
-        )
-
-    @classmethod
-    def sentences(cls, rows: Sequence[InstructionSwapEffect], context: TableContext) -> list[str]:
-        """Return one per category; a swap of the instruction enters no verdict."""
-        if context.lacks_sides:
-            return input_sentences(rows)
-        return [f"{begin_sentence(row)}: {swap_rates(row, 'instruction')}" for row in rows]
+    def swap_table(rows: Sequence[Any], context: TableContext) -> tuple[str, str, Mapping[str, Any]]:
+        """Return them with the sensitivity of one step."""
+        del rows
+        parts = {"Does the action follow the instruction?": SWAP_COLUMNS, "What one step owes to": _STEP_COLUMNS}
+        return f"Is the instruction read? {context.subject}", _LEGEND, parts
 
     @staticmethod
-    def finding(rows: Sequence[InstructionSwapEffect], context: TableContext) -> str:
+    def swap_sentence(row: InstructionSwapEffect, context: TableContext) -> str:
+        """Return the rates; a swap of the instruction enters no verdict."""
+        del context
+        return swap_rates(row, "instruction")
+
+    @staticmethod
+    def swap_finding(row: InstructionSwapEffect, context: TableContext) -> str:
         """Return whether the action follows a swap of the instruction."""
-        if context.lacks_sides:
-            return input_finding(rows)
-        (row,) = rows
+        del context
         follows = "followed" if row.follow_p < SIGNIFICANCE else "not shown"
         verdict = "reversed" if row.reversal_p < SIGNIFICANCE else follows
         return (
@@ -205,6 +178,6 @@ _STEP_COLUMNS: Mapping[str, Any] = {
     "instruction cm": lambda row: f"{100 * row.sensitivity.instruction:.2f}",
     "images cm": lambda row: f"{100 * row.sensitivity.images:.2f}",
     "noise cm": lambda row: f"{100 * row.sensitivity.noise:.2f}",
-    "instruction changes it %": lambda row: f"{100 * row.sensitivity.instruction_changed:.1f}",
-    "images change it %": lambda row: f"{100 * row.sensitivity.images_changed:.1f}",
+    "instruction changes it %": lambda row: percent(row.sensitivity.instruction_changed),
+    "images change it %": lambda row: percent(row.sensitivity.images_changed),
 }

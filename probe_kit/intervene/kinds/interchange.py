@@ -12,11 +12,11 @@ on the same episodes, in one intervention or in several.
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from probe_kit._tables.numbers import number, signed
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import KV_STREAM, Site
 from probe_kit.intervene.kinds.base import (
@@ -30,14 +30,14 @@ from probe_kit.intervene.kinds.base import (
     common_columns,
     count_edits,
     effect_table,
-    interval_text,
     lines_of,
     mean_of,
+    p_of,
     share_of_edits,
+    signed_interval,
     test_against_controls,
-    text_of,
 )
-from probe_kit.intervene.kinds.image_swap import SMALLEST_REACH, net_interval, share_of_swap, swap_sign
+from probe_kit.intervene.kinds.image_swap import SMALLEST_REACH, share_of_swap, swap_sign
 from probe_kit.intervene.outcomes import (
     CLEAN,
     IMAGE_SWAP,
@@ -50,17 +50,24 @@ from probe_kit.intervene.outcomes import (
 )
 from probe_kit.intervene.patching.attribution import LOCALISATION_SHARE
 from probe_kit.intervene.patching.patch import Cell, sites_of_cells
-from probe_kit.intervene.patching.sweep import SwapShare, share_fields, share_of_whole
+from probe_kit.intervene.patching.sweep import share_fields, share_of_whole
 from probe_kit.intervene.places import ALL, RESIDUAL, TILES, PlaceName, SiteGroup, resolve_all, roles_of
-from probe_kit.intervene.replay import CleanRun, Condition, Patched, SourceRun
+from probe_kit.intervene.replay import CLEAN_RUN, SOURCE_RUN, Condition, patched_run
 from probe_kit.runs.reader import RunReader
 from probe_kit.runs.run import Run
 from probe_kit.statistics.significance import SIGNIFICANCE
 
 if TYPE_CHECKING:
     from probe_kit._tables.table import Table
-    from probe_kit.intervene.directions import DirectionBasis
+    from probe_kit.intervene.directions import Directions
     from probe_kit.intervene.sessions import ReplaySession
+
+_LEGEND = (
+    "effect: share of what the whole image swap does, n/a where that is not beyond chance; net flip rate: share "
+    "of episodes that flip to the target side, minus those that flip away from it; p: family-wise over all edits "
+    "of the category, one-sided; relative change: how far tokens were moved, in their own norms; *: carries the "
+    "effect by construction and locates nothing; unread: nothing that acts reads this place"
+)
 
 
 # -- effects of edits at places ------------------------------------------------------------------------------
@@ -116,8 +123,8 @@ class PatchEffect(EffectRow):
         The first layer of the backbone holds the swapped images themselves, and the acting stream the action.
         """
         parsed = PlaceName.parse(self.place)
-        is_first = parsed.stream == "backbone" and parsed.layer == 0 and parsed.quantity in ("", RESIDUAL)
-        return parsed.stream not in ("backbone", KV_STREAM) or is_first
+        is_first = parsed.stream == BACKBONE and parsed.layer == 0 and parsed.quantity in ("", RESIDUAL)
+        return parsed.stream not in (BACKBONE, KV_STREAM) or is_first
 
     @property
     def name(self) -> str:
@@ -125,90 +132,65 @@ class PatchEffect(EffectRow):
         return " ".join(filter(None, (super().name, self.coefficient and f"coefficient {self.coefficient}")))
 
 
-def patch_effects(
-    outcomes: ConditionOutcomes, seed_text: str, target_side: str = IMAGE_SWAP, key: str = ""
-) -> list[PatchEffect]:
-    """Return one per category and edit. target_side: `image_swap`, or the side that is steered to."""
-    return [
-        row
-        for category, part in outcomes.by_category()
-        for row in _of_category(part, category, seed_text, target_side, key)
-    ]
-
-
-def target_sign(outcomes: ConditionOutcomes, target_side: str) -> NDArray[np.float64]:
+def target_sign(outcomes: ConditionOutcomes, target_side: str) -> Values:
     """Return (E,) the side that is pushed to, +1 for left."""
-    fixed = {"left": 1.0, "right": -1.0}
-    if target_side in fixed:
-        return np.full(outcomes.correct_sign.size, fixed[target_side])
-    return outcomes.correct_sign if target_side == "correct" else -outcomes.correct_sign
+    correct = outcomes.correct_sign
+    sides = {"left": np.ones_like(correct), "right": -np.ones_like(correct), "correct": correct}
+    return sides.get(target_side, -correct)
 
 
-def _of_category(
-    outcomes: ConditionOutcomes, category: str, seed_text: str, target_side: str, key: str
-) -> list[PatchEffect]:
-    push, clean = target_sign(outcomes, target_side), outcomes.of(CLEAN)
+def patch_effects(outcomes: ConditionOutcomes, target_side: str = IMAGE_SWAP) -> list[PatchEffect]:
+    """Return one per edit, of one category. target_side: `image_swap`, or the side that is steered to."""
     rows = [row for row, name in enumerate(outcomes.conditions) if name not in UNCHANGED]
     if not rows:
         return []
+    push, clean, has_swap = (
+        target_sign(outcomes, target_side),
+        outcomes.of(CLEAN),
+        IMAGE_SWAP in outcomes.conditions,
+    )
+    # Above zero on the left; without sides, where the action is nearer to the source's.
+    middle = 0.0 if outcomes.has_sides or not has_swap else outcomes.of(IMAGE_SWAP) / 2
+    toward = None if outcomes.toward is None or not has_swap else outcomes.toward
     names = [ConditionName.parse(outcomes.conditions[row]) for row in rows]
     displacements = push * (outcomes.displacement[rows] - clean)
     sign = swap_sign(outcomes) if target_side == IMAGE_SWAP else 1.0
-    tests = test_against_controls(sign * displacements, names, outcomes, seed_text, (), ())
+    tests = test_against_controls(sign * displacements, names, outcomes, (), ())
     effects = []
-    for at, (row, name, test) in enumerate(zip(rows, names, tests, strict=True)):
-        flips = _flips(push, _crossed(outcomes, clean), _crossed(outcomes, outcomes.displacement[row]))
-        toward = _share_toward(outcomes, row, seed_text)
+    for row, name, test, moved in zip(rows, names, tests, displacements, strict=True):
+        # 1 where the action flips to the target side, −1 where it flips away from it.
+        is_over = push * (outcomes.displacement[row] - middle) > 0
+        flips = is_over.astype(float) - (push * (clean - middle) > 0)
         # The swap moves actions to the wrong side; steering to another side is compared with its size.
-        share = share_of_swap(outcomes, -outcomes.correct_sign * displacements[at], seed_text)
-        columns: dict[str, Any] = common_columns(outcomes, row, name)
+        share = share_of_swap(outcomes, -outcomes.correct_sign * moved)
+        exchanged = None
+        if toward is not None:
+            full = toward[outcomes.conditions.index(IMAGE_SWAP)]
+            exchanged = share_of_whole(toward[row], full, outcomes.groups, outcomes.seed_text)
         effects.append(
             PatchEffect(
-                category=category,
-                **columns,
+                **common_columns(outcomes, row, name, flips),
                 coefficient=name.coefficient,
-                effect=None if share is None else share.value,
-                effect_ci=None if share is None else (share.low, share.high),
-                net=float(flips.mean()),
-                net_ci=net_interval(flips, outcomes, seed_text),
+                **share_fields("effect", share),
                 net_left=mean_of(flips[push > 0]) or 0.0,
                 net_right=mean_of(flips[push < 0]) or 0.0,
-                mean_displacement=float(displacements[at].mean()),
+                mean_displacement=float(moved.mean()),
                 control_displacement=mean_of(displacements[test.controls]),
                 t=test.t or 0.0,
                 p=test.p,
                 p_fwe=test.p_fwe,
-                **share_fields("action_share", toward),
-                key=key,
+                **share_fields("action_share", exchanged),
             )
         )
     return effects
 
 
-def _crossed(outcomes: ConditionOutcomes, displacement: Values) -> Values:
-    """Return (E,) above zero on the left; without sides, where the action is nearer to the source's."""
-    if outcomes.has_sides or IMAGE_SWAP not in outcomes.conditions:
-        return displacement
-    return np.asarray(displacement - outcomes.of(IMAGE_SWAP) / 2)
-
-
-def _share_toward(outcomes: ConditionOutcomes, row: int, seed_text: str) -> SwapShare | None:
-    """Return the displacement toward the source's action as a share of the full exchange; None without one."""
-    if outcomes.toward is None or IMAGE_SWAP not in outcomes.conditions:
-        return None
-    exchange = outcomes.toward[outcomes.conditions.index(IMAGE_SWAP)]
-    return share_of_whole(outcomes.toward[row], exchange, outcomes.groups, seed_text) if exchange.any() else None
-
-
-def _flips(push: Values, clean: Values, edited: Values) -> Values:
-    """Return (E,) 1 where the action flips to the target side, −1 where it flips away from it, else 0."""
-    flips: Values = (push * edited > 0).astype(float) - (push * clean > 0)
-    return flips
+# -- what is stored ------------------------------------------------------------------------------------------
 
 
 BACKBONE = "backbone"
-WHOLE, USUAL, WRONG = "none", "mean-difference", "wrong"
-"""Settings: no direction, that of the class means, and the side to which steering goes if nothing is said."""
+USUAL, WRONG = "mean-difference", "wrong"
+"""Settings of steering if nothing is said: the direction of the class means, and the side."""
 
 
 def stored_site_effects(run: RunReader) -> dict[str, list[PatchEffect]]:
@@ -216,12 +198,12 @@ def stored_site_effects(run: RunReader) -> dict[str, list[PatchEffect]]:
 
     The backbone first and `kv` last, shallow before deep. Raises RunDamagedError.
     """
-    return _by_category(run, _maps(run))
+    return _by_category(_maps(run))
 
 
 def stored_subspace_effects(run: RunReader) -> dict[str, list[PatchEffect]]:
     """Return by category the effects of patches along single directions, and along their random controls."""
-    return _by_category(run, _along(run))
+    return _by_category(_along(run))
 
 
 def stored_steering(run: RunReader) -> dict[str, dict[str, list[PatchEffect]]]:
@@ -231,15 +213,13 @@ def stored_steering(run: RunReader) -> dict[str, dict[str, list[PatchEffect]]]:
     (`backbone.02 image, probe, toward left`).
     """
     steering: dict[str, dict[str, list[PatchEffect]]] = {}
-    for selection, rows in _rows_of(_steering(run), run.seed_text):
-        steering.setdefault(selection.group.like.category, {})[_in_words(selection)] = rows
+    for selection, rows in _rows_of(_steering(run)):
+        name, settings = ConditionName.parse(selection.conditions[0]), selection.group.like.stored.settings
+        direction, side = str(settings.get("direction", USUAL)), str(settings.get("target_side", WRONG))
+        qualifiers = [direction] * (direction != USUAL) + [f"toward {side}"] * (side != WRONG)
+        subject = ", ".join([f"{name.site} {name.role}", *qualifiers])
+        steering.setdefault(selection.group.like.category, {})[subject] = rows
     return steering
-
-
-def keys_in_use(run: RunReader) -> set[str]:
-    """Return the keys of stored interventions of which any number is in a map, a direction or a steering above."""
-    every = [*_maps(run), *_along(run), *_steering(run)]
-    return {selection.group.sources[name].stored.key for selection in every for name in selection.conditions}
 
 
 def localised_sites(rows: Sequence[PatchEffect]) -> tuple[str, ...]:
@@ -249,7 +229,8 @@ def localised_sites(rows: Sequence[PatchEffect]) -> tuple[str, ...]:
     Without those that carry it by construction.
     """
     localised = [row for row in rows if row.is_localised and not row.direction and not row.is_by_construction]
-    by_role = {row.place for row in localised if row.role != ALL and _is_read(row)}
+    read = KV_STREAM + "."
+    by_role = {row.place for row in localised if row.role != ALL and row.place.startswith(read)}
     names = [
         row.name if row.place in by_role else row.place
         for row in localised
@@ -258,19 +239,10 @@ def localised_sites(rows: Sequence[PatchEffect]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names))
 
 
-def _is_read(row: PatchEffect) -> bool:
-    return PlaceName.parse(row.place).stream == KV_STREAM
-
-
 def is_backbone_layer(row: PatchEffect) -> bool:
     """Whether the backbone's stream itself was patched, not a part of a block such as one head."""
     name = PlaceName.parse(row.place)
     return name.stream == BACKBONE and name.is_whole_layer
-
-
-def is_upstream(site: str) -> bool:
-    """Whether a place of the backbone holds the images themselves, upstream of all that reads them."""
-    return PlaceName.parse(site).layer == 0
 
 
 def localised_by_category(maps: Mapping[str, Sequence[PatchEffect]]) -> dict[str, tuple[str, ...]]:
@@ -279,13 +251,12 @@ def localised_by_category(maps: Mapping[str, Sequence[PatchEffect]]) -> dict[str
     Searched is one of which all tokens of some layer of the backbone were patched, or of which a place was found:
     a null result for one role, iteration or block does not rule out the others.
     """
-    searched = {
-        category
-        for category, rows in maps.items()
-        if any(row.role == ALL and is_backbone_layer(row) for row in rows)
-    }
     localised = {category: localised_sites(rows) for category, rows in maps.items()}
-    return {category: places for category, places in localised.items() if places or category in searched}
+    return {
+        category: places
+        for category, places in localised.items()
+        if places or any(row.role == ALL and is_backbone_layer(row) for row in maps[category])
+    }
 
 
 def carrying_directions(along: Mapping[str, Sequence[PatchEffect]]) -> dict[str, tuple[str, ...]]:
@@ -294,17 +265,16 @@ def carrying_directions(along: Mapping[str, Sequence[PatchEffect]]) -> dict[str,
     along: as `stored_subspace_effects` gives it. A direction is spelt `mean-difference at backbone.02 image`.
     """
     return {
-        category: tuple(f"{row.direction} at {row.place} {row.role}" for row in rows if _is_carrier(row))
+        category: tuple(
+            f"{row.direction} at {row.place} {row.role}"
+            for row in rows
+            if row.is_localised and row.control_displacement is not None
+        )
         for category, rows in along.items()
     }
 
 
-def _is_carrier(row: PatchEffect) -> bool:
-    return row.is_localised and row.control_displacement is not None
-
-
-@dataclass(frozen=True)
-class _Selection:
+class _Selection(NamedTuple):
     """The conditions that stand for a subject. merit: of several, the largest is chosen."""
 
     group: PooledConditions
@@ -313,24 +283,20 @@ class _Selection:
 
 
 def _maps(run: RunReader) -> list[_Selection]:
-    results = [
-        result for result in stored_results(run, "interchange") if _direction(result.stored.settings) == WHOLE
-    ]
-    return _selections(pool_conditions(results), ())
+    results = stored_results(run, Interchange.kind)
+    in_full = [result for result in results if result.stored.settings.get("direction", NONE) == NONE]
+    return _selections(pool_conditions(in_full), ())
 
 
 def _along(run: RunReader) -> list[_Selection]:
-    results = [
-        result for result in stored_results(run, "interchange") if _direction(result.stored.settings) != WHOLE
-    ]
-    return _selections(pool_conditions(results, ("direction", "seed")), ("direction",))
+    results = stored_results(run, Interchange.kind)
+    along = [result for result in results if result.stored.settings.get("direction", NONE) != NONE]
+    return _selections(pool_conditions(along, ("direction", "seed")), ("direction",))
 
 
 def _steering(run: RunReader) -> list[_Selection]:
-    return _selections(
-        pool_conditions(stored_results(run, "steer"), ("direction", "seed", "target_side")),
-        ("direction", "target_side"),
-    )
+    pooled = pool_conditions(stored_results(run, "steer"), ("direction", "seed", "target_side"))
+    return _selections(pooled, ("direction", "target_side"))
 
 
 def _selections(groups: Sequence[PooledConditions], setting: Sequence[str]) -> list[_Selection]:
@@ -339,64 +305,41 @@ def _selections(groups: Sequence[PooledConditions], setting: Sequence[str]) -> l
     for group in groups:
         values = [str(group.like.stored.settings.get(name)) for name in setting]
         by_subject = selected.setdefault(group.like.category, {})
-        for subject, conditions in _by_place(group).items():
-            created = max(group.sources[name].newest for name in conditions)
-            candidate = _Selection(group, conditions, (group.like.rank, len(conditions), created))
+        by_place: dict[tuple[str, str], list[str]] = {}
+        for condition in sorted(group.sources):  # controls and coefficients among them
+            name = ConditionName.parse(condition)
+            by_place.setdefault((name.site, name.role), []).append(condition)
+        for subject, conditions in by_place.items():
+            newest = max(group.sources[name].stored.newest for name in conditions)
+            candidate = _Selection(group, tuple(conditions), (group.like.rank, len(conditions), newest))
             before = by_subject.setdefault((*subject, *values), candidate)
             if before.merit < candidate.merit:
                 by_subject[*subject, *values] = candidate
     return [by_subject[subject] for by_subject in selected.values() for subject in sorted(by_subject, key=_depth)]
 
 
-def _by_place(group: PooledConditions) -> dict[tuple[str, str], tuple[str, ...]]:
-    """The conditions of every place and role, controls and coefficients among them."""
-    grouped: dict[tuple[str, str], list[str]] = {}
-    for condition in sorted(group.sources):
-        name = ConditionName.parse(condition)
-        grouped.setdefault((name.site, name.role), []).append(condition)
-    return {cell: tuple(names) for cell, names in grouped.items()}
-
-
-def _rows_of(selections: Sequence[_Selection], seed_text: str) -> Iterator[tuple[_Selection, list[PatchEffect]]]:
+def _rows_of(selections: Sequence[_Selection]) -> Iterator[tuple[_Selection, list[PatchEffect]]]:
     """The numbers of each, tested against everything that its group tried in the same stream."""
     tested: dict[tuple[int, str], dict[str, PatchEffect]] = {}
     for selection in selections:
-        stream = _stream(selection.conditions[0])
-        at = id(selection.group), stream
+        group, stream = selection.group, selection.conditions[0].partition(".")[0]
+        at = id(group), stream
         if at not in tested:
-            tested[at] = _test_together(selection.group, stream, seed_text)
+            conditions = sorted(name for name in group.sources if name.partition(".")[0] == stream)
+            target_side = str(group.like.stored.settings.get("target_side", IMAGE_SWAP))
+            rows = patch_effects(group.outcomes(conditions), target_side)
+            keys = [group.sources[name].stored.key for name in conditions]
+            tested[at] = {
+                name: replace(row, key=key) for name, row, key in zip(conditions, rows, keys, strict=True)
+            }
         yield selection, [tested[at][name] for name in selection.conditions]
 
 
-def _test_together(group: PooledConditions, stream: str, seed_text: str) -> dict[str, PatchEffect]:
-    conditions = sorted(name for name in group.sources if _stream(name) == stream)
-    target_side = str(group.like.stored.settings.get("target_side", IMAGE_SWAP))
-    rows = patch_effects(group.outcomes(conditions), seed_text, target_side)
-    return {
-        name: replace(row, key=group.sources[name].stored.key) for name, row in zip(conditions, rows, strict=True)
-    }
-
-
-def _by_category(run: RunReader, selections: Sequence[_Selection]) -> dict[str, list[PatchEffect]]:
+def _by_category(selections: Sequence[_Selection]) -> dict[str, list[PatchEffect]]:
     effects: dict[str, list[PatchEffect]] = {}
-    for selection, rows in _rows_of(selections, run.seed_text):
+    for selection, rows in _rows_of(selections):
         effects.setdefault(selection.group.like.category, []).extend(rows)
     return effects
-
-
-def _direction(settings: Mapping[str, Any]) -> str:
-    return str(settings.get("direction", WHOLE))
-
-
-def _in_words(steered: _Selection) -> str:
-    name, settings = ConditionName.parse(steered.conditions[0]), steered.group.like.stored.settings
-    direction, target_side = str(settings.get("direction", USUAL)), str(settings.get("target_side", WRONG))
-    qualifiers = [direction] * (direction != USUAL) + [f"toward {target_side}"] * (target_side != WRONG)
-    return ", ".join([f"{name.site} {name.role}", *qualifiers])
-
-
-def _stream(condition: str) -> str:
-    return ConditionName.parse(condition).site.partition(".")[0]
 
 
 def _depth(subject: tuple[str, ...]) -> tuple[object, ...]:
@@ -435,15 +378,7 @@ def best_cell(rows: Sequence[PatchEffect]) -> PatchEffect | None:
     return max(last, key=lambda row: (row.role != ALL, row.effect or 0.0))
 
 
-_LEGEND = (
-    "effect: share of what the whole image swap does, n/a where that is not beyond chance; net flip rate: share "
-    "of episodes that flip to the target side, minus those that flip away from it; p: family-wise over all edits "
-    "of the category, one-sided; relative change: how far tokens were moved, in their own norms; *: carries the "
-    "effect by construction and locates nothing; unread: nothing that acts reads this place"
-)
-
-
-# -- patches of cells ----------------------------------------------------------------------------------------
+# -- the kind ------------------------------------------------------------------------------------------------
 
 
 def cells_at(session: "ReplaySession", places: Iterable[SiteGroup], roles: Sequence[str]) -> list[Cell]:
@@ -455,20 +390,21 @@ def cells_at(session: "ReplaySession", places: Iterable[SiteGroup], roles: Seque
     ]
 
 
-def patch_of(cell: Cell, source_sites: tuple[Site, ...], prefix: str = "") -> Patched:
+def patch_of(cell: Cell, source_sites: tuple[Site, ...], prefix: str = "") -> Condition:
     """Return the patch of one cell in full. prefix: of its name."""
-    return Patched(f"{prefix}{ConditionName(cell.site_group.name, cell.role)}", {"": (cell,)}, source_sites)
+    return patched_run(f"{prefix}{ConditionName(cell.site_group.name, cell.role)}", {"": (cell,)}, source_sites)
 
 
 def patches_within(
-    direction: str, bases: "DirectionBasis", cell: Cell, source_sites: tuple[Site, ...]
-) -> list[Patched]:
+    direction: str, bases: "Directions", cell: Cell, source_sites: tuple[Site, ...]
+) -> list[Condition]:
     """Return the patch along a direction, and along each of its controls."""
-    names = {
-        name: str(ConditionName(cell.site_group.name, cell.role, name))
+    return [
+        patched_run(
+            str(ConditionName(cell.site_group.name, cell.role, name)), {"": (cell,)}, source_sites, name, bases
+        )
         for name in (direction, *bases.control_names)
-    }
-    return [Patched(name, {"": (cell,)}, source_sites, along, bases) for along, name in names.items()]
+    ]
 
 
 def check_sites_and_roles(sites: Sequence[str], roles: Sequence[str], subject: str) -> None:
@@ -477,71 +413,16 @@ def check_sites_and_roles(sites: Sequence[str], roles: Sequence[str], subject: s
         raise UsageError(f"{subject} at least one site, and roles that share no token (not all)")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Interchange(AlongDirection):
-    """Every place is tried at every role, alone.
+class PatchKind(AlongDirection):
+    """A kind whose rows are `PatchEffect`: interchange or steering."""
 
-    sites: patterns, see `resolve_sites`. roles: of the tokens that are patched; a stream is tried at those
-    that it has. direction: patches tokens within it alone; `none` in full. controls: so many times as many random
-    directions, per place and role; see `AlongDirection`.
-    """
-
-    kind: ClassVar[str] = "interchange"
-    summary: ClassVar[str] = "Activation patching: where does the swapped image pass?"
-    position: ClassVar[int] = 3
     asks_where: ClassVar[bool] = True
-    options: ClassVar[Mapping[str, str]] = {
-        "sites": "where tokens are patched; default backbone.*",
-        "roles": "of the patched tokens; default all,image,language",
-        "direction": "patch within it: mean-difference, probe (of means), mean-difference:K (tokens), FILE#NAME",
-        "controls": "random directions; default 5 with --direction",
-        "seed": "of controls and folds; default 0",
-    }
-
-    sites: tuple[str, ...] = ("backbone.*",)
-    roles: tuple[str, ...] = (ALL, "image", "language")
-
-    def __post_init__(self) -> None:
-        from probe_kit.intervene.directions import check_direction
-
-        super().__post_init__()
-        if not self.sites or not self.roles:
-            raise UsageError("an interchange needs at least one site and one role")
-        if set(self.roles) & set(TILES) and self.direction != NONE:
-            raise UsageError(
-                "tiles have no mean in the run from which a direction could be found; patch them in full: leave "
-                "--direction out"
-            )
-        if self.direction != NONE:
-            check_direction(self.direction, self.vector)
-        elif self.controls:
-            raise UsageError("controls are directions beside another one; choose --direction, or no --controls")
-
-    @classmethod
-    def from_options(cls, run: Run, **options: Any) -> Self:
-        """Return it with five controls where a direction is given and their number is not."""
-        options.setdefault("controls", 5 if "direction" in options else 0)
-        return super().from_options(run, **options)
-
-    def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
-        """Return clean, images swapped, and every place at every role. Raises UnknownSiteError, NoProbesError."""
-        from probe_kit.intervene.directions import fit_token_directions
-
-        cells = cells_at(session, resolve_all(self.sites, session.policy).values(), self.roles)
-        source_sites = sites_of_cells(cells)
-        conditions: list[Condition] = [CleanRun(), SourceRun()]
-        if self.direction == NONE:
-            return conditions + [patch_of(cell, source_sites) for cell in cells]
-        bases = fit_token_directions(session, self, cells, self.sites)
-        for cell, basis in bases.items():
-            conditions += patches_within(self.direction, basis, cell, source_sites)
-        return conditions
 
     @staticmethod
     def effects(measurement: Measurement) -> list[PatchEffect]:
         """Return one row per category and edit."""
         target_side = str(measurement.settings.get("target_side", IMAGE_SWAP))
-        return patch_effects(measurement.outcomes, measurement.seed_text, target_side, measurement.key)
+        return measurement.rows(lambda part: patch_effects(part, target_side))
 
     @staticmethod
     def table(rows: Sequence[PatchEffect], context: TableContext) -> "Table":
@@ -594,17 +475,82 @@ class Interchange(AlongDirection):
     @staticmethod
     def keys_in_use(run: RunReader) -> set[str]:
         """Return keys of the stored ones of which any number is in a map, a direction or a steering."""
-        return keys_in_use(run)
+        every = [*_maps(run), *_along(run), *_steering(run)]
+        return {selection.group.sources[name].stored.key for selection in every for name in selection.conditions}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Interchange(PatchKind):
+    """Every place is tried at every role, alone.
+
+    sites: patterns, see `resolve_sites`. roles: of the tokens that are patched; a stream is tried at those
+    that it has. direction: patches tokens within it alone; `none` in full. controls: so many times as many random
+    directions, per place and role; see `AlongDirection`.
+    """
+
+    kind: ClassVar[str] = "interchange"
+    summary: ClassVar[str] = "Activation patching: where does the swapped image pass?"
+    position: ClassVar[int] = 3
+    options: ClassVar[Mapping[str, str]] = {
+        "sites": "where tokens are patched; default backbone.*",
+        "roles": "of the patched tokens; default all,image,language",
+        "direction": "patch within it: mean-difference, probe (of means), mean-difference:K (tokens), FILE#NAME",
+        "controls": "random directions; default 5 with --direction",
+        "seed": "of controls and folds; default 0",
+    }
+
+    sites: tuple[str, ...] = ("backbone.*",)
+    roles: tuple[str, ...] = (ALL, "image", "language")
+
+    def __post_init__(self) -> None:
+        from probe_kit.intervene.directions import check_direction
+
+        super().__post_init__()
+        if not self.sites or not self.roles:
+            raise UsageError("an interchange needs at least one site and one role")
+        if set(self.roles) & set(TILES) and self.direction != NONE:
+            raise UsageError(
+                "tiles have no mean in the run from which a direction could be found; patch them in full: leave "
+                "--direction out"
+            )
+        if self.direction != NONE:
+            check_direction(self.direction, self.vector)
+        elif self.controls:
+            raise UsageError("controls are directions beside another one; choose --direction, or no --controls")
+
+    @classmethod
+    def from_options(cls, run: Run, **options: Any) -> Self:
+        """Return it with five controls where a direction is given and their number is not."""
+        options.setdefault("controls", 5 if "direction" in options else 0)
+        return super().from_options(run, **options)
+
+    def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
+        """Return clean, images swapped, and every place at every role. Raises UnknownSiteError, NoProbesError."""
+        from probe_kit.intervene.directions import fit_token_directions
+
+        cells = cells_at(session, resolve_all(self.sites, session.policy).values(), self.roles)
+        source_sites = sites_of_cells(cells)
+        conditions = [CLEAN_RUN, SOURCE_RUN]
+        if self.direction == NONE:
+            return conditions + [patch_of(cell, source_sites) for cell in cells]
+        bases = fit_token_directions(session, self, cells, self.sites)
+        for cell, basis in bases.items():
+            conditions += patches_within(self.direction, basis, cell, source_sites)
+        return conditions
 
 
 KIND = Interchange
 _COLUMNS: Mapping[str, Any] = {
-    "effect": lambda row: text_of(row.effect, missing="n/a") + "*" * (row.is_localised and row.is_by_construction),
-    "net flip rate [95 %]": lambda row: interval_text(row.net, row.net_ci, "+.2f"),
+    "effect": lambda row: (
+        ("n/a" if row.effect is None else number(row.effect)) + "*" * (row.is_localised and row.is_by_construction)
+    ),
+    "net flip rate [95 %]": lambda row: signed_interval(row.net, row.net_ci),
     "left / right": lambda row: f"{row.net_left:+.2f} / {row.net_right:+.2f}",
     "displacement cm": lambda row: f"{100 * row.mean_displacement:+.2f}",
-    "controls cm": lambda row: text_of(_cm(row.control_displacement), "+.2f"),
-    "p": lambda row: text_of(row.p_fwe, ".2g"),
+    "controls cm": lambda row: signed(
+        None if row.control_displacement is None else 100 * row.control_displacement
+    ),
+    "p": lambda row: p_of(row.p_fwe),
     "relative change": lambda row: f"{row.relative_change:.2f}",
 }
 
@@ -613,15 +559,11 @@ _WITHOUT_SIDES: Mapping[str, Any] = {
     "effect": _COLUMNS["effect"],
     "nearer to the source [95 %]": _COLUMNS["net flip rate [95 %]"],
     "displacement": lambda row: f"{row.mean_displacement:+.2f}",
-    "controls": lambda row: text_of(row.control_displacement, "+.2f"),
+    "controls": lambda row: signed(row.control_displacement),
     "p": _COLUMNS["p"],
     "relative change": _COLUMNS["relative change"],
 }
 """Displacements are in spreads of clean actions, toward the source's action."""
-
-
-def _cm(metres: float | None) -> float | None:
-    return None if metres is None else 100 * metres
 
 
 def _carriers(rows: Sequence[PatchEffect]) -> tuple[list[PatchEffect], list[PatchEffect], int]:

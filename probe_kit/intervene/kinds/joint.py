@@ -4,12 +4,10 @@ Sets of cells are patched in one inference, as an interchange patches a single o
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from functools import partial
-from typing import TYPE_CHECKING, Any, ClassVar
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import KV_STREAM
@@ -24,7 +22,14 @@ from probe_kit.intervene.kinds.base import (
 )
 from probe_kit.intervene.kinds.image_swap import share_of_swap, swap_sign
 from probe_kit.intervene.kinds.interchange import cells_at, check_sites_and_roles
-from probe_kit.intervene.outcomes import CLEAN, PER_STEP, ConditionOutcomes, Effect, StoredResult, stored_results
+from probe_kit.intervene.outcomes import (
+    CLEAN,
+    PER_STEP,
+    ConditionOutcomes,
+    Effect,
+    StoredResult,
+    stored_results,
+)
 from probe_kit.intervene.patching.patch import Cell, all_but, sites_of_cells
 from probe_kit.intervene.patching.sweep import (
     CARRIES,
@@ -39,7 +44,7 @@ from probe_kit.intervene.patching.sweep import (
     share_fields,
 )
 from probe_kit.intervene.places import SEPARATOR, Pair, list_places, resolve_all
-from probe_kit.intervene.replay import CleanRun, Condition, Patched, ReplayBatch, SourceRun, replay
+from probe_kit.intervene.replay import CLEAN_RUN, SOURCE_RUN, Condition, patched_run, replay
 from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.paired_tests import max_t, paired_greater_p, smallest_flip_p
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -56,6 +61,8 @@ EVERY, ALONE, WITHOUT, MINIMAL, SECOND = "every-cell", "alone", "without", "mini
 WITHOUT_MINIMAL = f"{WITHOUT}|{MINIMAL}"
 WORTH_SEARCHING = 0.5
 """Effect of all cells together from which a smallest set is searched."""
+MOST_PLACES = 3
+"""Places that a short sentence names."""
 _LEGEND = (
     "alone: share of the image swap with only these cells patched; needed: what all cells lose without them; "
     "read here: both at least 0.5; enough alone: another copy is read as well; needed, not enough: one part of "
@@ -69,12 +76,11 @@ _PARTS = {EVERY: "all cells of", MINIMAL: "smallest set:", SECOND: "without it:"
 # -- the kind ------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class SearchedSets:
+class SearchedSets(NamedTuple):
     """The result of the search in one category; the sets may be empty.
 
-    cells: the smallest set; second: of the other cells, the smallest set that carries the effect as well.
-    choosing: the groups that were searched. effect: of `cells`, in these. tried: how many sets.
+    choosing: the groups that were searched. cells: the smallest set; second: of the other cells, the smallest set
+    that carries the effect as well. effect: of `cells`, in these groups. tried: how many sets.
     """
 
     choosing: tuple[str, ...]
@@ -86,14 +92,7 @@ class SearchedSets:
     def to_json(self) -> dict[str, Any]:
         """Return plain values."""
         sets = {"cells": list(map(str, self.cells)), "second": list(map(str, self.second))}
-        return {**asdict(self), **sets, "choosing": list(self.choosing)}
-
-
-@dataclass(frozen=True)
-class MinimalPatched(Patched):
-    """The smallest set of each category. searched: how it was found."""
-
-    searched: Mapping[str, SearchedSets] | None = None
+        return {"choosing": list(self.choosing), **sets, "effect": self.effect, "tried": self.tried}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,6 +107,7 @@ class JointPlaces(Intervention):
     kind: ClassVar[str] = NAME
     summary: ClassVar[str] = "Patch sets of places: each alone, all but it, smallest set."
     position: ClassVar[int] = 4
+    fits_always: ClassVar[bool] = True
     asks_where: ClassVar[bool] = True
     options: ClassVar[Mapping[str, str]] = {
         "sites": "of cells that run in parallel: several blocks of kv, or one layer; default kv.*",
@@ -123,36 +123,26 @@ class JointPlaces(Intervention):
         super().__post_init__()
         check_sites_and_roles(self.sites, self.roles, "joint places need")
 
-    @property
-    def fits_first(self) -> bool:
-        """Whether the smallest set is searched beforehand: always."""
-        return True
-
     def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
         """Return clean, images swapped, the sets of cells. Raises UsageError for cells that are not parallel."""
         cells = self._cells(session)
-        sites = sites_of_cells(cells)
         pairs: dict[str, list[Pair]] = {}
         for item in self.items_in(session.run):
             for pair in session.pairs(item):
                 pairs.setdefault(pair.category, []).append(pair)
         searched = {name: self._search(session, cells, part) for name, part in pairs.items()}
+        session.certificate[NAME] = {name: search.to_json() for name, search in searched.items()}
         sets: dict[str, dict[str, tuple[Cell, ...]]] = {EVERY: {"": cells}}
         for cell in cells:
             at = f"{cell.site_group.name}{SEPARATOR}{cell.role}"
             sets |= {f"{ALONE}|{at}": {"": (cell,)}, f"{WITHOUT}|{at}": {"": all_but(cells, (cell,))}}
-        without = {name: all_but(cells, search.cells) if search.cells else () for name, search in searched.items()}
-        sets |= {WITHOUT_MINIMAL: without, SECOND: {name: search.second for name, search in searched.items()}}
-        patches = [Patched(name, by_name, sites) for name, by_name in sets.items()]
-        smallest = {name: search.cells for name, search in searched.items()}
-        minimal = MinimalPatched(MINIMAL, smallest, sites, searched=searched)
-        return [CleanRun(), SourceRun(), *patches, minimal]
-
-    def certificate_entries(self, conditions: Sequence[Condition], batch: ReplayBatch) -> dict[str, Any]:
-        """Return by category the smallest sets, and the groups in which they were searched."""
-        del batch
-        (minimal,) = (condition for condition in conditions if isinstance(condition, MinimalPatched))
-        return {NAME: {name: search.to_json() for name, search in (minimal.searched or {}).items()}}
+        sets[WITHOUT_MINIMAL] = {
+            name: all_but(cells, search.cells) if search.cells else () for name, search in searched.items()
+        }
+        sets[SECOND] = {name: search.second for name, search in searched.items()}
+        sets[MINIMAL] = {name: search.cells for name, search in searched.items()}
+        sites = sites_of_cells(cells)
+        return [CLEAN_RUN, SOURCE_RUN, *(patched_run(name, by_name, sites) for name, by_name in sets.items())]
 
     def _cells(self, session: "ReplaySession") -> tuple[Cell, ...]:
         places = resolve_all(self.sites, session.policy)
@@ -173,40 +163,33 @@ class JointPlaces(Intervention):
 
     def _search(self, session: "ReplaySession", cells: tuple[Cell, ...], pairs: Sequence[Pair]) -> SearchedSets:
         """Return the smallest sets of one category, searched on the choosing half of its groups."""
-        choosing = choosing_half([pair.group for pair in pairs], self.seed)
-        searched_pairs = [pair for pair in pairs if pair.group in choosing]
-        effects = partial(self._effects, session, searched_pairs, sites_of_cells(cells))
-        if not searched_pairs or effects([cells])[0] < WORTH_SEARCHING:
-            return SearchedSets(choosing)
-        first = find_minimal_set(cells, effects)
-        remaining = all_but(cells, first.cells)
-        if not remaining or effects([remaining])[0] < KEEP * first.effect:
-            return SearchedSets(choosing, first.cells, (), first.effect, first.tried)
-        second = find_minimal_set(remaining, effects)
-        return SearchedSets(choosing, first.cells, second.cells, first.effect, first.tried + second.tried)
-
-    def _effects(
-        self, session: "ReplaySession", pairs: Sequence[Pair], sites: Any, sets: Sequence[tuple[Cell, ...]]
-    ) -> list[float]:
-        """Return the share of the image swap's displacement that each set carries."""
         from probe_kit.intervene.rollout import evaluate_per_step
 
-        patches = [Patched(str(number), {"": cells}, sites) for number, cells in enumerate(sets)]
-        play = evaluate_per_step if self.readout == PER_STEP else replay
-        clean, swapped, *moved = play(session, pairs, [CleanRun(), SourceRun(), *patches]).displacement
-        return [pooled_share(values - clean, swapped - clean) for values in moved]
+        choosing = choosing_half([pair.group for pair in pairs], self.seed)
+        searched_pairs = [pair for pair in pairs if pair.group in choosing]
+        play, sites = evaluate_per_step if self.readout == PER_STEP else replay, sites_of_cells(cells)
+
+        def effects(sets: Sequence[tuple[Cell, ...]]) -> list[float]:
+            """Return the share of the image swap's displacement that each set carries."""
+            patches = [patched_run(str(number), {"": part}, sites) for number, part in enumerate(sets)]
+            played = play(session, searched_pairs, [CLEAN_RUN, SOURCE_RUN, *patches])
+            clean, swapped, *moved = played.displacement
+            return [pooled_share(values - clean, swapped - clean) for values in moved]
+
+        if not searched_pairs or effects([cells])[0] < WORTH_SEARCHING:
+            return SearchedSets(choosing)
+        first, effect, tried = find_minimal_set(cells, effects)
+        remaining = all_but(cells, first)
+        if not remaining or effects([remaining])[0] < KEEP * effect:
+            return SearchedSets(choosing, first, (), effect, tried)
+        second, _, more = find_minimal_set(remaining, effects)
+        return SearchedSets(choosing, first, second, effect, tried + more)
 
     @staticmethod
     def effects(measurement: Measurement) -> "list[JointEffect]":
         """Return by category the cells, all of them, and the smallest sets."""
         searched: Mapping[str, Any] = measurement.certificate.get(NAME, {})
-        return [
-            row
-            for category, part in measurement.outcomes.by_category()
-            for row in _Category(
-                part, category, measurement.seed_text, measurement.settings, measurement.key
-            ).rows(searched.get(category, {}))
-        ]
+        return measurement.rows(lambda part: _rows(part, measurement.settings, searched))
 
     @staticmethod
     def table(rows: "Sequence[JointEffect]", context: TableContext) -> "Table":
@@ -238,9 +221,8 @@ class JointPlaces(Intervention):
         return f"{joint.verb}: at {joint.list_cells(MOST_PLACES)}"
 
     @staticmethod
-    def notes(rows: "Sequence[JointEffect]", measurement: Measurement) -> list[str]:
+    def notes(rows: "Sequence[JointEffect]") -> list[str]:
         """Return categories in which the half of the groups that scores a smallest set cannot confirm any."""
-        del measurement
         counts = {row.category: row.n_groups for row in rows if row.part == MINIMAL}
         return [
             f"{name}: the smallest set is scored in {count} groups, in which no p can be below "
@@ -263,9 +245,6 @@ _COLUMNS: Mapping[str, Any] = {
     "groups": lambda row: str(row.n_groups),
     "finding": lambda row: row.finding,
 }
-
-MOST_PLACES = 3
-"""Places that a short sentence names."""
 
 
 # -- effects -------------------------------------------------------------------------------------------------
@@ -302,12 +281,13 @@ def stored_joint_places(run: RunReader) -> dict[str, list[JointEffect]]:
 
     Raises RunDamagedError.
     """
-    return {
-        category: _Category(
-            result.outcomes, category, run.seed_text, result.stored.settings, result.stored.key
-        ).rows(result.stored.certificate().get(NAME, {}).get(category, {}))
-        for category, result in _preferred(run).items()
-    }
+    rows = {}
+    for category, result in _preferred(run).items():
+        stored = result.stored
+        certificate = stored.certificate()
+        measurement = Measurement(result.outcomes, stored.settings, certificate, stored.bundle.read, stored.key)
+        rows[category] = JointPlaces.effects(measurement)
+    return rows
 
 
 def _preferred(run: RunReader) -> dict[str, StoredResult]:
@@ -394,81 +374,70 @@ def describe_remainder(rows: Sequence[JointEffect]) -> str:
     return "; ".join(parts)
 
 
-@dataclass(frozen=True)
-class _Category:
-    outcomes: ConditionOutcomes
-    category: str
-    seed_text: str
-    settings: Mapping[str, Any]
-    key: str
-
-    def rows(self, searched: Mapping[str, Any]) -> list[JointEffect]:
-        outcomes = self.outcomes
-        names = [name.partition("|")[2] for name in outcomes.conditions if name.startswith(f"{ALONE}|")]
-        toward = np.array([self._toward(f"{ALONE}|{name}") for name in names])
-        _, p, p_fwe = max_t(toward, outcomes.items, outcomes.groups, flips_seed(outcomes, self.seed_text))
-        every = self._share(outcomes, self._moved(EVERY))
-        rows = []
-        for at, name in enumerate(names):
-            alone = self._share(outcomes, self._moved(f"{ALONE}|{name}"))
-            needed = self._share(outcomes, self._moved(EVERY) - self._moved(f"{WITHOUT}|{name}"))
-            finding = finding_of_cell(alone, needed, every, float(p_fwe[at]))
-            rows.append(self._row("cell", name, outcomes, alone, needed, float(p[at]), float(p_fwe[at]), finding))
-        exact = paired_greater_p(self._toward(EVERY), outcomes.items, outcomes.groups)
-        all_cells, finding = self._all_cells(names), _finding_of_all(every)
-        rows.append(self._row(EVERY, all_cells, outcomes, every, None, exact, None, finding))
-        return rows + self._searched(searched)
-
-    def _all_cells(self, names: Sequence[str]) -> str:
-        """Return all cells together: `kv` if nothing of it is missing, else their places and roles."""
-        if is_of_all_kv(self.settings):
-            return KV_STREAM
-        places, roles = (list(dict.fromkeys(name.split(SEPARATOR)[at] for name in names)) for at in (0, 1))
-        every_block = {*SITES} <= {*self.settings.get("sites", SITES)}
-        return f"{KV_STREAM if every_block else list_places(places)} {', '.join(roles)}"
-
-    def _searched(self, searched: Mapping[str, Any]) -> list[JointEffect]:
-        """Return the smallest sets, on the groups in which they were not searched."""
-        scoring = ~np.isin(self.outcomes.groups, searched.get("choosing", []))
-        scored = self.outcomes.of_episodes(scoring)
-        rows = []
-        for part, name in ((MINIMAL, "cells"), (SECOND, "second")):
-            cells = " + ".join(searched.get(name, []))
-            if not cells:
-                continue
-            alone = self._share(scored, self._moved(part)[scoring])
-            needed = None
-            if part == MINIMAL:
-                needed = self._share(scored, (self._moved(EVERY) - self._moved(WITHOUT_MINIMAL))[scoring])
-            p = paired_greater_p(self._toward(part)[scoring], scored.items, scored.groups)
-            confirmed = alone is not None and alone.value >= CARRIES and alone.low > NOTHING and p < SIGNIFICANCE
-            word = "read jointly" if "+" in cells else "read here"
-            finding = word if confirmed else "not confirmed"
-            rows.append(self._row(part, cells, scored, alone, needed, p, None, finding))
-        return rows
-
-    def _row(
-        self, part: str, cells: str, outcomes: ConditionOutcomes, alone: SwapShare | None,
-        needed: SwapShare | None, p: float, p_fwe: float | None, finding: str,
-    ) -> JointEffect:  # fmt: skip
-        shares: dict[str, Any] = {**share_fields("alone", alone), **share_fields("needed", needed)}
-        return JointEffect(
-            category=self.category, part=part, cells=cells.replace(SEPARATOR, " "), n_episodes=outcomes.items.size,
-            n_groups=np.unique(outcomes.groups).size, **shares, p=p, p_fwe=p_fwe, finding=finding, key=self.key,
-        )  # fmt: skip
-
-    def _moved(self, condition: str) -> NDArray[np.float64]:
-        return self.outcomes.of(condition) - self.outcomes.of(CLEAN)
-
-    def _toward(self, condition: str) -> NDArray[np.float64]:
-        """Return metres toward the side that the image swap leads to."""
-        return -swap_sign(self.outcomes) * self.outcomes.correct_sign * self._moved(condition)
-
-    def _share(self, outcomes: ConditionOutcomes, moved: NDArray[np.float64]) -> SwapShare | None:
-        return share_of_swap(outcomes, moved, self.seed_text)
+def _rows(
+    outcomes: ConditionOutcomes, settings: Mapping[str, Any], searches: Mapping[str, Any]
+) -> list[JointEffect]:
+    """Return the rows of one category. searches: by category, as the certificate has them."""
+    clean, leads = outcomes.of(CLEAN), -swap_sign(outcomes) * outcomes.correct_sign
+    moved = {name: outcomes.of(name) - clean for name in outcomes.conditions}
+    names = [name.partition("|")[2] for name in outcomes.conditions if name.startswith(f"{ALONE}|")]
+    # Metres toward the side that the image swap leads to.
+    toward = np.array([leads * moved[f"{ALONE}|{name}"] for name in names])
+    _, p, p_fwe = max_t(toward, outcomes.items, outcomes.groups, flips_seed(outcomes))
+    every = share_of_swap(outcomes, moved[EVERY])
+    rows = []
+    for at, name in enumerate(names):
+        alone = share_of_swap(outcomes, moved[f"{ALONE}|{name}"])
+        needed = share_of_swap(outcomes, moved[EVERY] - moved[f"{WITHOUT}|{name}"])
+        finding = finding_of_cell(alone, needed, every, float(p_fwe[at]))
+        rows.append(_row("cell", name, outcomes, (alone, needed), (float(p[at]), float(p_fwe[at])), finding))
+    exact = paired_greater_p(leads * moved[EVERY], outcomes.items, outcomes.groups)
+    rows.append(_row(EVERY, _all_cells(names, settings), outcomes, (every, None), (exact, None), _of_all(every)))
+    # The smallest sets, on the groups in which they were not searched.
+    searched = searches.get(str(outcomes.categories[0]), {})
+    scoring = ~np.isin(outcomes.groups, searched.get("choosing", []))
+    scored = outcomes.of_episodes(scoring)
+    for part, name in ((MINIMAL, "cells"), (SECOND, "second")):
+        cells = " + ".join(searched.get(name, []))
+        if not cells:
+            continue
+        alone, needed = share_of_swap(scored, moved[part][scoring]), None
+        if part == MINIMAL:
+            needed = share_of_swap(scored, (moved[EVERY] - moved[WITHOUT_MINIMAL])[scoring])
+        exact = paired_greater_p((leads * moved[part])[scoring], scored.items, scored.groups)
+        confirmed = alone is not None and alone.value >= CARRIES and alone.low > NOTHING and exact < SIGNIFICANCE
+        word = "read jointly" if "+" in cells else "read here"
+        finding = word if confirmed else "not confirmed"
+        rows.append(_row(part, cells, scored, (alone, needed), (exact, None), finding))
+    return rows
 
 
-def _finding_of_all(every: SwapShare | None) -> str:
+def _row(
+    part: str,
+    cells: str,
+    outcomes: ConditionOutcomes,
+    shares: tuple[SwapShare | None, SwapShare | None],
+    p: tuple[float, float | None],
+    finding: str,
+) -> JointEffect:
+    """Return one row. shares: alone, and needed. p: and the same against all cells."""
+    counts = {name: value for name, value in outcomes.counts.items() if name != "n_items"}
+    fields: dict[str, Any] = {**share_fields("alone", shares[0]), **share_fields("needed", shares[1])}
+    return JointEffect(
+        **counts, part=part, cells=cells.replace(SEPARATOR, " "), **fields, p=p[0], p_fwe=p[1], finding=finding
+    )
+
+
+def _all_cells(names: Sequence[str], settings: Mapping[str, Any]) -> str:
+    """Return all cells together: `kv` if nothing of it is missing, else their places and roles."""
+    if is_of_all_kv(settings):
+        return KV_STREAM
+    places, roles = (list(dict.fromkeys(name.split(SEPARATOR)[at] for name in names)) for at in (0, 1))
+    every_block = {*SITES} <= {*settings.get("sites", SITES)}
+    return f"{KV_STREAM if every_block else list_places(places)} {', '.join(roles)}"
+
+
+def _of_all(every: SwapShare | None) -> str:
     """Return what all cells together do."""
     if every is None:
         return "n/a"

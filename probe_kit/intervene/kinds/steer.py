@@ -15,16 +15,16 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, get_args
 
 from probe_kit.errors import UsageError
 from probe_kit.hooks.capturing.edits import AddVector, apply_patch
-from probe_kit.intervene.kinds.base import AlongDirection, ConditionName, Measurement
+from probe_kit.intervene.kinds.base import ConditionName
 from probe_kit.intervene.kinds.image_swap import SMALLEST_REACH
-from probe_kit.intervene.kinds.interchange import Interchange, PatchEffect
+from probe_kit.intervene.kinds.interchange import PatchEffect, PatchKind
 from probe_kit.intervene.patching.patch import Cell
 from probe_kit.intervene.places import TILES, resolve_all, role_tokens
-from probe_kit.intervene.replay import CleanRun, Condition, ConditionContext, ConditionResult, SourceRun
+from probe_kit.intervene.replay import CLEAN_RUN, SOURCE_RUN, Condition, ConditionContext, ConditionResult
 from probe_kit.runs.run import Run
 
 if TYPE_CHECKING:
-    from probe_kit.intervene.directions import DirectionBasis
+    from probe_kit.intervene.directions import Directions
     from probe_kit.intervene.sessions import ReplaySession
 
 TargetSide = Literal["wrong", "correct", "left", "right"]
@@ -32,38 +32,24 @@ LARGE_CHANGE = 2.0
 """Token norms beyond which a steering is said to be large."""
 
 
-@dataclass(frozen=True)
-class Steered:
-    """The tokens of one cell, moved along a direction."""
+def steered(cell: Cell, name: str, coefficient: float, target_side: TargetSide, bases: "Directions") -> Condition:
+    """Return the clean inference with the tokens of one cell moved along a direction of `bases`."""
 
-    cell: Cell
-    direction: str
-    coefficient: float
-    target_side: TargetSide
-    axes: "DirectionBasis"
-
-    @property
-    def name(self) -> str:
-        """Return place, role, direction and coefficient, see `ConditionName`."""
-        return str(
-            ConditionName(self.cell.site_group.name, self.cell.role, self.direction, f"{self.coefficient:g}")
-        )
-
-    def play(self, context: ConditionContext) -> ConditionResult:
-        """Infer with these tokens moved."""
-        pair, session, site_group = context.pair, context.session, self.cell.site_group
+    def play(context: ConditionContext) -> ConditionResult:
+        pair, session, site_group = context.pair, context.session, cell.site_group
         is_left = pair.side != "right"
         side = {"left": 1.0, "right": -1.0, "correct": 1.0 if is_left else -1.0, "wrong": -1.0 if is_left else 1.0}
-        strength = self.coefficient * (1.0 if pair.side is None else side[self.target_side])
-        shift = self.axes.shift(self.direction, pair.episode, pair.category, strength)
-        tokens = role_tokens(session.policy, pair, site_group.stream, self.cell.role, context.memo)
+        strength = coefficient * (1.0 if pair.side is None else side[target_side])
+        shift = bases.shift(name, pair.episode, strength)
+        tokens = role_tokens(session.policy, pair, site_group.stream, cell.role, context.memo)
         with apply_patch(session.policy, site_group.sites, tokens, AddVector(shift)) as edit_log:
-            chunk = session.act(pair.clean, pair.seed)
-        return ConditionResult(chunk, edit_log)
+            return ConditionResult(context.act(), edit_log)
+
+    return Condition(str(ConditionName(cell.site_group.name, cell.role, name, f"{coefficient:g}")), play)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Steering(AlongDirection):
+class Steering(PatchKind):
     """Every place and coefficient, toward one side, and the same for the controls; 0 is always played as well.
 
     sites: patterns of places. role: whose tokens are moved. direction: `mean-difference` or `probe`, one vector
@@ -77,7 +63,6 @@ class Steering(AlongDirection):
     kind: ClassVar[str] = "steer"
     summary: ClassVar[str] = "Add a direction to tokens, with controls of the same norm."
     position: ClassVar[int] = 6
-    asks_where: ClassVar[bool] = True
     options: ClassVar[Mapping[str, str]] = {
         "sites": "where tokens are moved; required",
         "roles": "the one whose tokens are moved; required",
@@ -134,44 +119,31 @@ class Steering(AlongDirection):
         from probe_kit.intervene.directions import fit_token_directions
 
         cells = [Cell(site_group, self.role) for site_group in resolve_all(self.sites, session.policy).values()]
-        conditions: list[Condition] = [CleanRun(), SourceRun()]
-        for cell, axes in fit_token_directions(session, self, cells, self.sites).items():
-            conditions.append(Steered(cell, self.direction, 0.0, self.target_side, axes))
-            conditions += [
-                Steered(cell, name, coefficient, self.target_side, axes)
-                for coefficient in self.coefficients
-                for name in (self.direction, *axes.control_names)
-            ]
+        conditions = [CLEAN_RUN, SOURCE_RUN]
+        for cell, bases in fit_token_directions(session, self, cells, self.sites).items():
+            doses = [(self.direction, 0.0)]
+            for coefficient in self.coefficients:
+                doses += [(name, coefficient) for name in (self.direction, *bases.control_names)]
+            conditions += [steered(cell, *dose, self.target_side, bases) for dose in doses]
         return conditions
 
     @staticmethod
-    def notes(rows: Sequence[PatchEffect], measurement: Measurement) -> list[str]:
+    def notes(rows: Sequence[PatchEffect]) -> list[str]:
         """Return notes about too large a change, and about a vector that cannot move the answer."""
-        del measurement
-        steered = {row.name: row.relative_change for row in rows if row.coefficient}
         large = [
             f"{name} moves tokens by {ratio:.1f} times their own norm; what that does is little evidence."
-            for name, ratio in steered.items()
+            for name, ratio in {row.name: row.relative_change for row in rows if row.coefficient}.items()
             if ratio > LARGE_CHANGE
         ]
+        # Categories in which a direction of the tokens' mean moves no action by a smallest reach.
+        pooled = [row for row in rows if row.is_dose and not row.is_control and ":" not in row.direction]
+        moved = {row.category for row in pooled if abs(row.mean_displacement) >= SMALLEST_REACH}
         return large + [
             f"{category}: one vector that is added to every token moves no action. An answer that lies in which "
             "tokens are marked has no such vector; --direction mean-difference:1 has a vector for each position."
-            for category in _unmoved_by_one_vector(rows)
+            for category in dict.fromkeys(row.category for row in pooled)
+            if category not in moved
         ]
-
-    effects = staticmethod(Interchange.effects)
-    table = staticmethod(Interchange.table)
-    sentence = staticmethod(Interchange.sentence)
-    finding = staticmethod(Interchange.finding)
-    keys_in_use = staticmethod(Interchange.keys_in_use)
 
 
 KIND = Steering
-
-
-def _unmoved_by_one_vector(rows: Sequence[PatchEffect]) -> list[str]:
-    """Return categories in which a direction of the tokens' mean moves no action by a smallest reach."""
-    pooled = [row for row in rows if row.is_dose and not row.is_control and ":" not in row.direction]
-    moved = {row.category for row in pooled if abs(row.mean_displacement) >= SMALLEST_REACH}
-    return [name for name in dict.fromkeys(row.category for row in pooled) if name not in moved]

@@ -7,7 +7,7 @@ https://arxiv.org/abs/2310.10348).
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,14 +100,6 @@ class AttributionEffect(Effect):
 # -- estimates -----------------------------------------------------------------------------------------------
 
 
-class Estimates(NamedTuple):
-    """One pair's outputs of the clean and the source's inference, and (C,) the estimate of every cell's patch."""
-
-    clean: Any
-    source: Any
-    by_cell: NDArray[np.float64]
-
-
 def estimate_patches(
     model: "Policy",
     pair: Pair,
@@ -115,8 +107,10 @@ def estimate_patches(
     slope: Slope,
     ends: Ends = "clean",
     act: Callable[[Given, int], Any] | None = None,
-) -> Estimates:
-    """Return Σ (source − clean) · ∂ slope / ∂ activation, over the tokens and features of every cell.
+) -> tuple[Any, Any, NDArray[np.float64]]:
+    """Return the outputs of the clean and the source's inference, and (C,) the estimate of every cell's patch.
+
+    Σ (source − clean) · ∂ slope / ∂ activation, over the tokens and features of the cell.
 
     act: how an inference is made; by default `infer`. Two inferences, and one with a backward pass; two of these
     for both ends.
@@ -137,7 +131,7 @@ def estimate_patches(
         slopes.append(gradients_at(model, [model_input], [pair.seed], sites, lambda chunks: slope(chunks[0]))[1])
     memo: dict[Any, Any] = {}
     masks = [role_token_mask(model, pair, cell.site_group.stream, cell.role, memo) for cell in cells]
-    return Estimates(clean, moved, sum_over_cells(activations, source, slopes, cells, masks))
+    return clean, moved, sum_over_cells(activations, source, slopes, cells, masks)
 
 
 def sum_over_cells(
@@ -353,7 +347,7 @@ def attribute_cells(model: "Policy", pairs: Sequence[Pair], cells: Sequence[Cell
         raise UsageError("gradients are of actions; give pairs of observations, not of questions")
     anchors = complete_cuts(model, list(dict.fromkeys(cell.site_group for cell in screened)))
     every = (*anchors, *(cell for cell in screened if cell not in anchors))
-    estimates = np.array([estimate_patches(model, pair, every, metric).by_cell for pair in pairs]).T
+    estimates = np.array([estimate_patches(model, pair, every, metric)[2] for pair in pairs]).T
     exact = sweep_cells(model, pairs, anchors, lambda actions, _: _number(metric, actions))
     rows = [_row(cell, moved, exact, anchors) for cell, moved in zip(every, estimates, strict=True)]
     return Screen(tuple(order_cells(rows)), {str(cell): cell for cell in every})

@@ -1,7 +1,7 @@
 """A sweep of sets of cells over pairs, and the smallest set that keeps the effect."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -42,8 +42,10 @@ class SwapShare(NamedTuple):
 
 def share_of_whole(
     moved: NDArray[np.float64], full: NDArray[np.float64], groups: NDArray[np.str_], seed_text: str
-) -> SwapShare:
-    """Return Σ moved · whole / Σ whole² over episodes (E,), with its interval by groups (E,)."""
+) -> SwapShare | None:
+    """Return Σ moved · whole / Σ whole² over episodes (E,), with its interval by groups (E,); None of nothing."""
+    if not full.any():
+        return None
     names, group_of = np.unique(groups, return_inverse=True)
     above, below = np.bincount(group_of, moved * full), np.bincount(group_of, full**2)
     times = draw_groups(names.size, units_seed(groups, seed_text))
@@ -222,19 +224,12 @@ CARRIES, NOTHING = 0.5, 0.1
 """Shares of the swap from which a set carries it, and below which, on both sides of 0, it carries nothing."""
 
 
-@dataclass(frozen=True)
-class MinimalSet[C]:
-    """A set of which no cell can be left out. effect: of these cells. tried: how many sets were tried."""
-
-    cells: tuple[C, ...]
-    effect: float
-    tried: int
-
-
 def find_minimal_set[C](
     cells: Sequence[C], effects: Callable[[Sequence[tuple[C, ...]]], Sequence[float]], keep: float = KEEP
-) -> MinimalSet[C]:
+) -> tuple[tuple[C, ...], float, int]:
     """Leave out cells while `keep` of the effect of all of them stays; of equal ones the first is left out.
+
+    Return a set of which no cell can be left out, its effect, and how many sets were tried.
 
     effects: the effect of each of some sets. At most n (n + 1) / 2 sets of up to `MOST_SINGLY` cells are tried.
     Adding cells one by one would stop at once where a majority decides: no first cell has an effect.
@@ -244,7 +239,10 @@ def find_minimal_set[C](
     effect, tried, is_singly = full, 1, len(have) <= MOST_SINGLY
     parts = len(have) if is_singly else 2
     while len(have) > 1:
-        smaller = [_without(have, chunk) for chunk in np.array_split(np.arange(len(have)), parts)]
+        smaller = [
+            tuple(cell for at, cell in enumerate(have) if at not in left_out)
+            for left_out in np.array_split(np.arange(len(have)), parts)
+        ]
         shares = effects(smaller)
         tried += len(smaller)
         best = int(np.argmax(shares))
@@ -256,12 +254,7 @@ def find_minimal_set[C](
             parts = min(2 * parts, len(have))
         else:  # no single cell can be left out
             break
-    return MinimalSet(have, effect, tried)
-
-
-def _without[C](cells: tuple[C, ...], left_out: Sequence[int]) -> tuple[C, ...]:
-    gone = set(map(int, left_out))
-    return tuple(cell for number, cell in enumerate(cells) if number not in gone)
+    return have, effect, tried
 
 
 def pooled_share(moved: NDArray[np.float64], full: NDArray[np.float64]) -> float:
@@ -335,13 +328,14 @@ def compare_alone_and_without(
     sets = [distinct, *[(cell,) for cell in distinct], *[all_but(distinct, (cell,)) for cell in distinct]]
     swept = sweep_cells(model, pairs, sets, metric)
     # The family of max-T: cells alone. All cells together, and all but one, are no tests of a cell.
-    alone = _only(swept, range(1, 1 + len(distinct)))
-    rows = []
+    rows = slice(1, 1 + len(distinct))
+    alone = replace(swept, cells=swept.cells[rows], patched=swept.patched[rows])
+    lines = []
     for at, cell in enumerate(distinct):
         lost = swept.patched[0] - swept.patched[1 + len(distinct) + at]
         needed = share_of_whole(lost, swept.full_effect, swept.groups, DRAWS) if alone.shares[at] else None
         p = float(alone.table["p_fwe"][at])
-        rows.append(
+        lines.append(
             {
                 "cells": str(cell),
                 **share_columns("alone", alone.shares[at]),
@@ -350,7 +344,7 @@ def compare_alone_and_without(
                 "finding": finding_of_cell(alone.shares[at], needed, swept.shares[0], p),
             }
         )
-    return pd.DataFrame(rows)
+    return pd.DataFrame(lines)
 
 
 def find_minimal_cells(
@@ -379,11 +373,9 @@ def find_minimal_cells(
         swept = sweep_cells(model, searched, sets, metric)
         return [pooled_share(values - swept.clean, swept.full_effect) for values in swept.patched]
 
-    smallest = find_minimal_set(distinct, effects, keep)
-    scored = sweep_cells(model, held_out, [smallest.cells], metric)
-    return MinimalCells(
-        smallest.cells, smallest.effect, smallest.tried, scored.shares[0], float(scored.table["p"][0]), choosing
-    )
+    smallest, effect, tried = find_minimal_set(distinct, effects, keep)
+    scored = sweep_cells(model, held_out, [smallest], metric)
+    return MinimalCells(smallest, effect, tried, scored.shares[0], float(scored.table["p"][0]), choosing)
 
 
 def _several(cells: Sequence[Cell]) -> tuple[Cell, ...]:
@@ -393,16 +385,3 @@ def _several(cells: Sequence[Cell]) -> tuple[Cell, ...]:
             f"a comparison of sets needs two cells or more; {', '.join(map(str, distinct)) or 'none'} given"
         )
     return distinct
-
-
-def _only(swept: Sweep, rows: range) -> Sweep:
-    """Some of the sets, tested among themselves."""
-    return Sweep(
-        tuple(swept.cells[row] for row in rows),
-        swept.groups,
-        swept.items,
-        swept.toward,
-        swept.clean,
-        swept.source,
-        swept.patched[np.array(rows)],
-    )

@@ -30,17 +30,18 @@ from probe_kit.intervene import (
     stored_attention,
 )
 from probe_kit.intervene.kinds.attention import (
-    AttentionRecorded,
     PatchAttention,
+    attention_recorded,
     shares_by_role,
     stored_patch_attention,
 )
-from probe_kit.intervene.kinds.base import Measurement, TableContext
+from probe_kit.intervene.kinds.base import TableContext
+from probe_kit.intervene.outcomes import ATTENTION_FILE, arrays_from_bytes, arrays_to_bytes
 from probe_kit.intervene.places import BANDS, TILES, Pair, patch_embeddings, token_boxes, tokens_overlapping
 from probe_kit.intervene.replay import ConditionContext, ReplayBatch
 from probe_kit.intervene.sessions import ReplaySession
 from probe_kit.runs import Run, open_run, verify_run
-from tests.intervene.answers import follower, outcomes_of
+from tests.intervene.answers import follower, measured, outcomes_of
 from tests.support.smolvla_checkpoints import write_smolvla
 
 if TYPE_CHECKING:
@@ -59,7 +60,7 @@ def attention_records(copy: Run, source: ReplaySource, twin: "Policy") -> Interv
 
 @pytest.fixture
 def weighed(attention_records: InterventionResult) -> AttentionShares:
-    return AttentionShares.of(attention_records.measurement)
+    return AttentionShares.from_bytes(attention_records.measurement.read(ATTENTION_FILE))
 
 
 def test_it_is_what_the_policy_tells_by_block_iteration_and_head(
@@ -129,7 +130,7 @@ def test_every_camera_has_its_patches_where_they_look_and_a_frame_shows_them_sid
     roles = ("all", "image.top", "image.wrist")
     session = SimpleNamespace(policy=policy, act=lambda seen, seed: policy.act([seen], [seed])[0])
     context = ConditionContext(session, Pair(observation, observation))  # type: ignore[arg-type]
-    result = AttentionRecorded("backbone", roles, boxes=boxes).play(context)
+    result = attention_recorded("backbone", roles, boxes).play(context)
     assert result.patches is not None
     assert result.mass is not None
     counts = [len(places) for places in boxes.values()]
@@ -140,7 +141,7 @@ def test_every_camera_has_its_patches_where_they_look_and_a_frame_shows_them_sid
         np.array(["a"]), np.zeros(1, int), result.patches[None].astype(np.float16),
         np.repeat(cameras, counts), np.concatenate(list(boxes.values())),
     )  # fmt: skip
-    stored = PatchAttention.from_bytes(stored.to_bytes())
+    stored = PatchAttention(**arrays_from_bytes(arrays_to_bytes(stored)))
     both, first = stored.on_frame(2), stored.on_frame(1)
     np.testing.assert_allclose(both.boxes[: counts[0], 0::2], boxes["top"][:, 0::2] / 2)
     np.testing.assert_allclose(both.boxes[counts[0] :, 0::2], 0.5 + boxes["wrist"][:, 0::2] / 2)
@@ -165,7 +166,7 @@ def test_noting_changes_no_action_bit_for_bit(attention_records: InterventionRes
         mass=np.zeros((1, 1, 1, 1, 1), np.float32), inferences=np.zeros((1, 2), int),
     )  # fmt: skip
     with pytest.raises(CaptureChangedActionError, match="1e-06"):
-        AttentionReadout().certificate_entries([AttentionRecorded("backbone", ("all",))], found)
+        AttentionReadout().extra_files(SimpleNamespace(), [], found)  # type: ignore[arg-type]
 
 
 def test_shares_add_up_and_tiles_are_told_by_where_the_answer_lies(weighed: AttentionShares) -> None:
@@ -206,15 +207,15 @@ def test_means_are_over_what_is_not_asked_for_and_every_episode_counts_alike() -
     assert by_call["share"].iloc[1] == pytest.approx(cells[1].mean())
     assert list(weighed.frame(("head",)).columns) == ["category", "role", "head", "share", "n_episodes"]
     assert weighed.correct_minus_other("suite") == {}
-    again = AttentionShares.from_bytes(weighed.to_bytes())
+    again = AttentionShares.from_bytes(arrays_to_bytes(weighed))
     np.testing.assert_array_equal(again.mass, mass)
-    assert again.to_bytes() == weighed.to_bytes()
+    assert arrays_to_bytes(again) == arrays_to_bytes(weighed)
     with pytest.raises(UsageError, match="no axis 'layer'"):
         weighed.rows(("layer",))  # type: ignore[arg-type]
 
 
 def headings(shares: AttentionShares) -> tuple[str, ...]:
-    measurement = Measurement(outcomes_of({"color": follower(4)}), "suite", {}, {}, lambda _: shares.to_bytes())
+    measurement = measured(outcomes_of({"color": follower(4)}), "suite", {}, {}, lambda _: arrays_to_bytes(shares))
     return AttentionReadout.table([], TableContext(measurement, "of", {})).columns[2:]
 
 
@@ -263,7 +264,7 @@ def test_the_command_shows_a_table_json_and_csv(copy: Run, attention_records: In
 def test_along_the_whole_episode_every_call_is_noted(copy: Run, source: ReplaySource, twin: "Policy") -> None:
     intervention = AttentionReadout(categories=("shape",), items=1, roles=("language",), readout="per-step")
     effects = run_intervention(copy, intervention, source, load=lambda *_: twin)
-    attended = AttentionShares.of(effects.measurement)
+    attended = AttentionShares.from_bytes(effects.measurement.read(ATTENTION_FILE))
     assert attended.roles == ("all", "language")
     calls = attended.calls
     assert calls.tolist() == 2 * list(range(ceil(STEPS / int(copy.settings["execute"]))))

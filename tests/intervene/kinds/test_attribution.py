@@ -22,6 +22,7 @@ from probe_kit.intervene.kinds.base import Measurement, TableContext
 from probe_kit.intervene.patching.attribution import kind_of_place
 from probe_kit.intervene.results import verdicts_of
 from probe_kit.runs import Run
+from tests.intervene.answers import measured
 from tests.intervene.wirings import WiredSession, outcomes_of, replay_inputs
 
 pytestmark = pytest.mark.slow  # `tests/acceptance` holds what a user sees of it
@@ -39,8 +40,8 @@ def screened(session: WiredSession, name: str, **options: Any) -> Measurement:
     asked = AttributionPatching(categories=(name,), roles=ROLES, **options)
     conditions = asked.conditions(session)
     outcomes = outcomes_of(session, [name], conditions[2:])
-    entries = asked.certificate_entries(conditions, None)  # type: ignore[arg-type]
-    return Measurement(outcomes, SUITE, asked.parameters() | {"kind": asked.kind}, entries, lambda _: b"")
+    entries = dict(session.certificate)
+    return measured(outcomes, SUITE, asked.parameters() | {"kind": asked.kind}, entries, lambda _: b"")
 
 
 def by_name(rows: list[AttributionEffect]) -> dict[str, AttributionEffect]:

@@ -22,13 +22,13 @@ from probe_kit.intervene import (
     run_intervention,
     stored_image_swaps,
 )
-from probe_kit.intervene.kinds.closed_loop import closed_loop_effects
 from probe_kit.intervene.kinds.interchange import PatchEffect, best_cell
-from probe_kit.intervene.replay import CleanRun
+from probe_kit.intervene.replay import CLEAN_RUN, Condition, ConditionContext, ConditionResult
 from probe_kit.intervene.rollout import roll_out
 from probe_kit.intervene.sessions import ReplaySession, open_session
 from probe_kit.runs import Run, open_run, verify_run
 from probe_kit.suite import Suite
+from tests.intervene.answers import measured
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
@@ -65,7 +65,7 @@ def made(episode_outcomes: Sequence[Sequence[str]], names: Sequence[str] = NAMES
 
 
 def found(episode_outcomes: Sequence[Sequence[str]], names: Sequence[str] = NAMES) -> dict[str, ClosedLoopEffect]:
-    return {row.name: row for row in closed_loop_effects(made(episode_outcomes, names), "suite")}
+    return {row.name: row for row in ClosedLoop.effects(measured(made(episode_outcomes, names), "suite"))}
 
 
 def test_a_choice_that_turns_beyond_its_control_is_confirmed() -> None:
@@ -274,15 +274,14 @@ def test_every_inference_has_its_own_state_and_the_pictures_exchanged(
 ) -> None:
     seen: list[tuple[Observation, Observation]] = []
 
-    class Watching(CleanRun):
-        def play(self, context):  # type: ignore[no-untyped-def]
-            seen.append((context.pair.clean, context.pair.source))
-            return super().play(context)
+    def watch(context: ConditionContext) -> ConditionResult:
+        seen.append((context.pair.clean, context.pair.source))  # type: ignore[arg-type]
+        return CLEAN_RUN.play(context)
 
     session: ReplaySession
     with open_session(run, source, lambda *_: twin) as session, session.ready():
         (replay_input, _) = session.pairs(str(run.episodes["item_id"][0]))
-        roll_out(session, replay_input, Watching())
+        roll_out(session, replay_input, Condition("watched", watch))
     assert len(seen) == CALLS
     assert (seen[0][0].state != seen[1][0].state).any()
     for own, other in seen:

@@ -31,9 +31,9 @@ from probe_kit.intervene.erasers import (
     leace_direction,
     ledoit_wolf,
 )
-from probe_kit.intervene.kinds.erase import ErasureEffect, erasure_effects
+from probe_kit.intervene.kinds.erase import ErasureEffect
 from probe_kit.runs import Run, open_run, verify_run
-from tests.intervene.answers import follower, habit, outcomes_of
+from tests.intervene.answers import follower, habit, measured, outcomes_of
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
@@ -147,7 +147,7 @@ def erased_answers(own: float, beside: float, base: str = "follower") -> Conditi
     ],
 )
 def test_what_is_lost_is_lost_beyond_the_controls(own: float, beside: float, base: str, finding: str) -> None:
-    row, *controls = erasure_effects(erased_answers(own, beside, base), "suite")
+    row, *controls = ConceptErasure.effects(measured(erased_answers(own, beside, base), "suite"))
     assert row.finding == finding
     assert [one.finding for one in controls] == ["control", "control"]
     if finding == "no baseline effect":
@@ -165,7 +165,7 @@ def test_a_loss_in_one_group_is_no_evidence() -> None:
     outcomes = erased_answers(1.0, 1.0)
     one = outcomes.groups == outcomes.groups[0]
     outcomes.displacement[1] = np.where(one, -outcomes.displacement[0], outcomes.displacement[0])
-    row = erasure_effects(outcomes, "suite")[0]
+    row = ConceptErasure.effects(measured(outcomes, "suite"))[0]
     assert row.net > 0
     assert row.p is not None
     assert row.p >= 0.5

@@ -10,7 +10,7 @@ import pytest
 
 from probe_kit.intervene.kinds import every_kind
 from probe_kit.intervene.kinds.attribution import AttributionPatching
-from probe_kit.intervene.kinds.base import Intervention, Measurement, TableContext
+from probe_kit.intervene.kinds.base import Intervention, TableContext
 from probe_kit.intervene.kinds.closed_loop import ClosedLoop, ClosedLoopEffect
 from probe_kit.intervene.kinds.erase import ConceptErasure, ErasureEffect
 from probe_kit.intervene.kinds.image_swap import Finding, ImageSwap, ImageSwapEffect, InputEffect
@@ -22,6 +22,7 @@ from probe_kit.intervene.outcomes import CLEAN, ConditionOutcomes
 from probe_kit.intervene.patching.attribution import AttributionEffect
 from probe_kit.intervene.verdict import UseVerdict, classify_use
 from probe_kit.retention.columns.summary import MOST_NUMBERS, MOST_WORDS, count_words
+from tests.intervene.answers import measured
 
 SWAPS = {
     "follows": (0.92, 0.02, (0.6, 1.0), 0.001, 1.0, 0.9, (0.8, 1.0)),
@@ -57,7 +58,7 @@ def context(verdict: UseVerdict | None) -> TableContext:
     outcomes = ConditionOutcomes(
         (CLEAN,), names, names, names, names, np.array(["left"]), numbers, numbers, moved, numbers[0]
     )
-    return TableContext(Measurement(outcomes, "", {}, {}, str.encode), "", verdicts)
+    return TableContext(measured(outcomes, "", {}, {}, str.encode), "", verdicts)
 
 
 @pytest.mark.parametrize("response", SWAPS)

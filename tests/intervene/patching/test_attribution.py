@@ -8,7 +8,7 @@ from probe_kit import patching as pt
 from probe_kit.errors import UnsupportedInterventionError, UsageError
 from probe_kit.hooks.contract.declared import Interventions
 from probe_kit.intervene import AttributionPatching
-from probe_kit.intervene.kinds.base import Measurement
+from tests.intervene.answers import measured
 from tests.intervene.wirings import WiredPolicy, WiredSession, outcomes_of
 
 ROLES = ("image", "language", "state")
@@ -69,8 +69,8 @@ def test_its_numbers_are_those_of_the_command(wired: WiredSession, copied: pt.Sc
     asked = AttributionPatching(categories=("copied",), roles=ROLES)
     conditions = asked.conditions(wired)
     outcomes = outcomes_of(wired, ["copied"], conditions[2:])
-    entries = asked.certificate_entries(conditions, None)  # type: ignore[arg-type]
-    measurement = Measurement(outcomes, "suite", asked.parameters() | {"kind": asked.kind}, entries, lambda _: b"")
+    entries = dict(wired.certificate)
+    measurement = measured(outcomes, "suite", asked.parameters() | {"kind": asked.kind}, entries, lambda _: b"")
     stored = {row.name: row for row in AttributionPatching.effects(measurement)}
     assert stored.keys() == set(copied.table["cells"])
     for row in copied.rows:

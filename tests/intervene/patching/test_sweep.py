@@ -5,7 +5,8 @@ import pytest
 
 from probe_kit import patching as pt
 from probe_kit.errors import UnknownCategoryError, UsageError
-from probe_kit.intervene.kinds.interchange import patch_effects, patch_of
+from probe_kit.intervene.kinds.interchange import patch_of
+from tests.intervene.answers import patches_of
 from tests.intervene.wirings import WiredSession, outcomes_of
 
 KV = "kv.*|image,language,state"
@@ -41,7 +42,7 @@ def test_a_sweep_gives_the_numbers_of_the_interchange(copied: pt.Sweep, wired: W
     sites = tuple(dict.fromkeys(site for cell in cells for site in cell.site_group.sites))
     stored = outcomes_of(wired, ["copied"], [patch_of(own, sites) for own in cells])
     rows = copied.table.iloc[chosen].iterrows()
-    for at, (effect, (row, own)) in enumerate(zip(patch_effects(stored, "suite"), rows, strict=True)):
+    for at, (effect, (row, own)) in enumerate(zip(patches_of(stored, "suite"), rows, strict=True)):
         assert f"{effect.place} {effect.role}" == own["cells"]
         assert own["share"] == pytest.approx(effect.effect, abs=1e-9)
         assert own["moved"] == pytest.approx(effect.mean_displacement, abs=1e-9)

@@ -9,8 +9,7 @@ from probe_kit.errors import UsageError
 from probe_kit.hooks import Site, capture
 from probe_kit.intervene import ClosedLoop, Interchange, ReplaySource, Steering, run_intervention
 from probe_kit.intervene.directions import (
-    PassedOver,
-    TokenDirections,
+    Directions,
     TokenFeatures,
     by_episode,
     fit_by_fold,
@@ -18,7 +17,8 @@ from probe_kit.intervene.directions import (
     half_differences_of,
 )
 from probe_kit.intervene.erasers import Method, PaddedTokens
-from probe_kit.intervene.places import resolve_sites
+from probe_kit.intervene.patching.patch import Cell
+from probe_kit.intervene.places import SiteGroup, resolve_sites
 from probe_kit.intervene.sessions import ReplaySession
 from probe_kit.runs import Run
 
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from probe_kit.hooks import Policy
 
 SITE = Site("backbone", 2)
+CELL = Cell(SiteGroup("backbone.02", (SITE,)), "image")
 GROUPS, POSITIONS, WIDTH = 10, 6, 12
 
 
@@ -49,7 +50,7 @@ def test_marks_that_cancel_in_the_mean_lie_along_one_direction() -> None:
     pooled = own.tokens.values.mean(axis=1)
     difference = pooled[own.is_left].mean(axis=0) - pooled[~own.is_left].mean(axis=0)
     assert np.linalg.norm(difference) < 0.05
-    fits = fit_by_fold(own, SITE, "image", Method.of("mean-difference:1"), 2, 0, "color")
+    fits = fit_by_fold(own, CELL, Method.of("mean-difference:1"), 2, 0, "color")
     found = by_episode(own, fits)
     assert set(found) == {"mean-difference:1", "control-1", "control-2"}
     for episode in own.episodes:
@@ -70,17 +71,17 @@ def test_a_place_without_a_direction_is_refused_by_category_site_and_role(method
         own.episodes, own.groups, own.is_left, PaddedTokens(np.repeat(values, 4, axis=0), own.tokens.present)
     )
     with pytest.raises(UsageError, match=f"color, {SITE}, role image: no direction for {method}"):
-        fit_by_fold(same, SITE, "image", Method.of(method), 1, 0, "color")
+        fit_by_fold(same, CELL, Method.of(method), 1, 0, "color")
 
 
 def test_an_episodes_own_group_has_no_say_in_its_directions() -> None:
     own, method = marked(np.eye(WIDTH)[3]), Method.of("mean-difference:2")
-    before = by_episode(own, fit_by_fold(own, SITE, "image", method, 1, 0, "color"))
+    before = by_episode(own, fit_by_fold(own, CELL, method, 1, 0, "color"))
     spoilt = own.tokens.values.copy()
     mine = own.groups == "g4"
     spoilt[mine] = 100 * np.random.default_rng(1).normal(size=spoilt[mine].shape)
     other = TokenFeatures(own.episodes, own.groups, own.is_left, PaddedTokens(spoilt, own.tokens.present))
-    after = by_episode(other, fit_by_fold(other, SITE, "image", method, 1, 0, "color"))
+    after = by_episode(other, fit_by_fold(other, CELL, method, 1, 0, "color"))
     same = [
         np.array_equal(before[str(method)][name].removed, after[str(method)][name].removed)
         for name in own.episodes
@@ -93,17 +94,16 @@ def test_they_are_the_leading_differences_of_class_means_of_the_other_folds(
     session: ReplaySession, copy: Run
 ) -> None:
     """Compared with numpy's decomposition of the tokens that the policy has there."""
-    items = list(dict.fromkeys(copy.episodes.loc[copy.episodes["category"] == "color", "item_id"].astype(str)))[:6]
+    items = list(dict.fromkeys(copy.episodes.loc[copy.episodes["category"] == "color", "item_id"].astype(str)))
     (place,) = resolve_sites("backbone.02", session.policy)
     captured: list[tuple[int, int]] = []
     session.on_fit_progress = lambda done, total, _: captured.append((done, total))
-    passed_over = PassedOver(session, ("backbone.02",))
-    (axes,) = fit_token_directions(
-        session, items, {place: ["image"]}, "mean-difference:2", 1, 0, passed_over
-    ).values()
+    asked = Interchange(
+        categories=("color",), sites=("backbone.02",), roles=("image",), direction="mean-difference:2", controls=1
+    )
+    (axes,) = fit_token_directions(session, asked, [Cell(place, "image")], asked.sites).values()
     session.on_fit_progress = None
     assert captured == [(done, len(items)) for done in range(1, len(items) + 1)]
-    assert isinstance(axes, TokenDirections)
     replay_inputs = [replay_input for item in items for replay_input in session.pairs(item)]
     rows = []
     for replay_input in replay_inputs:
@@ -115,17 +115,15 @@ def test_they_are_the_leading_differences_of_class_means_of_the_other_folds(
         np.array(rows),
         np.array([replay_input.side == "left" for replay_input in replay_inputs]),
     )
-    chosen = {
-        name: axes.basis("mean-difference:2", name, "color") for name in (q.episode_id for q in replay_inputs)
-    }
-    episode = replay_inputs[0].episode_id
-    fold = np.array([np.array_equal(chosen[q.episode_id], chosen[episode]) for q in replay_inputs])
+    chosen = {name: axes.basis("mean-difference:2", name) for name in (q.episode for q in replay_inputs)}
+    episode = replay_inputs[0].episode
+    fold = np.array([np.array_equal(chosen[q.episode], chosen[episode]) for q in replay_inputs])
     assert 0 < fold.sum() < fold.size
     differences = values[~fold & left].mean(axis=0) - values[~fold & ~left].mean(axis=0)
     _, _, expected = np.linalg.svd(differences, full_matrices=False)
     basis = chosen[episode].astype(float)
     np.testing.assert_allclose(basis.T @ basis, expected[:2].T @ expected[:2], atol=1e-5)
-    control = axes.basis("control-1", episode, "color")
+    control = axes.basis("control-1", episode)
     assert control.shape == basis.shape
     np.testing.assert_allclose(control @ basis.T, 0, atol=1e-5)
 
@@ -164,19 +162,19 @@ def test_a_dose_of_two_takes_the_marks_from_one_half_of_the_tokens_to_the_other(
     """Marks are planted; the vector of every position is the difference of the class means there."""
     mark = np.eye(WIDTH)[3]
     own, method = marked(mark), "mean-difference:1"
-    fits = fit_by_fold(own, SITE, "image", Method.of(method), 1, 0, "color")
+    fits = fit_by_fold(own, CELL, Method.of(method), 1, 0, "color")
     bases = {
         (name, episode): eraser.removed[0].astype(np.float32)
         for name, of_episode in by_episode(own, fits).items()
         for episode, eraser in of_episode.items()
     }
-    axes = TokenDirections(bases, half_differences_of(own, fits, method), ("control-1",))
+    axes = Directions(bases, half_differences_of(own, fits, method), ("control-1",))
     first = np.arange(POSITIONS) < POSITIONS // 2
     for episode, left in zip(own.episodes, own.is_left, strict=True):
-        shift = axes.shift(method, episode, "color", -2.0 if left else 2.0)
+        shift = axes.shift(method, episode, -2.0 if left else 2.0)
         expected = np.where(first == left, -1.0, 1.0)[:, None] * mark
         np.testing.assert_allclose(shift, expected, atol=0.1)
-        control = axes.shift("control-1", episode, "color", -2.0 if left else 2.0)
+        control = axes.shift("control-1", episode, -2.0 if left else 2.0)
         np.testing.assert_allclose(
             np.linalg.norm(control, axis=1), np.linalg.norm(shift, axis=1), rtol=1e-4, err_msg=episode
         )

@@ -26,7 +26,7 @@ from probe_kit.intervene.kinds.interchange import (
     stored_steering,
     stored_subspace_effects,
 )
-from probe_kit.intervene.outcomes import ATTENTION_FILE, FORMAT, StoredIntervention, key_of
+from probe_kit.intervene.outcomes import ATTENTION_FILE, FORMAT, StoredIntervention, arrays_to_bytes, key_of
 from probe_kit.intervene.results import effects_of, listed_interventions, verdicts_of
 from probe_kit.runs.layout import INTERVENTIONS
 from probe_kit.runs.results import read_bundles, write_bundle
@@ -83,7 +83,7 @@ def attention_records(episodes: int, *roles: str) -> tuple[ConditionOutcomes, di
         np.zeros(episodes, int),
         mass,
     )
-    return outcomes, {ATTENTION_FILE: weighed.to_bytes()}
+    return outcomes, {ATTENTION_FILE: arrays_to_bytes(weighed)}
 
 
 def ended(outcomes: ConditionOutcomes) -> ConditionOutcomes:
@@ -187,7 +187,7 @@ def read(run: ArrayRun) -> dict[str, Any]:
         "maps": stored_site_effects(run),
         "along": stored_subspace_effects(run),
         "steering": stored_steering(run),
-        "attention": {name: own.to_bytes() for name, own in stored_attention(run).items()},
+        "attention": {name: arrays_to_bytes(own) for name, own in stored_attention(run).items()},
         "verdicts": classify_all(found, encoded, stored_places(StoredEvidence(run))),
         "targets": best_patch_targets(run, ["color"]),
     }
@@ -256,7 +256,7 @@ def test_the_verdict_says_first_chunk_and_whole_episode_whichever_is_asked_for(r
     """Color follows in the first chunk; the stored episodes along which each step was evaluated do not move."""
     for name, readout in (("image-swap", "first-chunk"), ("follow, shadow", "per-step")):
         key = key_of(settings_of(run, name))
-        shown = effects_of(run, StoredIntervention(read_bundles(run.location, INTERVENTIONS)[key]))
+        shown = effects_of(run, StoredIntervention(read_bundles(run.location, INTERVENTIONS)[key], run.seed_text))
         found = shown.verdicts["color"]
         assert (found.readout, shown.effects[0].readout) == (readout, readout)
         assert found.verdict == "first chunk used; episode undecided"
@@ -269,7 +269,7 @@ def test_the_verdict_says_first_chunk_and_whole_episode_whichever_is_asked_for(r
 
 def test_a_follow_that_is_asked_for_by_its_key_has_its_own_verdict(run: ArrayRun) -> None:
     key = key_of(settings_of(run, "follow, few"))
-    effects = effects_of(run, StoredIntervention(read_bundles(run.location, INTERVENTIONS)[key]))
+    effects = effects_of(run, StoredIntervention(read_bundles(run.location, INTERVENTIONS)[key], run.seed_text))
     assert effects.effects[0].n_episodes == FEW
     assert effects.verdicts["color"].behaviour == "undecided"
 

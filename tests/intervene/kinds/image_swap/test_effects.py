@@ -7,16 +7,16 @@ import pytest
 
 from probe_kit.env import SceneSpec
 from probe_kit.intervene import ImageSwapEffect
-from probe_kit.intervene.kinds.image_swap import TILES_APART, image_swap_effects
+from probe_kit.intervene.kinds.image_swap import TILES_APART
 from probe_kit.intervene.outcomes import ConditionOutcomes
-from tests.intervene.answers import follower, habit, outcomes_of
+from tests.intervene.answers import follower, habit, outcomes_of, swaps_of
 
 Kind = Callable[[int], tuple[np.ndarray, np.ndarray]]
 SUITE = "suite@1#0123456789ab"
 
 
 def of(signs: tuple[np.ndarray, np.ndarray], groups: int | None = None) -> ImageSwapEffect:
-    (found,) = image_swap_effects(outcomes_of({"color": signs}, groups), SUITE)
+    (found,) = swaps_of(outcomes_of({"color": signs}, groups), SUITE)
     return found
 
 
@@ -56,7 +56,7 @@ def test_the_reach_of_a_policy_that_goes_to_one_side_is_the_distance_between_the
 
 def test_a_few_categories_that_move_weakly_do_not_shorten_the_reach() -> None:
     weak = tuple(0.02 * part for part in follower(48))
-    rows = image_swap_effects(outcomes_of({"color": follower(96), "shape": weak}), SUITE)  # type: ignore[dict-item]
+    rows = swaps_of(outcomes_of({"color": follower(96), "shape": weak}), SUITE)  # type: ignore[dict-item]
     assert [row.reach for row in rows] == [pytest.approx(0.2)] * 2
     assert rows[1].reach_share == pytest.approx(0.02)
 
@@ -96,4 +96,4 @@ def test_answers_are_read_back_as_they_were() -> None:
     assert back.to_bytes() == made.to_bytes()
     assert back.conditions == made.conditions
     np.testing.assert_array_equal(back.displacement, made.displacement)
-    assert back.only("shape").items.tolist() == ["shape-0", "shape-0", "shape-1", "shape-1"]
+    assert dict(back.by_category())["shape"].items.tolist() == ["shape-0", "shape-0", "shape-1", "shape-1"]

@@ -9,16 +9,15 @@ import pytest
 
 import probe_kit
 from probe_kit.intervene import ImageSwapEffect, classify_all, classify_use
-from probe_kit.intervene.kinds.image_swap import image_swap_effects
 from probe_kit.intervene.verdict import classify_behaviour, size_of_groups
 from probe_kit.statistics.sufficiency import groups_for_not_used
-from tests.intervene.answers import Cell, follower, habit, outcomes_of
+from tests.intervene.answers import Cell, follower, habit, outcomes_of, swaps_of
 
 SUITE = "suite@1#0123456789ab"
 
 
 def of(signs: tuple[Cell, Cell], groups: int | None = None) -> ImageSwapEffect:
-    (found,) = image_swap_effects(outcomes_of({"color": signs}, groups), SUITE)
+    (found,) = swaps_of(outcomes_of({"color": signs}, groups), SUITE)
     return found
 
 
@@ -82,7 +81,7 @@ def test_what_goes_against_in_half_of_the_episodes_is_not_called_unused() -> Non
 
 
 def test_not_used_needs_another_category_that_is_used() -> None:
-    both = image_swap_effects(outcomes_of({"color": follower(48), "state": habit(48)}), SUITE)
+    both = swaps_of(outcomes_of({"color": follower(48), "state": habit(48)}), SUITE)
     found = {one.category: one for one in both}
     assert classify_all(found, {})["state"].reason.endswith("positive control: color")
     alone = classify_all({"state": found["state"]}, {})["state"]
@@ -120,7 +119,7 @@ def drawn(seed: int, groups: int, mean: float, spread: float, other: float = 0.0
     habits = lot * (max(mean, other) < 0.5) * 0.15
     clean, swapped = (habits + sign * 0.15 * toward + draw.normal(size=2 * items) * 0.002 for sign in (1, -1))
     made = outcomes_of({"color": (clean, swapped), "shape": (np.full(400, 0.15), np.full(400, -0.15))}, groups)
-    return classify_all({row.category: row for row in image_swap_effects(made, SUITE)}, {})["color"].behaviour
+    return classify_all({row.category: row for row in swaps_of(made, SUITE)}, {})["color"].behaviour
 
 
 DRAWS = 300
