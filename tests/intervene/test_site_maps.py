@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -27,7 +27,7 @@ from probe_kit.intervene import (
     stored_site_effects,
 )
 from probe_kit.intervene.directions import fit_directions
-from probe_kit.intervene.kinds.base import ConditionName, Measurement
+from probe_kit.intervene.kinds.base import ConditionName
 from probe_kit.intervene.kinds.interchange import localised_sites, target_sign
 from probe_kit.intervene.outcomes import FORMAT
 from probe_kit.intervene.places import resolve_sites, token_mask
@@ -439,9 +439,9 @@ def test_the_note_about_one_vector_is_of_steering_along_one_and_not_of_its_contr
     plain, exchanged = follower(48)
     still = {f"a__image__{name}__2": plain for name in ("mean_difference:1", "control_1")}
     along_tokens = patches_of(with_changes((plain, exchanged), **still), SUITE)
-    assert Steering.notes(along_tokens, cast("Measurement", None)) == []
+    assert Steering.notes(along_tokens) == []
     in_all = patches_of(with_changes((plain, exchanged), a__image__mean_difference__2=plain), SUITE)
-    (note,) = Steering.notes(in_all, cast("Measurement", None))
+    (note,) = Steering.notes(in_all)
     assert note.startswith("color: one vector that is added to every token moves no action")
 
 

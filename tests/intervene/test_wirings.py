@@ -178,8 +178,8 @@ def test_a_single_place_is_read_and_is_the_smallest_set(wired: WiredSession) -> 
     assert (rows["kv.01 language"].finding, rows["kv.02 language"].finding) == ("read here", "nothing alone")
     assert (rows["minimal"].cells, rows["minimal"].finding) == ("kv.01 language", "read here")
     assert describe_joint_places(list(rows.values())) == "read at kv.01 language"
-    assert JointPlaces.notes([rows["minimal"]], None) == []  # type: ignore[arg-type]
-    (note,) = JointPlaces.notes([replace(rows["minimal"], n_groups=4)], None)  # type: ignore[arg-type]
+    assert JointPlaces.notes([rows["minimal"]]) == []
+    (note,) = JointPlaces.notes([replace(rows["minimal"], n_groups=4)])
     assert note.startswith("copied: the smallest set is scored in 4 groups, in which no p can be below 0.062")
 
 
@@ -272,8 +272,8 @@ class OneDirection:
     vector: np.ndarray
     control_names: tuple[str, ...] = ("control-1",)
 
-    def basis(self, name: str, episode: str, category: str) -> np.ndarray:
-        del episode, category
+    def basis(self, name: str, episode: str) -> np.ndarray:
+        del episode
         other = np.zeros_like(self.vector)
         other[-1] = 1.0
         return (other if name.startswith("control") else self.vector)[None]
