@@ -9,6 +9,7 @@ import numpy as np
 from probe_kit.suite.generators.drawing import (
     COLORS,
     RGB,
+    SHIRT,
     Canvas,
     Pen,
     Placement,
@@ -69,26 +70,18 @@ def _tree(pen: Pen, level: float, color: RGB) -> None:
     pen.line(polygon((-0.7, 0.9), (0.7, 0.9)), _DARK, 0.06)
 
 
-def _arc(bend: float = 0.5) -> Points:
-    x = np.linspace(-0.78, 0.78, 41)
-    return np.stack([x, bend * np.cos(x / 0.78 * np.pi / 2) - bend / 2], axis=1)
-
-
 def _thick_line(pen: Pen, level: float, color: RGB) -> None:
-    pen.line(_arc(), color, 0.07 + 0.4 * level)
-
-
-def _shirt_outline() -> Points:
-    half = [(0.2, -0.7), (0.42, -0.66), (0.92, -0.3), (0.7, 0.04), (0.5, -0.1), (0.5, 0.8)]
-    return polygon(*half, *((-x, y) for x, y in reversed(half)))
+    x = np.linspace(-0.78, 0.78, 41)
+    arc = np.stack([x, 0.5 * np.cos(x / 0.78 * np.pi / 2) - 0.25], axis=1)
+    pen.line(arc, color, 0.07 + 0.4 * level)
 
 
 def _striped_shirt(pen: Pen, level: float, color: RGB) -> None:
-    pen.fill(_shirt_outline(), color)
+    pen.fill(SHIRT, color)
     count = 1 + round(6 * level)
     for y in np.linspace(-0.2, 0.68, count + 2)[1:-1] if count > 1 else [0.2]:
         pen.fill(rectangle(-0.5, y - 0.045, 0.5, y + 0.045), _WHITE)
-    pen.outline(_shirt_outline(), _DARK, 0.04)
+    pen.outline(SHIRT, _DARK, 0.04)
 
 
 def _wavy_line(pen: Pen, level: float, color: RGB) -> None:

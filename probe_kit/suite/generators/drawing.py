@@ -171,6 +171,10 @@ def rectangle(left: float, top: float, right: float, bottom: float) -> Points:
     return polygon((left, top), (right, top), (right, bottom), (left, bottom))
 
 
+_HALF_SHIRT = ((0.2, -0.7), (0.42, -0.66), (0.92, -0.3), (0.7, 0.04), (0.5, -0.1), (0.5, 0.8))
+SHIRT = polygon(*_HALF_SHIRT, *((-x, y) for x, y in reversed(_HALF_SHIRT)))
+
+
 def ellipse(x: float, y: float, rx: float, ry: float, start: float = 0, end: float = 360) -> Points:
     """Points (49, 2) along an ellipse from angle `start` to `end` in degrees, 0 to the right, 90 down."""
     angles = np.deg2rad(np.linspace(start, end, 49))

@@ -11,7 +11,6 @@ from probe_kit.suite.generators.drawing import (
     Canvas,
     Pen,
     Placement,
-    Points,
     Tile,
     background_for,
     ellipse,
@@ -116,33 +115,25 @@ def _draw_eye(pen: Pen, side: int, opening: float, lid: RGB) -> None:
 
 def _draw_mouth(pen: Pen, set_as: Expression, color: RGB) -> None:
     if set_as.smile > 0.05:
-        _draw_smile(pen, set_as, color)
+        bend = 0.08 + 0.28 * set_as.smile
+        lower = ellipse(0, _MOUTH_Y - 0.1 * set_as.smile, 0.4, bend, 0, 180)
+        if set_as.gape > 0.5:
+            pen.fill(lower, _WHITE)
+            pen.outline(lower, color, 0.08)
+        else:
+            pen.line(lower, color, 0.1)
     elif set_as.smile < -0.05:
         bend = 0.26 * -set_as.smile
         pen.line(ellipse(0, _MOUTH_Y + bend * 0.7, 0.32, bend, 180, 360), color, 0.1)
     elif set_as.wave > 0.05:
-        pen.line(_wave(set_as.wave), color, 0.09)
+        x = np.linspace(-0.36, 0.36, 41)
+        wave = _MOUTH_Y + 0.08 * set_as.wave * np.sin(x / 0.36 * 2.5 * np.pi)
+        pen.line(np.stack([x, wave], axis=1), color, 0.09)
     elif set_as.gape > 0.05:
         pen.fill(ellipse(0, _MOUTH_Y + 0.02, 0.1 + 0.1 * set_as.gape, 0.06 + 0.2 * set_as.gape), color)
         pen.fill(ellipse(0, _MOUTH_Y + 0.02, 0.04 + 0.1 * set_as.gape, 0.2 * set_as.gape), _LIP)
     else:
         pen.line(polygon((-0.28, _MOUTH_Y), (0.28, _MOUTH_Y)), color, 0.1)
-
-
-def _draw_smile(pen: Pen, set_as: Expression, color: RGB) -> None:
-    bend = 0.08 + 0.28 * set_as.smile
-    top = _MOUTH_Y - 0.1 * set_as.smile
-    lower = ellipse(0, top, 0.4, bend, 0, 180)
-    if set_as.gape > 0.5:
-        pen.fill(lower, _WHITE)
-        pen.outline(lower, color, 0.08)
-    else:
-        pen.line(lower, color, 0.1)
-
-
-def _wave(strength: float) -> Points:
-    x = np.linspace(-0.36, 0.36, 41)
-    return np.stack([x, _MOUTH_Y + 0.08 * strength * np.sin(x / 0.36 * 2.5 * np.pi)], axis=1)
 
 
 def _standing_out(skin: RGB) -> RGB:

@@ -33,7 +33,7 @@ from probe_kit.suite.generators.drawing import (
     polygon,
     random_placement,
 )
-from probe_kit.suite.generators.generator import Concept, Generator, each, each_on_hues
+from probe_kit.suite.generators.generator import Concept, Generator, each, each_on_hues, none_alike
 
 _AREA = 0.95**2  # in drawing units; the most that keeps every placement of every outline on its tile
 
@@ -150,13 +150,15 @@ def _colored_tiles(left: Concept, right: Concept, rng: np.random.Generator) -> t
         random_figure(right.name, str(right_outline), "edged", rng),
     )
     # After both, whose own backgrounds and places stay in the stream of `rng`: suite 2.0.0 is drawn in this order.
-    first, second = (_among_colors(figure, (left, right), rng) for figure in drawn)
+    first, second = (
+        replace(
+            figure,
+            background=other_color((left, right), figure.ink, rng),
+            placement=moved(figure.placement, rng),
+        )
+        for figure in drawn
+    )
     return first, second
-
-
-def _among_colors(figure: Figure, concepts: Sequence[Concept], rng: np.random.Generator) -> Figure:
-    background = other_color(concepts, figure.ink, rng)
-    return replace(figure, background=background, placement=moved(figure.placement, rng))
 
 
 def other_color(concepts: Sequence[Concept], ink: RGB, rng: np.random.Generator) -> RGB:
@@ -196,10 +198,6 @@ _CONFUSABLE = (
 _NAMES = [name for name in OUTLINES if name != "right triangle"]
 
 
-def _distinct(first: Concept, second: Concept) -> bool:
-    return not any({first.name, second.name} <= family for family in _CONFUSABLE)
-
-
 def _figure(concept: Concept, rng: np.random.Generator) -> Figure:
     color = str(rng.choice(list(COLORS)))
     return random_figure(color, concept.name, "hollow" if rng.random() < _HOLLOW_SHARE else "plain", rng)
@@ -210,7 +208,7 @@ SHAPE = Generator(
     pairs=tuple(
         (first, second)
         for first, second in combinations([Concept(name, name) for name in _NAMES], 2)
-        if _distinct(first, second)
+        if none_alike(_CONFUSABLE)(first, second)
     ),
     tiles=each_on_hues(_figure),
     name_of=colored_outline,

@@ -9,6 +9,7 @@ from probe_kit.suite.generators.drawing import (
     COLORS,
     FULL_DISK,
     RGB,
+    SHIRT,
     Canvas,
     Pen,
     Placement,
@@ -224,10 +225,8 @@ def _toast(pen: Pen, burnt: bool, color: RGB) -> None:
 
 
 def _shirt(pen: Pen, stained: bool, color: RGB) -> None:
-    half = [(0.2, -0.7), (0.42, -0.66), (0.92, -0.3), (0.7, 0.04), (0.5, -0.1), (0.5, 0.8)]
-    shirt = polygon(*half, *((-x, y) for x, y in reversed(half)))
-    pen.fill(shirt, color)
-    pen.outline(shirt, darker(color), 0.05)
+    pen.fill(SHIRT, color)
+    pen.outline(SHIRT, darker(color), 0.05)
     if stained:
         for x, y, size in ((0.06, 0.12, 0.26), (0.26, 0.34, 0.15), (-0.2, 0.42, 0.12), (-0.22, -0.14, 0.1)):
             pen.fill(ellipse(x, y, size, size * 0.85), (84, 52, 24))
