@@ -10,10 +10,11 @@ import json
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from functools import cache, cached_property
+from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
+from probe_kit.errors import SuiteError
 from probe_kit.extract.settings import Settings
 from probe_kit.extract.sources.player import traceback_of
 from probe_kit.hashing import canonical_json, sha256_json
@@ -41,21 +42,38 @@ class PlannedSuite:
 
 def planned_suite(table: SuiteTable) -> tuple[PlannedSuite, list[Mistake]]:
     """The suite that a file names, and what is wrong with it."""
+    from probe_kit.suite import load_suite
+    from probe_kit.suite.build import ITEMS, default_identity
+    from probe_kit.suite.generators import GENERATORS
+    from probe_kit.suite.suite import count_by_category
+
     if table.path is None:
-        return _embedded(), []
+        drawn = dict.fromkeys(in_order(GENERATORS), ITEMS)
+        return PlannedSuite(default_identity(), drawn, None, "the embedded suite"), []
     folder = Path(table.path)
     counts = {slug(name): count for name, count in table.counts.items()}
-    if folder.is_dir():
-        return _from_folder(folder, table.counts)
-    if counts:
+    if counts and not folder.is_dir():
         ordered = {name: counts[name] for name in in_order(counts)}
         return PlannedSuite(f"not here: {table.path}", ordered, folder, "suite.counts"), []
-    text = f"there is no folder {folder}. Make the suite, or give items per category in [suite.counts] for a plan"
-    return _unknown(table.path, folder, text)
-
-
-def _unknown(name: str, folder: Path, why: str) -> tuple[PlannedSuite, list[Mistake]]:
-    return PlannedSuite(f"not here: {name}", {}, folder, "nothing"), [Mistake(("suite", "path"), why)]
+    why = f"there is no folder {folder}. Make the suite, or give items per category in [suite.counts] for a plan"
+    try:
+        suite = load_suite(folder) if folder.is_dir() else None
+    except SuiteError as error:
+        suite, why = None, str(error)
+    if suite is None:
+        unknown_suite = PlannedSuite(f"not here: {table.path}", {}, folder, "nothing")
+        return unknown_suite, [Mistake(("suite", "path"), why)]
+    items = count_by_category(suite.items)
+    wrong = [
+        Mistake(
+            ("suite", "counts", name),
+            f"{slug(name)} has {items.get(slug(name), 0)} items in {folder}, not {count}",
+        )
+        for name, count in table.counts.items()
+        if items.get(slug(name)) != count
+    ]
+    contents = {item.item_id: item.content_sha256 for item in suite.items}
+    return PlannedSuite(f"{suite.name}@{suite.version}", items, folder, str(folder), contents), wrong
 
 
 def slug(name: str) -> str:
@@ -66,37 +84,6 @@ def slug(name: str) -> str:
 def slugs(names: Sequence[str]) -> tuple[str, ...]:
     """The same of several, each once, in order."""
     return tuple(dict.fromkeys(map(slug, names)))
-
-
-@cache
-def _embedded() -> PlannedSuite:
-    from probe_kit.suite.build import ITEMS, default_identity
-    from probe_kit.suite.generators import GENERATORS
-
-    return PlannedSuite(default_identity(), dict.fromkeys(in_order(GENERATORS), ITEMS), None, "the embedded suite")
-
-
-def _from_folder(folder: Path, counts: Mapping[str, int]) -> tuple[PlannedSuite, list[Mistake]]:
-    from probe_kit.errors import SuiteError
-    from probe_kit.suite import load_suite
-    from probe_kit.suite.suite import count_by_category
-
-    try:
-        suite = load_suite(folder)
-    except SuiteError as error:
-        return _unknown(str(folder), folder, str(error))
-    items = count_by_category(suite.items)
-    wrong = [
-        Mistake(
-            ("suite", "counts", name),
-            f"{slug(name)} has {items.get(slug(name), 0)} items in {folder}, not {count}",
-        )
-        for name, count in counts.items()
-        if items.get(slug(name)) != count
-    ]
-    contents = {item.item_id: item.content_sha256 for item in suite.items}
-    identity = f"{suite.name}@{suite.version}"
-    return PlannedSuite(identity, items, folder, str(folder), contents=contents), wrong
 
 
 KEY_DIGITS = 8
