@@ -22,15 +22,6 @@ from probe_kit.suite.pictures import encode_png, letterboxed, picture_file_name,
 from probe_kit.version import __version__
 
 
-def content_sha256(items: Iterable[Item], name: str, version: str, schema_version: str) -> str:
-    """Hex sha256 of a suite's identity: name, version, format, and the content of its items in any order.
-
-    Suites are compared by this hash. Seeds come from `questions_sha256`, which pairs and versions leave alone.
-    """
-    head = {"name": name, "version": version, "schema_version": schema_version}
-    return _sha256_of_lines([head, *(item.content for item in _by_id(items))])
-
-
 def questions_sha256(items: Iterable[Item]) -> str:
     """Hex sha256 of what the items ask and show, and of their groups, in any order. Seeds are made of it."""
     return _sha256_of_lines(item.question for item in _by_id(items))
@@ -81,12 +72,16 @@ class Suite:
 
     @cached_property
     def content_sha256(self) -> str:
-        """Hex sha256 of the suite's identity, see `content_sha256`."""
+        """Hex sha256 of the suite's identity, see `content_sha256_of`."""
         return self.content_sha256_of(self.items)
 
     def content_sha256_of(self, items: Iterable[Item]) -> str:
-        """Hex sha256 that this suite had with other items, such as some of its own."""
-        return content_sha256(items, self.name, self.version, self.schema_version)
+        """Hex sha256 of name, version, format, and the content of items in any order: its own, or some of them.
+
+        Suites are compared by this hash. Seeds come from `questions_sha256`, which pairs and versions leave alone.
+        """
+        head = {"name": self.name, "version": self.version, "schema_version": self.schema_version}
+        return _sha256_of_lines([head, *(item.content for item in _by_id(items))])
 
     @cached_property
     def questions_sha256(self) -> str:
@@ -196,10 +191,11 @@ def new_suite(
         "licenses": sorted({item.license for item in items}),
         "contains_real_faces": any(item.contains_real_face for item in items),
         "environment": drawing_libraries(),
-        "content_sha256": content_sha256(items, name, version, SCHEMA_VERSION),
         **(extra or {}),
     }
-    return Suite(name, version, items, Path(), card)
+    suite = Suite(name, version, items, Path(), card)
+    card["content_sha256"] = suite.content_sha256
+    return suite
 
 
 def drawing_libraries() -> dict[str, str]:
