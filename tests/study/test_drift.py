@@ -359,7 +359,7 @@ def test_a_file_names_pairs_and_an_archive_prints_their_table_without_activation
     (curves,) = make_figures(study, "curves")
     with curves.drawn() as figure:
         titles = [axes.get_title(loc="left") for axes in figure.axes if axes.get_visible()]
-    assert [title.partition(":")[0] for title in titles] == ["color", "color"], "backbone and action"
+    assert [title.partition(":")[0] for title in titles] == ["Color", "Color"], "backbone and action"
     pack_study(study, tmp_path / "study.zip")
     assert make_table(load_study(tmp_path / "study.zip"), "drift").texts == made.texts
 
