@@ -28,7 +28,8 @@ def lines(table: Content, width: int) -> "Iterator[RenderableType]":
     if table.overflow == "leave out":
         table, left_out = _fitting(table, width)
     elif table.overflow == "fold" and width_of(table) > width:
-        table = _folded(table)
+        folded = (replace(row, cells=tuple(map(_two_lines, row.cells))) for row in table.rows)
+        table = replace(table, rows=tuple(folded))
     yield Text(table.title, style="italic")
     yield from [_wrapped(table)] if table.overflow == "wrap" and _can_wrap(table, width) else _tables(table, width)
     notes = [*table.sentences, *[f"With --details or more room: {', '.join(left_out)}."] * bool(left_out)]
@@ -70,13 +71,8 @@ def width_of(table: Content) -> int:
     return _name_width(table) + sum(_column_widths(table)[table.names :])
 
 
-def _folded(table: Content) -> Content:
-    """Return the table with intervals below their values, and words broken at commas."""
-    rows = [replace(row, cells=tuple(map(_two_lines, row.cells))) for row in table.rows]
-    return replace(table, rows=tuple(rows))
-
-
 def _two_lines(cell: Cell) -> Cell:
+    """Return a cell with the interval below its value, and words broken at commas."""
     text = f"{cell.value}\n{cell.limits}" if cell.limits else cell.text.replace(", ", ",\n")
     return replace(cell, text=text)
 

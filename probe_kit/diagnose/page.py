@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from probe_kit.diagnose.results import diagnosis_table, sentences
-from probe_kit.retention.displays.base.style import footer, legend_above, panels, plain, series
+from probe_kit.retention.displays.style import footer, legend_above, panels, plain, series
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -60,7 +60,7 @@ def write_page(diagnosis: "Diagnosis", file: Path) -> None:
 
     from markupsafe import Markup, escape
 
-    from probe_kit.retention.displays.base.display import picture_of
+    from probe_kit.retention.displays.shown_figure import picture_of
 
     items = Markup("").join(Markup("<li>{}</li>").format(line) for line in sentences(diagnosis))
     parts = [_HEAD.format(title=escape(f"Inputs of {diagnosis.label}")), diagnosis_table(diagnosis)._repr_html_()]

@@ -75,39 +75,21 @@ __all__ = [
 ]
 
 # `probe-kit --help` must load neither pandas nor matplotlib.
-__getattr__, __dir__ = lazy_names(
-    __name__,
-    {
-        "scored": "behaviour",
-        "match_runs": "compare.known_used",
-        "CallCurveDisplay": "displays",
-        "event_calls": "displays.call_curves",
-        "Difference": "compare.compare",
-        "FinalPositionsDisplay": "displays",
-        "IterationMapDisplay": "displays",
-        "KnowledgeActionDisplay": "displays",
-        "LayerCurveDisplay": "displays",
-        "ModelDepthDisplay": "displays",
-        "OutcomeRulesDisplay": "displays",
-        "PairedItems": "behaviour",
-        "PairedLayoutsDisplay": "displays",
-        "Peak": "estimators",
-        "Regime": "behaviour",
-        "Retention": "estimators",
-        "RetentionRow": "rows.row",
-        "RetentionTable": "table",
-        "RetentionTableDisplay": "displays",
-        "RoleCurvesDisplay": "displays",
-        "SideTableDisplay": "displays",
-        "SuccessRate": "behaviour",
-        "SuccessTableDisplay": "displays",
-        "best_site": "estimators",
-        "chance_margin": "probe_kit.statistics.significance",
-        "layer_curve": "displays",
-        "measure_retention": "estimators",
-        "normalised_score": "behaviour",
-        "retention_table": "table",
-        "sensitivity": "behaviour",
-        "success_rate": "behaviour",
-    },
-)
+_HOMES = {
+    "behaviour": (
+        "PairedItems", "Regime", "SuccessRate", "normalised_score", "scored", "sensitivity", "success_rate",
+    ),
+    "compare.compare": ("Difference",),
+    "compare.known_used": ("match_runs",),
+    "displays": (
+        "CallCurveDisplay", "FinalPositionsDisplay", "IterationMapDisplay", "KnowledgeActionDisplay",
+        "LayerCurveDisplay", "ModelDepthDisplay", "OutcomeRulesDisplay", "PairedLayoutsDisplay",
+        "RetentionTableDisplay", "RoleCurvesDisplay", "SideTableDisplay", "SuccessTableDisplay", "layer_curve",
+    ),
+    "displays.call_curves": ("event_calls",),
+    "estimators": ("Peak", "Retention", "best_site", "measure_retention"),
+    "rows.row": ("RetentionRow",),
+    "table": ("RetentionTable", "retention_table"),
+    "probe_kit.statistics.significance": ("chance_margin",),
+}  # fmt: skip
+__getattr__, __dir__ = lazy_names(__name__, {name: home for home, names in _HOMES.items() for name in names})

@@ -62,8 +62,6 @@ class ScoredAnswers:
     """
 
     def __init__(self, run: RunReader, score: str = "text", with_side_words: bool = False) -> None:
-        if score not in SCORES:
-            raise UsageError(f"score is {score!r}; expected one of {', '.join(SCORES)}")
         self._run, self.score, self._with_side_words = run, score, with_side_words
 
     def __getattr__(self, name: str) -> Any:

@@ -29,9 +29,8 @@ from probe_kit.scene_names import RuleName
 
 if TYPE_CHECKING:
     from probe_kit.retention.choices import Iterations
-    from probe_kit.retention.displays.base.report_figure import ReportFigure
+    from probe_kit.retention.displays.report_figure import ReportFigure
     from probe_kit.retention.table import RetentionTable
-    from probe_kit.runs.reader import RunReader
 
 
 RUNS = "Probes"
@@ -320,7 +319,9 @@ def retention(
     grouped = _groups(runs) if kind == "groups" else {"": tuple(runs)}
     _check_doubles([path for paths in grouped.values() for path in paths])
     steps = read_iterations(iterations)
-    _check_places(html, figures)
+    if html is not None and html.is_dir():
+        raise UsageError(f"--html {html} is a folder; give a file, such as {html / 'report.html'}")
+    check_file(figures)
     opened = {
         name: [open_run(p, allow_partial=partial).in_wording(wording) for p in paths]
         for name, paths in grouped.items()
@@ -343,28 +344,17 @@ def retention(
         _show_steps(table, training, style, figures)
     else:
         scored_runs = listed if target else [scored(run, score, with_side_words) for run in listed]
-        _write_files(scored_runs, table, figures, html, "all" in details)
+        if figures is not None:
+            from probe_kit.retention.displays import collect_figures
+
+            save_all(collect_figures(scored_runs, table), figures, "all" in details)
+        if html is not None:
+            from probe_kit.retention.report import write_report
+
+            with err.status("drawing the report"):
+                written = write_report(scored_runs, html, table)
+            say_report(written)
         _print_sections(table, style, details)
-
-
-def _write_files(
-    runs: "Sequence[RunReader]",
-    table: "RetentionTable",
-    figures: Path | None,
-    html: Path | None,
-    every_figure: bool,
-) -> None:
-    """Draw the figures into a folder and the report into a file, each where it is asked for."""
-    if figures is not None:
-        from probe_kit.retention.displays import collect_figures
-
-        save_all(collect_figures(runs, table), figures, every_figure)
-    if html is not None:
-        from probe_kit.retention.report import write_report
-
-        with err.status("drawing the report"):
-            written = write_report(runs, html, table)
-        say_report(written)
 
 
 def _print_sections(table: "RetentionTable", style: str, details: Sequence[str]) -> None:
@@ -383,9 +373,8 @@ def _print_sections(table: "RetentionTable", style: str, details: Sequence[str])
 
 def _show_steps(table: "RetentionTable", training: Mapping[str, int], style: str, figures: Path | None) -> None:
     """Print the table over training steps, and draw its figure. training: steps by the location of a run."""
-    from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
-    from probe_kit.retention.displays.training_steps import training_step_figure
-    from probe_kit.retention.training_steps import step_table
+    from probe_kit.retention.displays.style import ProvenanceLine
+    from probe_kit.retention.training_steps import step_table, training_step_figure
 
     by_step = step_table(table, training)
     if figures is not None:
@@ -406,13 +395,6 @@ def _check_only(values: Mapping[str, object], allowed: Collection[str], option: 
         if name not in (*allowed, option)
     }
     common.check_no_others(are_set, table)
-
-
-def _check_places(html: Path | None, figures: Path | None) -> None:
-    """Refuse places that cannot be written to before anything is computed."""
-    if html is not None and html.is_dir():
-        raise UsageError(f"--html {html} is a folder; give a file, such as {html / 'report.html'}")
-    check_file(figures)
 
 
 def check_file(figures: Path | None) -> None:
@@ -531,6 +513,6 @@ def show_stages(
         for note in joined.notes:
             out.print(marked("[yellow]{}[/]", note))
     if figures is not None:
-        from probe_kit.retention.displays.known_used import known_used_figures
+        from probe_kit.retention.displays.bars import known_used_figure
 
-        save_all(list(known_used_figures([joined])), figures)
+        save_all([known_used_figure(joined)], figures)

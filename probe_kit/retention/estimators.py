@@ -113,14 +113,6 @@ def score_streams(curve: ProbeCurve, rows: Mapping[str, NDArray[np.intp]], seed_
 
 
 @dataclass(frozen=True)
-class RowEstimates:
-    """Estimates behind a row. rates: shares of episodes by name, such as `sr`. streams: None without probes."""
-
-    rates: Mapping[str, Share] = field(default_factory=dict)
-    streams: StreamScores | None = None
-
-
-@dataclass(frozen=True)
 class Rate:
     """A share of episodes with its 95 % interval. share: by groups, None where it averages over other groups."""
 
@@ -389,24 +381,13 @@ def _missing_signal(exceeds: Exceeds, streams: StreamScores, absent_below: float
 def stream_rows(curve: ProbeCurve, stream: str, iterations: Iterations) -> NDArray[np.intp]:
     """Positions of a stream's sites at these iterations. Raises UsageError if it has no such iteration."""
     rows = curve.stream(stream)
-    step = known_iteration(stream, [curve.sites[row].iteration for row in rows], iterations)
-    if step is None:
-        return rows
-    return np.array([row for row in rows if curve.sites[row].iteration == step], dtype=np.intp)
-
-
-def known_iteration(stream: str, every: Sequence[int | None], iterations: Iterations) -> int | None:
-    """The one iteration that takes part; None for all, and of a stream that runs once.
-
-    every: the iterations of its sites. Raises UsageError if it has no such iteration.
-    """
-    steps = set(every) - {None}
+    steps = {curve.sites[row].iteration for row in rows} - {None}
     if iterations in ("all", "best") or not steps:
-        return None
+        return rows
     step = max(filter(None, steps), default=0) if iterations == "last" else iterations
     if step not in steps:
         raise UsageError(f"the stream {stream} has iterations 0 to {len(steps) - 1}, not {step}")
-    return int(step)
+    return np.array([row for row in rows if curve.sites[row].iteration == step], dtype=np.intp)
 
 
 def _rows(curve: ProbeCurve, stream: str | None, iterations: Iterations = "all") -> NDArray[np.intp]:

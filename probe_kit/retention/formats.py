@@ -64,11 +64,9 @@ def _frame(lines: Sequence[_Flat]) -> "pd.DataFrame":
     dtypes = {name: dtype for line in lines for name, (dtype, _) in line.items()}
     values = [{name: value for name, (_, value) in line.items()} for line in lines]
     frame = pd.DataFrame(values, columns=list(dtypes))
-    return frame.astype({name: _nullable(dtype, bool(frame[name].isna().any())) for name, dtype in dtypes.items()})
-
-
-def _nullable(dtype: str, has_gaps: bool) -> str:
-    return "boolean" if dtype == "bool" and has_gaps else dtype  # numpy's has no missing value
+    # numpy's bool has no missing value
+    gaps = {name for name, dtype in dtypes.items() if dtype == "bool" and frame[name].isna().any()}
+    return frame.astype({name: "boolean" if name in gaps else dtype for name, dtype in dtypes.items()})
 
 
 def _key(row: RetentionRow, by_view: bool) -> _Flat:
@@ -95,7 +93,9 @@ def _flat(part: Any, before: str = "") -> _Flat:
         elif _is_interval(declared.name):
             flat |= _limits(name, value)
         elif isinstance(value, dict):
-            flat |= {f"{name}.{key}": _heading_and_value(number) for key, number in value.items()}
+            for key, number in value.items():
+                is_flag = isinstance(number, bool) or number is None
+                flat[f"{name}.{key}"] = ("boolean" if is_flag else "float64", number)
         elif isinstance(value, tuple):
             flat[name] = ("string", " ".join(value))
         else:
@@ -120,10 +120,6 @@ def _is_interval(name: str) -> bool:
 def _limits(name: str, value: Any) -> _Flat:
     low, high = value or (None, None)
     return {f"{name}_low": ("float64", low), f"{name}_high": ("float64", high)}
-
-
-def _heading_and_value(value: Any) -> tuple[str, Any]:
-    return ("boolean" if isinstance(value, bool) or value is None else "float64"), value
 
 
 def _dtype(hint: Any) -> str:

@@ -27,7 +27,6 @@ from probe_kit.retention.columns.tables import retention_tables
 from probe_kit.retention.columns.text import model_name
 from probe_kit.retention.compare.compare import Difference
 from probe_kit.retention.compare.pairing import (
-    PairedRuns,
     compare_groups,
     compare_runs,
     compare_with_vlms,
@@ -347,71 +346,77 @@ def retention_table(
     # The default itself, and not radii equal to it, means that the caller named none.
     check_epsilons(check_rule(rule), epsilons is not SENSITIVITY_RADII)
     groups = runs if isinstance(runs, Mapping) else {None: runs}
-    for run in (of_category for of_group in groups.values() for of_category in of_group):
+    for run in (run for of_group in groups.values() for run in of_group):
         check_sides(run, "a retention table")
     listed = [(name, scored(run, score, with_side_words)) for name, of_group in groups.items() for run in of_group]
     key_of_run = _key_of_run(keys, len(listed))
     _check_doubles([run for _, run in listed])
     order = sorted(range(len(listed)), key=lambda at: ask_of(listed[at][1]) is None)
     listed, key_of_run = [listed[at] for at in order], [key_of_run[at] for at in order]
-    results, notes = _read_probes([run for _, run in listed], key_of_run)
-    unscored = [note for _, run in listed if (note := _not_scored(run, rule, last_steps))]
+    every = [run for _, run in listed]
+    results, notes = _read_probes(every, key_of_run)
+    unscored = [
+        f"{run.location} keeps no trajectories, so that its success rate by the rule {rule} is n/a. Extract it "
+        "again to have it."
+        for run in every
+        if not can_be_judged(run, rule, last_steps)
+    ]
     if unscored and isinstance(runs, Mapping):
         raise NoTrajectoryError(f"groups cannot be compared by the rule {rule}: {unscored[0]}")
-    notes += unscored
     settings = RowSettings(views, iterations, epsilons, rule, last_steps, absent_below, categories, with_behaviour)
     drawn: list[RowWithEstimates] = []
     means: list[RetentionRow] = []
     for name, run in listed:
         of_run = run_rows(run, results.get(str(run.location)), settings, name)
         drawn += of_run
-        views_of = dict.fromkeys(of_category.row.view for of_category in of_run)
-        means += [
-            mean_row([of_category for of_category in of_run if of_category.row.view == view], averaged_fields())
-            for view in views_of
-        ]
-    names = distinct_labels([run for _, run in listed], labels)
+        views_of = dict.fromkeys(row.row.view for row in of_run)
+        in_views = [[row for row in of_run if row.row.view == view] for view in views_of]
+        means += [mean_row(rows, averaged_fields()) for rows in in_views]
+    names = distinct_labels(every, labels)
     results = {
         location: replace(probes, label=(labels or {}).get(location, probes.label))
         for location, probes in results.items()
     }
-    compared = PairedRuns([], ())
+    differences, unpaired = list[Difference](), tuple[str, ...]()
     if isinstance(runs, Mapping):
         by_group = {name: [run for group, run in listed if group == name] for name in runs}
-        compared = compare_groups(by_group, drawn, against, origins)
-    elif len(listed) > 1 or against is not None:
-        compared = compare_runs([run for _, run in listed], drawn, names, against, bool(vlm_vla), pairs)
+        differences, unpaired = compare_groups(by_group, drawn, against, origins)
+    elif len(every) > 1 or against is not None:
+        differences, unpaired = compare_runs(every, drawn, names, against, bool(vlm_vla), pairs)
+    unmoving = [run for run in every if capture_only(run.episodes)]
     notes += [
-        f"{run.location} captured activations only and did not act: SR is n/a." for _, run in listed if _heard(run)
+        *unscored,
+        *(f"{run.location} captured activations only and did not act: SR is n/a." for run in unmoving),
+        *mixed_settings(results, views),
+        *mixed_episodes(every),
+        *chosen_wordings(every),
+        *left_out(every),
     ]
-    notes += [*mixed_settings(results, views), *mixed_episodes([run for _, run in listed])]
-    notes += [*chosen_wordings([run for _, run in listed]), *left_out([run for _, run in listed])]
-    rows, means = (
-        [replace(row, run=replace(row.run, label=names[row.run.location])) for row in part]
-        for part in ([d.row for d in drawn], means)
-    )
-    judged = [under_rule(run, rule, last_steps) for _, run in listed if can_be_judged(run, rule, last_steps)]
-    worded = compare_wordings([run for run in judged if not _heard(run)])
-    chosen_pairs = None if isinstance(vlm_vla, bool) else vlm_vla
-    found_differences = (
-        [] if vlm_vla is False else compare_with_vlms([run for _, run in listed], drawn, names, chosen_pairs)
-    )
-    if vlm_vla is True and not found_differences:
+    judged = [under_rule(run, rule, last_steps) for run in every if can_be_judged(run, rule, last_steps)]
+    gaps: list[Difference] = []
+    if vlm_vla is not False:
+        gaps = compare_with_vlms(every, drawn, names, None if isinstance(vlm_vla, bool) else vlm_vla)
+    if vlm_vla is True and not gaps:
         raise UsageError(
             "--compare vlm-vla compares VLM runs with policy runs in the same categories, and these runs have no "
             "such pair. Make the missing ones with `probe-kit ask` or `probe-kit extract`"
         )
     return RetentionTable(
-        rows,
-        means,
-        compared.differences,
+        _called([row.row for row in drawn], names),
+        _called(means, names),
+        differences,
         {(location, probes.settings.target): probes for location, probes in results.items()},
         iterations,
         tuple(notes),
-        worded,
-        found_differences,
-        compared.unpaired,
+        compare_wordings([run for run in judged if not capture_only(run.episodes)]),
+        gaps,
+        unpaired,
     )
+
+
+def _called(rows: Sequence[RetentionRow], names: Mapping[str, str]) -> list[RetentionRow]:
+    """Return the rows with the names of their runs by location."""
+    return [replace(row, run=replace(row.run, label=names[row.run.location])) for row in rows]
 
 
 def _label_table(
@@ -428,10 +433,7 @@ def _label_table(
         raise UsageError("retention of a label needs at least one run and one target")
     results = read_labels(runs, targets, _key_of_run(keys, len(runs)))
     names = distinct_labels(runs, labels)
-    rows = [
-        replace(row, run=replace(row.run, label=names[row.run.location]))
-        for row in label_rows(runs, results, views, iterations, family)
-    ]
+    rows = _called(label_rows(runs, results, views, iterations, family), names)
     full = {row.run.location: row.run.name for row in rows}
     notes = [*label_notes(runs, rows, family, full), *mixed_episodes(runs)]
     return RetentionTable(rows, [], results=results, iterations=iterations, notes=tuple(notes))
@@ -441,20 +443,6 @@ def _key_of_run(keys: Sequence[str | None] | None, runs: int) -> list[str | None
     if keys is not None and len(keys) != runs:
         raise UsageError(f"{len(keys)} keys for {runs} runs; give one per run, or None for the newest")
     return list(keys or [None] * runs)
-
-
-def _not_scored(run: RunReader, rule: str, last_steps: int) -> str | None:
-    """A sentence about a run that has no success rate by this rule."""
-    if can_be_judged(run, rule, last_steps):
-        return None
-    return (
-        f"{run.location} keeps no trajectories, so that its success rate by the rule {rule} is n/a. Extract it "
-        "again to have it."
-    )
-
-
-def _heard(run: RunReader) -> bool:
-    return capture_only(run.episodes)
 
 
 def _check_doubles(runs: Sequence[RunReader]) -> None:

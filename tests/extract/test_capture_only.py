@@ -14,8 +14,8 @@ from probe_kit.extract import ExtractSettings, extract_run, prepare
 from probe_kit.retention import retention_table
 from probe_kit.retention.behaviour import success_rate
 from probe_kit.retention.compare.compare import Side, compare
-from probe_kit.retention.displays.paired_layouts import PairedLayoutsDisplay
-from probe_kit.retention.displays.report_figures import collect_figures
+from probe_kit.retention.displays.bars import PairedLayoutsDisplay
+from probe_kit.retention.displays.report_figure import collect_figures
 from probe_kit.retention.report import write_report
 from probe_kit.retention.rows.build import RowSettings, run_rows
 from probe_kit.runs import Run, open_run, verify_run

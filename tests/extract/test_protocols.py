@@ -221,7 +221,7 @@ def test_a_run_names_its_protocol_and_the_report_lists_what_differs(small_suite:
     assert run.settings["rotation"] == run.certificate["rotation"] == "axis-angle"
     assert run.label == "pi0 · act2answer · checkpoint=pi0 · dtype=float32 · scene max_steps=2"
     assert len(run.episodes) == 4
-    facts = dict(provenance("pi0", run, None).facts)
+    facts = dict(provenance("pi0", run, [])["facts"])
     assert facts["protocol"] == "act2answer"
     assert "scene max_steps 2 instead of 80" in facts["deviates from it in"]
     assert "-M openness release instead of measured" in facts["it differs from the default in"]

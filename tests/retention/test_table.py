@@ -1,14 +1,19 @@
+"""What a row says of a stream: shown, not shown with what could be there, or absent below a stated bound."""
+
 import csv
 import io
 import json
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from probe_kit.errors import UnknownSiteError, UsageError
 from probe_kit.retention import RetentionTable, retention_table
-from probe_kit.train import ArrayRun
+from probe_kit.retention.columns.text import exceeds_text, verdict_text
+from probe_kit.train import ArrayRun, ControlComparison, Controls, load_results, save_results
 
 ProbedRun = Callable[..., ArrayRun]
 
@@ -199,3 +204,116 @@ def test_the_first_iteration_stands_beside_the_best(probed_run: ProbedRun) -> No
     assert row.action.peak == pytest.approx(0.95)
     assert (row.run.call, mean.run.call) == (0, 0)
     assert mean.action.first_peak == row.action.first_peak
+
+
+@pytest.fixture
+def table_category_mean(probed_run: Callable[..., ArrayRun]) -> RetentionTable:
+    return retention_table([probed_run({"color": SIGNAL, "shape": SIGNAL, "counting": NONE})])
+
+
+def test_the_mean_of_categories_is_known_better_than_one_of_them(table_category_mean: RetentionTable) -> None:
+    (mean,) = table_category_mean.means
+    for part in ("success", "backbone", "action"):
+        widths = [limits[1] - limits[0] for row in table_category_mean.rows for limits in [getattr(row, part).ci]]
+        low, high = getattr(mean, part).ci
+        assert high - low == pytest.approx(np.sqrt(np.mean(np.square(widths)) / 3), rel=0.15)
+    assert mean.success.ci is not None
+    assert mean.success.ci[0] < mean.success.sr < mean.success.ci[1]
+
+
+def test_mean_retention_is_over_all_categories_and_known_better_than_one_of_them(
+    table_category_mean: RetentionTable,
+) -> None:
+    (mean,) = table_category_mean.means
+    assert mean.left_out == ("counting",), "of the published ratios"
+    scores = [[part.score - 0.5 for part in (row.action, row.backbone)] for row in table_category_mean.rows]
+    assert mean.retention.value == pytest.approx(np.divide(*np.mean(scores, axis=0)))
+    low, high = mean.retention.ci
+    of_one = table_category_mean.rows[0].retention.ci
+    assert low < mean.retention.value < high
+    assert high - low < of_one[1] - of_one[0]
+
+
+def test_a_mean_has_limits_where_a_category_of_it_has_none(table_category_mean: RetentionTable) -> None:
+    """The mean backbone is known well enough to divide by."""
+    assert table_category_mean.rows[2].retention.ci == (None, None)
+    assert None not in table_category_mean.means[0].retention.ci
+
+
+def test_the_mean_of_one_category_is_that_category(probed_run: Callable[..., ArrayRun]) -> None:
+    row, mean = retention_table([probed_run({"color": SIGNAL})]).all_rows
+    assert mean.retention.value == row.retention.value
+    assert mean.retention.published == row.retention.published
+    for part in ("success", "backbone", "action", "retention"):
+        assert getattr(mean, part).ci == pytest.approx(getattr(row, part).ci), part
+
+
+def test_selectivity_is_the_peak_above_the_permuted_probes(table_category_mean: RetentionTable) -> None:
+    row = json.loads(table_category_mean.to_json())[0]
+    assert row["backbone"]["selectivity"] == pytest.approx(0.9 - 0.5)  # the fixture's null is centred on one half
+    assert row["action"]["selectivity"] == pytest.approx(0.7 - 0.5)
+
+
+def held_against(run: ArrayRun, p: float, control: str = "random-features") -> ArrayRun:
+    """The run with every site compared with a control."""
+    results = load_results(run)
+    found = [
+        ControlComparison(control, category, view, str(site), 0.8, p)
+        for (category, view), curve in results.curves.items()
+        for site in curve.sites
+    ]
+    save_results(replace(results, controls=Controls().with_scores([], found)), run.path)
+    return run
+
+
+def test_a_signal_is_shown_and_none_is_absent_where_it_could_be_no_more_than_the_bound(
+    probed_run: ProbedRun,
+) -> None:
+    color, counting = retention_table([probed_run({"color": SIGNAL, "counting": NONE})]).rows
+    assert (color.backbone.verdict, verdict_text(color.backbone)) == ("shown", "shown")
+    most = counting.backbone.at_most
+    assert most is not None
+    assert 0.58 < most < 0.65
+    assert (counting.backbone.verdict, verdict_text(counting.backbone)) == (
+        "absent",
+        f"absent (at most {100 * most:.0f} %)",
+    )
+
+
+def test_with_a_lower_bound_the_same_is_not_shown(probed_run: ProbedRun) -> None:
+    run = probed_run({"counting": NONE})
+    part = retention_table([run], absent_below=0.6).rows[0].backbone
+    assert part.verdict == "not shown"
+    assert verdict_text(part) == f"not shown (could be up to {100 * (part.at_most or 0):.0f} %)"
+    assert retention_table([run], absent_below=0.6).rows[0].retention.note.startswith("n/a (backbone not shown")
+
+
+def test_a_signal_that_is_not_shown_to_beat_a_control_is_not_absent(probed_run: ProbedRun) -> None:
+    row = retention_table([held_against(probed_run({"color": SIGNAL}), 0.2)]).rows[0]
+    assert row.backbone.at_most is not None
+    assert 0.9 < row.backbone.at_most < 0.96
+    assert (row.backbone.verdict, row.retention.defined) == ("not shown", False)
+    assert verdict_text(row.backbone) == f"not shown (could be up to {100 * row.backbone.at_most:.0f} %)"
+    assert exceeds_text(row.backbone) == "chance; not shown: random-features"
+    assert row.retention.note == "n/a (backbone not shown to beat random-features)"
+    better = retention_table([held_against(probed_run({"color": SIGNAL}, "better"), 0.01)]).rows[0]
+    assert (better.backbone.verdict, better.retention.defined) == ("shown", True)
+    assert exceeds_text(better.backbone) == "chance, random-features"
+
+
+def test_without_a_control_the_table_says_that_none_was_run(probed_run: ProbedRun) -> None:
+    color, counting = retention_table([probed_run({"color": SIGNAL, "counting": NONE})]).rows
+    assert exceeds_text(color.backbone) == "chance (no control was run)"
+    assert exceeds_text(counting.backbone) == "not shown: chance"
+
+
+def test_every_format_shows_the_verdicts(probed_run: ProbedRun) -> None:
+    table: RetentionTable = retention_table([held_against(probed_run({"color": SIGNAL, "counting": NONE}), 0.2)])
+    color, counting = table.rows
+    for words in (verdict_text(color.backbone), verdict_text(counting.backbone), "in the backbone"):
+        assert words in table.to_markdown()
+        assert words.replace("%", r"\%") in table.to_latex("all")
+    frame = table.to_frame()
+    assert frame["backbone.verdict"][0] == "not shown"
+    assert frame["backbone.at_most"][0] == pytest.approx(color.backbone.at_most)
+    assert not frame["backbone.exceeds.random-features"][0]

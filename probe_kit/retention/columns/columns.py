@@ -14,18 +14,17 @@ from probe_kit._tables.numbers import number, p_text, percent, points, signed, w
 from probe_kit.retention.behaviour import Regime
 from probe_kit.retention.choices import Section
 from probe_kit.retention.columns.text import (
+    ABOVE_CHANCE,
     P_DECIDES,
     Modes,
     above_chance,
-    action_place,
-    backbone_place,
-    baseline,
     difference_test,
     exceeds_text,
     models_test,
     published_value,
     regime_value,
     retention_value,
+    site_text,
     success_interval,
     verdict_text,
 )
@@ -70,7 +69,9 @@ class Column:
         if modes == "answers":
             return replace(self, heading=heading, help=meaning)
         both = self.heading if heading == self.heading else f"{self.heading.removesuffix(' %')} / {heading}"
-        return replace(self, heading=both, help=f"{self.help} Of a model that was asked: {_lower(meaning)}")
+        return replace(
+            self, heading=both, help=f"{self.help} Of a model that was asked: {meaning[:1].lower()}{meaning[1:]}"
+        )
 
     def sort_value(self, row: RetentionRow) -> Any:
         """Return what a row is sorted by in this column; None for last."""
@@ -88,10 +89,6 @@ class ColumnGroup:
     columns: tuple[Column, ...]
     detail: bool = False
     section: Section = "success"
-
-
-def _lower(sentence: str) -> str:
-    return f"{sentence[:1].lower()}{sentence[1:]}"
 
 
 def share(key: str, heading: str, meaning: str, **more: Any) -> Column:
@@ -506,7 +503,12 @@ BACKBONE_VERDICT = Column(
     text=lambda row: verdict_text(row.backbone),
     sort=lambda row: row.backbone.at_most,
 )
-BACKBONE_LAYER = Column(key="backbone.layer", heading="backbone layer", help=_LAYER, text=backbone_place)
+BACKBONE_LAYER = Column(
+    key="backbone.layer",
+    heading="backbone layer",
+    help=_LAYER,
+    text=lambda row: site_text(row.backbone.layer, None, row.backbone.ties),
+)
 BACKBONE_P = p_value("backbone.p_fwe", "backbone p", _P)
 BACKBONE_PEAK = share(
     "backbone.peak",
@@ -544,7 +546,7 @@ ACTION_LAYER = Column(
     heading="action layer @iteration",
     help=f"{_LAYER} After @: the iteration, a flow-matching step or an action token, of which the first sees no "
     "action yet.",
-    text=action_place,
+    text=lambda row: site_text(row.action.layer, row.action.iteration, row.action.ties),
     answers=("answer layer", _LAYER),
 )
 ACTION_P = p_value("action.p_fwe", "action p", _P, answers=("answer p", _P))
@@ -611,7 +613,12 @@ GROUPS = Column(
 
 
 def _baseline(name: str) -> Column:
-    text = baseline(name)
+    """A baseline's accuracy in percent, and whether it is above chance."""
+
+    def text(row: RetentionRow) -> str:
+        mark = f" {ABOVE_CHANCE}" if name in row.controls.leaks else ""
+        return percent(row.controls.baselines.get(name)) + mark
+
     return Column(
         key=f"controls.baselines.{name}",
         heading=f"{name} %",

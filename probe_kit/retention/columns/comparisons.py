@@ -1,6 +1,7 @@
 """Tables of what was compared: wordings, sizes of the picture, VLM − VLA, and answers with probes and success."""
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from itertools import chain, count, groupby
 
 from probe_kit._tables.numbers import number, percent, points, with_limits
@@ -14,7 +15,7 @@ from probe_kit.retention.columns.text import (
     success_interval,
 )
 from probe_kit.retention.compare.compare import Difference
-from probe_kit.retention.compare.known_used import OVERALL, PAIRS, CategoryCounts, Comparison, KnownUsedTable
+from probe_kit.retention.compare.known_used import OVERALL, PAIRS, CategoryCounts, KnownUsedTable
 from probe_kit.retention.compare.models import Relation
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.runs.reader import full_name
@@ -147,7 +148,7 @@ def known_used_tables(joined: KnownUsedTable) -> list[Table]:
     return [
         _counts(title, f"{_LEGEND}; {probes}", rows, ("Items", _SHARES), ("Answer right, without success", _LOST)),
         _counts(which, _CODES, rows, ("", _codes(rows))),
-        _counts("Equally many?", _TESTS, rows, ("", _tests())),
+        _counts("Equally many?", _TESTS, rows, ("", _TESTED)),
         _counts("Single episodes (nothing is tested)", "", rows, ("", _episodes(rows))),
     ]
 
@@ -183,24 +184,19 @@ _LOST: Columns = [
 
 
 def _codes(rows: Sequence[CategoryCounts]) -> Columns:
-    codes = dict.fromkeys(code for row in rows for code in row.counts)
-    return [(_spelt(code), _count_of(code)) for code in codes]
-
-
-def _count_of(code: str) -> Callable[[CategoryCounts], str]:
-    def cell(row: CategoryCounts) -> str:
+    def cell(code: str, row: CategoryCounts) -> str:
         return f"{row.counts[code]} ({row.guessed[code]:.1f})" if code in row.counts else "–"
 
-    return cell
+    codes = dict.fromkeys(code for row in rows for code in row.counts)
+    return [(_spelt(code), partial(cell, code)) for code in codes]
 
 
 def _episodes(rows: Sequence[CategoryCounts]) -> Columns:
+    def cell(code: str, row: CategoryCounts) -> str:
+        return str(row.episodes.get(code, "–"))
+
     codes = dict.fromkeys(code for row in rows for code in row.episodes)
-    return [(_spelt(code), _episodes_of(code)) for code in codes]
-
-
-def _episodes_of(code: str) -> Callable[[CategoryCounts], str]:
-    return lambda row: str(row.episodes.get(code, "–"))
+    return [(_spelt(code), partial(cell, code)) for code in codes]
 
 
 def _spelt(code: str) -> str:
@@ -209,21 +205,15 @@ def _spelt(code: str) -> str:
     return " ".join(letter if mark == "1" else letter.lower() for letter, mark in letters if mark != "-")
 
 
-def _tests() -> Columns:
-    return [
-        (f"{_NAMES[first]} − {_NAMES[second]}: only one of them, p (Holm)", _test_of(first, second))
-        for first, second in PAIRS
-    ]
+def _test(first: str, second: str, row: CategoryCounts) -> str:
+    for test in row.comparisons:
+        if (test.first, test.second) == (first, second):
+            corrected = "" if test.p_holm is None else f" ({number(test.p_holm, 4)})"
+            return f"{test.only_first} against {test.only_second}, {number(test.p, 4)}{corrected}"
+    return "–"
 
 
-def _test_of(first: str, second: str) -> Callable[[CategoryCounts], str]:
-    def cell(row: CategoryCounts) -> str:
-        tests = [test for test in row.comparisons if (test.first, test.second) == (first, second)]
-        return _spell_test(tests[0]) if tests else "–"
-
-    return cell
-
-
-def _spell_test(test: Comparison) -> str:
-    corrected = "" if test.p_holm is None else f" ({number(test.p_holm, 4)})"
-    return f"{test.only_first} against {test.only_second}, {number(test.p, 4)}{corrected}"
+_TESTED: Columns = [
+    (f"{_NAMES[first]} − {_NAMES[second]}: only one of them, p (Holm)", partial(_test, first, second))
+    for first, second in PAIRS
+]

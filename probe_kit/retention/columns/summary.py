@@ -444,7 +444,11 @@ def summarise_runs(all_rows: Sequence[RetentionRow]) -> list[RunSummary]:
     ]
     rows = [row for row in all_rows if row.is_side and row.category != MEAN]
     means = [row for row in all_rows if row.is_side and row.category == MEAN]
-    answers = [row for row in rows if is_vlm(row) and _asks_for_the_answer(row)]
+    answers = [
+        row
+        for row in rows
+        if is_vlm(row) and row.answers.asked_for in (None, "target") and row.answers.picture != "none"
+    ]
     answer_means = {row.run.location: row for row in means if is_vlm(row)}
     # A VLM is printed with the policies of its suite, and by itself only where there is none.
     policies = by_run([row for row in rows if not is_vlm(row)])
@@ -462,7 +466,3 @@ def summarise_runs(all_rows: Sequence[RetentionRow]) -> list[RunSummary]:
         mean = CategorySummary(mean_of[head.key, head.view], vlm_mean)
         summaries.append(RunSummary(model_name(head), model_name(same[0]) if same else "", categories, mean))
     return [*summaries, *labels]
-
-
-def _asks_for_the_answer(row: RetentionRow) -> bool:
-    return row.answers.asked_for in (None, "target") and row.answers.picture != "none"

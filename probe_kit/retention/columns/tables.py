@@ -15,14 +15,12 @@ from probe_kit.retention.columns.text import (
     TERMS,
     by_run,
     call_words,
-    controlled,
     difference_name,
     is_vlm,
     model_name,
     modes_of,
     name_of,
     once_per_category,
-    probed,
     title_of,
 )
 from probe_kit.retention.compare.compare import Difference, behaviour_once
@@ -53,12 +51,13 @@ def retention_tables(
     A table without rows is left out, and a column in which no row has anything to show. unpaired: why runs have no
     differences; notes of the last table of behaviour. sections: groups of columns that are shown, all by default.
     """
-    once = once_per_category(rows)
+    once, probed = once_per_category(rows), [row for row in rows if row.view is not None]
+    is_controlled = any(row.controls.baselines or row.controls.untrained for row in probed)
     rows_of = {
         "Accuracy of answers": [row for row in once if row.is_side and is_vlm(row)],
         "Success rate": [row for row in once if row.is_side and not is_vlm(row)],
-        "Retention": probed(rows),
-        "Controls": probed(rows) if controlled(rows) else [],
+        "Retention": probed,
+        "Controls": probed if is_controlled else [],
     }
     # Said once, below the last table that it is about.
     last = next((title for title in reversed(BEHAVIOUR) if rows_of[title]), None)
@@ -150,34 +149,32 @@ def _name_columns(
     title: str, rows: Sequence[RetentionRow], differences: Sequence[Difference]
 ) -> list[tuple[Heading, Callable[[TableRow], str]]]:
     """Return the columns that tell rows apart: the category, and of several runs, views or calls which one."""
+
+    def name(line: TableRow) -> str:
+        return title_of(line.category) if isinstance(line, Difference) else name_of(line)
+
+    def run(line: TableRow) -> str:
+        return difference_name(line) if isinstance(line, Difference) else model_name(line)
+
+    def call(line: TableRow) -> str:
+        number = line.call if isinstance(line, Difference) else line.run.call
+        return "–" if number is None else str(number)
+
     names: list[tuple[Heading, Callable[[TableRow], str]]] = [
-        (Heading("category", "Kind of question."), lambda line: title_of(line.category))
+        (Heading("category", "Kind of question."), name)
         if all(row.is_side for row in rows)
-        else (Heading("label", "What the probes decode, and in which category."), _label_name)
+        else (Heading("label", "What the probes decode, and in which category."), name)
     ]
     if differences or len({row.key for row in rows}) > 1:
-        names.append((Heading("run", "A run, or two of which the second is subtracted."), _run_name))
+        names.append((Heading("run", "A run, or two of which the second is subtracted."), run))
     if title in BEHAVIOUR:
         return names
     if len({row.view for row in rows}) > 1:
         help_ = "How the tokens of an episode became one vector."
         names.append((Heading("view", help_), lambda line: line.view or "–"))
     if len({row.run.call for row in rows}) > 1:
-        names.append((Heading("call", TERMS["call"]), _call))
+        names.append((Heading("call", TERMS["call"]), call))
     return names
-
-
-def _label_name(line: TableRow) -> str:
-    return title_of(line.category) if isinstance(line, Difference) else name_of(line)
-
-
-def _run_name(line: TableRow) -> str:
-    return difference_name(line) if isinstance(line, Difference) else model_name(line)
-
-
-def _call(line: TableRow) -> str:
-    call = line.call if isinstance(line, Difference) else line.run.call
-    return "–" if call is None else str(call)
 
 
 def _title(title: str, rows: Sequence[RetentionRow]) -> str:

@@ -1,6 +1,6 @@
 """The words of a retention table: texts of single values, of modes, and terms that are no column."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Literal
 
 from probe_kit._tables.numbers import NONE, Write, number, p_text, percent, with_limits
@@ -19,23 +19,12 @@ RATE: Mapping[Modes, str] = {
     "both": "Success rate / accuracy of answers",
 }
 """The share of right episodes at the head of a table or an axis."""
-_HEADINGS: Mapping[str, str] = {"SR": "accuracy", "outside": "unread", "goes left": "answers left"}
-"""By the first words of a policy's heading, those of a model that was asked."""
 
 
 def modes_of(rows: Iterable[RetentionRow]) -> Modes:
     """Return what all rows did, `both` for a mixture."""
     modes = {row.run.mode for row in rows}
     return "both" if len(modes) > 1 else "answers" if modes == {"answers"} else "acts"
-
-
-def heading(name: str, modes: Modes) -> str:
-    """A policy's heading, such as `SR % [95 %]`, over rows of `modes`."""
-    for acting, asking in _HEADINGS.items():
-        if modes != "acts" and name.startswith(acting):
-            words = asking if modes == "answers" else f"{acting} / {asking}"
-            return f"{words}{name.removeprefix(acting)}"
-    return name
 
 
 NOT_ACTED = "n/a"
@@ -98,16 +87,6 @@ def published_value(row: RetentionRow) -> str:
     return number(row.retention.published) if row.retention.defined else "–"
 
 
-def backbone_place(row: RetentionRow) -> str:
-    """Return where the backbone's best site is."""
-    return site_text(row.backbone.layer, None, row.backbone.ties)
-
-
-def action_place(row: RetentionRow) -> str:
-    """Return where the best site of the action is."""
-    return site_text(row.action.layer, row.action.iteration, row.action.ties)
-
-
 def call_words(call: int) -> str:
     """A captured inference in words: 0 is the only one before the arm has moved."""
     return f"call {call}" + (", before anything moves" if call == 0 else ", counted from 0")
@@ -141,32 +120,15 @@ def exceeds_text(part: StreamPart) -> str:
     return "; ".join(filter(None, [", ".join(exceeded), f"not shown: {', '.join(open_)}" if open_ else ""])) or "–"
 
 
-def baseline(name: str) -> Callable[[RetentionRow], str]:
-    """Writes a baseline's accuracy in percent, and whether it is above chance."""
-
-    def cell(row: RetentionRow) -> str:
-        mark = f" {ABOVE_CHANCE}" if name in row.controls.leaks else ""
-        return percent(row.controls.baselines.get(name)) + mark
-
-    return cell
-
-
 # -- differences ---------------------------------------------------------------------------------------------
 
 
 def difference_name(row: Difference) -> str:
-    """Minuend and subtrahend, and what is unusual about their items."""
-    mark = difference_items(row)
-    return f"{row.group} − {row.minus}" + (f" ({mark})" if mark else "")
-
-
-def difference_items(row: Difference) -> str:
-    """Return how many items both sides have, or that they ran other ones; empty where all are in common."""
-    if not row.paired:
-        return "other items"
-    if row.n_items is None or row.n_items == row.of_items:
-        return ""
-    return f"{row.n_items} of {row.of_items} items"
+    """Minuend and subtrahend, and that they ran other items, or how many they have in common if not all."""
+    mark = "" if row.paired else " (other items)"
+    if row.paired and row.n_items is not None and row.n_items != row.of_items:
+        mark = f" ({row.n_items} of {row.of_items} items)"
+    return f"{row.group} − {row.minus}{mark}"
 
 
 def difference_test(row: Difference) -> str:
@@ -218,16 +180,6 @@ def by_run(rows: Sequence[RetentionRow]) -> list[list[RetentionRow]]:
     for row in rows:
         runs.setdefault(row.key, []).append(row)
     return list(runs.values())
-
-
-def probed(rows: Sequence[RetentionRow]) -> list[RetentionRow]:
-    """The rows that have probes."""
-    return [row for row in rows if row.view is not None]
-
-
-def controlled(rows: Sequence[RetentionRow]) -> bool:
-    """Whether any row was compared with a control."""
-    return any(row.controls.baselines or row.controls.untrained for row in rows)
 
 
 def is_vlm(row: RetentionRow) -> bool:

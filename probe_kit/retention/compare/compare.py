@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import reduce
 from math import lcm
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ from probe_kit.retention.compare.models import (
     retention_of_model,
     success_of_model,
 )
-from probe_kit.retention.estimators import ACTION, BACKBONE, Limits, PooledScores, Rate, RowEstimates, limits
+from probe_kit.retention.estimators import ACTION, BACKBONE, Limits, PooledScores, Rate, limits
 from probe_kit.retention.rows.build import RowWithEstimates
 from probe_kit.retention.rows.row import MEAN, Mode
 from probe_kit.runs.reader import RunReader
@@ -121,37 +121,29 @@ _FINEST = 1000
 """Parts that an outcome is counted in, where several last steps or several runs make shares of it."""
 
 
-@dataclass(frozen=True)
-class Gains:
-    """p: exact and two-sided, of both sides being right equally often, whole groups of items turned together.
+def gains(first: "Sequence[pd.DataFrame]", second: "Sequence[pd.DataFrame]") -> dict[str, Any]:
+    """Return an exact, two-sided test of both sides being right equally often, as fields of `Difference`.
 
-    n_groups: groups that it rests on. more, fewer: episodes in which the first side is right more, and less.
+    Whole groups of items are turned together. first, second: tables of episodes, each of one run and category;
+    runs of a side count by their mean. Empty unless every run of both sides has the same episodes.
     """
-
-    p: float
-    n_groups: int
-    more: int
-    fewer: int
-
-    @classmethod
-    def of(cls, first: "Sequence[pd.DataFrame]", second: "Sequence[pd.DataFrame]") -> "Gains | None":
-        """Return the test of tables of episodes, each of one run and category; runs of a side count by their mean.
-
-        None unless every run of both sides has the same episodes.
-        """
-        sides = [_of_side(tables) for tables in (first, second)]
-        if None in sides:
-            return None
-        (mine, units), (theirs, _) = (side for side in sides if side is not None)
-        if not mine or set(mine) != set(theirs):
-            return None
-        gains = [mine[episode] - theirs[episode] for episode in mine]
-        # The exact test counts in whole units, as coarse as the gains allow: its time grows with their number.
-        scale = min(_FINEST, lcm(*(gain.denominator for gain in gains)))
-        scaled: NDArray[np.int64] = np.array([round(gain * scale) for gain in gains])
-        groups = [units[episode] for episode in mine]
-        more, fewer = int((scaled > 0).sum()), int((scaled < 0).sum())
-        return cls(flip_gains_p(scaled, groups), len(set(groups)), more, fewer)
+    sides = [_of_side(tables) for tables in (first, second)]
+    if None in sides:
+        return {}
+    (mine, units), (theirs, _) = (side for side in sides if side is not None)
+    if not mine or set(mine) != set(theirs):
+        return {}
+    leads = [mine[episode] - theirs[episode] for episode in mine]
+    # The exact test counts in whole units, as coarse as the gains allow: its time grows with their number.
+    scale = min(_FINEST, lcm(*(lead.denominator for lead in leads)))
+    scaled: NDArray[np.int64] = np.array([round(lead * scale) for lead in leads])
+    groups = [units[episode] for episode in mine]
+    return {
+        "p": flip_gains_p(scaled, groups),
+        "n_groups": len(set(groups)),
+        "only": int((scaled > 0).sum()),
+        "only_minus": int((scaled < 0).sum()),
+    }
 
 
 def _of_side(tables: "Sequence[pd.DataFrame]") -> tuple[dict[str, Fraction], dict[str, str]] | None:
@@ -270,8 +262,8 @@ def compare(
     ]
     call = next(iter(calls)) if len(calls) == 1 and of == "all" else None
     mode = sides[0].rows[0].row.run.mode if differences else "acts"
-    labelled = [replace(row, call=call, run=first.run, minus_run=second.run, mode=mode) for row in differences]
-    return [_with_counts(row, shared) for row in labelled]
+    common: dict[str, Any] = {"call": call, "run": first.run, "minus_run": second.run, "mode": mode}
+    return [replace(row, **common, **_counts(row, shared)) for row in differences]
 
 
 def behaviour_once(differences: Sequence[Difference]) -> list[Difference]:
@@ -285,23 +277,20 @@ def with_holm(rows: Sequence[Difference]) -> list[Difference]:
 
     Categories of all pairs are one family, means of all pairs another; views do not multiply tests of success.
     """
-    p_values = corrected(rows, lambda row: row.p, lambda row: row.category == MEAN, _test)
+
+    def test(row: Difference) -> tuple[str | None, str, str, str]:
+        return row.run, row.group, row.minus, row.category
+
+    p_values = corrected(rows, lambda row: row.p, lambda row: row.category == MEAN, test)
     return [replace(row, p_holm=p) for row, p in zip(rows, p_values, strict=True)]
 
 
-def _test(row: Difference) -> tuple[str | None, str, str, str]:
-    return row.run, row.group, row.minus, row.category
-
-
-def _with_counts(row: Difference, items: Mapping[str, CommonItems]) -> Difference:
-    """Return the row with `n_items` and `of_items`, where they are known."""
+def _counts(row: Difference, items: Mapping[str, CommonItems]) -> dict[str, Any]:
+    """Return `n_items` and `of_items` of a row, where they are known."""
     names = row.categories or (row.category,)
     if not all(name in items for name in names):
-        return row
-    counts = [items[name] for name in names]
-    return replace(
-        row, n_items=sum(count.n_items for count in counts), of_items=sum(count.of_items for count in counts)
-    )
+        return {}
+    return {name: sum(getattr(items[category], name) for category in names) for name in ("n_items", "of_items")}
 
 
 def _on_common_items(
@@ -320,9 +309,9 @@ def _on_common_items(
             return row
         outcomes = None if row.outcomes is None else in_common.select(row.outcomes)
         rates = {} if outcomes is None else {"sr": success_share(outcomes, seed_text)}
-        streams = row.estimates.streams if in_common.is_complete else None
-        estimates = RowEstimates(rates, None if streams is None else streams.as_of(seed_text))
-        return replace(row, estimates=estimates, outcomes=outcomes)
+        streams = row.streams if in_common.is_complete else None
+        streams = None if streams is None else streams.as_of(seed_text)
+        return replace(row, rates=rates, streams=streams, outcomes=outcomes)
 
     shared = {name for name, items_of in items.items() if items_of.n_items}
     return replace(
@@ -351,7 +340,7 @@ def _behaviour(views: Mapping[str | None, Drawn]) -> dict[str | None, Drawn]:
     first = next(iter(views.values()), {})
     return {
         None: {
-            category: [replace(row, estimates=RowEstimates(row.estimates.rates)) for row in of_category]
+            category: [replace(row, streams=None) for row in of_category]
             for category, of_category in first.items()
         }
     }
@@ -400,12 +389,12 @@ class _Gap:
 
 
 def _rate(rows: Sequence[RowWithEstimates]) -> Rate | None:
-    shares = [row.estimates.rates["sr"] for row in rows if "sr" in row.estimates.rates]
+    shares = [row.rates["sr"] for row in rows if "sr" in row.rates]
     return Rate.pooled(shares) if shares and len(shares) == len(rows) else None
 
 
 def _pooled(rows: Sequence[RowWithEstimates]) -> PooledScores | None:
-    streams = [row.estimates.streams for row in rows if row.estimates.streams is not None]
+    streams = [row.streams for row in rows if row.streams is not None]
     return PooledScores.of(streams) if streams and len(streams) == len(rows) else None
 
 
@@ -419,23 +408,11 @@ def _compare(
         if category in subtrahends
     }
     gaps = {category: gap for category, gap in gaps.items() if gap.sr is not None or gap.accuracies}
-    rows = [
-        _row(sides, [category], view, [gap], drawn, _gains(outcomes, [category], [gap]))
-        for category, gap in gaps.items()
-    ]
+    rows = [_row(sides, [category], view, [gap], drawn, outcomes) for category, gap in gaps.items()]
     if rows:
-        common, of_all = list(gaps), list(gaps.values())
-        mean = _row(sides, common, view, of_all, drawn, _gains(outcomes, common, of_all))
-        rows.append(replace(mean, category=MEAN, categories=tuple(common)))
+        mean = _row(sides, list(gaps), view, list(gaps.values()), drawn, outcomes)
+        rows.append(replace(mean, category=MEAN, categories=tuple(gaps)))
     return rows
-
-
-def _gains(outcomes: tuple[Outcomes, Outcomes], categories: Sequence[str], gaps: Sequence[_Gap]) -> Gains | None:
-    """Return the test of success rates, if both sides have one on the same items."""
-    if not all(gap.paired and gap.sr is not None for gap in gaps):
-        return None
-    first, second = ([table for name in categories for table in side.get(name, ())] for side in outcomes)
-    return Gains.of(first, second)
 
 
 def _row(
@@ -444,45 +421,37 @@ def _row(
     view: str | None,
     gaps: Sequence[_Gap],
     drawn: tuple[Drawn, Drawn],
-    gains: Gains | None,
+    outcomes: tuple[Outcomes, Outcomes],
 ) -> Difference:
     """Return the difference in one category, or in the mean of several."""
     first, second = ([of_side[category] for category in categories] for of_side in drawn)
-    sr, backbone, action = (
-        _mean_rate(of_stream)
-        for of_stream in (
-            [gap.sr for gap in gaps],
-            [gap.accuracies.get(BACKBONE) for gap in gaps],
-            [gap.accuracies.get(ACTION) for gap in gaps],
-        )
-    )
-    defined = all(
-        any(row.row.retention.defined for of_runs in side for row in of_runs) for side in (first, second)
-    )
-    ratio = _retention([gap for gap in gaps if gap.has_retention]) if defined else None
-    rates = [[gap.rates[side] for gap in gaps] for side in (0, 1)]
-    has_rates = sr is not None
-    origins = {**sides[0].origins, **sides[1].origins}
-    numbers: dict[str, float | Limits | None] = {
-        name: float(np.mean([rate.value for rate in of_side if rate is not None])) if has_rates else None
-        for name, of_side in zip(("sr_group", "sr_minus"), rates, strict=True)
+    estimates: dict[str, Rate | Ratio | None] = {
+        "sr": _mean_rate([gap.sr for gap in gaps]),
+        "backbone": _mean_rate([gap.accuracies.get(BACKBONE) for gap in gaps]),
+        "action": _mean_rate([gap.accuracies.get(ACTION) for gap in gaps]),
     }
-    for name, estimate in (("sr", sr), ("backbone", backbone), ("action", action), ("retention", ratio)):
+    if all(any(row.row.retention.defined for of_runs in side for row in of_runs) for side in (first, second)):
+        estimates["retention"] = _retention([gap for gap in gaps if gap.has_retention])
+    numbers: dict[str, Any] = {}
+    for name, estimate in estimates.items():
         if estimate is not None:
             numbers |= {name: estimate.value, f"{name}_ci": limits(estimate.interval)}
+    if "sr" in numbers:
+        for at, name in enumerate(("sr_group", "sr_minus")):
+            numbers[name] = float(np.mean([rate.value for gap in gaps if (rate := gap.rates[at]) is not None]))
+    if all(gap.paired and gap.sr is not None for gap in gaps):
+        numbers |= gains(*([table for name in categories for table in side.get(name, ())] for side in outcomes))
+    origins = {**sides[0].origins, **sides[1].origins}
+    if "retention" in numbers:
+        numbers["retention_models"] = compare_models((first, second), origins, retention_of_model)
     return Difference(
         sides[0].name,
         sides[1].name,
         categories[0],
         view,
         all(gap.paired for gap in gaps),
-        **numbers,  # type: ignore[arg-type]
         sr_models=compare_models((first, second), origins, success_of_model, largest=1.0),
-        retention_models=None if ratio is None else compare_models((first, second), origins, retention_of_model),
-        p=None if gains is None else gains.p,
-        n_groups=None if gains is None else gains.n_groups,
-        only=None if gains is None else gains.more,
-        only_minus=None if gains is None else gains.fewer,
+        **numbers,
     )
 
 

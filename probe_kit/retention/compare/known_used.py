@@ -145,15 +145,20 @@ def match_runs(
     frames differ or carry no hash.
     """
     check_sides(policy, "a comparison with answers")
-    _check_kinds(vlm, policy)
+    if ask_of(vlm) is None or ask_of(policy) is not None:
+        raise UsageError(
+            f"{vlm.location} and {policy.location} are not a VLM run and a policy run, in this order; make them "
+            "with `probe-kit ask` and `probe-kit extract`"
+        )
     pairs = _same_questions(vlm, policy)
     probed_view = None if results is None else view or results.settings.views[0]
     if results is not None and probed_view not in results.settings.views:
         raise UsageError(f"view {probed_view!r} was not probed; probed were {', '.join(results.settings.views)}")
-    answered, acted_on = (_right(pairs[column]) for column in ("outcome_asked", "outcome"))
-    encoded = None if results is None or probed_view is None else _encoded(pairs, results, probed_view)
+    answered, acted_on = ((pairs[column] == "correct").to_numpy(bool) for column in ("outcome_asked", "outcome"))
+    encoded, signals = None, dict[str, bool]()
+    if results is not None and probed_view is not None:
+        encoded, signals = _encoded(pairs, results, probed_view), _signals(results, probed_view)
     items, unprobed = _only_probed(_items(pairs, answered, acted_on, encoded))
-    signals = {} if results is None or probed_view is None else _signals(results, probed_view)
     rows = [
         _joined(str(name), of_category, signals.get(str(name)))
         for name, of_category in items.groupby("category", sort=False)
@@ -183,14 +188,6 @@ def correct_joins(joins: Sequence[KnownUsedTable]) -> list[KnownUsedTable]:
 
 
 # -- the same questions ----------------------------------------------------------------------------------
-
-
-def _check_kinds(vlm: RunReader, policy: RunReader) -> None:
-    if ask_of(vlm) is None or ask_of(policy) is not None:
-        raise UsageError(
-            f"{vlm.location} and {policy.location} are not a VLM run and a policy run, in this order; make them "
-            "with `probe-kit ask` and `probe-kit extract`"
-        )
 
 
 def _same_questions(vlm: RunReader, policy: RunReader) -> "pd.DataFrame":
@@ -225,10 +222,6 @@ def _same_questions(vlm: RunReader, policy: RunReader) -> "pd.DataFrame":
     if both.empty:
         raise UsageError(f"{vlm.location} and {policy.location} share no item in both layouts; finish both runs")
     return both.reset_index(drop=True)
-
-
-def _right(outcomes: "pd.Series[str]") -> Bools:
-    return (outcomes == "correct").to_numpy(bool)
 
 
 # -- encoded ---------------------------------------------------------------------------------------------
@@ -311,14 +304,9 @@ def _joined(category: str, items: "pd.DataFrame", clear: bool | None) -> Categor
     values = items["encoded"].to_numpy(float)
     probed = bool(len(values)) and not np.isnan(values).any()
     encoded = values == 1 if probed else None
-    marks = ["1", "0"]
-    middle = marks if probed else ["-"]
-    sets = [answered, *([] if encoded is None else [encoded]), used]
-    codes = [
-        _mark(*row)
-        for row in zip(answered, values if probed else np.full(len(answered), np.nan), used, strict=True)
-    ]
-    every = ["".join(parts) for parts in product(marks, middle, marks)]
+    middle = values if probed else np.full(len(answered), np.nan)
+    codes = [_mark(*row) for row in zip(answered, middle, used, strict=True)]
+    every = ["".join(parts) for parts in product("10", "10" if probed else "-", "10")]
     singles = [mark if probed else f"{mark[0]}-{mark[2]}" for of_item in items["marks"] for mark in of_item]
     return CategoryCounts(
         category=category,
@@ -328,17 +316,16 @@ def _joined(category: str, items: "pd.DataFrame", clear: bool | None) -> Categor
         encoded=None if encoded is None else int(encoded.sum()),
         acted_correctly=int(used.sum()),
         counts={code: codes.count(code) for code in every},
-        guessed={code: len(items) * _by_coin(code) for code in every},
+        guessed={
+            # A coin per mark, right in both layouts of an item in 25 %.
+            code: len(items) * float(np.prod([COIN if mark == "1" else 1 - COIN for mark in code if mark != "-"]))
+            for code in every
+        },
         episodes={code: singles.count(code) for code in every},
         has_signal=clear if probed else None,
         comparisons=tuple(_comparisons(answered, encoded, used, items["group"].to_numpy(str))),
-        **({} if clear is False else _readable_sites(sets, encoded)),
+        **({} if clear is False else _readable_sites(answered, encoded, used)),
     )
-
-
-def _by_coin(code: str) -> float:
-    """Share of items that three coins, or two, would give."""
-    return float(np.prod([COIN if mark == "1" else 1 - COIN for mark in code if mark != "-"]))
 
 
 def _comparisons(
@@ -356,11 +343,10 @@ def _comparisons(
     return comparisons
 
 
-def _readable_sites(sets: Sequence[Bools], encoded: Bools | None) -> dict[str, Any]:
+def _readable_sites(answered: Bools, encoded: Bools | None, used: Bools) -> dict[str, Any]:
     """Return counts of items that are answered right and encoded, by what the action does with them."""
     if encoded is None:
         return {}
-    answered, _, used = sets
     both = answered & encoded
     lost, count = int((both & ~used).sum()), int(both.sum())
     return {
@@ -379,13 +365,11 @@ def _over_all(items: "pd.DataFrame", rows: Sequence[CategoryCounts], seed: int) 
         return overall
     items = items[items["category"].isin([row.category for row in rows if row.has_signal])]
     answered, encoded, used = (items[name].to_numpy(bool) for name in ("answered", "encoded", "used"))
-    strata = items["category"].to_numpy(str)[encoded]
-    p = (
-        overlap_p(answered[encoded], used[encoded], strata, derive_seed("overlap", seed))
-        if encoded.any()
-        else None
-    )
-    return replace(overall, **{**_readable_sites([answered, encoded, used], encoded), "p_linked": p})
+    p = None
+    if encoded.any():
+        strata = items["category"].to_numpy(str)[encoded]
+        p = overlap_p(answered[encoded], used[encoded], strata, derive_seed("overlap", seed))
+    return replace(overall, **{**_readable_sites(answered, encoded, used), "p_linked": p})
 
 
 # -- what a reader must know -----------------------------------------------------------------------------

@@ -182,6 +182,6 @@ def success_of_model(rows: Sequence[RowWithEstimates]) -> float | None:
 
 def retention_of_model(rows: Sequence[RowWithEstimates]) -> float | None:
     """Return the retention of a run over its probed categories; None without both streams."""
-    pooled = [None if row.estimates.streams is None else PooledScores.of([row.estimates.streams]) for row in rows]
+    pooled = [None if row.streams is None else PooledScores.of([row.streams]) for row in rows]
     scores = [run.scores for run in pooled if run is not None and run.names == (ACTION, BACKBONE)]
     return retention(Scores.mean(scores)).value if scores else None

@@ -1,8 +1,7 @@
 """The sides that are compared: runs, groups of models, VLMs with policies, wordings; and why some are not."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from itertools import combinations, product
 from typing import TYPE_CHECKING, Any
 
@@ -25,17 +24,12 @@ from probe_kit.runs.layout import FIRST_FRAME
 from probe_kit.runs.reader import RunReader
 
 if TYPE_CHECKING:
-    import pandas as pd
+    pass
 
 
-@dataclass(frozen=True)
-class PairedRuns:
-    """differences: of runs or groups on the items that they have in common. unpaired: why others have none, and
-    which items were left out, a sentence each.
-    """
-
-    differences: list[Difference]
-    unpaired: tuple[str, ...]
+PairedRuns = tuple[list[Difference], tuple[str, ...]]
+"""Differences of runs or groups on the items that they have in common; and why others have none, and which items
+were left out, a sentence each."""
 
 
 def compare_runs(
@@ -71,7 +65,7 @@ def compare_runs(
         differences += compare(first, second, items=items)
     if not vlm_vla and pairs is None and len({ask_of(run) is None for run in runs}) == 2:
         unpaired.append("VLM runs and policy runs are not compared with each other; --compare vlm-vla does that.")
-    return PairedRuns(with_holm(differences), tuple(unpaired))
+    return with_holm(differences), tuple(unpaired)
 
 
 def compare_groups(
@@ -93,17 +87,12 @@ def compare_groups(
         runs = [run for name in names for run in groups[name]]
         items = {name: in_common for name, in_common in common_items(runs).items() if in_common.is_many}
         first, second = (
-            Side(
-                name,
-                tuple(groups[name]),
-                tuple(row for row in drawn if row.row.group == name),
-                origins=grown,
-            )
+            Side(name, tuple(groups[name]), tuple(row for row in drawn if row.row.group == name), origins=grown)
             for name in names
         )
         notes += _left_out(" and ".join(names), items)
         differences += compare(first, second, items=items, others_too=True)
-    return PairedRuns(with_holm(differences), tuple(notes))
+    return with_holm(differences), tuple(notes)
 
 
 def group_pairs(groups: Sequence[str], against: str | None = None) -> list[tuple[str, str]]:
@@ -176,19 +165,14 @@ def _same_frames(
 
 
 class _InWording:
-    """A run with the episodes of one wording; everything else is the run's own."""
+    """A run with the episodes of one wording, which are not read again; everything else is the run's own."""
 
     def __init__(self, run: RunReader, wording: str) -> None:
-        self._run, self._wording = run, wording
+        self._run = run
+        self.episodes = run.episodes[run.episodes["wording"] == wording]
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._run, name)
-
-    @cached_property
-    def episodes(self) -> "pd.DataFrame":
-        """Return the episodes of the wording."""
-        episodes = self._run.episodes
-        return episodes[episodes["wording"] == self._wording]
 
 
 def compare_wordings(runs: Sequence[RunReader]) -> list[Difference]:
@@ -287,9 +271,8 @@ def _why_not(minuend: RunReader, subtrahend: RunReader, items: Mapping[str, Comm
     return "no item in common in any category" if items else "no category in common"
 
 
-def _seed(run: RunReader) -> Any:
-    return run.settings.get("seed")
-
-
-_SAME = {"seeds": _seed, "wordings": wording_of}
+_SAME: Mapping[str, Callable[[RunReader], Any]] = {
+    "seeds": lambda run: run.settings.get("seed"),
+    "wordings": wording_of,
+}
 """What two runs must share for the episodes of an item to be the same questions; None where unknown."""

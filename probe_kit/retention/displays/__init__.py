@@ -4,32 +4,45 @@ Without `ax` a display makes its own figure, with a legend and a caption that na
 `collect_figures` makes all figures that fit a table, of sides or of labels.
 """
 
-from probe_kit.retention.displays.attention import AttentionDisplay, attention_curve, attention_on_picture
-from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
-from probe_kit.retention.displays.base.report_figure import ReportFigure
+from probe_kit.retention.displays.bars import KnownUsedDisplay, OutcomeRulesDisplay, PairedLayoutsDisplay
 from probe_kit.retention.displays.call_curves import CallCurveDisplay, aligned_curves, call_curves
-from probe_kit.retention.displays.class_confusion import ClassConfusionDisplay, class_confusions
-from probe_kit.retention.displays.dose_response import DoseResponseDisplay, dose_response
 from probe_kit.retention.displays.final_positions import FinalPositionsDisplay, final_positions
-from probe_kit.retention.displays.heat_table import (
+from probe_kit.retention.displays.interventions import (
+    AttentionDisplay,
+    DoseResponseDisplay,
+    SiteEffectDisplay,
+    attention_curve,
+    attention_on_picture,
+    dose_response,
+    site_effect_curve,
+)
+from probe_kit.retention.displays.iteration_maps import IterationMapDisplay, iteration_maps
+from probe_kit.retention.displays.label_figures import (
+    ClassConfusionDisplay,
+    PredictedValuesDisplay,
+    StepScoresDisplay,
+    class_confusions,
+    predicted_values,
+    step_scores,
+)
+from probe_kit.retention.displays.layer_curves import LayerCurveDisplay, layer_curve
+from probe_kit.retention.displays.report_figure import ReportFigure, collect_figures, save_figures
+from probe_kit.retention.displays.side_by_side import (
+    ModelDepthDisplay,
+    RoleCurvesDisplay,
+    curves_side_by_side,
+    maps_side_by_side,
+    model_depths,
+    role_curves,
+)
+from probe_kit.retention.displays.style import ProvenanceLine
+from probe_kit.retention.displays.table_figures import (
     HeatTableDisplay,
+    KnowledgeActionDisplay,
     RetentionTableDisplay,
     SideTableDisplay,
     SuccessTableDisplay,
 )
-from probe_kit.retention.displays.iteration_maps import IterationMapDisplay, iteration_maps
-from probe_kit.retention.displays.knowledge_action import KnowledgeActionDisplay
-from probe_kit.retention.displays.known_used import KnownUsedDisplay
-from probe_kit.retention.displays.layer_curves import LayerCurveDisplay, layer_curve
-from probe_kit.retention.displays.model_depth import ModelDepthDisplay, model_depths
-from probe_kit.retention.displays.outcome_rules import OutcomeRulesDisplay
-from probe_kit.retention.displays.paired_layouts import PairedLayoutsDisplay
-from probe_kit.retention.displays.predicted_values import PredictedValuesDisplay, predicted_values
-from probe_kit.retention.displays.report_figures import collect_figures, save_figures
-from probe_kit.retention.displays.role_curves import RoleCurvesDisplay, role_curves
-from probe_kit.retention.displays.side_by_side import curves_side_by_side, maps_side_by_side
-from probe_kit.retention.displays.site_effect_curve import SiteEffectDisplay, site_effect_curve
-from probe_kit.retention.displays.step_scores import StepScoresDisplay, step_scores
 
 __all__ = [
     "AttentionDisplay",

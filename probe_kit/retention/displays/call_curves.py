@@ -1,7 +1,7 @@
 """Accuracy over the captured calls of an episode, and the same counted from what happens in it."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Self
 
@@ -12,18 +12,19 @@ from probe_kit.env.scoring import EVENTS, Events
 from probe_kit.errors import TooFewGroupsError, UsageError
 from probe_kit.hooks.contract.sites import label_of
 from probe_kit.retention.columns.text import title_of
-from probe_kit.retention.displays.base.display import Display
-from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
-from probe_kit.retention.displays.base.report_figure import (
+from probe_kit.retention.displays.display import Display, known_view
+from probe_kit.retention.displays.report_figure import (
     ONLY_FILLED,
+    DrawnRun,
     FigureSource,
     ReportFigure,
+    in_report,
     in_view,
     view_suffix,
 )
-from probe_kit.retention.displays.base.selection import known_view
-from probe_kit.retention.displays.base.style import (
+from probe_kit.retention.displays.style import (
     PARTS,
+    ProvenanceLine,
     accuracy_axis,
     axes_for,
     caption,
@@ -35,7 +36,6 @@ from probe_kit.retention.displays.base.style import (
     significance_handles,
 )
 from probe_kit.retention.estimators import best_site, score_streams
-from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.crossfit import CHANCE
 from probe_kit.statistics.sufficiency import FEWEST_PERMUTATIONS
 from probe_kit.train.results.control_scores import has_signal
@@ -183,28 +183,22 @@ class CallCurves:
         curve = next(iter(self._curves.values()))
         return curve.parts[int(curve.stream(stream)[0])]
 
-    def _accuracy(self, curve: ProbeCurve, stream: str) -> tuple[float, float, float]:
-        seed_text = next(iter(self.results.values())).settings.seed_text
-        try:
-            scores = score_streams(curve, {stream: curve.stream(stream)}, seed_text)
-        except TooFewGroupsError:
-            return float(curve.sums.only(curve.stream(stream)).accuracies.max()), np.nan, np.nan
-        assert scores is not None, "one stream was given"
-        interval = scores.interval(stream)
-        return scores.accuracy(stream), interval.low, interval.high
-
     def _point(self, call: int, curve: ProbeCurve, stream: str) -> tuple[float, float, float, bool, float, int]:
-        peak = best_site(curve, stream)
+        rows, peak = curve.stream(stream), best_site(curve, stream)
         assert peak is not None, "the stream was probed at every call"
         exceeds = self.results[call].controls.exceeds(self.category, self.view, str(peak.site), peak.p_fwe)
-        best_null = curve.null[curve.stream(stream)]
-        null = np.percentile(best_null.max(axis=0), 95) if best_null.shape[1] >= FEWEST_PERMUTATIONS else np.nan
-        return (
-            *self._accuracy(curve, stream),
-            has_signal(exceeds),
-            float(null),
-            curve.labels.size,
-        )
+        nulls = curve.null[rows]
+        null = np.percentile(nulls.max(axis=0), 95) if nulls.shape[1] >= FEWEST_PERMUTATIONS else np.nan
+        seed_text = next(iter(self.results.values())).settings.seed_text
+        try:
+            scores = score_streams(curve, {stream: rows}, seed_text)
+        except TooFewGroupsError:
+            accuracy, low, high = float(curve.sums.only(rows).accuracies.max()), np.nan, np.nan
+        else:
+            assert scores is not None, "one stream was given"
+            interval = scores.interval(stream)
+            accuracy, low, high = scores.accuracy(stream), interval.low, interval.high
+        return accuracy, low, high, has_signal(exceeds), float(null), curve.labels.size
 
 
 def event_calls(run: Any) -> EventCalls:
@@ -240,12 +234,10 @@ class CallCurveDisplay(Display):
 
     category: str
     view: str
-    chance: float
     lines: tuple[CallLine, ...]
     events: tuple[EventTimes, ...]
     aligned: Mapping[str, tuple[AlignedLine, ...]]
     certificate: ProvenanceLine
-    ax_: "Axes | None" = field(default=None, init=False, repr=False)
 
     @classmethod
     def from_results(
@@ -268,7 +260,6 @@ class CallCurveDisplay(Display):
         return cls(
             category=category,
             view=curves.view,
-            chance=CHANCE,
             lines=tuple(map(curves.line, curves.streams)),
             events=tuple(curves.event_times()),
             aligned={event: lines for event, lines in aligned.items() if lines},
@@ -277,39 +268,55 @@ class CallCurveDisplay(Display):
 
     def plot(self, ax: "Axes | None" = None) -> Self:
         """Draw on `ax`, or on a figure of its own with legend and caption."""
-        axes, figure = axes_for(ax, 6.2, 3.9)
-        axes.axhline(100 * self.chance, color="0.45", lw=1, ls="--", label="chance")
-        for line in self.lines:
-            _draw(axes, line.calls, line)
-            style = PARTS[line.part]
-            axes.plot(line.calls, 100 * line.null, color=style.colour, lw=0.9, ls=":", label=_PERMUTED)
-            clear = line.significant
-            axes.plot(
-                line.calls[clear], 100 * line.accuracy[clear], color=style.colour, ls="none", marker=style.marker
-            )
-        for number, event in enumerate(self.events):
-            _draw_event(axes, event, len(self.events) - number)
-        _finish(axes, title_of(self.category), "call (captured inference, from 0)")
-        if figure is not None:
-            _complete(figure, axes, self.certificate, tested=True)
-        self.ax_ = axes
-        return self
+        return self._plot(ax, None)
 
     def plot_aligned(self, event: str, ax: "Axes | None" = None) -> Self:
         """Draw the accuracies counted from an event. Raises UsageError if too few episodes have it."""
         if event not in self.aligned:
             events = ", ".join(self.aligned) or "none"
             raise UsageError(f"too few episodes have the event {event!r}, or no trajectories; there are: {events}")
+        return self._plot(ax, event)
+
+    def _plot(self, ax: "Axes | None", event: str | None) -> Self:
+        from matplotlib.ticker import MaxNLocator
+
         axes, figure = axes_for(ax, 6.2, 3.9)
-        axes.axhline(100 * self.chance, color="0.45", lw=1, ls="--", label="chance")
-        axes.axvline(0, color="0.6", lw=0.8)
-        for line in self.aligned[event]:
-            _draw(axes, line.offsets, line)
-        _finish(axes, f"{title_of(self.category)}: {event}", "calls after the last one before it")
+        axes.axhline(100 * CHANCE, color="0.45", lw=1, ls="--", label="chance")
+        if event is None:
+            self._draw_calls(axes)
+        else:
+            axes.axvline(0, color="0.6", lw=0.8)
+            for line in self.aligned[event]:
+                _draw(axes, line.offsets, line)
+        plain(axes)
+        accuracy_axis(axes)
+        axes.xaxis.set_major_locator(MaxNLocator(nbins=8, integer=True, min_n_ticks=2))
+        axes.set_title(f"{title_of(self.category)}{f': {event}' if event else ''}", fontsize=9, loc="left")
+        below = "calls after the last one before it" if event else "call (captured inference, from 0)"
+        axes.set_xlabel(below, fontsize=8.5)
         if figure is not None:
-            _complete(figure, axes, self.certificate, tested=False)
+            _complete(figure, axes, self.certificate, tested=event is None)
         self.ax_ = axes
         return self
+
+    def _draw_calls(self, axes: "Axes") -> None:
+        for line in self.lines:
+            _draw(axes, line.calls, line)
+            style, clear = PARTS[line.part], line.significant
+            axes.plot(line.calls, 100 * line.null, color=style.colour, lw=0.9, ls=":", label=_PERMUTED)
+            axes.plot(
+                line.calls[clear], 100 * line.accuracy[clear], color=style.colour, ls="none", marker=style.marker
+            )
+        for number, event in enumerate(self.events):
+            # Names stand one above the other below chance, as several events may fall into one call.
+            height = 8 * (len(self.events) - number) - 5
+            axes.axvspan(event.low, event.high, color="0.5", alpha=0.08, lw=0)
+            axes.axvline(event.median, color="0.4", lw=0.8)
+            words = event.event + ("" if event.share > 0.995 else f" ({100 * event.share:.0f} %)")
+            axes.annotate(
+                words, (event.median, 0), (3, height), xycoords=("data", "axes fraction"), fontsize=6.5,
+                textcoords="offset points", color="0.3",
+            )  # fmt: skip
 
 
 def call_curves(
@@ -335,10 +342,7 @@ def aligned_curves(
 def _figure(displays: list[CallCurveDisplay], event: str | None) -> "Figure":
     figure, grid = panels(len(displays))
     for display, axes in zip(displays, grid, strict=True):
-        if event is None:
-            display.plot(axes)
-        else:
-            display.plot_aligned(event, axes)
+        display._plot(axes, event)
     _complete(figure, grid[0], displays[0].certificate, tested=event is None)
     return figure
 
@@ -356,27 +360,6 @@ def _draw(axes: "Axes", places: "ArrayLike", line: CallLine | AlignedLine) -> No
     mark_below(axes, places, accuracy, style.colour)
 
 
-def _draw_event(axes: "Axes", event: EventTimes, number: int) -> None:
-    """Names stand one above the other below chance, as several events may fall into one call."""
-    axes.axvspan(event.low, event.high, color="0.5", alpha=0.08, lw=0)
-    axes.axvline(event.median, color="0.4", lw=0.8)
-    words = event.event + ("" if event.share > 0.995 else f" ({100 * event.share:.0f} %)")
-    axes.annotate(
-        words, (event.median, 0), (3, 8 * number - 5), xycoords=("data", "axes fraction"), fontsize=6.5,
-        textcoords="offset points", color="0.3",
-    )  # fmt: skip
-
-
-def _finish(axes: "Axes", title: str, below: str) -> None:
-    from matplotlib.ticker import MaxNLocator
-
-    plain(axes)
-    accuracy_axis(axes)
-    axes.xaxis.set_major_locator(MaxNLocator(nbins=8, integer=True, min_n_ticks=2))
-    axes.set_title(title, fontsize=9, loc="left")
-    axes.set_xlabel(below, fontsize=8.5)
-
-
 def _complete(figure: "Figure", axes: "Axes", certificate: ProvenanceLine, tested: bool) -> None:
     """tested: whether markers are filled where something is evidence."""
     legend_above(figure, [*legend_handles(axes).values(), *(significance_handles() if tested else ())])
@@ -384,37 +367,31 @@ def _complete(figure: "Figure", axes: "Axes", certificate: ProvenanceLine, teste
     caption(figure, replace(certificate, call=None))
 
 
-PLACE = 12
-"""Of its figures in the report."""
-
-
-def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
+@in_report(12)
+def call_figures(source: FigureSource) -> Iterator[ReportFigure]:
     """The figures that a report of these runs shows."""
     for drawn in source.runs:
-        if drawn.results is not None:
-            yield from _of_run(drawn.stem, drawn.position, drawn.run, drawn.results)
+        # Only where a later inference was probed as well.
+        if drawn.results is not None and len(calls := load_results_by_call(drawn.run, drawn.results)) > 1:
+            yield from _of_run(drawn, drawn.results, calls)
 
 
-def _of_run(name: str, position: int, run: RunReader, results: ProbeResults) -> Iterator[ReportFigure]:
-    """Only where a later inference was probed as well."""
-    calls = load_results_by_call(run, results)
-    if len(calls) < 2:
-        return
-    views, events = results.settings.views, event_calls(run)
+def _of_run(drawn: DrawnRun, results: ProbeResults, calls: Mapping[int, ProbeResults]) -> Iterator[ReportFigure]:
+    views, events = results.settings.views, event_calls(drawn.run)
     for view in views:
         yield ReportFigure(
-            f"{name}-calls{view_suffix(view, views)}", in_view("Over the episode", view, views), "probes",
+            f"{drawn.stem}-calls{view_suffix(view, views)}", in_view("Over the episode", view, views), "probes",
             f"The best site of each part at every inference that was captured, counted from 0. {ONLY_FILLED}; "
             "dotted: what the best site of permuted labels stays below. An answer that is not there at "
             "call 0 may not be needed yet: upright lines say when the arm set off, grasped, chose a side, let go.",
-            position, partial(call_curves, calls, view, events), is_detail=view != views[0],
+            drawn.position, partial(call_curves, calls, view, events), is_detail=view != views[0],
         )  # fmt: skip
     curves = [CallCurves.of(calls, category, views[0], events) for category in results.settings.categories]
     for event in EVENTS:
         if any(curve.aligned(stream, event) is not None for curve in curves for stream in curve.streams):
             yield ReportFigure(
-                f"{name}-calls-{event.replace(' ', '-')}", f"Around an event: {event}", "probes",
+                f"{drawn.stem}-calls-{event.replace(' ', '-')}", f"Around an event: {event}", "probes",
                 "The same, with every episode's inferences counted from its own event: 0 is the last one "
                 "before it.",
-                position, partial(aligned_curves, calls, event, views[0], events), is_detail=True,
+                drawn.position, partial(aligned_curves, calls, event, views[0], events), is_detail=True,
             )  # fmt: skip

@@ -1,7 +1,7 @@
 """A map of where the cube ended, over the tiles, seen from above."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, Self
 
@@ -12,10 +12,17 @@ from probe_kit.env.scoring import DEFAULT_RULE, Box, Disc, OutcomeRule, Released
 from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour import capture_only
 from probe_kit.retention.columns.text import title_of
-from probe_kit.retention.displays.base.display import Display
-from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
-from probe_kit.retention.displays.base.report_figure import FigureSource, ReportFigure
-from probe_kit.retention.displays.base.style import GREEN, VERMILION, axes_for, caption, legend_above, panels
+from probe_kit.retention.displays.display import Display
+from probe_kit.retention.displays.report_figure import FigureSource, ReportFigure, in_report
+from probe_kit.retention.displays.style import (
+    GREEN,
+    VERMILION,
+    ProvenanceLine,
+    axes_for,
+    caption,
+    legend_above,
+    panels,
+)
 from probe_kit.runs.reader import RunReader
 
 if TYPE_CHECKING:
@@ -47,7 +54,6 @@ class FinalPositionsDisplay(Display):
     scene: Mapping[str, Any]
     certificate: ProvenanceLine
     rule: str = DEFAULT_RULE
-    ax_: "Axes | None" = field(default=None, init=False, repr=False)
 
     @classmethod
     def from_run(cls, run: RunReader, category: str | None = None, scene: Mapping[str, Any] | None = None) -> Self:
@@ -194,11 +200,8 @@ def _draw_legend(figure: "Figure", panel: "Axes") -> None:
     legend_above(figure, handles)
 
 
-PLACE = 8
-"""Of its figures in the report."""
-
-
-def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
+@in_report(8)
+def position_figures(source: FigureSource) -> Iterator[ReportFigure]:
     """The figures that a report of these runs shows."""
     for drawn in source.runs:
         run = drawn.judged(source.table)

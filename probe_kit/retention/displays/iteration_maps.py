@@ -1,7 +1,7 @@
 """Layer × iteration maps: where and when in the action expert the answer can be read."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Self
 
@@ -10,11 +10,24 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import UnknownSiteError, UsageError
 from probe_kit.retention.columns.text import title_of
-from probe_kit.retention.displays.base.display import Display
-from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
-from probe_kit.retention.displays.base.report_figure import DOTS, FigureSource, ReportFigure, in_view, view_suffix
-from probe_kit.retention.displays.base.selection import curve_of, known_view, scores_of
-from probe_kit.retention.displays.base.style import FILLED, PARTS, axes_for, caption, legend_above, panels
+from probe_kit.retention.displays.display import Display, curve_of, known_view, scores_of
+from probe_kit.retention.displays.report_figure import (
+    DOTS,
+    FigureSource,
+    ReportFigure,
+    in_report,
+    in_view,
+    view_suffix,
+)
+from probe_kit.retention.displays.style import (
+    FILLED,
+    PARTS,
+    ProvenanceLine,
+    axes_for,
+    caption,
+    legend_above,
+    panels,
+)
 from probe_kit.statistics.crossfit import CHANCE
 from probe_kit.train.results.probe_results import ProbeResults
 
@@ -39,13 +52,11 @@ class IterationMapDisplay(Display):
     view: str
     stream: str
     part: str
-    chance: float
     layers: NDArray[np.int64]
     iterations: NDArray[np.int64]
     accuracy: NDArray[np.float64]
     significant: NDArray[np.bool_]
     certificate: ProvenanceLine
-    ax_: "Axes | None" = field(default=None, init=False, repr=False)
 
     @classmethod
     def from_results(
@@ -74,7 +85,6 @@ class IterationMapDisplay(Display):
             view=view,
             stream=str(stream),
             part=str(scores["part"].iloc[0]),
-            chance=CHANCE,
             layers=grid["accuracy"].columns.to_numpy(dtype=np.int64),
             iterations=grid.index.to_numpy(dtype=np.int64),
             accuracy=grid["accuracy"].to_numpy(dtype=float),
@@ -94,8 +104,7 @@ class IterationMapDisplay(Display):
         drawn = draw_map(axes, self)
         if figure is not None:
             axes.set_ylabel("iteration", fontsize=9)
-            draw_scale(figure, [axes], drawn, [self])
-            draw_legend(figure)
+            draw_keys(figure, [axes], drawn)
             caption(figure, self.certificate)
         self.ax_ = axes
         return self
@@ -112,8 +121,7 @@ def iteration_maps(results: ProbeResults, view: str | None = None, stream: str |
     for display, axes in zip(displays, grid, strict=True):
         drawn = draw_map(axes, display)
     figure.supylabel("iteration", fontsize=9)
-    draw_scale(figure, grid, drawn, displays)
-    draw_legend(figure)
+    draw_keys(figure, grid, drawn)
     caption(figure, displays[0].certificate)
     return figure
 
@@ -124,7 +132,7 @@ def draw_map(axes: "Axes", display: IterationMapDisplay) -> "ScalarMappable":
     from matplotlib.patches import Rectangle
     from matplotlib.patheffects import withStroke
 
-    norm = Normalize(100 * display.chance, 100)
+    norm = Normalize(100 * CHANCE, 100)
     colours = _colours(display.part)
     image = axes.imshow(100 * display.accuracy, cmap=colours, norm=norm, aspect="auto", origin="lower")
     iterations, layers = display.accuracy.shape
@@ -156,52 +164,30 @@ def _colours(part: str) -> "Colormap":
     return LinearSegmentedColormap.from_list(part, ["#FFFFFF", colour, dark]).with_extremes(under="0.93")
 
 
-def draw_legend(figure: "Figure") -> None:
-    """Draw the legend of dots, frames and grey cells."""
-    from matplotlib.lines import Line2D
-    from matplotlib.patches import Patch
-
-    handles: list[Artist] = [
-        Line2D(
-            [],
-            [],
-            color="0.3",
-            ls="none",
-            marker="o",
-            ms=3,
-            label=FILLED.removeprefix("filled: "),
-        ),
-        Patch(fill=False, ec="black", lw=1.4, label="best of its stream (all, where several tie)"),
-        Patch(fc="0.93", label="below chance"),
-    ]
-    legend_above(figure, handles)
-
-
 def _ink(value: float, norm: "Normalize") -> str:
     return "white" if norm(value) > 0.45 else "black"  # the colours get dark in their middle
 
 
-def draw_scale(
-    figure: "Figure", grid: "list[Axes]", drawn: "ScalarMappable", displays: Sequence[IterationMapDisplay]
-) -> None:
-    """The colour bar of maps in one view; where chance differs between them it is named instead of numbered."""
+def draw_keys(figure: "Figure", grid: "list[Axes]", drawn: "ScalarMappable") -> None:
+    """The colour bar of maps, and the legend of dots, frames and grey cells."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    handles: list[Artist] = [
+        Line2D([], [], color="0.3", ls="none", marker="o", ms=3, label=FILLED.removeprefix("filled: ")),
+        Patch(fill=False, ec="black", lw=1.4, label="best of its stream (all, where several tie)"),
+        Patch(fc="0.93", label="below chance"),
+    ]
     bar = figure.colorbar(drawn, ax=grid, extend="min", aspect=30, shrink=0.9, pad=0.01)
     bar.set_label("held-out accuracy (%)", fontsize=8)
     bar.ax.tick_params(labelsize=8)
     bar.outline.set_visible(False)
-    chances = {round(display.chance, 6) for display in displays}
-    low = 100 * displays[-1].chance
-    if len(chances) > 1:
-        bar.set_ticks([low, 100], labels=["chance", "100"])
-    else:
-        bar.set_ticks([low, *(tick for tick in range(50, 101, 10) if tick > low + 4)])
+    bar.set_ticks(range(50, 101, 10))
+    legend_above(figure, handles)
 
 
-PLACE = 10
-"""Of its figures in the report."""
-
-
-def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
+@in_report(10)
+def map_figures(source: FigureSource) -> Iterator[ReportFigure]:
     """The figures that a report of these runs shows."""
     for drawn in source.runs:
         if drawn.results is None:

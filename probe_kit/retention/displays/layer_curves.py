@@ -1,7 +1,7 @@
 """Layer curves: score by layer, the backbone beside where the action is made, a line per iteration."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from math import ceil
 from typing import TYPE_CHECKING, Literal, Self
@@ -9,23 +9,24 @@ from typing import TYPE_CHECKING, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit.hooks.contract.sites import label_of
 from probe_kit.retention.choices import Iterations
 from probe_kit.retention.columns.text import title_of
-from probe_kit.retention.displays.base.display import Display
-from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
-from probe_kit.retention.displays.base.report_figure import (
+from probe_kit.retention.displays.display import Display, known_view, of_iterations, probed_curve, scores_of
+from probe_kit.retention.displays.report_figure import (
     ONLY_FILLED,
     FigureSource,
     ReportFigure,
+    in_report,
     in_view,
     label_views,
     view_suffix,
 )
-from probe_kit.retention.displays.base.selection import known_view, probed_curve, scores_of
-from probe_kit.retention.displays.base.style import (
+from probe_kit.retention.displays.style import (
     DPI,
     PARTS,
     Line,
+    ProvenanceLine,
     accuracy_axis,
     caption,
     layer_axis,
@@ -35,17 +36,106 @@ from probe_kit.retention.displays.base.style import (
     plain,
     significance_handles,
 )
-from probe_kit.retention.displays.stream_curve import LayerLine, StreamCurve
 from probe_kit.statistics.sufficiency import FEWEST_PERMUTATIONS
 from probe_kit.train.choices import EVERYWHERE, SIDES
 from probe_kit.train.crossval.task_scores import METRICS
 from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
+
+
+Shares = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class LayerLine:
+    """Held-out score by layer; arrays (L,), accuracies as shares or R², with their 95 % interval over groups.
+
+    iteration: of all values, None where the stream runs once or where every layer has its best one.
+    significant: above chance, family-wise, and above the controls that were run.
+    """
+
+    iteration: int | None
+    layers: NDArray[np.int64]
+    score: Shares
+    low: Shares
+    high: Shares
+    significant: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, rows: "pd.DataFrame", iteration: int | None = None) -> Self:
+        """Read rows of `ProbeResults.scores`, one per layer."""
+        rows = rows.sort_values("layer")
+        score, low, high = (rows[name].to_numpy(dtype=float) for name in ("score", "ci_low", "ci_high"))
+        significant = rows["signal"].to_numpy(dtype=bool)
+        return cls(iteration, rows["layer"].to_numpy(dtype=np.int64), score, low, high, significant)
+
+
+@dataclass(frozen=True)
+class StreamCurve(LayerLine):
+    """One stream's held-out score by layer; arrays (L,), accuracies as shares or R².
+
+    part: of the model, see `Stream.part`. depth: the layer as a fraction.
+
+    sites: L best ones of the iterations that are shown, of a label by the score above their own chance. score: of
+    these. iterations: how many are shown.
+    lines: what is drawn: one per iteration, or the best. peaks: (layer, iteration) of the best sites, all of them
+    where several tie.
+    """
+
+    stream: str
+    part: str
+    sites: tuple[str, ...]
+    depth: Shares
+    iterations: int
+    lines: tuple[LayerLine, ...]
+    peaks: tuple[tuple[int, int | None], ...]
+
+    @classmethod
+    def of_stream(cls, scores: "pd.DataFrame", iterations: Iterations = "best") -> Self:
+        """Read the rows of one category, view and stream of `ProbeResults.scores`.
+
+        Raises UsageError if the stream has no such iteration.
+        """
+        scores = of_iterations(scores, iterations)
+        excess = scores["score"] - (0.0 if scores["target"].iloc[0] in SIDES else scores["chance"].fillna(0.0))
+        best_rows = scores.loc[excess.groupby(scores["layer"]).idxmax()].sort_values("layer")
+        best = LayerLine.of(best_rows)
+        steps = sorted(int(step) for step in scores["iteration"].dropna().unique())
+        each = tuple(LayerLine.of(scores[scores["iteration"] == step], step) for step in steps)
+        tied = scores[excess >= excess.max() - 1e-12]  # equal but for rounding of sums
+        return cls(
+            stream=str(scores["stream"].iloc[0]),
+            part=str(scores["part"].iloc[0]),
+            sites=tuple(best_rows["site"]),
+            **vars(best),
+            depth=best_rows["depth"].to_numpy(dtype=float),
+            iterations=len(steps) or 1,
+            lines=each if each and iterations != "best" else (best,),
+            peaks=tuple(
+                (int(layer), None if np.isnan(step) else int(step))
+                for layer, step in zip(tied["layer"], tied["iteration"].astype("float64"), strict=True)
+            ),
+        )
+
+    @property
+    def name(self) -> str:
+        """Return the name that people call the stream."""
+        return label_of(self.stream)
+
+    @property
+    def label(self) -> str:
+        """The name, and which iterations are shown if not all are."""
+        if self.iterations > 1:
+            return f"{self.name}, best iteration" if len(self.lines) == 1 else self.name
+        step = self.lines[0].iteration
+        return self.name if step is None else f"{self.name}, iteration {step}"
+
 
 _SIDESTEP = 0.1  # of a layer, so that the bars of two streams on one axes do not hide each other
 
@@ -122,7 +212,6 @@ class LayerCurveDisplay(Display):
     streams: tuple[StreamCurve, ...]
     grounds: tuple[Ground, ...]
     certificate: ProvenanceLine
-    ax_: "Axes | None" = field(default=None, init=False, repr=False)
 
     @classmethod
     def from_results(
@@ -140,8 +229,9 @@ class LayerCurveDisplay(Display):
         """
         category, view, _ = probed_curve(results, view, category)
         scores, settings = scores_of(results, category, view), results.settings
-        streams = tuple(StreamCurve.of(rows, iterations) for _, rows in scores.groupby("stream", sort=False))
-        of_label = ProvenanceLine.of_label(results, category, view)
+        streams = tuple(
+            StreamCurve.of_stream(rows, iterations) for _, rows in scores.groupby("stream", sort=False)
+        )
         return cls(
             target=settings.target,
             metric=METRICS[settings.task],
@@ -149,7 +239,7 @@ class LayerCurveDisplay(Display):
             view=view,
             streams=streams,
             grounds=tuple(Ground.of(results, category, view, stream) for stream in streams),
-            certificate=ProvenanceLine.of_results(results, view) if settings.is_side else of_label,
+            certificate=ProvenanceLine.of_results(results, view, None if settings.is_side else category),
         )
 
     @property
@@ -239,7 +329,7 @@ def _pairs(displays: Sequence[LayerCurveDisplay], in_pyplot: bool = False) -> "t
     """
     from matplotlib import pyplot as plt
 
-    from probe_kit.retention.displays.base.shown_figure import ShownFigure
+    from probe_kit.retention.displays.shown_figure import ShownFigure
 
     streams = max(len(display.streams) for display in displays)
     across = 1 if len(displays) == 1 else max(1, 4 // streams)
@@ -379,11 +469,8 @@ def _peak_handle() -> "Line2D":
     return Line2D([], [], color="black", ls="none", marker=_MARK, ms=5, label=_PEAK)
 
 
-PLACE = 9
-"""Of its figures in the report."""
-
-
-def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
+@in_report(9)
+def layer_figures(source: FigureSource) -> Iterator[ReportFigure]:
     """The figures that a report of these runs shows."""
     for drawn in source.runs:
         views = () if drawn.results is None else drawn.results.settings.views
@@ -401,7 +488,8 @@ def report_figures(source: FigureSource) -> Iterator[ReportFigure]:
             )  # fmt: skip
 
 
-def label_figures(source: FigureSource) -> Iterator[ReportFigure]:
+@in_report(9, "labels")
+def label_layer_figures(source: FigureSource) -> Iterator[ReportFigure]:
     """Yield the figures that a report of these labels shows."""
     iterations = "best" if source.table.iterations == "all" else source.table.iterations
     for view in label_views(source):
@@ -410,5 +498,5 @@ def label_figures(source: FigureSource) -> Iterator[ReportFigure]:
             "How well a linear probe decodes the label in groups it has not seen, layer by layer, with 95 % "
             f"intervals over groups. {ONLY_FILLED}. Grey: what the same probes reach with labels exchanged "
             "between groups. Dotted: the best control.",
-            partial(layer_curve, view.results, view.name, iterations, [view.category]),
+            layer_curve, iterations, [view.category],
         )  # fmt: skip

@@ -128,10 +128,8 @@ def _fitting(listed: Sequence[_Listed], step: int, most: int) -> int:
     """The smallest multiple of `step` that keeps at most so many bytes of pictures, or no more than one item's."""
     last = max((episode.rank for episode in listed), default=0) + step
     for stride in range(step, last, step):
-        if (
-            sum(map(len, {episode for episode, _ in _without_repeats(_with_pictures(listed, stride)).values()}))
-            <= most
-        ):
+        pictures = {picture for picture, _ in _without_repeats(_with_pictures(listed, stride)).values()}
+        if sum(map(len, pictures)) <= most:
             return stride
     return last
 

@@ -1,7 +1,7 @@
 """The page put together: one HTML file with everything in it, for every target."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,11 +15,10 @@ from probe_kit.errors import UsageError
 from probe_kit.retention.columns.comparisons import known_used_tables
 from probe_kit.retention.columns.tables import SUBJECTS
 from probe_kit.retention.columns.text import Modes, model_name, modes_of, title_of
-from probe_kit.retention.displays.base.report_figure import ONLY_FILLED, ReportFigure
-from probe_kit.retention.displays.base.style import axes_for, legend_above
+from probe_kit.retention.displays.bars import joins_of
 from probe_kit.retention.displays.layer_curves import LayerCurveDisplay
-from probe_kit.retention.displays.report_figures import collect_figures
-from probe_kit.retention.joins import joins_of
+from probe_kit.retention.displays.report_figure import ONLY_FILLED, ReportFigure, collect_figures
+from probe_kit.retention.displays.style import axes_for, legend_above
 from probe_kit.retention.report.episodes import PICTURES, EpisodeGrid, episode_grid
 from probe_kit.retention.report.parts import Picture, arranged, citation, data_uri, provenance, render, words_of
 from probe_kit.retention.report.summaries import RunInWords, read_run
@@ -37,23 +36,11 @@ from probe_kit.version import __version__
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-
-@dataclass(frozen=True)
-class Question:
-    """An episode of the grid. source: its picture as a data URI."""
-
-    card: Mapping[str, Any]
-    source: str
-
-    @property
-    def caption(self) -> str:
-        """Return how it ended, in words."""
-        outcome = (_ANSWERS if self.card["asked"] else _OUTCOMES).get(self.card["outcome"], "it was captured only")
-        answer = f": {self.card['answer']}" if self.card["answer"] else ""
-        frames = "First frame" if self.card["frames"] == 1 else "First and last frame"
-        return f"{frames}. The correct picture lies {_SIDES[self.card['side']]}{answer}; {outcome}."
-
-
+_ANSWERED: dict[Modes, str] = {
+    "acts": "the answer is where the cube ends",
+    "answers": "the answer is what the model says",
+    "both": "a policy answers by where the cube ends, a model that was asked by what it says",
+}
 _SIDES = {"left": "on the left", "right": "on the right"}
 _OUTCOMES = {
     "correct": "the cube ended on it",
@@ -65,6 +52,129 @@ _ANSWERS = {
     "wrong": "the model answers wrong",
     "oob": "no answer could be read",
 }
+_TASKS: dict[Task, str] = {"binary": "binary", "classes": "categorical", "continuous": "continuous"}
+
+
+def write_report(
+    runs: Sequence[RunReader],
+    path: Path | str,
+    table: RetentionTable | None = None,
+    *,
+    pictures: int = PICTURES,
+) -> Path:
+    """Write the report of `runs` as one HTML file, whole or not at all, and return its path.
+
+    table: their retention table, of sides with its defaults if it is not given. pictures: at most so many episodes
+    show their frames; a page of labels shows none. Raises UsageError without runs, and for a run that the table
+    was not made of.
+    """
+    path = Path(path)
+    write_whole(path, report_html(runs, table, pictures=pictures))
+    return path
+
+
+def report_html(
+    runs: Sequence[RunReader], table: RetentionTable | None = None, *, pictures: int = PICTURES
+) -> str:
+    """Return the page as text; the same runs and probes give the same text. See `write_report`."""
+    if not runs:
+        raise UsageError("a report needs at least one run")
+    table = table or retention_table(runs)
+    called = {row.run.location: model_name(row) for row in table.rows}
+    exhibits = [exhibit for exhibit in collect_figures(runs, table) if not exhibit.is_table]
+    names = [called[str(run.location)] for run in runs]
+    places = tuple(path for run in runs for path in (run.location.address, str(run.location)))
+    summary = table.summary_table
+    sides: dict[str, Any] = {}
+    tables = [summary]
+    if table.is_of_sides:
+        sides, of_sides = _sides(runs, table, exhibits, names, places, pictures)
+        tables += of_sides
+        labels = _stored_labels(runs, names, places)
+    else:
+        labels = _labels(runs, table, exhibits, names, places)
+    tables += [part for label in labels for part in (label["retention"], *label["probes"])]
+    sentence, bibtex = citation(runs)
+    return render(
+        "page.html.jinja",
+        places,
+        is_of_sides=table.is_of_sides,
+        title=enumerated(names if table.is_of_sides else table.targets),
+        suites=list(dict.fromkeys(run.suite for run in runs)),
+        version=__version__,
+        finding=table.summary,
+        summary=summary,
+        notes=table.notes,
+        several=len(runs) > 1,
+        provenance=[
+            provenance(name, run, [probes for (at, _), probes in table.results.items() if at == str(run.location)])
+            for name, run in zip(names, runs, strict=True)
+        ],
+        interventions=arranged(exhibits, "interventions", names, places),
+        labels=labels,
+        words=words_of(
+            [summary, *tables, *(part for label in labels for part in (label["retention"], *label["probes"]))]
+        ),
+        sentence=sentence,
+        bibtex=bibtex,
+        **sides,
+    )
+
+
+# -- sides -------------------------------------------------------------------------------------------------------
+
+
+def _sides(
+    runs: Sequence[RunReader],
+    table: RetentionTable,
+    exhibits: Sequence[ReportFigure],
+    names: Sequence[str],
+    places: tuple[str, ...],
+    pictures: int,
+) -> tuple[dict[str, Any], list[Table]]:
+    """Return what the page shows of sides alone, such as success, episodes and answers; and all tables of it."""
+    modes = modes_of(table.all_rows)
+    shown_names = [without_places(name, places) for name in names]
+    grid = episode_grid([under_rule(run, table.rule, table.last_steps) for run in runs], shown_names, pictures)
+    in_words: dict[tuple[str | None, str], list[RunInWords]] = {}
+    for mean in table.means:
+        rows = [row for row in table.rows if (*row.key, row.view) == (*mean.key, mean.view)]
+        in_words.setdefault(mean.key, []).append(read_run([*rows, mean]))
+    opening, question, curve = opening_row(table), None, None
+    if opening is not None:
+        position = [str(run.location) for run in runs].index(opening.run.location)
+        question = _question(opening, shown_names[position], grid)
+        if (exhibit := _opening_curve(opening, table, position)) is not None:
+            source = data_uri(exhibit, places)
+            curve = Picture(exhibit.title, shown_names[position], exhibit.reading, *source, False)
+    joins, refused = joins_of(runs, table)
+    joined = [part for join in joins for part in known_used_tables(join)]
+    tables: dict[str, list[Table]] = {subject: [] for subject in SUBJECTS.values()}
+    for title, part in table.tables().items():
+        tables[SUBJECTS[title]].append(part)
+    further_tables = table.further_tables
+    content = {
+        "modes": modes,
+        "answered": _ANSWERED[modes],
+        "did": "What it answers" if modes == "answers" else "What it does",
+        "reached": "What reaches the answer" if modes == "answers" else "What reaches the action",
+        "question": question,
+        "curve": curve,
+        "in_words": list(in_words.values()),
+        "warnings": [(views[0].name, warning) for views in in_words.values() for warning in views[0].warnings],
+        "tables": tables,
+        "wordings": table.wording_tables,
+        "further": further_tables,
+        "joined": joined,
+        "join_notes": [*refused, *dict.fromkeys(note for join in joins for note in join.notes)],
+        "pictures": {
+            subject: arranged(exhibits, subject, names, places)
+            for subject in ("behaviour", "probes", "retention", "join")
+        },
+        "grid": grid,
+        "heat": heat_key(),
+    }
+    return content, [*(part for of_subject in tables.values() for part in of_subject), *further_tables, *joined]
 
 
 def opening_row(table: RetentionTable) -> RetentionRow | None:
@@ -74,21 +184,27 @@ def opening_row(table: RetentionTable) -> RetentionRow | None:
     """
     rows = [category.row for run in table.summary for category in run.categories]
     probed = [row for row in rows if row.backbone.score is not None]
-    lost = [row for row in probed if row.backbone.has_signal and not row.action.has_signal]
     encoded = [row for row in probed if row.backbone.has_signal]
+    lost = [row for row in encoded if not row.action.has_signal]
     return next(iter((*lost, *encoded, *probed, *rows)), None)
 
 
-def opening_question(row: RetentionRow, name: str, grid: EpisodeGrid) -> Question | None:
-    """The first episode of the row's category with a picture, of this run by its name; None without one."""
-    cards = [card for card in grid.cards if card["run"] == name and card["category"] == row.category]
-    for card in cards:
-        if card["picture"] is not None:
-            return Question(card, f"data:image/webp;base64,{grid.picture(card)}")
+def _question(row: RetentionRow, name: str, grid: EpisodeGrid) -> Mapping[str, Any] | None:
+    """The first episode of the row's category with a picture, of this run by its name; None without one.
+
+    Its card, its picture as a data URI, and how it ended, in words.
+    """
+    for card in grid.cards:
+        if card["run"] == name and card["category"] == row.category and card["picture"] is not None:
+            outcome = (_ANSWERS if card["asked"] else _OUTCOMES).get(card["outcome"], "it was captured only")
+            answer = f": {card['answer']}" if card["answer"] else ""
+            frames = "First frame" if card["frames"] == 1 else "First and last frame"
+            caption = f"{frames}. The correct picture lies {_SIDES[card['side']]}{answer}; {outcome}."
+            return {"card": card, "source": f"data:image/webp;base64,{grid.picture(card)}", "caption": caption}
     return None
 
 
-def opening_curve(row: RetentionRow, table: RetentionTable, position: int) -> ReportFigure | None:
+def _opening_curve(row: RetentionRow, table: RetentionTable, position: int) -> ReportFigure | None:
     """Accuracy by layer of the row's category; None where it was not probed. position: of the run."""
     results = table.results_of(row.run.location)
     if results is None or row.backbone.score is None:
@@ -116,243 +232,63 @@ def _together(display: LayerCurveDisplay) -> "Figure":
     return figure
 
 
-@dataclass(frozen=True)
-class LabelSection:
-    """One label. run: its name, empty where the section is of all runs. measured: task and metric.
-
-    retention, sentences: its rows of the retention table, and what they say. pictures: by kind, see `arranged`.
-    probes: best sites and controls, a table per run. notes: what the probes say, and what was left out.
-    """
-
-    target: str
-    run: str
-    measured: str
-    retention: Table
-    sentences: tuple[str, ...]
-    pictures: list[list[Picture]]
-    probes: tuple[Table, ...]
-    notes: tuple[str, ...]
-
-    @property
-    def tables(self) -> tuple[Table, ...]:
-        """All of them."""
-        return self.retention, *self.probes
+# -- labels ------------------------------------------------------------------------------------------------------
 
 
-def label_sections(
+def _labels(
     runs: Sequence[RunReader],
     table: RetentionTable,
     exhibits: Sequence[ReportFigure],
     names: Sequence[str],
     places: tuple[str, ...],
-    of_one: str = "",
-) -> list[LabelSection]:
+    of_run: str = "",
+) -> list[dict[str, Any]]:
     """Return a section per label of the table.
 
-    exhibits: its figures. names: of the runs. of_one: name of the run where sections are of one.
+    Its rows of the table and what they say, its figures, its best sites beside their controls, a table per run,
+    and what the probes say. exhibits: figures of the table. names: of the runs. of_run: name of the run where
+    sections are of one.
     """
-    sections = []
+    sections: list[dict[str, Any]] = []
     for target in table.targets:
         of_target = table.of_target(target)
         probes = {name: table.results[str(run.location), target] for name, run in zip(names, runs, strict=True)}
         several = len(probes) > 1
-        sections.append(
-            LabelSection(
-                target,
-                of_one,
-                _measured(next(iter(probes.values()))),
-                of_target.tables()["Retention"],
-                tuple(category.details for run in of_target.summary for category in run.categories),
-                arranged(exhibits, target, names, places),
-                tuple(
-                    _probes_table(results, f"Best sites and controls{f', {name}' if several else ''}")
-                    for name, results in probes.items()
-                ),
-                tuple(
-                    f"{name}: {sentence}" if several else sentence
-                    for name, results in probes.items()
-                    for sentence in best_sites_sentences(results)
-                ),
-            )
-        )
+        section = {
+            "target": target,
+            "run": of_run,
+            "measured": _measured(next(iter(probes.values()))),
+            "retention": of_target.tables()["Retention"],
+            "sentences": [category.details for run in of_target.summary for category in run.categories],
+            "pictures": arranged(exhibits, target, names, places),
+            "probes": [
+                replace(best_sites_table([of]), title=f"Best sites and controls{f', {name}' if several else ''}")
+                for name, of in probes.items()
+            ],
+            "notes": [
+                f"{name}: {sentence}" if several else sentence
+                for name, of in probes.items()
+                for sentence in best_sites_sentences(of)
+            ],
+        }
+        sections.append(section)
     return sections
 
 
-def stored_label_sections(
+def _stored_labels(
     runs: Sequence[RunReader], names: Sequence[str], places: tuple[str, ...]
-) -> list[LabelSection]:
+) -> list[dict[str, Any]]:
     """A section per run and label column of which the run has probes; none for other runs."""
     sections = []
     for run, name in zip(runs, names, strict=True):
-        of_one = name if len(runs) > 1 else ""
         if targets := list(stored_targets(run)):
             table = retention_table([run], target=targets)
-            sections += label_sections([run], table, collect_figures([run], table), [name], places, of_one)
+            of_run = name if len(runs) > 1 else ""
+            sections += _labels([run], table, collect_figures([run], table), [name], places, of_run)
     return sections
 
 
 def _measured(results: ProbeResults) -> str:
-    settings = results.settings
-    curve = next(iter(results.curves.values()))
+    settings, curve = results.settings, next(iter(results.curves.values()))
     classes = f" of {len(curve.classes)} classes" if settings.task == "classes" else ""
     return f"A {_TASKS[settings.task]} label{classes}; the score is {METRICS[settings.task]}."
-
-
-_TASKS: dict[Task, str] = {"binary": "binary", "classes": "categorical", "continuous": "continuous"}
-
-
-def _probes_table(results: ProbeResults, title: str) -> Table:
-    return replace(best_sites_table([results]), title=title)
-
-
-def write_report(
-    runs: Sequence[RunReader],
-    path: Path | str,
-    table: RetentionTable | None = None,
-    *,
-    pictures: int = PICTURES,
-) -> Path:
-    """Write the report of `runs` as one HTML file, whole or not at all, and return its path.
-
-    table: their retention table, of sides with its defaults if it is not given. pictures: at most so many episodes
-    show their frames; a page of labels shows none. Raises UsageError without runs, and for a run that the table
-    was not made of.
-    """
-    path = Path(path)
-    page = report_html(runs, table, pictures=pictures)
-    write_whole(path, page)
-    return path
-
-
-def report_html(
-    runs: Sequence[RunReader], table: RetentionTable | None = None, *, pictures: int = PICTURES
-) -> str:
-    """Return the page as text; the same runs and probes give the same text. See `write_report`."""
-    if not runs:
-        raise UsageError("a report needs at least one run")
-    table = table or retention_table(runs)
-    called = {row.run.location: model_name(row) for row in table.rows}
-    exhibits = [exhibit for exhibit in collect_figures(runs, table) if not exhibit.is_table]
-    names = [called[str(run.location)] for run in runs]
-    places = tuple(path for run in runs for path in (run.location.address, str(run.location)))
-    summary = table.summary_table
-    if table.is_of_sides:
-        sides, tables = _sides(runs, table, exhibits, names, places, pictures)
-        labels = stored_label_sections(runs, names, places)
-    else:
-        sides, tables = {}, []
-        labels = label_sections(runs, table, exhibits, names, places)
-    sentence, bibtex = citation(runs)
-    return render(
-        "page.html.jinja",
-        places,
-        is_of_sides=table.is_of_sides,
-        title=enumerated(names if table.is_of_sides else table.targets),
-        suites=list(dict.fromkeys(run.suite for run in runs)),
-        version=__version__,
-        finding=table.summary,
-        summary=summary,
-        notes=table.notes,
-        several=len(runs) > 1,
-        provenance=[
-            provenance(
-                name,
-                run,
-                [results for (location, _), results in table.results.items() if location == str(run.location)],
-            )
-            for name, run in zip(names, runs, strict=True)
-        ],
-        interventions=arranged(exhibits, "interventions", names, places),
-        labels=labels,
-        words=words_of([summary, *tables, *(part for label in labels for part in label.tables)]),
-        sentence=sentence,
-        bibtex=bibtex,
-        **sides,
-    )
-
-
-def _sides(
-    runs: Sequence[RunReader],
-    table: RetentionTable,
-    exhibits: Sequence[ReportFigure],
-    names: Sequence[str],
-    places: tuple[str, ...],
-    pictures: int,
-) -> tuple[dict[str, Any], list[Table]]:
-    """Return what the page shows of sides alone, such as success, episodes and answers; and all tables of it."""
-    modes = modes_of(table.all_rows)
-    shown_names = [without_places(name, places) for name in names]
-    grid = episode_grid([under_rule(run, table.rule, table.last_steps) for run in runs], shown_names, pictures)
-    in_words = _in_words(table)
-    question, curve = _opening(table, runs, shown_names, grid, places)
-    joins = joins_of(runs, table)
-    joined = [part for join in joins.tables for part in known_used_tables(join)]
-    tables, further_tables = _tables(table), table.further_tables
-    content = {
-        "modes": modes,
-        "answered": _ANSWERED[modes],
-        "did": "What it answers" if modes == "answers" else "What it does",
-        "reached": "What reaches the answer" if modes == "answers" else "What reaches the action",
-        "question": question,
-        "curve": curve,
-        "in_words": in_words,
-        "warnings": [(views[0].name, warning) for views in in_words for warning in views[0].warnings],
-        "tables": tables,
-        "wordings": table.wording_tables,
-        "further": further_tables,
-        "joined": joined,
-        "join_notes": [*joins.refused, *dict.fromkeys(note for join in joins.tables for note in join.notes)],
-        "pictures": {
-            subject: arranged(exhibits, subject, names, places)
-            for subject in ("behaviour", "probes", "retention", "join")
-        },
-        "grid": grid,
-        "heat": heat_key(),
-    }
-    return content, [*(part for of_subject in tables.values() for part in of_subject), *further_tables, *joined]
-
-
-_ANSWERED: dict[Modes, str] = {
-    "acts": "the answer is where the cube ends",
-    "answers": "the answer is what the model says",
-    "both": "a policy answers by where the cube ends, a model that was asked by what it says",
-}
-
-
-def _tables(table: RetentionTable) -> dict[str, list[Table]]:
-    """Return the tables by subject."""
-    by_subject: dict[str, list[Table]] = {subject: [] for subject in SUBJECTS.values()}
-    for title, part in table.tables().items():
-        by_subject[SUBJECTS[title]].append(part)
-    return by_subject
-
-
-def _opening(
-    table: RetentionTable,
-    runs: Sequence[RunReader],
-    names: Sequence[str],
-    grid: EpisodeGrid,
-    places: tuple[str, ...],
-) -> tuple[Question | None, Picture | None]:
-    """The question and the curve of the first screen."""
-    row = opening_row(table)
-    if row is None:
-        return None, None
-    position = [str(run.location) for run in runs].index(str(row.run.location))
-    question, curve = opening_question(row, names[position], grid), opening_curve(row, table, position)
-    if curve is None:
-        return question, None
-    return question, Picture(curve.title, names[position], curve.reading, *data_uri(curve, places), False)
-
-
-def _in_words(table: RetentionTable) -> list[list[RunInWords]]:
-    """Per run, its sentences per view."""
-    by_run: dict[tuple[str | None, str], list[RunInWords]] = {}
-    for mean in table.means:
-        rows = [
-            r
-            for r in table.rows
-            if (r.group, r.run.location, r.view) == (mean.group, mean.run.location, mean.view)
-        ]
-        by_run.setdefault((mean.group, mean.run.location), []).append(read_run([*rows, mean]))
-    return list(by_run.values())

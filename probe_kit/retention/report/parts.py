@@ -17,9 +17,8 @@ from probe_kit._tables.table import Table
 from probe_kit.retention.behaviour import ask_of
 from probe_kit.retention.columns.sentences import VERDICT_HELP
 from probe_kit.retention.columns.text import TERMS
-from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
-from probe_kit.retention.displays.base.report_figure import ReportFigure
-from probe_kit.retention.displays.report_figures import caption_of
+from probe_kit.retention.displays.report_figure import ReportFigure, caption_of
+from probe_kit.retention.displays.style import ProvenanceLine
 from probe_kit.runs.reader import SIDE, RunReader
 from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.version import __version__
@@ -148,20 +147,12 @@ def _rounded(numbers: str) -> str:
 PAPER = "arXiv:2606.19297"
 
 
-@dataclass(frozen=True)
-class Provenance:
-    """One run's identity. facts: name and value. documents: name and pretty JSON."""
+def provenance(name: str, run: RunReader, results: Sequence[ProbeResults]) -> dict[str, Any]:
+    """Return what a run says about itself and its probes; runs that were not made by probe_kit say less.
 
-    name: str
-    line: str
-    facts: tuple[tuple[str, str], ...]
-    documents: tuple[tuple[str, str], ...]
-
-
-def provenance(name: str, run: RunReader, results: Sequence[ProbeResults]) -> Provenance:
-    """Return what a run says about itself and its probes; runs that were not made by probe_kit say less."""
-    settings = run.settings
-    certificate = run.certificate
+    Its name, its line, facts by name, and documents by name as pretty JSON.
+    """
+    settings, certificate = run.settings, run.certificate
     facts = {
         "run": run.label,
         "model": run.model,
@@ -179,13 +170,22 @@ def provenance(name: str, run: RunReader, results: Sequence[ProbeResults]) -> Pr
         **({f"probes{_of_target(probes)}": probes.key for probes in results} or {"probes": "none"}),
     }
     documents = {"run settings": settings, "certificate": certificate}
-    documents |= {f"probe settings{_of_target(probes)}": _probe_settings(probes) for probes in results}
-    return Provenance(
-        name,
-        ProvenanceLine.of_run(run).line,
-        tuple((key, value) for key, value in facts.items() if value),
-        tuple((key, json.dumps(value, indent=2, ensure_ascii=False)) for key, value in documents.items() if value),
-    )
+    documents |= {
+        f"probe settings{_of_target(probes)}": {
+            "key": probes.key,
+            "created": probes.created,
+            **asdict(probes.settings),
+        }
+        for probes in results
+    }
+    return {
+        "name": name,
+        "line": ProvenanceLine.of_run(run).line,
+        "facts": [(key, value) for key, value in facts.items() if value],
+        "documents": [
+            (key, json.dumps(value, indent=2, ensure_ascii=False)) for key, value in documents.items() if value
+        ],
+    }
 
 
 def _protocol(settings: Mapping[str, Any]) -> dict[str, str]:
@@ -195,18 +195,17 @@ def _protocol(settings: Mapping[str, Any]) -> dict[str, str]:
         return {}
     return {
         "protocol": protocol["name"],
-        "deviates from it in": _listed(protocol["deviations"], "instead of") or "nothing",
+        "deviates from it in": _listed(protocol["deviations"]) or "nothing",
         "it differs from the default in": _listed(
-            {name: pair[::-1] for name, pair in protocol["differs_from_default"].items()}, "instead of"
+            {name: pair[::-1] for name, pair in protocol["differs_from_default"].items()}
         ),
         "of it cannot be matched": "; ".join(protocol["unmatched"]),
     }
 
 
-def _listed(pairs: dict[str, list[str | None]], between: str) -> str:
-    return "; ".join(
-        f"{name} {now or 'nothing'} {between} {was or 'nothing'}" for name, (was, now) in pairs.items()
-    )
+def _listed(pairs: Mapping[str, Sequence[str | None]]) -> str:
+    changes = (f"{name} {now or 'nothing'} instead of {was or 'nothing'}" for name, (was, now) in pairs.items())
+    return "; ".join(changes)
 
 
 def citation(runs: Sequence[RunReader]) -> tuple[str, str]:
@@ -243,32 +242,15 @@ def _of_target(probes: ProbeResults) -> str:
     return "" if probes.settings.is_side else f" of {probes.settings.target}"
 
 
-def _probe_settings(probes: ProbeResults) -> dict[str, Any]:
-    return {"key": probes.key, "created": probes.created, **asdict(probes.settings)}
-
-
-_AGAINST = "against: "
-"""Before a verdict of the opposite direction."""
-
-
-@dataclass(frozen=True)
-class Word:
-    """An entry. anchor: its id in the page."""
-
-    name: str
-    meaning: str
-    anchor: str
-
-
 @dataclass(frozen=True)
 class Words:
-    """entries: by what they stand in.
+    """entries: name, meaning and place of each word, by what they stand in.
 
     headings: the place of a column's word and meaning; two tables may give a word two meanings. values: the place
     of a cell's text that is a word.
     """
 
-    entries: Mapping[str, tuple[Word, ...]]
+    entries: Mapping[str, tuple[tuple[str, str, str], ...]]
     headings: Mapping[tuple[str, str], str]
     values: Mapping[str, str]
 
@@ -286,7 +268,7 @@ def words_of(tables: Sequence[Table]) -> Words:
     groups["Further terms"] = {word: None for word in TERMS.items() if word not in _all(groups)}
     places = {word: f"word-{number}" for number, word in enumerate(_all(groups))}
     entries = {
-        title: tuple(Word(*word, places[word]) for word in entries_of)
+        title: tuple((*word, places[word]) for word in entries_of)
         for title, entries_of in groups.items()
         if entries_of
     }
@@ -298,7 +280,7 @@ def words_of(tables: Sequence[Table]) -> Words:
 
 def _word(cell: str) -> str:
     """A verdict without its direction, side and bound."""
-    return cell.removeprefix(_AGAINST).partition(" (")[0]
+    return cell.removeprefix("against: ").partition(" (")[0]
 
 
 def _all(groups: Mapping[str, Mapping[tuple[str, str], None]]) -> list[tuple[str, str]]:

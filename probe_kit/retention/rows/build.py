@@ -1,7 +1,7 @@
 """The rows of one run and their mean, with the estimates that averages and differences are made of."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import isfinite
 from operator import attrgetter
 from statistics import fmean
@@ -26,7 +26,7 @@ from probe_kit.retention.behaviour import (
     units_of,
 )
 from probe_kit.retention.choices import Iterations
-from probe_kit.retention.estimators import ACTION, BACKBONE, Limits, Rate, RowEstimates, StreamScores, limits
+from probe_kit.retention.estimators import ACTION, BACKBONE, Limits, Rate, StreamScores, limits
 from probe_kit.retention.rows.outcome_rules import OutcomeRuleScores, RunUnderRule
 from probe_kit.retention.rows.probe_parts import number_or_none, with_probes
 from probe_kit.retention.rows.row import (
@@ -41,6 +41,7 @@ from probe_kit.retention.rows.row import (
     SwapEffect,
 )
 from probe_kit.runs.reader import RunReader
+from probe_kit.statistics.intervals import Share
 from probe_kit.statistics.retention import Scores, retention
 from probe_kit.statistics.sufficiency import ABSENT_BELOW
 from probe_kit.train.choices import CORRECT
@@ -52,10 +53,15 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RowWithEstimates:
-    """A row and the estimates behind its numbers. outcomes: the episodes of its success rate, if it has one."""
+    """A row and the estimates behind its numbers.
+
+    rates: shares of episodes by name, such as `sr`. streams: scores, None without probes. outcomes: the episodes
+    of its success rate, if it has one.
+    """
 
     row: RetentionRow
-    estimates: RowEstimates
+    rates: Mapping[str, Share] = field(default_factory=dict)
+    streams: StreamScores | None = None
     outcomes: "pd.DataFrame | None" = None
 
 
@@ -129,12 +135,13 @@ def _row(
     scored = judged.scored and not heard
     success = success_rate(episodes) if scored else _no_success(episodes, heard)
     rules = OutcomeRuleScores(rule=judged.rule, rule_words=judged.words)
-    estimates = RowEstimates()
+    rates, streams = dict[str, Share](), None
     if scored:
         radii = settings.epsilons if settings.rule == DEFAULT_RULE else ()
         by_radius = {f"{radius:g}": rate for radius, rate in sensitivity(episodes, radii).items()}
-        rules = replace(judged.part(episodes), sr_by_epsilon=by_radius)
-        estimates = RowEstimates({"sr": success_share(episodes, run.seed_text), **judged.shares(episodes)})
+        rules, shares = judged.part(episodes)
+        rules = replace(rules, sr_by_epsilon=by_radius)
+        rates = {"sr": success_share(episodes, run.seed_text), **shares}
     row = RetentionRow(
         category=category,
         view=view,
@@ -147,8 +154,7 @@ def _row(
     )
     if results is not None and view is not None:
         row, streams = with_probes(row, results, settings.iterations, settings.absent_below, run.seed_text)
-        estimates = replace(estimates, streams=streams)
-    return RowWithEstimates(row, estimates, episodes if scored else None)
+    return RowWithEstimates(row, rates, streams, episodes if scored else None)
 
 
 def add_image_swap(
@@ -215,6 +221,9 @@ def _no_success(episodes: "pd.DataFrame", heard: bool) -> SuccessRate:
     return SuccessRate(n_episodes=len(episodes), n_items=items, n_groups=groups, reason=reason)
 
 
+_PARTS = ("success", "rules", "answers", "backbone", "action", "controls", "image_swap")
+
+
 def mean_row(drawn: Sequence[RowWithEstimates], averaged: Sequence[str]) -> RetentionRow:
     """The category average of rows of one run and view; retention is the ratio of the mean scores.
 
@@ -223,10 +232,14 @@ def mean_row(drawn: Sequence[RowWithEstimates], averaged: Sequence[str]) -> Rete
     categories, see `probe_kit.statistics.crossfit`.
     """
     rows = [part.row for part in drawn]
-    estimates = [part.estimates for part in drawn]
-    probed = _probed(estimates)
+    of_streams = [part.streams for part in drawn if part.streams is not None]
+    # None where categories are of different streams
+    probed = of_streams if len({streams.names for streams in of_streams}) == 1 else []
     first = rows[0]
-    means = _means(rows, averaged)
+    means: dict[str, dict[str, Any]] = {part: {} for part in _PARTS}
+    for path in averaged:
+        part, _, name = path.partition(".")
+        means[part][name] = _mean(rows, path)
     return RetentionRow(
         category=MEAN,
         view=first.view,
@@ -234,8 +247,8 @@ def mean_row(drawn: Sequence[RowWithEstimates], averaged: Sequence[str]) -> Rete
         categories=tuple(row.category for row in rows),
         left_out=_left_out(rows),
         run=first.run,
-        success=_success(rows, estimates, means["success"]),
-        rules=_rules(rows, estimates, means["rules"]),
+        success=_success(rows, drawn, means["success"]),
+        rules=_rules(rows, drawn, means["rules"]),
         answers=replace(first.answers, **means["answers"]),
         backbone=BackbonePart(ci=_accuracy_limits(probed, BACKBONE), **means["backbone"]),
         action=ActionPart(ci=_accuracy_limits(probed, ACTION), **means["action"]),
@@ -251,12 +264,6 @@ def mean_row(drawn: Sequence[RowWithEstimates], averaged: Sequence[str]) -> Rete
     )
 
 
-def _probed(estimates: Sequence[RowEstimates]) -> list[StreamScores]:
-    """Scores of the probed categories; none where they are of different streams."""
-    streams_of = [estimate.streams for estimate in estimates if estimate.streams is not None]
-    return streams_of if len({streams.names for streams in streams_of}) == 1 else []
-
-
 def _accuracy_limits(probed: Sequence[StreamScores], name: str) -> Limits | None:
     if not probed or name not in probed[0].names:
         return None
@@ -264,33 +271,21 @@ def _accuracy_limits(probed: Sequence[StreamScores], name: str) -> Limits | None
     return limits(Rate.mean(accuracies).interval)
 
 
-_PARTS = ("success", "rules", "answers", "backbone", "action", "controls", "image_swap")
-
-
-def _means(rows: Sequence[RetentionRow], averaged: Sequence[str]) -> dict[str, dict[str, Any]]:
-    """Return by part the averages of its fields."""
-    means: dict[str, dict[str, Any]] = {part: {} for part in _PARTS}
-    for path in averaged:
-        part, _, name = path.partition(".")
-        means[part][name] = _mean(rows, path)
-    return means
-
-
 def _success(
-    rows: Sequence[RetentionRow], estimates: Sequence[RowEstimates], means: dict[str, Any]
+    rows: Sequence[RetentionRow], drawn: Sequence[RowWithEstimates], means: dict[str, Any]
 ) -> SuccessRate:
     rates = [row.success.sr for row in rows if row.success.sr is not None]
     return SuccessRate(
         n_episodes=sum(row.success.n_episodes for row in rows),
         n_items=sum(row.success.n_items for row in rows),
-        ci=_rate_limits(estimates, "sr"),
+        ci=_rate_limits(drawn, "sr"),
         normalised_score=normalised_score(rates) if len(rates) == len(rows) else None,
         **means,
     )
 
 
 def _rules(
-    rows: Sequence[RetentionRow], estimates: Sequence[RowEstimates], means: dict[str, Any]
+    rows: Sequence[RetentionRow], drawn: Sequence[RowWithEstimates], means: dict[str, Any]
 ) -> OutcomeRuleScores:
     rules = [row.rules for row in rows]
     sides = {of_category.idle_side for of_category in rules}
@@ -300,8 +295,8 @@ def _rules(
         last_steps=rules[0].last_steps,
         n_answered=_sum([of_category.n_answered for of_category in rules]),
         n_grasped=_sum([of_category.n_grasped for of_category in rules]),
-        sr_answered_ci=_rate_limits(estimates, "sr_answered"),
-        sr_grasped_ci=_rate_limits(estimates, "sr_grasped"),
+        sr_answered_ci=_rate_limits(drawn, "sr_answered"),
+        sr_grasped_ci=_rate_limits(drawn, "sr_grasped"),
         idle_side=sides.pop() if len(sides) == 1 else "both",
         sr_by_rule=_mean_by_key([of_category.sr_by_rule for of_category in rules]),
         sr_by_epsilon=_mean_by_key([of_category.sr_by_epsilon for of_category in rules]),
@@ -330,8 +325,8 @@ def _retention(rows: Sequence[RetentionRow], probed: Sequence[StreamScores]) -> 
     )
 
 
-def _rate_limits(estimates: Sequence[RowEstimates], name: str) -> Limits | None:
-    shares = [estimate.rates[name] for estimate in estimates if name in estimate.rates]
+def _rate_limits(drawn: Sequence[RowWithEstimates], name: str) -> Limits | None:
+    shares = [part.rates[name] for part in drawn if name in part.rates]
     if not shares:
         return None
     return limits(Rate.mean([Rate(share.value, share.interval()) for share in shares]).interval)

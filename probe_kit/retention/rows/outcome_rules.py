@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol, Self, cast
+from typing import TYPE_CHECKING, Any, Self, cast
 
 import numpy as np
 
@@ -52,20 +52,6 @@ class OutcomeRuleScores:
     behaviour: dict[str, float] = field(default_factory=dict)
 
 
-class Judgeable(Protocol):
-    """A run that keeps trajectories; see `probe_kit.runs.Run`."""
-
-    episodes: "pd.DataFrame"
-    settings: Mapping[str, Any]
-    behaviour: "pd.DataFrame"
-
-    def judged(self, rule: str, last_steps: int = 1) -> "pd.DataFrame":
-        """A row per episode."""
-
-    def under(self, rule: str, last_steps: int = 1) -> RunReader:
-        """The run with its outcomes by another rule."""
-
-
 @dataclass(frozen=True)
 class RunUnderRule:
     """A run by one rule. run: with its outcomes by that rule. verdicts, behaviour: None without trajectories."""
@@ -88,11 +74,9 @@ class RunUnderRule:
         scene = run.settings.get("scene")
         words = "" if scene is None else rule_of(rule, scene).words
         is_stored = (rule, last_steps) == (DEFAULT_RULE, 1)
-        if scene is None or run.episodes.empty or (is_stored and not with_behaviour):
+        if scene is None or run.episodes.empty or (is_stored and not with_behaviour) or not run.has_trajectories:
             return cls(run, rule, words, last_steps)
-        if not run.has_trajectories:
-            return cls(run, rule, words, last_steps)
-        judgeable = cast("Judgeable", run)
+        judgeable: Any = run  # a run of `probe_kit.runs`, which keeps trajectories
         verdicts = {name: judgeable.judged(name) for name in RULES}
         return cls(judgeable.under(rule, last_steps), rule, words, last_steps, verdicts, judgeable.behaviour)
 
@@ -101,55 +85,39 @@ class RunUnderRule:
         """Whether there is a success rate by this rule: by the default rule it was stored with every run."""
         return self.verdicts is not None or (self.rule, self.last_steps) == (DEFAULT_RULE, 1)
 
-    def part(self, episodes: "pd.DataFrame") -> OutcomeRuleScores:
-        """The row part of some of the episodes; their index is their position in the run."""
+    def part(self, episodes: "pd.DataFrame") -> tuple[OutcomeRuleScores, dict[str, Share]]:
+        """The row part of some of the episodes, whose index is their position in the run, and shares by name.
+
+        Shares: `sr_answered` and `sr_grasped`, where they are defined.
+        """
+        identity: dict[str, Any] = {"rule": self.rule, "rule_words": self.words, "last_steps": self.last_steps}
         if not self.scored:
-            return OutcomeRuleScores(rule=self.rule, rule_words=self.words, last_steps=self.last_steps)
+            return OutcomeRuleScores(**identity), {}
         answered = 1 - shares_of(episodes, "oob")
-        rate = self._conditional(episodes, answered)
-        facts = {} if self.verdicts is None else self._facts(episodes, answered)
-        return OutcomeRuleScores(
-            rule=self.rule,
-            rule_words=self.words,
-            last_steps=self.last_steps,
-            n_answered=int((episodes["outcome"] != "oob").sum()),
-            share_answered=float(answered.mean()),
-            sr_answered=None if rate is None else rate.value,
-            sr_answered_ci=None if rate is None else limits(rate.interval()),
-            **facts,
-        )
-
-    def shares(self, episodes: "pd.DataFrame") -> dict[str, Share]:
-        """`sr_answered` and `sr_grasped`, where they are defined."""
-        if not self.scored:
-            return {}
-        shares = {"sr_answered": self._conditional(episodes, 1 - shares_of(episodes, "oob"))}
-        if self.behaviour is not None:
-            grasped = self.behaviour["grasped"].to_numpy(float)[episodes.index]
-            shares["sr_grasped"] = self._conditional(episodes, grasped)
-        return {name: share for name, share in shares.items() if share is not None}
-
-    def _facts(
-        self, episodes: "pd.DataFrame", answered: "np.ndarray[Any, np.dtype[np.float64]]"
-    ) -> dict[str, Any]:
-        assert self.verdicts is not None
-        assert self.behaviour is not None
-        verdicts = {name: of_rule.loc[episodes.index] for name, of_rule in self.verdicts.items()}
-        acted, by_rule = self.behaviour.loc[episodes.index], verdicts[self.rule]
-        grasped = acted["grasped"].to_numpy(float)
-        rate = self._conditional(episodes, grasped)
-        stayed = answered[~acted["moved"].to_numpy(bool)].sum()
-        return {
-            "n_grasped": int(grasped.sum()),
-            "sr_grasped": None if rate is None else rate.value,
-            "sr_grasped_ci": None if rate is None else limits(rate.interval()),
-            "share_unmoved_answers": float(stayed / answered.sum()) if answered.any() else None,
-            "sr_idle": float((by_rule["idle"] == "correct").mean()),
-            "idle_side": _idle_side(by_rule["idle"], episodes["side_correct"]),
-            "share_both_zones": float(by_rule["both"].mean()),
-            "sr_by_rule": {name: float(of_rule["correct"].mean()) for name, of_rule in verdicts.items()},
-            "behaviour": _behaviour(acted),
+        shares = {"sr_answered": self._conditional(episodes, answered)}
+        facts: dict[str, Any] = {
+            "n_answered": int((episodes["outcome"] != "oob").sum()),
+            "share_answered": float(answered.mean()),
         }
+        if self.verdicts is not None and self.behaviour is not None:
+            verdicts = {name: of_rule.loc[episodes.index] for name, of_rule in self.verdicts.items()}
+            acted, by_rule = self.behaviour.loc[episodes.index], verdicts[self.rule]
+            grasped = acted["grasped"].to_numpy(float)
+            shares["sr_grasped"] = self._conditional(episodes, grasped)
+            stayed = answered[~acted["moved"].to_numpy(bool)].sum()
+            facts |= {
+                "n_grasped": int(grasped.sum()),
+                "share_unmoved_answers": float(stayed / answered.sum()) if answered.any() else None,
+                "sr_idle": float((by_rule["idle"] == "correct").mean()),
+                "idle_side": _idle_side(by_rule["idle"], episodes["side_correct"]),
+                "share_both_zones": float(by_rule["both"].mean()),
+                "sr_by_rule": {name: float(of_rule["correct"].mean()) for name, of_rule in verdicts.items()},
+                "behaviour": _behaviour(acted),
+            }
+        defined = {name: share for name, share in shares.items() if share is not None}
+        for name, share in defined.items():
+            facts |= {name: share.value, f"{name}_ci": limits(share.interval())}
+        return OutcomeRuleScores(**identity, **facts), defined
 
     def _conditional(self, episodes: "pd.DataFrame", weights: "NDArray[np.float64]") -> Share | None:
         """Success where the weights are, groups of items as the unit; None where there is no weight."""
@@ -210,7 +178,8 @@ def under_rule(run: RunReader, rule: str, last_steps: int = 1) -> RunReader:
     """The run with its outcomes by a rule, for figures; as it is where it cannot be judged."""
     if (rule, last_steps) == (DEFAULT_RULE, 1) or not run.has_trajectories:
         return run
-    return cast("Judgeable", run).under(rule, last_steps)
+    judged: RunReader = cast("Any", run).under(rule, last_steps)
+    return judged
 
 
 def check_epsilons(rule: str, are_set: bool) -> None:

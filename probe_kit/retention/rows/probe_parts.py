@@ -36,7 +36,7 @@ from probe_kit.statistics.paired_tests import holm
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.statistics.sufficiency import ABSENT_BELOW, verdict
 from probe_kit.train.choices import SIDES
-from probe_kit.train.results.control_scores import Controls, Exceeds, has_signal
+from probe_kit.train.results.control_scores import has_signal
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.train.results.store import load_results, stored_targets
@@ -64,33 +64,42 @@ def with_probes(
         note = f"n/a (probes {results.key} are of {', '.join(results.settings.categories)})"
         return replace(row, retention=RetentionPart(note=note)), None
     streams, peaks = curve_scores(curve, iterations, seed_text), stream_peaks(curve, iterations)
-    exceeds = {
-        name: results.controls.exceeds(row.category, row.view, str(peak.site), peak.p_fwe)
-        for name, peak in peaks.items()
+    parts = {
+        name: _stream_part(row, results, curve, name, peak, streams, absent_below) for name, peak in peaks.items()
     }
-    parts = {name: _stream_part(curve, peak, exceeds[name]) for name, peak in peaks.items()}
-    for part in parts.values():
-        part["remedy"] = results.remedy(row.category, row.view)
-    if streams is not None:
-        scored = _of_side(exceeds, streams, absent_below) if curve.is_side else _above_chance(streams)
-        parts = {name: part | scored.get(name, {}) for name, part in parts.items()}
-    for name, peak in peaks.items() if curve.is_side else ():
-        parts[name] |= _selectivity(row, results.controls, curve, peak)
     row = replace(
         row,
         backbone=BackbonePart(**parts.get(BACKBONE, {})),
         action=ActionPart(**parts.get(ACTION, {}), **_iterations(curve, peaks.get(ACTION))),
-        retention=_retention(curve.is_side, peaks, streams, exceeds.get(BACKBONE), absent_below),
     )
-    row = replace(row, controls=_controls(row, results, curve, peaks))
+    estimate = RetentionPart(note="n/a (one stream only)")
+    if len(peaks) == 2:
+        ratio = estimate_retention(peaks, streams, parts[BACKBONE]["exceeds"], absent_below)
+        estimate = RetentionPart(
+            value=number_or_none(ratio.value),
+            ci=limits(ratio.interval),
+            # The paper's ratio is of accuracies above one half, which the metric of a label is not.
+            published=number_or_none(ratio.published) if curve.is_side else None,
+            defined=ratio.defined,
+            note=ratio.note,
+        )
+    row = replace(row, retention=estimate, controls=_controls(row, results, curve, peaks))
     return row if curve.is_side else with_reason(row, results), streams
 
 
-# -- streams -------------------------------------------------------------------------------------------------
-
-
-def _stream_part(curve: ProbeCurve, peak: Peak, exceeds: Exceeds) -> dict[str, Any]:
-    return {
+def _stream_part(
+    row: RetentionRow,
+    results: ProbeResults,
+    curve: ProbeCurve,
+    name: str,
+    peak: Peak,
+    streams: StreamScores | None,
+    absent_below: float,
+) -> dict[str, Any]:
+    """Return the fields of `StreamPart` of one stream."""
+    view = row.view or ""
+    exceeds = results.controls.exceeds(row.category, view, str(peak.site), peak.p_fwe)
+    part: dict[str, Any] = {
         "stream": peak.site.stream,
         "peak": peak.score,
         "chance": None if curve.is_side else number_or_none(peak.chance),
@@ -100,39 +109,27 @@ def _stream_part(curve: ProbeCurve, peak: Peak, exceeds: Exceeds) -> dict[str, A
         "ties": peak.ties,
         "p_fwe": number_or_none(peak.p_fwe),
         "exceeds": exceeds,
+        "remedy": results.remedy(row.category, view),
     }
-
-
-def _of_side(exceeds: Mapping[str, Exceeds], streams: StreamScores, bound: float) -> dict[str, dict[str, Any]]:
-    """Return by stream the accuracy of a side; peaks are balanced between the sides too."""
-    return {
-        name: {
+    if not curve.is_side:
+        if streams is not None:
+            part |= {"above": streams.above(name), "above_ci": limits(streams.above_interval(name))}
+        return part
+    untrained = results.controls.untrained_peak(row.category, view, peak.site.stream)
+    # How much more accurate the best site is than on random labels, and untrained.
+    part["selectivity"] = number_or_none(peak.score - float(curve.control_accuracy[curve.sites.index(peak.site)]))
+    if untrained is not None:
+        part |= {"minus_untrained": untrained.difference, "minus_untrained_ci": untrained.ci}
+    if streams is not None:
+        most, findable = streams.at_most[name], streams.findable[name]
+        part |= {
             "score": streams.accuracy(name),
             "ci": limits(streams.interval(name)),
-            "peak": streams.peak(name),
-            "at_most": streams.at_most[name],
-            "verdict": verdict(has_signal(exceeds[name]), streams.at_most[name], streams.findable[name], bound),
+            "peak": streams.peak(name),  # balanced between the sides too
+            "at_most": most,
+            "verdict": verdict(has_signal(exceeds), most, findable, absent_below),
         }
-        for name in streams.names
-    }
-
-
-def _above_chance(streams: StreamScores) -> dict[str, dict[str, Any]]:
-    return {
-        name: {"above": streams.above(name), "above_ci": limits(streams.above_interval(name))}
-        for name in streams.names
-    }
-
-
-def _selectivity(row: RetentionRow, controls: Controls, curve: ProbeCurve, peak: Peak) -> dict[str, Any]:
-    """Return how much more accurate the best site of a side is than on random labels, and untrained."""
-    untrained = controls.untrained_peak(row.category, row.view or "", peak.site.stream)
-    control = float(curve.control_accuracy[curve.sites.index(peak.site)])
-    return {
-        "selectivity": number_or_none(peak.score - control),
-        "minus_untrained": None if untrained is None else untrained.difference,
-        "minus_untrained_ci": None if untrained is None else untrained.ci,
-    }
+    return part
 
 
 def _iterations(curve: ProbeCurve, peak: Peak | None) -> dict[str, Any]:
@@ -152,29 +149,6 @@ def _iterations(curve: ProbeCurve, peak: Peak | None) -> dict[str, Any]:
     }
 
 
-# -- retention and controls ----------------------------------------------------------------------------------
-
-
-def _retention(
-    is_side: bool,
-    peaks: Mapping[str, Peak],
-    streams: StreamScores | None,
-    backbone: Exceeds | None,
-    bound: float,
-) -> RetentionPart:
-    if len(peaks) < 2 or backbone is None:
-        return RetentionPart(note="n/a (one stream only)")
-    estimate = estimate_retention(peaks, streams, backbone, bound)
-    return RetentionPart(
-        value=number_or_none(estimate.value),
-        ci=limits(estimate.interval),
-        # The paper's ratio is of accuracies above one half, which the metric of a label is not.
-        published=number_or_none(estimate.published) if is_side else None,
-        defined=estimate.defined,
-        note=estimate.note,
-    )
-
-
 def _controls(
     row: RetentionRow, results: ProbeResults, curve: ProbeCurve, peaks: Mapping[str, Peak]
 ) -> ControlScores:
@@ -183,25 +157,21 @@ def _controls(
     if not curve.is_side:
         return sizes
     baselines = results.controls.of_category(row.category)
-    untrained = [
+    untrained = (
         results.controls.untrained_peak(row.category, row.view or "", peak.site.stream) for peak in peaks.values()
-    ]
+    )
     accuracy, success = row.backbone.score, row.success.sr
+    items, sides = set(curve.items.tolist()), {"left": curve.labels, "right": ~curve.labels}
     return replace(
         sizes,
-        missing=missing_episodes(curve),
+        missing={
+            side: 1 - len(set(curve.items[is_side].tolist())) / len(items) for side, is_side in sides.items()
+        },
         probe_minus_sr=None if accuracy is None or success is None else accuracy - success,
         baselines={name: score.score for name, score in baselines.items()},
         leaks=tuple(name for name, score in baselines.items() if score.above_chance),
         untrained=next((peak.untrained for peak in untrained if peak is not None), None),
     )
-
-
-def missing_episodes(curve: ProbeCurve) -> dict[str, float]:
-    """Return by side the share of items that lack their episode of that side."""
-    items = len(set(curve.items.tolist()))
-    sides = {"left": curve.labels, "right": ~curve.labels}
-    return {side: 1 - len(set(curve.items[is_side].tolist())) / items for side, is_side in sides.items()}
 
 
 def number_or_none(value: float) -> float | None:

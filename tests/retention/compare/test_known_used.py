@@ -1,5 +1,6 @@
 """The join of known, encoded and used, recomputed from first principles, and what it refuses."""
 
+import json
 import math
 from collections import Counter
 from dataclasses import replace
@@ -11,11 +12,22 @@ import numpy as np
 import pandas as pd
 import pytest
 from rich.console import Console
+from typer.testing import CliRunner
 
+from probe_kit.cli import app
+from probe_kit.env import SceneSpec
 from probe_kit.errors import OtherFramesError, UsageError
+from probe_kit.extract import AskSettings, ExtractSettings, ask_run, extract_run
+from probe_kit.extract.prompts import TEMPLATES
+from probe_kit.retention import retention_table
 from probe_kit.retention.behaviour import scored
 from probe_kit.retention.columns.comparisons import known_used_tables
 from probe_kit.retention.compare.known_used import CategoryCounts, encoded_decisions, match_runs
+from probe_kit.retention.displays import KnownUsedDisplay, collect_figures
+from probe_kit.retention.displays.bars import joins_of
+from probe_kit.retention.report import report_html
+from probe_kit.runs import Run
+from probe_kit.suite import Suite
 from tests.retention.asked_runs import SaidRun, acted, asked, probes
 
 SIZES = {"color": 14, "shape": 12}
@@ -221,3 +233,119 @@ def test_it_reads_on_a_console_as_a_frame_and_as_plain_values(runs: tuple[SaidRu
     assert found.to_json()["rows"][0]["counts"] == found.rows[0].counts
     assert isinstance(found.rows[0], CategoryCounts)
     assert isinstance(frame, pd.DataFrame)
+
+
+KNOWN = {"color": np.array([[1, 1], [1, 1], [0, 1], [0, 0]], bool)}
+USED = {"color": np.array([[1, 1], [0, 1], [1, 1], [0, 0]], bool)}
+
+
+def pair(folder: Path) -> tuple[object, SaidRun]:
+    return scored(asked(folder, KNOWN), "text"), acted(folder, USED)
+
+
+def test_bars_are_the_counts_of_the_join(tmp_path: Path) -> None:
+    vlm, policy = pair(tmp_path)
+    joined = match_runs(vlm, policy)  # type: ignore[arg-type]
+    display = KnownUsedDisplay.from_join(joined).plot()
+    assert display.counts == {"color": {"1-1": 1, "1-0": 1, "0-1": 1, "0-0": 1}}
+    axes = display.ax_
+    assert axes is not None
+    assert [patch.get_width() for patch in axes.patches] == [25.0] * 4  # type: ignore[attr-defined]
+    labels = [text.get_text() for legend in axes.figure.legends for text in legend.get_texts()]  # type: ignore[union-attr]
+    assert labels == [
+        "answer right, success",
+        "answer not, success",
+        "answer right, no success",
+        "answer not, no success",
+    ]
+
+
+def test_the_report_of_an_asked_and_an_acting_run_holds_their_join(tmp_path: Path) -> None:
+    vlm, policy = pair(tmp_path)
+    runs = [vlm, policy]
+    table = retention_table(runs)  # type: ignore[arg-type]
+    (joined,), _ = joins_of(runs, table)  # type: ignore[arg-type]
+    assert [one.name for one in collect_figures(runs, table) if one.subject == "join"] == ["known-used-1"]  # type: ignore[arg-type]
+    page = report_html(runs, table)  # type: ignore[arg-type]
+    section = page.split('<details class="part" id="join">')[1].split("</details>")[0]
+    for plain in known_used_tables(joined):
+        assert plain.title in section
+        for cells in plain.texts:
+            assert all(f">{cell}<" in section for cell in cells if "[" not in cell)
+    assert section.count("<img") == 1
+
+
+def test_runs_that_saw_other_frames_are_not_joined_and_the_report_says_so(tmp_path: Path) -> None:
+    vlm, policy = pair(tmp_path)
+    policy.episodes["first_frame_sha256"] = "other"
+    runs = [vlm, policy]
+    table = retention_table(runs)  # type: ignore[arg-type]
+    joins, refused = joins_of(runs, table)  # type: ignore[arg-type]
+    assert joins == []
+    assert "begin with another frame" in refused[0]
+    assert "begin with another frame" in report_html(runs, table)  # type: ignore[arg-type]
+
+
+def test_acting_runs_alone_have_no_join(tmp_path: Path) -> None:
+    _, policy = pair(tmp_path)
+    assert 'id="join"' not in report_html([policy])
+
+
+# `tests/acceptance` holds what a user sees of the command, so that its own tests are slow.
+
+
+@pytest.fixture(scope="module")
+def runs_stages_command(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> tuple[Run, Run]:
+    """An untrained VLM that was asked, and a scripted expert that acted, on the same frames."""
+    folder = tmp_path_factory.mktemp("stages")
+    scene = SceneSpec(max_steps=4)
+    subset = {"suite": small_suite.folder, "categories": ("color",), "items": 4, "scene": scene}
+    asked = ask_run(
+        AskSettings("vlm-tiny", random_weights=True, prompt=TEMPLATES["p1"], **subset), folder / "asked"
+    )
+    acted = extract_run(ExtractSettings("expert", **subset), folder / "acted")
+    return asked, acted
+
+
+@pytest.mark.slow
+def test_it_prints_the_counts_of_match_runs_and_draws_their_figure(
+    runs_stages_command: tuple[Run, Run], tmp_path: Path
+) -> None:
+    asked, acted = runs_stages_command
+    command = ["retention", str(asked.path), str(acted.path), "--compare", "stages"]
+    answer = CliRunner().invoke(app, [*command, "--format", "json"])
+    assert answer.exit_code == 0, answer.output
+    assert json.loads(answer.stdout) == json.loads(
+        json.dumps(match_runs(scored(asked, "text", False), acted).to_json())
+    )
+    drawn = CliRunner().invoke(app, [*command, "--figures", str(tmp_path / "figures")])
+    assert "Answer, probe, success" in drawn.stdout
+    assert list((tmp_path / "figures").glob("*.png"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--format", "csv"], "--format csv is not for --compare stages"),
+        (["--rule", "box"], "--rule is not for --compare stages"),
+        (["--as-paper"], "--as-paper is not for --compare stages"),
+        (["--views", "mean,last"], "--compare stages reads probes of one view; --views mean,last has 2. Give one"),
+        (["--views", "mean"], "has no probes. Run `probe-kit train"),
+    ],
+)
+def test_options_of_other_tables_are_refused(
+    options: list[str], words: str, runs_stages_command: tuple[Run, Run]
+) -> None:
+    answer = CliRunner().invoke(
+        app, ["retention", *(str(run.path) for run in runs_stages_command), "--compare", "stages", *options]
+    )
+    assert answer.exit_code == 2
+    assert words in " ".join(answer.stderr.split())
+
+
+@pytest.mark.slow
+def test_it_needs_two_runs(runs_stages_command: tuple[Run, Run]) -> None:
+    answer = CliRunner().invoke(app, ["retention", str(runs_stages_command[0].path), "--compare", "stages"])
+    assert answer.exit_code == 2
+    assert "expected VLM_RUN RUN" in answer.stderr

@@ -1,4 +1,4 @@
-"""Several runs as one comparison: which are paired, what their differences are, and what they are called."""
+"""Runs and groups of models compared: which are paired, on which items, and the tests of their differences."""
 
 import json
 from collections.abc import Callable, Mapping
@@ -11,11 +11,15 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from rich.console import Console
+from scipy import stats
 
+from probe_kit._tables.numbers import points, signed
 from probe_kit.errors import UsageError
 from probe_kit.retention import RetentionTable, retention_table
 from probe_kit.retention.behaviour import full_names
-from probe_kit.retention.compare.compare import Difference
+from probe_kit.retention.columns.text import models_test
+from probe_kit.retention.compare.compare import Difference, ModelTest
 from probe_kit.train import ArrayRun, load_results, save_results
 from tests.retention.asked_runs import SUITE, SaidRun, asked, episodes
 from tests.retention.paired_limits import mover
@@ -377,3 +381,260 @@ def test_json_of_plain_runs_is_a_list_whose_rows_hold_their_differences(tmp_path
     assert found["category"] == both[3]["category"] == "color"
     assert found["sr"] == pytest.approx(both[3]["success"]["sr"] - both[0]["success"]["sr"])
     assert [row["differences"] for row in both[:3]] == [[], [], []]
+
+
+NONE = ([0.5, 0.55, 0.5], [[0.58, 0.5]])
+
+
+@pytest.fixture
+def table(probed_run: ProbedRun) -> RetentionTable:
+    vqa = probed_run({"color": SIGNAL, "shape": SIGNAL}, "vqa")
+    plain = probed_run({"color": WEAK, "shape": NONE}, "plain")
+    return retention_table({"without": [plain], "with VQA": [vqa]})
+
+
+def test_a_difference_is_the_later_group_minus_the_earlier(table: RetentionTable) -> None:
+    color, shape, mean = table.differences
+    assert [row.category for row in table.differences] == ["color", "shape", "mean"]
+    assert (color.group, color.minus, color.view) == ("with VQA", "without", "mean")
+    other, weaker, one, _ = table.rows
+    assert color.backbone == pytest.approx(0.9 - 0.8, abs=1e-3)
+    assert color.action == pytest.approx(one.action.score - other.action.score)  # type: ignore[operator]
+    assert color.retention == pytest.approx(one.retention.value - other.retention.value)  # type: ignore[operator]
+    assert weaker.backbone.score is not None
+    assert mean.backbone == pytest.approx((0.1 + 0.9 - weaker.backbone.score) / 2, abs=1e-3)
+    assert shape.backbone_ci is not None
+    assert shape.backbone_ci[0] is not None
+    assert shape.backbone_ci[0] > 0
+
+
+def test_retention_is_compared_only_where_both_groups_have_it(table: RetentionTable) -> None:
+    color, shape, mean = table.differences
+    assert (shape.retention, shape.retention_ci) == (None, None)
+    assert color.retention is not None
+    second, first = (row.retention.value for row in table.means)
+    assert mean.retention == pytest.approx(first - second)  # type: ignore[operator]
+    assert mean.retention_ci is not None
+    assert mean.retention_ci[0] < mean.retention < mean.retention_ci[1]  # type: ignore[operator]
+
+
+def test_equal_behaviour_on_the_same_items_is_no_proof_of_equality(table: RetentionTable) -> None:
+    """Of 100 items that all agree, 3 % unlike them would not have been missed."""
+    for row in table.differences:
+        assert row.paired
+        assert row.sr == 0.0
+        low, high = row.sr_ci
+        assert low == pytest.approx(-0.03, abs=0.011)
+        assert high == pytest.approx(0.03, abs=0.011)
+
+
+def test_other_suites_are_compared_without_pairing(probed_run: ProbedRun) -> None:
+    one = probed_run({"color": SIGNAL}, "one")
+    other = probed_run({"color": SIGNAL}, "other", suite="other@1#ba9876543210")
+    row = retention_table({"a": [one], "b": [other]}).differences[0]
+    assert not row.paired
+    assert row.p is None
+    assert row.sr == 0.0
+    assert row.sr_ci[0] is not None
+    assert row.sr_ci[0] < -0.05
+
+
+def test_a_group_is_the_mean_of_its_runs(probed_run: ProbedRun) -> None:
+    strong, weak = probed_run({"color": SIGNAL}, "strong"), probed_run({"color": WEAK}, "weak")
+    alone = probed_run({"color": SIGNAL}, "alone")
+    table = retention_table({"both": [strong, weak], "strong": [alone]})
+    assert table.differences[0].backbone == pytest.approx(0.9 - (0.9 + 0.8) / 2, abs=1e-3)
+    assert table.differences[0].paired
+    assert [(mean.group, mean.run.model) for mean in table.means] == [
+        ("both", "strong"), ("both", "weak"), ("strong", "alone"),
+    ]  # fmt: skip
+    assert len(table.all_rows) == 2 * 3
+
+
+def test_every_format_shows_groups_and_differences(table: RetentionTable) -> None:
+    content = json.loads(table.to_json())
+    assert [row["group"] for row in content["rows"]] == ["without"] * 3 + ["with VQA"] * 3
+    assert content["differences"][0]["sr_ci"][0] < 0
+    assert "| Color | with VQA − without | +0.0 [" in table.to_markdown()
+    assert "| Color | with VQA: vqa |" in table.to_markdown()
+    assert "Color & with VQA $-$ without & " in table.to_latex("all")
+    frame = table.differences_frame()
+    assert frame["backbone"].tolist() == [row.backbone for row in table.differences]
+    assert frame["backbone"][0] == pytest.approx(0.1, abs=1e-3)
+    assert (frame["backbone_ci_low"] < frame["backbone"]).all()
+
+
+def test_keys_follow_the_runs_of_all_groups(probed_run: ProbedRun) -> None:
+    run = probed_run({"color": SIGNAL})
+    with pytest.raises(UsageError, match="1 keys for 2 runs"):
+        retention_table({"a": [run], "b": [run]}, keys=[None])
+
+
+# -- models as the unit --------------------------------------------------------------------------------------
+
+
+def test_groups_of_models_have_a_p_over_models_and_the_least_that_so_few_allow(probed_run: ProbedRun) -> None:
+    """Three against three cannot be below 0.1, whatever their questions say."""
+    groups = {
+        name: [probed_run({"color": ([0.5, 0.95], [[top + 0.02 * at]])}, f"{name}{at}") for at in range(3)]
+        for name, top in (("high", 0.85), ("low", 0.65))
+    }
+    table = retention_table(groups)
+    color, mean = table.differences
+    own = {row.run.model: row.retention.value for row in table.rows}
+    values = [[float(own[f"{name}{at}"] or 0) for at in range(3)] for name in groups]
+    for row in (color, mean):
+        found = row.retention_models
+        assert found is not None
+        assert (found.n, found.n_minus) == (3, 3)
+        assert found.p == pytest.approx(0.1), "the most extreme of 20 ways, either way round"
+        assert found.smallest_p == pytest.approx(0.1)
+        assert found.difference == pytest.approx(np.mean(values[1]) - np.mean(values[0]))
+        welch = stats.ttest_ind(*values[::-1], equal_var=False).confidence_interval()
+        assert found.ci == pytest.approx((welch.low, welch.high))
+    assert color.sr_models is not None
+    assert (color.sr_models.p, color.sr_models.difference) == (1, 0), "all did the same"
+
+
+def test_a_single_model_against_another_has_no_p_over_models(table: RetentionTable) -> None:
+    assert all(row.sr_models is None and row.retention_models is None for row in table.differences)
+
+
+def test_a_group_with_a_model_without_probes_has_no_p_of_retention(probed_run: ProbedRun, tmp_path: Path) -> None:
+    one, other = (probed_run({"color": SIGNAL}, name) for name in ("one", "other"))
+    bare = ArrayRun(tmp_path / "bare", "bare", one.suite, one.episodes, {})
+    rows = retention_table({"b": [bare], "a": [one, other]}).differences
+    assert all(row.retention is None and row.retention_models is None for row in rows)
+    assert all(row.sr_models is not None and row.sr_models.n_minus == 1 for row in rows)
+
+
+@pytest.fixture
+def table_model_groups(probed_run: ProbedRun) -> RetentionTable:
+    """Three models against three whose backbones are as good; their probes differ by chance alone."""
+    names = ("one", "two", "three", "four", "five", "six")
+    good = {name: ([0.5, 0.8 + 0.02 * at], [[0.6, 0.7 - 0.02 * at]]) for at, name in enumerate(names)}
+    runs = [probed_run({"color": curves, "shape": curves}, name) for name, curves in good.items()]
+    return retention_table({"first": runs[:3], "second": runs[3:]})
+
+
+def test_three_models_against_three_cannot_be_below_one_tenth(table_model_groups: RetentionTable) -> None:
+    assert len(table_model_groups.differences) == 3
+    for row in table_model_groups.differences:
+        for test in (row.sr_models, row.retention_models):
+            assert test is not None
+            assert (test.n, test.n_minus, test.smallest_p) == (3, 3, pytest.approx(0.1))
+            assert test.p >= test.smallest_p - 1e-12
+
+
+def test_every_format_shows_the_p_over_models_and_the_least_possible_one(
+    table_model_groups: RetentionTable,
+) -> None:
+    console = Console(width=400, file=StringIO())
+    console.print(table_model_groups.to_rich("all"))
+    for text in (
+        console.file.getvalue(),
+        table_model_groups.to_markdown(),
+        table_model_groups.to_latex("all"),
+        table_model_groups._repr_html_(),
+    ):  # type: ignore[attr-defined]
+        assert "over models" in text
+        assert "(0.100)" in text
+
+
+def test_runs_of_one_model_are_no_further_models(probed_run: ProbedRun) -> None:
+    """Seeds of two models against seeds of two others: four models, whatever the number of seeds."""
+    runs = [
+        replace(probed_run({"color": ([0.5, 0.7 + 0.02 * at], [[0.6, 0.7]])}, f"run {at}"), weights_sha256=model)
+        for at, model in enumerate("aaabbbcccddd")
+    ]
+    for row in retention_table({"first": runs[:6], "second": runs[6:]}).differences:
+        assert row.sr_models is not None
+        assert (row.sr_models.n, row.sr_models.n_minus, row.sr_models.smallest_p) == (2, 2, pytest.approx(1 / 3))
+    again = replace(runs[6], weights_sha256="b")
+    both = retention_table({"first": runs[:6], "second": [again, *runs[7:]]}).differences
+    assert [row.sr_models for row in both] == [None, None], "a model on both sides cannot change sides"
+
+
+def sisters(probed_run: ProbedRun) -> list[ArrayRun]:
+    """Six models with weights of their own."""
+    return [
+        replace(probed_run({"color": ([0.5, 0.7 + 0.02 * at], [[0.6, 0.7]])}, f"run {at}"), weights_sha256=model)
+        for at, model in enumerate("abcdef")
+    ]
+
+
+def test_models_of_one_origin_are_averaged_first(probed_run: ProbedRun) -> None:
+    runs = sisters(probed_run)
+    origins = {str(run.location): origin for run, origin in zip(runs[:3], ("base", "base", "other"), strict=True)}
+    row = retention_table({"first": runs[:3], "second": runs[3:]}, origins=origins).differences[0]
+    alone = retention_table({"first": runs[:3], "second": runs[3:]}).differences[0]
+    assert row.sr_models is not None
+    assert alone.retention_models is not None
+    assert row.retention_models is not None
+    assert (row.sr_models.n, row.sr_models.n_minus) == (3, 2)
+    assert (alone.retention_models.n, alone.retention_models.n_minus) == (3, 3)
+    assert row.retention_models.difference != alone.retention_models.difference, "two sisters weigh as one model"
+
+
+def test_checkpoints_of_one_training_are_one_model(probed_run: ProbedRun) -> None:
+    runs = sisters(probed_run)
+    for run, folder in zip(
+        runs, ("m/a/020000", "m/a/040000", "m/b/020000", "m/c/1", "m/d/1", "m/e/1"), strict=True
+    ):
+        certificate = {"policy": {"checkpoint": f"{folder}/pretrained_model"}}
+        object.__setattr__(run, "certificate", certificate)
+    row = retention_table({"first": runs[:3], "second": runs[3:]}).differences[0]
+    assert row.sr_models is not None
+    assert (row.sr_models.n, row.sr_models.n_minus) == (3, 2)
+
+
+def test_an_origin_of_no_run_is_refused(probed_run: ProbedRun) -> None:
+    runs = sisters(probed_run)
+    with pytest.raises(UsageError, match="an origin is declared of elsewhere; expected one of the runs"):
+        retention_table({"first": runs[:3], "second": runs[3:]}, origins={"elsewhere": "base"})
+
+
+def test_a_smaller_group_with_a_larger_spread_has_an_interval_and_no_p() -> None:
+    few, many = [0.2, 0.6, 0.9], [0.5, 0.51, 0.52, 0.5, 0.49, 0.5]
+    test = ModelTest.of(few, many)
+    assert test is not None
+    assert (test.p, test.smallest_p) == (None, None)
+    assert models_test(test, signed).startswith("– ")
+    other = ModelTest.of(many, [*few[:2], 0.5, 0.55, 0.45, 0.5])
+    assert other is not None
+    assert other.p is not None, "groups of equal size exchange whatever their spreads"
+
+
+def test_single_runs_have_no_p_over_models(probed_run: ProbedRun) -> None:
+    runs = [probed_run({"color": ([0.5, 0.9], [[0.6, 0.7]])}, name) for name in ("one", "two")]
+    table_model_groups = retention_table(runs)
+    assert [row.sr_models for row in table_model_groups.differences] == [None, None]
+    assert "over models" not in table_model_groups.to_markdown()
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "written"),
+    [
+        ([0.0, 1.0], [0.4, 0.9], "–"),  # Welch: −9 to +9 times all that rates can differ by
+        ([0.9, 1.0], [0.4], "+100.0]"),
+        ([0.9, 0.91, 0.92], [0.5, 0.51, 0.52], "+42.3]"),
+    ],
+)
+def test_an_interval_of_rates_stays_within_a_hundred_points(
+    first: list[float], second: list[float], written: str
+) -> None:
+    test = ModelTest.of(first, second, largest=1.0)
+    assert test is not None
+    assert models_test(test, points).endswith(f" {written}")
+    assert all(limit is None or abs(limit) <= 1 for limit in test.ci)
+
+
+def test_rates_of_a_table_are_given_their_bound(probed_run: ProbedRun) -> None:
+    """Two models and one: their retention can differ by any amount, their success rates cannot."""
+    runs = []
+    for name, wrong in (("one", 200), ("two", 0), ("three", 100)):
+        runs.append(run := probed_run({"color": ([0.5, 0.8], [[0.6, 0.7]])}, name))
+        run.episodes["outcome"] = ["wrong"] * wrong + ["correct"] * (len(run.episodes) - wrong)
+    (row, *_) = retention_table({"first": runs[:2], "second": runs[2:]}).differences
+    assert row.sr_models is not None
+    assert row.sr_models.ci == (None, None)

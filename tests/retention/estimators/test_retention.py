@@ -1,8 +1,8 @@
-"""Retention of one category: the ratio of two cross-fitted scores, checked against formulas by hand."""
+"""Cross-fitted scores of streams, and retention, against formulas and simulations."""
 
 from collections.abc import Callable
 from dataclasses import replace
-from math import isnan
+from math import isnan, sqrt
 
 import numpy as np
 import pandas as pd
@@ -12,8 +12,21 @@ from scipy import stats
 from probe_kit.errors import UsageError
 from probe_kit.hooks import Site
 from probe_kit.retention import best_site, measure_retention
-from probe_kit.retention.estimators import NO_SCORES, Retention, StreamScores, curve_scores
+from probe_kit.retention.behaviour import success_share
+from probe_kit.retention.estimators import (
+    NO_SCORES,
+    PooledScores,
+    Rate,
+    Retention,
+    StreamScores,
+    curve_scores,
+    limits,
+    score_streams,
+)
+from probe_kit.statistics.intervals import Interval, Share
+from probe_kit.statistics.retention import Scores, retention, retention_difference
 from probe_kit.train import ProbeCurve
+from tests.support.inner_qualities import inner_of
 
 CurveOf = Callable[..., ProbeCurve]
 Outcomes = Callable[..., pd.DataFrame]
@@ -241,3 +254,276 @@ def test_action_tokens_take_the_place_of_an_expert_that_is_not_there(
     assert (found.published, found.value, found.interval) == (same.published, same.value, same.interval)
     with pytest.raises(UsageError, match="stream action has iterations 0 to 1"):
         measure_retention(curve_of(episodes, *PLAIN, action_stream="action"), 2)
+
+
+SUITE = "suite@1"
+
+
+@pytest.fixture
+def scored(curve_of: CurveOf, outcome_table: Outcomes) -> Callable[..., StreamScores]:
+    """Scores of a run on 60 items. others: whether on items of other names. seed: of who is right where."""
+
+    def make(
+        backbone: list[float], expert: list[list[float]], seed: int = 0, others: bool = False
+    ) -> StreamScores:
+        curve = curve_of(outcome_table(120, 0, 0, "shape" if others else "color"), backbone, expert)
+        mixed = np.random.default_rng(seed).permutation(60)
+        pairs = curve.decisions.reshape(len(curve.sites), 60, 2) * np.where(curve.labels, 1, -1).reshape(60, 2)
+        right = pairs[:, mixed].reshape(len(curve.sites), 120)
+        found = curve_scores(decided(curve, right * np.where(curve.labels, 1, -1)), seed_text=SUITE)
+        assert found is not None
+        return found
+
+    return make
+
+
+def decided(curve: ProbeCurve, decisions: np.ndarray) -> ProbeCurve:
+    """The curve with these decisions, in its inner folds too."""
+    right = (decisions > 0) == curve.labels
+    return replace(curve, decisions=decisions, inner=inner_of(right, curve.fold_of, curve.groups))
+
+
+def share(right: list[int], names: str = "g") -> Share:
+    """Groups of two episodes, of which so many are right."""
+    values = np.array([[hits > 0, hits > 1] for hits in right]).ravel()
+    return Share.of(values, [f"{names}{group:03}" for group in range(len(right)) for _ in range(2)])
+
+
+def as_pair(interval: Interval) -> tuple[float, float]:
+    return interval.low, interval.high
+
+
+# -- rates ---------------------------------------------------------------------------------------------------
+
+
+def test_twelve_groups_that_are_all_right_have_clopper_and_pearsons_limits() -> None:
+    rate = Rate.pooled([share([2] * 12)])
+    assert rate.value == 1
+    assert as_pair(rate.interval) == pytest.approx((0.735, 1), abs=5e-4)
+    assert as_pair(rate.interval) == pytest.approx(as_pair(_exact(12, 12)))
+
+
+def _exact(hits: int, trials: int) -> Interval:
+    found = stats.binomtest(hits, trials).proportion_ci(0.95, "exact")
+    return Interval(found.low, found.high)
+
+
+def test_runs_on_the_same_groups_are_pooled_group_by_group() -> None:
+    """Two runs that are right in opposite groups are right in half of every one: the sum varies less than they."""
+    one, other = share([2, 0] * 20), share([0, 2] * 20)
+    both = Rate.pooled([one, other])
+    assert (both.value, both.share is not None) == (0.5, True)
+    assert both.share is not None
+    assert both.share.variance == pytest.approx(0)
+    assert one.variance > 0
+    alike = Rate.pooled([one, one])
+    assert as_pair(alike.interval) == pytest.approx(as_pair(Rate.pooled([one]).interval)), "no news, no narrowing"
+
+
+def test_runs_on_other_groups_are_independent() -> None:
+    one, other = share([2, 0, 1, 2] * 10), share([2, 0, 1, 2] * 10, "h")
+    both = Rate.pooled([one, other])
+    assert both.share is None
+    width = np.diff(as_pair(one.interval()))[0]
+    assert np.diff(as_pair(both.interval))[0] == pytest.approx(width / sqrt(2))
+
+
+def test_the_mean_of_one_rate_is_that_rate() -> None:
+    one = Rate.pooled([share([2, 0, 1, 2] * 5)])
+    mean = Rate.mean([one])
+    assert (mean.value, *as_pair(mean.interval)) == pytest.approx((one.value, *as_pair(one.interval)))
+
+
+def test_a_run_minus_its_equal_is_nothing_and_leaves_room_for_groups_that_were_not_seen() -> None:
+    """Of 40 groups that all agree, 8 % that do not would not have been missed, and no more is allowed for."""
+    unseen = 1 - 0.025 ** (1 / 40)
+    for right in ([2, 0, 1, 2], [2, 0, 2, 0], [2, 2, 2, 2]):
+        one = Rate.pooled([share(right * 10)])
+        gap = one.minus(one)
+        assert gap.value == 0
+        assert gap.interval.low == pytest.approx(-gap.interval.high, abs=0.02)
+        assert 0.6 * unseen < gap.interval.high < 1.2 * unseen
+
+
+def test_one_run_minus_another_has_movers_limits() -> None:
+    one, other = Rate.pooled([share([2, 0, 1, 2] * 10)]), Rate.pooled([share([2, 1, 1, 1] * 10)])
+    assert one.paired_with(other)
+    assert one.share is not None
+    assert other.share is not None
+    rests = [part.sums - 2 * part.value for part in (one.share, other.share)]
+    rho = np.corrcoef(*rests)[0, 1]
+    (low, high), (below, above) = as_pair(one.interval), as_pair(other.interval)
+    a, b = one.value, other.value
+    wanted = (
+        a - b - sqrt((a - low) ** 2 + (above - b) ** 2 - 2 * rho * (a - low) * (above - b)),
+        a - b + sqrt((high - a) ** 2 + (b - below) ** 2 - 2 * rho * (high - a) * (b - below)),
+    )
+    assert as_pair(one.minus(other).interval) == pytest.approx(wanted)
+
+
+def test_rates_of_other_groups_are_not_paired_and_their_difference_is_wider() -> None:
+    one, same = Rate.pooled([share([2, 0, 1, 2] * 10)]), Rate.pooled([share([2, 0, 2, 2] * 10)])
+    other = Rate.pooled([share([2, 0, 2, 2] * 10, "h")])
+    assert not one.paired_with(other)
+    paired, apart = one.minus(same), one.minus(other)
+    assert paired.value == apart.value
+    assert np.diff(as_pair(paired.interval))[0] < 0.7 * np.diff(as_pair(apart.interval))[0]
+
+
+def test_a_mean_is_known_no_better_than_one_of_its_parts_allows() -> None:
+    """Two that are known exactly: the interval of the third is a third as wide in their mean."""
+    known, open_ = Rate(1.0, Interval(1.0, 1.0)), Rate(0.5, Interval(0.19, 0.81))
+    assert as_pair(Rate.mean([known, known, open_]).interval) == pytest.approx(
+        (2.5 / 3 - 0.31 / 3, 2.5 / 3 + 0.31 / 3)
+    )
+
+
+def test_groups_of_two_suites_are_not_the_same(outcome_table: Outcomes) -> None:
+    table = outcome_table(20, 10, 10)
+    one, other = (Rate.pooled([success_share(table, suite)]) for suite in ("a", "b"))
+    assert not one.paired_with(other)
+    assert one.paired_with(Rate.pooled([success_share(table, "a")]))
+
+
+# -- scores of one run ---------------------------------------------------------------------------------------
+
+
+def test_a_stream_whose_best_site_never_changes_is_scored_by_that_site(
+    scored: Callable[..., StreamScores],
+) -> None:
+    found = scored([0.5, 0.9], [[0.5, 0.75]])
+    assert found.names == ("action", "backbone")
+    assert (found.accuracy("backbone"), found.peak("backbone")) == (pytest.approx(0.9), pytest.approx(0.9))
+    low, high = limits(found.interval("backbone"))
+    assert low is not None
+    assert high is not None
+    V = found.scores.covariance[1, 1]
+    # Wilson's limits are the roots of (0.9 − x)² = t² · x (1 − x) / n.
+    cut = stats.t.ppf(0.975, found.fit.df) ** 2 / min(0.9 * 0.1 / V, 120)
+    wanted = sorted(np.roots([1 + cut, -(1.8 + cut), 0.81]).real)
+    assert (low, high) == pytest.approx(tuple(wanted))
+
+
+def test_the_best_of_sites_that_guess_scores_one_half_where_its_peak_does_not(
+    curve_of: CurveOf, outcome_table: Outcomes
+) -> None:
+    above, peaks = [], []
+    draw = np.random.default_rng(3)
+    for _ in range(30):
+        curve = curve_of(outcome_table(120, 0, 0), [0.5] * 20, [])
+        found = curve_scores(decided(curve, draw.normal(size=curve.decisions.shape)), seed_text=SUITE)
+        assert found is not None
+        above.append(found.accuracy("backbone") - 0.5)
+        peaks.append(found.peak("backbone"))
+    assert abs(np.mean(above)) < 0.02
+    assert np.mean(peaks) > 0.57
+
+
+def test_no_streams_have_no_scores(curve_of: CurveOf, outcome_table: Outcomes) -> None:
+    assert score_streams(curve_of(outcome_table(20, 0, 0), [0.9], []), {}, SUITE) is None
+
+
+def test_an_interval_without_limits_is_a_pair_of_nothing() -> None:
+    assert limits(Interval(float("-inf"), 3.0)) == (None, None)
+    assert limits(Interval(0.25, 0.5)) == (0.25, 0.5)
+
+
+# -- scores of several runs ----------------------------------------------------------------------------------
+
+
+def pooled(*runs: StreamScores) -> PooledScores:
+    found = PooledScores.of(runs)
+    assert found is not None
+    return found
+
+
+def test_one_run_pooled_is_that_run(scored: Callable[..., StreamScores]) -> None:
+    one = scored([0.5, 0.9], [[0.6, 0.75]])
+    found = pooled(one)
+    for name in one.names:
+        rate = found.accuracy(name)
+        assert (rate.value, *as_pair(rate.interval)) == (one.accuracy(name), *as_pair(one.interval(name)))
+    np.testing.assert_array_equal(found.scores.covariance, one.scores.covariance)
+    assert retention(found.scores) == retention(one.scores)
+
+
+def test_runs_on_the_same_groups_have_the_mean_score_and_share_their_groups(
+    scored: Callable[..., StreamScores],
+) -> None:
+    one, other = scored([0.5, 0.9], [[0.6, 0.75]]), scored([0.5, 0.7], [[0.7, 0.65]], seed=1)
+    found, alike = pooled(one, other), pooled(one, one)
+    assert found.fit is not None
+    for name in one.names:
+        assert found.accuracy(name).value == pytest.approx((one.accuracy(name) + other.accuracy(name)) / 2)
+    np.testing.assert_allclose(alike.scores.covariance, one.scores.covariance, err_msg="the same run is no news")
+    shares = (one.fit.influence + other.fit.influence) / 2
+    np.testing.assert_allclose(found.scores.covariance[0, 1], (shares @ shares.T * 60 / 59)[0, 1])
+
+
+def test_runs_on_other_groups_are_pooled_as_independent(scored: Callable[..., StreamScores]) -> None:
+    one, other = scored([0.5, 0.9], [[0.6, 0.75]]), scored([0.5, 0.9], [[0.6, 0.75]], others=True)
+    found = pooled(one, other)
+    assert found.fit is None
+    V = (one.scores.covariance + other.scores.covariance) / 4
+    np.testing.assert_allclose(found.scores.covariance, V)
+    rate = found.accuracy("backbone")
+    arms = np.array([np.abs(np.subtract(as_pair(run.interval("backbone")), 0.9)) for run in (one, other)])
+    below, above = np.sqrt((arms**2).sum(axis=0)) / 2
+    assert as_pair(rate.interval) == pytest.approx((0.9 - below, 0.9 + above))
+    assert (found.covariance_with(pooled(one)) == 0).all()
+
+
+def test_only_streams_that_all_runs_have_are_pooled(
+    scored: Callable[..., StreamScores], curve_of: CurveOf, outcome_table: Outcomes
+) -> None:
+    both = scored([0.5, 0.9], [[0.6, 0.75]])
+    bare = curve_scores(curve_of(outcome_table(120, 0, 0), [0.5, 0.7], []), seed_text=SUITE)
+    assert bare is not None
+    found = pooled(both, bare)
+    assert found.names == ("backbone",)
+    assert found.accuracy("backbone").value == pytest.approx(0.8, abs=1e-3)
+    assert PooledScores.of([]) is None
+
+
+def test_a_run_minus_its_equal_is_nothing_in_every_number_and_narrow(scored: Callable[..., StreamScores]) -> None:
+    """Of 60 groups that all agree, 6 % would not have been missed in which one run knows all and one nothing."""
+    one = pooled(scored([0.5, 0.85], [[0.6, 0.75]]))
+    most = (1 - 0.025 ** (1 / 60)) / 2
+    for name in one.names:
+        gap = one.accuracy_difference(one, name)
+        assert gap.value == 0
+        assert 0.7 * most < min(gap.interval.high, -gap.interval.low), name
+        own = one.accuracy(name).interval
+        assert gap.interval.high - gap.interval.low < 0.5 * (own.high - own.low), name
+    ratio, own = retention_difference(one.scores, one.scores, one.covariance_with(one)), retention(one.scores)
+    assert ratio.value == 0
+    assert 0.01 < ratio.interval.high < 0.35 * (own.interval.high - own.interval.low)
+    assert 0.01 < -ratio.interval.low < 0.35 * (own.interval.high - own.interval.low)
+
+
+def test_runs_on_the_same_groups_are_paired_and_others_are_not(scored: Callable[..., StreamScores]) -> None:
+    """Two runs that are right about the same items: their difference is known better than that of strangers."""
+    strong = pooled(scored([0.5, 0.85], [[0.6, 0.75]]))
+    same, other = pooled(scored([0.5, 0.8], [[0.6, 0.7]])), pooled(scored([0.5, 0.8], [[0.6, 0.7]], others=True))
+    for name in strong.names:
+        paired, apart = strong.accuracy_difference(same, name), strong.accuracy_difference(other, name)
+        assert strong.covariance_with(other)[0, 0] == 0
+        assert apart.interval.low < paired.value < apart.interval.high
+        a, b = strong.accuracy(name), other.accuracy(name)
+        low = a.value - b.value - sqrt((a.value - a.interval.low) ** 2 + (b.interval.high - b.value) ** 2)
+        assert apart.interval.low == pytest.approx(low), "MOVER without correlation"
+    V, joint = strong.covariance_with(same), strong.fit.influence @ same.fit.influence.T * 60 / 59  # type: ignore[union-attr]
+    assert (V[0, 1], V[1, 0]) == pytest.approx((joint[0, 1], joint[1, 0]))
+    assert (V.diagonal() <= joint.diagonal() + 1e-12).all()
+    assert (V.diagonal() > 0).all()
+
+
+def test_the_mean_of_one_category_is_the_category_and_of_two_alike_is_known_better(
+    scored: Callable[..., StreamScores],
+) -> None:
+    one = scored([0.5, 0.85], [[0.6, 0.75]]).scores
+    alone, two = Scores.mean([one]), Scores.mean([one, one])
+    assert retention(alone) == retention(one)
+    assert retention(two).value == pytest.approx(retention(one).value)
+    widths = [np.diff(as_pair(retention(found).interval))[0] for found in (two, one)]
+    assert widths[0] == pytest.approx(widths[1] / sqrt(2), rel=0.1)

@@ -1,13 +1,24 @@
-"""Figures that notebooks show although pyplot does not know them and no `%matplotlib` was said."""
+"""A figure that notebooks show although pyplot does not know it and no `%matplotlib` was said."""
 
+from io import BytesIO
 from typing import Any
 
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from probe_kit.retention.displays.base.display import Picture, picture_of
-
+Picture = tuple[bytes, dict[str, int]]
+"""A PNG, and the size in pixels at which a page shows it."""
 PRINT_DPI = 300
+_DPI = 160  # of the PNG in a notebook
+_PAGE_DPI = 90  # fewer than the picture has, so that it is sharp on fine screens
+
+
+def picture_of(figure: Figure) -> Picture:
+    """The figure as a notebook's front end takes it."""
+    file = BytesIO()
+    figure.savefig(file, format="png", dpi=_DPI)
+    width, height = figure.get_size_inches()
+    return file.getvalue(), {"width": round(width * _PAGE_DPI), "height": round(height * _PAGE_DPI)}
 
 
 class ShownFigure(Figure):

@@ -1,15 +1,20 @@
-"""The look that all figures share: colours, markers, axes without clutter, and the caption."""
+"""The look that all figures share: colours, markers, axes without clutter, legends, and the caption."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import ceil
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from probe_kit.retention.displays.base.provenance_line import ProvenanceLine
+from probe_kit._system.counting import counted
+from probe_kit._tables.numbers import span
+from probe_kit.retention.rows.row import RetentionRow
+from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.train.choices import CORRECT, EVERYWHERE
+from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -17,6 +22,93 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
     from numpy.typing import ArrayLike
+
+
+RANDOM = "RANDOM WEIGHTS"
+SHOWN = 12
+"""Hex digits of a hash that a caption shows."""
+
+
+@dataclass(frozen=True)
+class ProvenanceLine:
+    """The origin of the numbers of a figure.
+
+    weights: sha256 of the weights that acted, None for a scripted policy. suite: `name@version#hash`.
+    n: number of episodes, in words. settings: sha256 of the run's settings. probes: key of the probe results.
+    call: captured inference that was probed, None without probes.
+    """
+
+    model: str
+    random_weights: bool
+    weights: str | None
+    suite: str
+    n: str
+    settings: str
+    probes: str | None = None
+    target: str = CORRECT
+    call: int | None = None
+
+    @classmethod
+    def of_run(cls, run: RunReader) -> Self:
+        """Return the line of a run's behaviour."""
+        rule = run.rule
+        n = f"n = {counted(len(run.episodes), 'episode')}" + ("" if rule == "disc" else f" by the rule {rule}")
+        return cls(run.label, run.random_weights, run.weights_sha256, run.suite, n, run.settings_sha256)
+
+    @classmethod
+    def of_results(cls, results: ProbeResults, view: str, category: str | None = None) -> Self:
+        """Return the line of probes in one view: of all categories of a side, or of a label in one category."""
+        settings = results.settings
+        if category is None:
+            sizes = [curve.labels.size for (_, name), curve in results.curves.items() if name == view]
+            n = f"n = {span(sizes)} episodes per category, view {view}"
+        else:
+            curve = results.curves[category, view]
+            of = "" if category == EVERYWHERE else f", category {category}"
+            samples = f"{counted(curve.labels.size, 'sample')} in {counted(curve.n_groups, 'group')}"
+            n = f"n = {samples}, view {view}{of}"
+        return cls(
+            results.label if category is None else settings.model, settings.random_weights, settings.weights,
+            settings.suite, n, settings.run_settings, results.key, settings.target,
+            settings.call if category is None or settings.window == 1 else None,
+        )  # fmt: skip
+
+    @classmethod
+    def of_row(cls, row: RetentionRow) -> Self:
+        """Return the line of a row of the retention table, usually a mean."""
+        n = f"n = {counted(row.success.n_episodes, 'episode')}"
+        return cls(
+            row.run.label or row.run.model,
+            row.run.random_weights,
+            row.run.weights_sha256,
+            row.run.suite,
+            n,
+            row.run.settings,
+            row.run.probes,
+            call=row.run.call,
+        )
+
+    @property
+    def parts(self) -> tuple[str, str, str, str, str, str, str]:
+        """Return the parts of the line, most important first; random weights are named in capitals.
+
+        Model, suite, n, call, target, probes, weights; empty where there is nothing to say.
+        """
+        return (
+            f"{self.model} {RANDOM}" if self.random_weights else self.model,
+            self.suite,
+            self.n,
+            "" if self.call is None else f"call {self.call}",
+            f"target {self.target}" if self.target != CORRECT else "",
+            f"probes {self.probes}" if self.probes else "",
+            f"weights {self.weights[:SHOWN]}" if self.weights else "",
+        )
+
+    @property
+    def line(self) -> str:
+        """Everything in one line, for a caption."""
+        return " · ".join(filter(None, [*self.parts, f"settings {self.settings[:SHOWN]}"]))
+
 
 # Okabe and Ito's palette: apart for every kind of colour vision.
 BLUE, VERMILION, GREEN, ORANGE = "#0072B2", "#D55E00", "#009E73", "#E69F00"
@@ -92,7 +184,7 @@ def axes_for(ax: "Axes | None", width: float, height: float) -> "tuple[Axes, Fig
         return ax, None
     from matplotlib import pyplot as plt
 
-    from probe_kit.retention.displays.base.shown_figure import ShownFigure
+    from probe_kit.retention.displays.shown_figure import ShownFigure
 
     figure, axes = plt.subplots(FigureClass=ShownFigure, figsize=(width, height), layout="constrained", dpi=DPI)
     return axes, figure
@@ -102,7 +194,7 @@ def panels(
     count: int, width: float = 3.1, height: float = 2.5, columns: int | None = None, *, share: bool = True
 ) -> "tuple[Figure, list[Axes]]":
     """A figure of `count` panels of `width` × `height` inches, at most three or `columns` in a row."""
-    from probe_kit.retention.displays.base.shown_figure import ShownFigure
+    from probe_kit.retention.displays.shown_figure import ShownFigure
 
     across = columns or (2 if count == 4 else min(3, count))
     rows = ceil(count / across)

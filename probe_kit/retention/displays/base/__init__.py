@@ -1,1 +1,0 @@
-"""The parts that all figures share."""

@@ -1,0 +1,473 @@
+"""Stored interventions: where an answer passes and is read, attention, and how much of a direction turns."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import NoInterventionsError
+from probe_kit.hooks.contract.sites import KV_STREAM
+from probe_kit.intervene.kinds.attention import (
+    ACTION,
+    CORRECT,
+    OTHER,
+    AttentionShares,
+    Axis,
+    stored_attention,
+    stored_patch_attention,
+)
+from probe_kit.intervene.kinds.interchange import BACKBONE, PatchEffect, stored_site_effects, stored_steering
+from probe_kit.intervene.places import ALL, TILE_ROLES, PlaceName
+from probe_kit.retention.columns.text import title_of
+from probe_kit.retention.displays.display import Panelled, draw_series, in_panels, scores_of
+from probe_kit.retention.displays.report_figure import FigureSource, ReportFigure, in_report
+from probe_kit.retention.displays.style import GREY, ProvenanceLine, caption, layer_axis, panels, series
+from probe_kit.runs.reader import RunReader
+from probe_kit.runs.thumbnails import episode_frames
+from probe_kit.statistics.crossfit import CHANCE
+from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.train.results.probe_results import ProbeResults
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True)
+class Points:
+    """One line: percent by layer, and which points are significant, family-wise."""
+
+    layers: NDArray[np.int64]
+    percent: NDArray[np.float64]
+    significant: NDArray[np.bool_]
+
+
+@dataclass
+class SiteEffectDisplay(Panelled):
+    """Curves by backbone layer: held-out accuracy of probes, and the episodes that turn when tokens are exchanged.
+
+    readable: accuracy in percent. passes: by role, share of episodes in percent whose action turns to the side of
+    the swapped images, minus those that turn from it. read: the same for the keys and values that the acting
+    part reads of each block; None where it was not tested. Filled: significant, family-wise.
+    """
+
+    measure = "% of episodes"
+    category: str
+    readable: Points
+    passes: dict[str, Points]
+    read: Points | None
+    certificate: ProvenanceLine
+
+    @classmethod
+    def from_run(
+        cls,
+        run: RunReader,
+        results: ProbeResults,
+        category: str,
+        view: str = "mean",
+        stored: Mapping[str, Sequence[PatchEffect]] | None = None,
+    ) -> Self:
+        """Read the stored interchange and probes of a run. stored: what `shown_passing` returns.
+
+        Raises NoInterventionsError if none is stored of the category, UnknownCategoryError, UnknownSiteError.
+        """
+        rows = (shown_passing(run) if stored is None else stored).get(category, [])
+        if not rows:
+            raise NoInterventionsError(
+                f"{run.location} has no stored interchange of {category!r} in a layer of the backbone or of the "
+                f"keys and values. Run `probe-kit intervene {run.location} --kind interchange`"
+            )
+        scores = scores_of(results, category, view)
+        scores = scores[scores["stream"] == BACKBONE].sort_values("layer")
+        by_role: dict[str, list[PatchEffect]] = {}
+        for row in rows:
+            if _stream(row) == BACKBONE:
+                by_role.setdefault(row.role, []).append(row)
+        read = [row for row in rows if _stream(row) == KV_STREAM]
+        return cls(
+            category=category,
+            readable=Points(
+                scores["layer"].to_numpy(int), 100 * scores["accuracy"].to_numpy(float),
+                (scores["p_fwe"] < SIGNIFICANCE).to_numpy(bool),
+            ),
+            passes={role: _points(of_role) for role, of_role in by_role.items()},
+            read=_points(read) if read else None,
+            certificate=ProvenanceLine.of_results(results, view),
+        )  # fmt: skip
+
+    @property
+    def title(self) -> str:
+        """The category."""
+        return title_of(self.category)
+
+    def draw(self, axes: "Axes") -> None:
+        """A line for probes, one for every role, one for `kv`."""
+        axes.axhline(100 * CHANCE, color="0.45", lw=1, ls=(0, (1, 1)), label="chance of probes")
+        lines = {
+            "readable (probe)": self.readable,
+            **{f"passes: {role}": passing for role, passing in self.passes.items()},
+        }
+        if self.read is not None:
+            lines["read (keys and values)"] = self.read
+        for position, (label, points) in enumerate(lines.items()):
+            x = points.layers.astype(np.float64) + 0.05 * (position - 2)
+            draw_series(axes, series(position), x, points.percent, points.significant, label)
+        layer_axis(axes, int(self.readable.layers.max()) + 1)
+        axes.set_ylim(-12, 108)
+
+
+def shown_passing(run: RunReader) -> dict[str, list[PatchEffect]]:
+    """Return by category what a figure by layers shows: the backbone at every role, `kv` as a whole.
+
+    Categories of which nothing of the two is stored are not there. Raises RunDamagedError.
+    """
+    by_category = {
+        category: [
+            row
+            for row in rows
+            if PlaceName.parse(row.place).is_whole_layer
+            and (_stream(row) == BACKBONE or (_stream(row) == KV_STREAM and row.role == ALL))
+        ]
+        for category, rows in stored_site_effects(run).items()
+    }
+    return {category: rows for category, rows in by_category.items() if rows}
+
+
+def site_effect_curve(run: RunReader, results: ProbeResults, view: str = "mean") -> "Figure":
+    """A panel per category of which an interchange is stored. Raises NoInterventionsError if there is none."""
+    stored = shown_passing(run)
+    names = [name for name in results.settings.categories if name in stored] or ["any"]
+    return in_panels([SiteEffectDisplay.from_run(run, results, name, view, stored) for name in names])
+
+
+def _points(rows: Sequence[PatchEffect]) -> Points:
+    return Points(
+        np.array([PlaceName.parse(row.place).layer for row in rows], np.int64),
+        np.array([100 * row.net for row in rows]),
+        np.array([row.p_fwe is not None and row.p_fwe < SIGNIFICANCE for row in rows], bool),
+    )
+
+
+def _stream(row: PatchEffect) -> str:
+    return PlaceName.parse(row.place).stream
+
+
+@in_report(13)
+def site_effect_figures(source: FigureSource) -> Iterator[ReportFigure]:
+    """The figures that a report of these runs shows."""
+    for drawn in source.runs:
+        if drawn.results is None or not set(shown_passing(drawn.run)) & set(drawn.results.settings.categories):
+            continue
+        yield ReportFigure(
+            f"{drawn.stem}-causes", "Readable and used", "interventions",
+            "Where a probe reads the answer, and how many episodes turn to the other side when the tokens of one "
+            "layer are taken from the same inference with swapped images. A layer that is readable and "
+            "turns nothing is read by nothing behind it.",
+            drawn.position, partial(site_effect_curve, drawn.run, drawn.results, drawn.results.settings.views[0]),
+        )  # fmt: skip
+
+
+Percent = NDArray[np.float64]
+Picture = NDArray[np.uint8]
+Boxes = NDArray[np.float32]
+_LABELS = {CORRECT: "correct picture's tile", OTHER: "other picture's tile", ACTION: "its own tokens"}
+
+
+@dataclass
+class AttentionDisplay(Panelled):
+    """A curve by block of the backbone: the share of attention in percent that lies on one role's tokens.
+
+    blocks: (B,) those that are read. roles: names of R; of tiles by where the answer lies. mean: (R, B) over
+    iterations, heads and inferences. iterations: (R, B, I) over heads and inferences. heads: (R, B, H) over
+    iterations and inferences. Descriptive: attended tokens need not be used, and no verdict reads this.
+    """
+
+    measure = "% of attention (describes, no cause)"
+    category: str
+    blocks: NDArray[np.int64]
+    roles: tuple[str, ...]
+    mean: Percent
+    iterations: Percent
+    heads: Percent
+    certificate: ProvenanceLine
+
+    @classmethod
+    def from_run(cls, run: RunReader, category: str, stored: Mapping[str, AttentionShares] | None = None) -> Self:
+        """Read the newest attention that is stored of a category. stored: what `stored_attention` returns.
+
+        Raises NoInterventionsError if there is none.
+        """
+        recorded = (stored_attention(run) if stored is None else stored).get(category)
+        if recorded is None:
+            raise NoInterventionsError(
+                f"{run.location} has no stored attention of {category!r}. Run `probe-kit intervene {run.location} "
+                "--kind attention`"
+            )
+        left_out = {ALL, "special", *TILE_ROLES}
+        by_block = recorded.frame(("block",))
+        blocks = np.unique(by_block["block"].to_numpy(np.int64))
+        # A role that no token plays has no row, such as a tile outside the scene.
+        roles = tuple(role for role in dict.fromkeys(by_block["role"]) if role not in left_out)
+
+        def shares(*by: Axis) -> Percent:
+            frame = recorded.frame(("block", *by))
+            table = frame.pivot_table(index=["role", "block"], columns=list(by) or None, values="share")
+            return 100 * np.stack([table.loc[role].loc[blocks].to_numpy(float) for role in roles])
+
+        return cls(
+            category=category,
+            blocks=blocks,
+            roles=roles,
+            mean=shares()[..., 0],
+            iterations=shares("iteration"),
+            heads=shares("head"),
+            certificate=ProvenanceLine.of_run(run),
+        )
+
+    @property
+    def title(self) -> str:
+        """The category."""
+        return title_of(self.category)
+
+    def draw(self, axes: "Axes") -> None:
+        """A line for every role, with what iterations and heads there are around it."""
+        for position, role in enumerate(self.roles):
+            line, x = series(position), self.blocks + 0.06 * (position - len(self.roles) / 2)
+            reach = np.nanmin(self.iterations[position], axis=1), np.nanmax(self.iterations[position], axis=1)
+            axes.vlines(x, *reach, color=line.colour, lw=3, alpha=0.25)
+            axes.plot(
+                np.repeat(x, self.heads.shape[2]), self.heads[position].ravel(), ls="none", marker=".", ms=2.5,
+                color=line.colour, alpha=0.6,
+            )  # fmt: skip
+            axes.plot(
+                x, self.mean[position], color=line.colour, ls=line.dash, marker=line.marker, ms=5, mfc="white",
+                lw=1.4, label=_LABELS.get(role, role),
+            )  # fmt: skip
+        layer_axis(axes, int(self.blocks.max()) + 1, label=False)
+        axes.set_xlabel("block whose keys are read", fontsize=8.5)
+        axes.set_ylim(bottom=0)
+
+
+def attention_curve(run: RunReader) -> "Figure":
+    """A panel per category of which attention is stored. Raises NoInterventionsError if there is none."""
+    stored = stored_attention(run)
+    return in_panels([AttentionDisplay.from_run(run, category, stored) for category in stored or ["any"]])
+
+
+_HEAT = (1.0, 122 / 255, 0.0)
+"""The colour of the viewer's overlay."""
+_HEAVIEST = 0.8
+"""Opacity of the strongest patch, as in the viewer."""
+
+
+def attention_on_picture(run: RunReader, category: str | None = None) -> "Figure":
+    """An episode's first inference: the attention on each patch over the picture, of all blocks and of each.
+
+    Means over heads and iterations; the strongest patch of a panel has the full colour. category: by default the
+    first one with stored patches, of whose episodes the first one with a picture is drawn. Raises
+    NoInterventionsError where patches or pictures are not stored.
+    """
+    pictured = _first_pictured(run, category)
+    if pictured is None:
+        raise NoInterventionsError(
+            f"{run.location} has no attention on patches{f' of {category!r}' if category else ''}, or no picture "
+            f"to draw it on. Run `probe-kit intervene {run.location} --kind attention` on a run that stores "
+            "pictures, with a family that says which token sees which pixels"
+        )
+    return _draw_on_picture(pictured, ProvenanceLine.of_run(run))
+
+
+def _draw_on_picture(pictured: "_Pictured", certificate: ProvenanceLine) -> "Figure":
+    from matplotlib.collections import PatchCollection
+    from matplotlib.patches import Rectangle
+
+    episode, picture, on_frame, weights = pictured
+    read = [block for block in range(len(weights)) if not np.isnan(weights[block]).all()]
+    maps = {"all blocks": weights[read].mean(axis=0), **{f"block {block}": weights[block] for block in read}}
+    height, width = picture.shape[:2]
+    figure, grid = panels(len(maps), 1.5, 1.5 * height / width + 0.25, columns=min(5, len(maps)))
+    figure.set_figheight(figure.get_figheight() - 0.8)  # `panels` leaves room for a legend
+    # matplotlib's pixels begin half a pixel before their number.
+    boxes = on_frame * np.tile([width, height], 2) - 0.5
+    visible = ~np.isnan(boxes).any(axis=1)
+    for (title, values), axes in zip(maps.items(), grid, strict=True):
+        axes.imshow(picture, interpolation="nearest")
+        patches = [Rectangle((x, y), right - x, bottom - y) for x, y, right, bottom in boxes[visible]]
+        strength = _HEAVIEST * values[visible] / max(values.max(initial=0.0), 1e-9)
+        axes.add_collection(PatchCollection(patches, facecolors=[(*_HEAT, alpha) for alpha in strength], lw=0))
+        axes.set_title(f"{title}: {100 * values.sum():.0f} %", fontsize=8, loc="left")
+        axes.set_axis_off()
+    caption(figure, certificate)
+    figure.caption = f"episode {episode} · {figure.caption}"  # type: ignore[attr-defined]
+    return figure
+
+
+_Pictured = tuple[str, Picture, Boxes, Percent]
+"""An episode: its id, its picture, (P, 4) boxes of patches and (B, P) shares of the attention."""
+
+
+def _first_pictured(run: RunReader, category: str | None = None) -> _Pictured | None:
+    """The first episode with attention and a picture."""
+    stored = stored_patch_attention(run)
+    patches = stored.get(category) if category is not None else next(iter(stored.values()), None)
+    if patches is None:
+        return None
+    positions = {str(name): at for at, name in enumerate(run.episodes["episode_id"])}
+    for row in np.argsort(patches.calls, kind="stable"):
+        position, call = positions[str(patches.episodes[row])], int(patches.calls[row])
+        if (frames := episode_frames(run, position)) is not None:
+            # Interventions count inferences of an episode, and name frames of recordings by their number.
+            inference = int(np.flatnonzero(run.control_steps[position] == call)[0]) if run.recorded else call
+            picture = frames.decoded[inference if frames.kind == "inferences" else 0]
+            on_frame = patches.on_frame(frames.cameras)
+            return str(patches.episodes[row]), picture, on_frame.boxes, on_frame.weights[row].astype(np.float64)
+    return None
+
+
+@in_report(15, "sides", "labels")
+def attention_figures(source: FigureSource) -> Iterator[ReportFigure]:
+    """Yield the figures that a report of these runs shows, once per run."""
+    for drawn in {drawn.position: drawn for drawn in reversed(source.runs)}.values():
+        if (pictured := _first_pictured(drawn.run)) is not None:
+            yield ReportFigure(
+                f"{drawn.stem}-attention-picture", "Attention on the picture", "interventions",
+                "Where on the picture the acting stream's attention lies at one episode's first inference, by "
+                "block, with the share of all attention. The strongest patch has the full colour. Descriptive: an "
+                "attended patch need not be used, and no verdict reads this.",
+                drawn.position, partial(_draw_on_picture, pictured, ProvenanceLine.of_run(drawn.run)),
+            )  # fmt: skip
+        if stored_attention(drawn.run):
+            yield ReportFigure(
+                f"{drawn.stem}-attention", "Attention by layer", "interventions",
+                "How much of the attention that the acting stream pays lies on the pictures, the words and its "
+                "own tokens, by the block whose keys are read. Dots: single heads; bars: from the least to the "
+                "most of any iteration. Descriptive: attended tokens need not be used, and no verdict reads this.",
+                drawn.position, partial(attention_curve, drawn.run), is_detail=True,
+            )  # fmt: skip
+
+
+@dataclass
+class DoseResponseDisplay(Panelled):
+    """A curve by coefficient: the share of episodes that turn to the target side, minus those that turn from it.
+
+    coefficients: (K,) in half class-mean differences, ascending, 0 among them. net, net_left, net_right: (K,)
+    percent, of all episodes and of those that are pushed to either side, one of which may be saturated.
+    controls: (C, K) percent of random directions of the same norm, NaN at a coefficient at which none was played.
+    relative_change: (K,) how far tokens were moved, in their own norms; beyond two, an effect is little evidence.
+    significant: (K,) beyond the controls, family-wise.
+    """
+
+    measure = "% of episodes that turn"
+    category: str
+    position: str
+    coefficients: NDArray[np.float64]
+    net: Percent
+    net_left: Percent
+    net_right: Percent
+    controls: Percent
+    relative_change: NDArray[np.float64]
+    significant: NDArray[np.bool_]
+    certificate: ProvenanceLine
+
+    @classmethod
+    def from_run(
+        cls,
+        run: RunReader,
+        category: str,
+        position: str | None = None,
+        stored: Mapping[str, Mapping[str, Sequence[PatchEffect]]] | None = None,
+    ) -> Self:
+        """Read the steering that is stored of a category. position: one of several, as `backbone.02 image`.
+
+        stored: what `stored_steering` returns. Raises NoInterventionsError if there is none.
+        """
+        by_position = (stored_steering(run) if stored is None else stored).get(category, {})
+        if not by_position or (position is not None and position not in by_position):
+            alternatives = f"; it has it at {', '.join(by_position)}" if by_position else ""
+            raise NoInterventionsError(
+                f"{run.location} has no stored steering of {category!r}"
+                f"{f' at {position}' if position else ''}{alternatives}. "
+                f"Run `probe-kit intervene {run.location} --kind steer --sites backbone.NN --roles image`"
+            )
+        position = position or next(iter(by_position))
+        rows = by_position[position]
+        steered = sorted((row for row in rows if not row.is_control), key=lambda row: float(row.coefficient))
+        coefficients = np.array([float(row.coefficient) for row in steered])
+        names = dict.fromkeys(row.direction for row in rows if row.is_control)
+        nets = {(row.direction, float(row.coefficient)): 100 * row.net for row in rows}
+        return cls(
+            category=category,
+            position=position,
+            coefficients=coefficients,
+            net=np.array([100 * row.net for row in steered]),
+            net_left=np.array([100 * row.net_left for row in steered]),
+            net_right=np.array([100 * row.net_right for row in steered]),
+            controls=np.array(
+                [[nets.get((name, coefficient), np.nan) for coefficient in coefficients] for name in names]
+            ).reshape(len(names), len(coefficients)),
+            relative_change=np.array([row.relative_change for row in steered]),
+            significant=np.array([row.p_fwe is not None and row.p_fwe < SIGNIFICANCE for row in steered]),
+            certificate=ProvenanceLine.of_run(run),
+        )
+
+    @property
+    def title(self) -> str:
+        """The category, and where."""
+        return "\n".join([title_of(self.category), *self.position.split(", ")])
+
+    def draw(self, axes: "Axes") -> None:
+        """A line for all episodes and one for either side, over the band of the controls."""
+        axes.axhline(0, color="0.45", lw=1, ls=(0, (1, 1)))
+        if self.controls.size:
+            # Nothing was added at coefficient 0, by a control either.
+            played = np.where(self.coefficients == 0, 0.0, self.controls)
+            axes.fill_between(
+                self.coefficients, played.min(axis=0), played.max(axis=0), color=GREY, alpha=0.35, lw=0,
+                label="random directions of the same norm",
+            )  # fmt: skip
+        lines = {
+            "all episodes": self.net,
+            "pushed to the left": self.net_left,
+            "pushed to the right": self.net_right,
+        }
+        for position, (label, percent) in enumerate(lines.items()):
+            filled = self.significant if position == 0 else np.zeros(self.coefficients.size, bool)
+            draw_series(axes, series(position), self.coefficients, percent, filled, label, 3.0 - 0.1 * position)
+        ticks = zip(self.coefficients, self.relative_change, strict=True)
+        axes.set_xticks(self.coefficients, [f"{coefficient:g}\n{_share(ratio)}" for coefficient, ratio in ticks])
+        axes.set_ylim(-108, 108)
+        axes.set_xlabel("half class-mean differences\n%: of the tokens' own norm", fontsize=7.5)
+
+
+def _share(ratio: float) -> str:
+    """Return a ratio in percent with one or two digits that count, however small it is."""
+    if 0 < ratio < 0.001:
+        return "<0.1 %"
+    return f"{100 * ratio:.2g} %" if ratio < 1 else f"{100 * ratio:.0f} %"
+
+
+def dose_response(run: RunReader) -> "Figure":
+    """A panel per category and place that was steered. Raises NoInterventionsError if none is stored."""
+    stored = stored_steering(run)
+    pairs: list[tuple[str, str | None]] = [
+        (category, position) for category, by_position in stored.items() for position in by_position
+    ]
+    displays = [DoseResponseDisplay.from_run(run, *pair, stored) for pair in pairs or [("any", None)]]
+    return in_panels(displays, height=2.7, share=False)
+
+
+@in_report(14)
+def dose_figures(source: FigureSource) -> Iterator[ReportFigure]:
+    """The figures that a report of these runs shows."""
+    for drawn in source.runs:
+        if stored_steering(drawn.run):
+            yield ReportFigure(
+                f"{drawn.stem}-doses", "How much of a direction turns the action", "interventions",
+                "Episodes that turn to the side they are pushed to, minus those that turn from it, by how much of "
+                "the direction is added; filled: beyond random directions of the same norm (the band). One side "
+                "may be saturated, and beyond about two norms of the tokens any direction breaks the hand.",
+                drawn.position, partial(dose_response, drawn.run),
+            )  # fmt: skip

@@ -1,0 +1,256 @@
+"""The figures of reports and `--figures`: each with how to read it, and all that fit a table."""
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from importlib import import_module
+from inspect import isfunction
+from pathlib import Path
+from pkgutil import iter_modules
+from typing import TYPE_CHECKING, Any, Literal
+
+from probe_kit.errors import UsageError
+from probe_kit.retention.columns.text import model_name
+from probe_kit.retention.displays.style import SIGNAL
+from probe_kit.retention.rows.outcome_rules import can_be_judged, under_rule
+from probe_kit.retention.table import RetentionTable
+from probe_kit.runs.reader import RunReader
+from probe_kit.train.choices import EVERYWHERE
+from probe_kit.train.results.probe_curve import ProbeCurve
+from probe_kit.train.results.probe_results import ProbeResults
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+ONLY_FILLED = f"Only filled markers are evidence: {SIGNAL}"
+DOTS = f"Dots mark evidence: {SIGNAL}"
+
+
+@dataclass(frozen=True)
+class DrawnRun:
+    """A run of a table, of labels each with one. stem: beginning of its files' names. name: in legends.
+
+    position: among the runs. results: its probes, None without any.
+    """
+
+    run: RunReader
+    stem: str
+    name: str
+    position: int
+    results: ProbeResults | None
+
+    def judged(self, table: RetentionTable) -> RunReader | None:
+        """The run with its outcomes by the table's rule; None where it cannot be judged by that."""
+        if not can_be_judged(self.run, table.rule, table.last_steps):
+            return None
+        return under_rule(self.run, table.rule, table.last_steps)
+
+
+@dataclass(frozen=True)
+class FigureSource:
+    """The table and the runs that figures of a report are made of."""
+
+    table: RetentionTable
+    runs: tuple[DrawnRun, ...]
+
+
+@dataclass(frozen=True)
+class ReportFigure:
+    """A figure that can be drawn.
+
+    name: file stem. subject: which numbers it shows, such as `behaviour` or `probes`. run: its position among the
+    runs, None if it shows all of them. reading: how to read it, in plain language. is_table: its numbers are a
+    table that is printed as such elsewhere. is_detail: the main figures can be read without it.
+    """
+
+    name: str
+    title: str
+    subject: str
+    reading: str
+    run: int | None
+    draw: "Callable[[], Figure]"
+    is_table: bool = False
+    is_detail: bool = False
+
+    @contextmanager
+    def drawn(self) -> "Iterator[Figure]":
+        """The figure, closed again afterwards, so that pyplot keeps none of many."""
+        from matplotlib import pyplot as plt
+
+        figure = self.draw()
+        try:
+            yield figure
+        finally:
+            plt.close(figure)
+
+
+Maker = Callable[[FigureSource], Iterator[ReportFigure]]
+
+
+def in_report(rank: int, *targets: Literal["sides", "labels"]) -> Callable[[Maker], Maker]:
+    """Mark a function that yields figures of reports and `--figures`. rank: in their order.
+
+    targets: the tables that it draws, those of sides by default.
+    """
+
+    def mark(make: Maker) -> Maker:
+        vars(make).update(rank=rank, targets=targets or ("sides",))
+        return make
+
+    return mark
+
+
+def figure_of(read: Callable[..., Any], *arguments: Any) -> "Figure":
+    """The figure of a display that draws on axes of its own. read: makes it of the arguments."""
+    from matplotlib.figure import Figure
+
+    figure = read(*arguments).plot().ax_.figure
+    assert isinstance(figure, Figure)
+    return figure
+
+
+def in_view(title: str, view: str, views: Sequence[str]) -> str:
+    """The title, which names the view where there are several."""
+    return f"{title}, view {view}" if len(views) > 1 else title
+
+
+def view_suffix(view: str, views: Sequence[str]) -> str:
+    """Return the end of a file's name; the first view needs none."""
+    return "" if view == views[0] else f"-{view.replace(':', '-')}"
+
+
+# -- labels ------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class LabelView:
+    """One label of one run in one category and view, for a figure. name: of the view."""
+
+    drawn: DrawnRun
+    results: ProbeResults
+    category: str
+    name: str
+
+    @property
+    def curve(self) -> ProbeCurve:
+        """Its probes."""
+        return self.results.curves[self.category, self.name]
+
+    def figure(
+        self, name: str, title: str, reading: str, draw: "Callable[..., Figure]", *more: Any
+    ) -> ReportFigure:
+        """Return a figure of it for a report; those of other views than the first are details.
+
+        name: of the figure in file names. title: without the view. reading: how to read it, in plain language.
+        draw: makes it of results, view and category, or of results, view and `more`.
+        """
+        views = self.results.settings.views
+        of_category = "" if self.category == EVERYWHERE else f"-{file_names([self.category])[0]}"
+        return ReportFigure(
+            f"{self.drawn.stem}{of_category}-{name}{view_suffix(self.name, views)}",
+            in_view(title, self.name, views), self.results.settings.target, reading, self.drawn.position,
+            partial(draw, self.results, self.name, *(more or [self.category])), is_detail=self.name != views[0],
+        )  # fmt: skip
+
+
+def label_views(source: FigureSource) -> Iterator[LabelView]:
+    """Yield the categories and views of the rows of a table of labels, label by label and run by run."""
+    for drawn in source.runs:
+        for row in source.table.rows:
+            results = drawn.results
+            if results and (row.target, row.run.location) == (results.settings.target, str(drawn.run.location)):
+                yield LabelView(drawn, results, row.category, row.view or "")
+
+
+def file_names(targets: Sequence[str]) -> list[str]:
+    """Return label columns as parts of file names, no two alike."""
+    names: list[str] = []
+    for target in targets:
+        name = re.sub(r"[^\w.-]+", "-", target).strip(".-") or "label"
+        tries = (name, *(f"{name}-{number}" for number in range(2, len(targets) + 1)))
+        used = {other.casefold() for other in names}
+        names.append(next(free for free in tries if free.casefold() not in used))
+    return names
+
+
+SUFFIXES = (".png", ".pdf")
+
+
+def collect_figures(runs: Sequence[RunReader], table: RetentionTable) -> list[ReportFigure]:
+    """Return every figure that the runs and their table allow, those of all runs first. Nothing is drawn yet.
+
+    Of labels one after the other; `subject` is the label. Raises UsageError for a run that the table was not made
+    of.
+    """
+    called = {row.run.location: model_name(row) for row in table.rows}
+    if strangers := [str(run.location) for run in runs if str(run.location) not in called]:
+        raise UsageError(f"the table has no rows of {', '.join(strangers)}; make it of the runs that are drawn")
+    stems = run_names(runs)
+    if table.is_of_sides:
+        probes = [
+            (at, stem, table.results_of(run.location))
+            for at, (run, stem) in enumerate(zip(runs, stems, strict=True))
+        ]
+    else:
+        labels = dict(zip(table.targets, file_names(table.targets), strict=True))
+        probes = [
+            (at, f"{stem}-{label}", table.results[str(run.location), target])
+            for target, label in labels.items()
+            for at, (run, stem) in enumerate(zip(runs, stems, strict=True))
+        ]
+    drawn = tuple(
+        DrawnRun(runs[at], stem, called[str(runs[at].location)], at, results) for at, stem, results in probes
+    )
+    source = FigureSource(table, drawn)
+    figures = [figure for make in _makers(table.is_of_sides) for figure in make(source)]
+    order = {target: at for at, target in enumerate(table.targets)}
+    return sorted(
+        figures, key=lambda figure: (order.get(figure.subject, 0), -1 if figure.run is None else figure.run)
+    )
+
+
+def _makers(of_sides: bool) -> list[Maker]:
+    """Return the functions of this folder that `in_report` marks, in their order."""
+    target = "sides" if of_sides else "labels"
+    makers: dict[Maker, int] = {}
+    for file in iter_modules(import_module(__package__).__path__):
+        functions = filter(isfunction, vars(import_module(f"{__package__}.{file.name}")).values())
+        makers |= {make: vars(make)["rank"] for make in functions if target in vars(make).get("targets", ())}
+    return sorted(makers, key=makers.__getitem__)
+
+
+def save_figures(exhibits: Sequence[ReportFigure], folder: Path) -> Iterator[Path]:
+    """Draw exhibits into `folder` as PNG and PDF, one after the other; gives the path of every PNG."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for exhibit in exhibits:
+        path = folder / f"{exhibit.name}{SUFFIXES[0]}"
+        with exhibit.drawn() as figure:
+            for suffix in SUFFIXES:
+                figure.savefig(path.with_suffix(suffix), metadata=_metadata(suffix, exhibit, caption_of(figure)))
+        yield path
+
+
+def caption_of(figure: "Figure") -> str:
+    """Return the whole line under a figure; its footer holds the beginning."""
+    return str(getattr(figure, "caption", ""))
+
+
+def _metadata(suffix: str, exhibit: ReportFigure, caption: str) -> dict[str, str | None]:
+    """The caption goes with the file, in what readers of its format show of it."""
+    if suffix == ".pdf":
+        # Without its date a figure of the same numbers has the same bytes.
+        return {"Title": exhibit.title, "Subject": f"{caption}. {exhibit.reading}", "CreationDate": None}
+    return {"Title": exhibit.title, "Description": f"{caption}. {exhibit.reading}"}
+
+
+def run_names(runs: Sequence[RunReader]) -> list[str]:
+    """Names of the runs; a name that comes again is numbered."""
+    names: list[str] = []
+    for run in runs:
+        name = run.location.name
+        count = sum(other == name or other.startswith(f"{name}-") for other in names)
+        names.append(f"{name}-{count + 1}" if name in names else name)
+    return names
