@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from probe_kit.errors import SuiteNotFoundError, UsageError
 from probe_kit.hashing import derive_seed
@@ -29,8 +28,8 @@ from probe_kit.train.results.control_scores import (
     ControlScore,
     UntrainedScore,
 )
-from probe_kit.train.results.probe_curve import ProbeCurve
-from probe_kit.train.results.probe_results import ProbeResults, ProbeSettings
+from probe_kit.train.results.probe_curve import Matrix, ProbeCurve
+from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.train.run_suite import suite_of
 from probe_kit.train.samples import Samples
 from probe_kit.train.target_samples import TargetSamples
@@ -89,20 +88,18 @@ def prepare_controls(
             if names is not None:
                 raise
             lost = [name for name in missing if name in PICTURED]
-            _warn_of_no_control(lost, error, is_side)
+            subject = f"control {lost[0]} is" if len(lost) == 1 else f"controls {' and '.join(lost)} are"
+            judged = (
+                ", so that a signal is judged against chance only" if is_side and RANDOM_FEATURES in lost else ""
+            )
+            warnings.warn(
+                f"the {subject} on by default and NOT run{judged}: {error}; or say that you want none (--controls "
+                "none, controls=())",
+                stacklevel=3,
+            )
             left_out |= dict.fromkeys(lost, "the pictures of the suite were not found")
             missing = [name for name in missing if name not in PICTURED]
     return PreparedControls(tuple(missing), ControlInputs(run, samples, is_side, suite), left_out)
-
-
-def _warn_of_no_control(lost: Sequence[str], reason: SuiteNotFoundError, is_side: bool) -> None:
-    names = f"control {lost[0]} is" if len(lost) == 1 else f"controls {' and '.join(lost)} are"
-    judged = ", so that a signal is judged against chance only" if is_side and RANDOM_FEATURES in lost else ""
-    warnings.warn(
-        f"the {names} on by default and NOT run{judged}: {reason}; or say that you want none (--controls none, "
-        "controls=())",
-        stacklevel=4,
-    )
 
 
 def add_controls(
@@ -122,23 +119,32 @@ def add_controls(
         for category, problem in problems.items():
             if features is None:
                 references = {
-                    stream: problem.curve(_by_site(_layer_probes(prepared.inputs, problem, width, seed)))
+                    stream: _controlled(problem, _layer_probes(prepared.inputs, problem, width, seed))
                     for stream, width in widths.items()
                 }
-                scores = _layer_scores(category, references, problem.is_side)
+                # Of a side one score, as wide as the backbone.
+                scored = references
+                if problem.is_side:
+                    scored = {"": references.get("backbone", next(iter(references.values())))}
             else:
-                reference = problem.curve(_by_site([problem.probe(features)]))
-                references = dict.fromkeys(widths, reference)
-                scores = [control_score(name, category, reference)]
-            compared = name == RANDOM_FEATURES or not problem.is_side
-            comparisons = list(_compared(results, name, category, references)) if compared else []
-            controls = controls.with_scores(scores, comparisons)
+                reference = _controlled(problem, [problem.probe(features)])
+                references, scored = dict.fromkeys(widths, reference), {"": reference}
+            scores = [control_score(name, category, curve, stream) for stream, curve in scored.items()]
+            compared: list[ControlComparison] = []
+            if name == RANDOM_FEATURES or not problem.is_side:
+                compared = [
+                    comparison
+                    for (curve_category, view), curve in results.curves.items()
+                    for stream in (curve.streams if curve_category == category else ())
+                    for comparison in _compared(results, name, (category, view), stream, references[stream].scores)
+                ]
+            controls = controls.with_scores(scores, compared)
     return replace(results, controls=controls)
 
 
-def _by_site(probes: Sequence[SiteProbe]) -> dict[Site, SiteProbe]:
-    """Probes of controls by sites that stand for none."""
-    return {Site("control", number): probe for number, probe in enumerate(probes)}
+def _controlled(problem: Problem, probes: Sequence[SiteProbe]) -> ProbeCurve:
+    """Return the curve of the probes of a control, of sites that stand for none."""
+    return problem.curve({Site("control", number): probe for number, probe in enumerate(probes)})
 
 
 def _layer_probes(inputs: ControlInputs, problem: Problem, width: int, seed: int) -> list[SiteProbe]:
@@ -147,14 +153,6 @@ def _layer_probes(inputs: ControlInputs, problem: Problem, width: int, seed: int
     kind = "binding" if problem.is_side else "label random features"
     layers = (inputs.layer(problem.positions, width, derive_seed(kind, seed, number)) for number in range(LAYERS))
     return [problem.fit(Samples.pooled(layer)) for layer in layers]
-
-
-def _layer_scores(category: str, references: Mapping[str, ProbeCurve], is_side: bool) -> list[ControlScore]:
-    """One score as wide as the backbone for a side, else one for every stream."""
-    if is_side:
-        widest = references.get("backbone", next(iter(references.values())))
-        return [control_score(RANDOM_FEATURES, category, widest)]
-    return [control_score(RANDOM_FEATURES, category, curve, stream) for stream, curve in references.items()]
 
 
 def control_score(name: str, category: str, curve: ProbeCurve, stream: str = "", view: str = "") -> ControlScore:
@@ -180,36 +178,25 @@ def control_score(name: str, category: str, curve: ProbeCurve, stream: str = "",
 
 
 def _compared(
-    results: ProbeResults, name: str, category: str, references: Mapping[str, ProbeCurve]
+    results: ProbeResults, name: str, key: tuple[str, str], stream: str, references: Matrix
 ) -> Iterator[ControlComparison]:
-    for (curve_category, view), curve in results.curves.items():
-        for stream in curve.streams if curve_category == category else ():
-            rows, reference = curve.stream(stream), references[stream].scores.mean(axis=0)
-            seed = comparison_seed(results.settings, name, category, view, stream)
-            p = better_than_reference(curve.scores[rows], reference, curve.groups, seed, curve.widening)
-            yield from comparisons(name, category, view, curve, rows, float(reference.mean()), p)
-
-
-def comparison_seed(settings: ProbeSettings, name: str, category: str, view: str, stream: str) -> int:
-    """Return the seed of the resamples that compare a stream in a category and view with a control."""
+    """Yield every site of a stream against the mean of (S', E) scores of a control, or the best untrained site."""
+    curve, settings = results.curves[key], results.settings
+    rows = curve.stream(stream)
     if settings.is_side:
-        return derive_seed(_SIDE_SEEDS[name], settings.seed, category, view, stream)
-    parts = (view, stream) if settings.categories == (EVERYWHERE,) else (category, view, stream)
-    return derive_seed("label control", settings.seed, name, *parts)
-
-
-def comparisons(
-    name: str,
-    category: str,
-    view: str,
-    curve: ProbeCurve,
-    rows: NDArray[np.intp],
-    reference: float,
-    p: NDArray[np.float64],
-) -> Iterator[ControlComparison]:
-    """Yield the comparison of every site at `rows` with a control, from (len(rows),) p."""
+        seed = derive_seed(_SIDE_SEEDS[name], settings.seed, *key, stream)
+    else:
+        scope = key[1:] if settings.categories == (EVERYWHERE,) else key
+        seed = derive_seed("label control", settings.seed, name, *scope, stream)
+    if name == UNTRAINED:
+        level = float(references.mean(axis=1).max())
+        p = better_than_best(curve.scores[rows], references, curve.groups, seed, curve.widening)
+    else:
+        reference = references.mean(axis=0)
+        level = float(reference.mean())
+        p = better_than_reference(curve.scores[rows], reference, curve.groups, seed, curve.widening)
     for row, of_site in zip(rows, p, strict=True):
-        yield ControlComparison(name, category, view, str(curve.sites[row]), reference, float(of_site))
+        yield ControlComparison(name, *key, str(curve.sites[row]), level, float(of_site))
 
 
 _SHOWN = (DATASET, "suite", "scene", "seed")
@@ -227,7 +214,11 @@ def check_same_source(run: RunReader, untrained: RunReader, samples: TargetSampl
         )
     if is_side:
         return
-    _check_settings(run, untrained)
+    if differing := [name for name in _SHOWN if _identity(run, name) != _identity(untrained, name)]:
+        raise UsageError(
+            f"the untrained control {untrained.location} has another {differing[0]} than {run.location}; expected "
+            "the same frames. Extract both by the same command, one with --random-weights"
+        )
     names = run.episodes["episode_id"].to_numpy(str)[samples.rows]
     missing = names[~np.isin(names, untrained.episodes["episode_id"].to_numpy(str))]
     if missing.size:
@@ -271,8 +262,22 @@ def check_untrained(
             f"{untrained.location} is a copy of {run.location}, which cannot be its own untrained control; "
             "give a run of other weights"
         )
-    if not is_side:
-        _check_frames(run, untrained, samples, untrained_samples)
+    if run.recorded and not is_side:
+        frames, other_frames = (
+            reader.control_steps[reader_samples.rows, reader_samples.inferences]
+            for reader, reader_samples in ((run, samples), (untrained, untrained_samples))
+        )
+        if (frames != other_frames).any():
+            raise UsageError(
+                f"the untrained control {untrained.location} shows other frames than {run.location}. Extract both "
+                "with the same --select"
+            )
+    elif not is_side and samples.inferences.any():
+        raise UsageError(
+            f"an untrained control of labels after the first inference: the network of {untrained.location} acted "
+            "otherwise, so it saw other frames. Expected labels of whole episodes at --call 0, --window 1, or "
+            "recordings"
+        )
 
 
 def _identities(run: RunReader, samples: TargetSamples) -> list[tuple[str, str, int, float]]:
@@ -284,38 +289,9 @@ def _identities(run: RunReader, samples: TargetSamples) -> list[tuple[str, str, 
     return list(zip(names, texts, samples.inferences.tolist(), samples.values.tolist(), strict=True))
 
 
-def _check_settings(run: RunReader, untrained: RunReader) -> None:
-    if differing := [name for name in _SHOWN if _identity(run, name) != _identity(untrained, name)]:
-        raise UsageError(
-            f"the untrained control {untrained.location} has another {differing[0]} than {run.location}; expected "
-            "the same frames. Extract both by the same command, one with --random-weights"
-        )
-
-
 def _identity(run: RunReader, name: str) -> Any:
     value = run.settings.get(name)
     return value.get("identity", value) if isinstance(value, dict) else value
-
-
-def _check_frames(
-    run: RunReader, untrained: RunReader, samples: TargetSamples, untrained_samples: TargetSamples
-) -> None:
-    if run.recorded:
-        frames, other_frames = (
-            reader.control_steps[reader_samples.rows, reader_samples.inferences]
-            for reader, reader_samples in ((run, samples), (untrained, untrained_samples))
-        )
-        if (frames != other_frames).any():
-            raise UsageError(
-                f"the untrained control {untrained.location} shows other frames than {run.location}. Extract both "
-                "with the same --select"
-            )
-    elif samples.inferences.any():
-        raise UsageError(
-            f"an untrained control of labels after the first inference: the network of {untrained.location} acted "
-            "otherwise, so it saw other frames. Expected labels of whole episodes at --call 0, --window 1, or "
-            "recordings"
-        )
 
 
 def add_untrained(results: ProbeResults, untrained: ProbeResults) -> ProbeResults:
@@ -328,7 +304,11 @@ def add_untrained(results: ProbeResults, untrained: ProbeResults) -> ProbeResult
     compared: list[ControlComparison] = []
     for key, curve in results.curves.items():
         other = untrained.curves[key]
-        _check_samples(key[0], curve, other, untrained.label)
+        if other.episodes.tolist() != curve.episodes.tolist() or (other.labels != curve.labels).any():
+            raise UsageError(
+                f"category {key[0]!r}: the untrained control {untrained.label!r} has {other.labels.size} "
+                f"episodes, this run {curve.labels.size}, and they are not the same. Extract both from the same suite."
+            )
         if curve.is_side:
             gains += _gains(key, curve, other, untrained)
         for stream in curve.streams:
@@ -338,36 +318,11 @@ def add_untrained(results: ProbeResults, untrained: ProbeResults) -> ProbeResult
                     "expected all streams of the run. Extract both by the same command"
                 )
             if not curve.is_side:
-                best = replace(other, **_only(other, other.best(stream)))
+                best = other.only(other.best(stream))
                 scores.append(replace(control_score(UNTRAINED, key[0], best, stream, key[1]), chance=None, p=None))
-            compared += _compared_with_best(results, key, stream, other.scores[other_rows])
+            compared += _compared(results, UNTRAINED, key, stream, other.scores[other_rows])
     controls = results.controls.with_untrained(gains).with_scores(scores, compared)
     return replace(results, controls=controls)
-
-
-def _only(curve: ProbeCurve, row: int) -> dict[str, Any]:
-    """The members of a curve with a single one of its sites."""
-    members = ("decisions", "strengths", "null", "inner", "sample_scores")
-    arrays = {name: getattr(curve, name)[[row]] for name in members if getattr(curve, name) is not None}
-    return {"sites": (curve.sites[row],), "parts": (curve.parts[row],), **arrays}
-
-
-def _check_samples(category: str, curve: ProbeCurve, other: ProbeCurve, name: str) -> None:
-    if other.episodes.tolist() != curve.episodes.tolist() or (other.labels != curve.labels).any():
-        raise UsageError(
-            f"category {category!r}: the untrained control {name!r} has {other.labels.size} "
-            f"episodes, this run {curve.labels.size}, and they are not the same. Extract both from the same suite."
-        )
-
-
-def _compared_with_best(
-    results: ProbeResults, key: tuple[str, str], stream: str, other_scores: NDArray[np.float64]
-) -> Iterator[ControlComparison]:
-    """Yield every site of a stream against the best of the untrained network's."""
-    curve = results.curves[key]
-    rows, seed = curve.stream(stream), comparison_seed(results.settings, UNTRAINED, *key, stream)
-    p = better_than_best(curve.scores[rows], other_scores, curve.groups, seed, curve.widening)
-    yield from comparisons(UNTRAINED, *key, curve, rows, float(other_scores.mean(axis=1).max()), p)
 
 
 def _gains(

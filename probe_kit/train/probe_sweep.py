@@ -41,35 +41,26 @@ Problems = Mapping[str, Problem]
 Probed = dict[str, SiteProbe]
 
 
-@dataclass(frozen=True)
-class ExecutionSettings:
-    """The workers that probe, which change no number.
+def probe_columns(
+    columns: Columns,
+    problems: Problems,
+    jobs: int | None = None,
+    device: str | None = None,
+    ray: str | None = None,
+) -> Iterator[tuple[Key, Probed]]:
+    """The probes of every column by category, as they are done; who probes them changes no number.
 
     jobs: columns at once, 1 by default. device: where torch solves them; numpy does without one. ray: address of
     a cluster that solves them, `auto` for the one this process belongs to or a new one on this machine; `jobs` is
-    then by default as many as it has cores.
+    then by default as many as it has cores. Raises MissingExtraError if Ray is asked for and not installed,
+    WorkerDiedError if workers die with the same column or before they begin, and what a worker raises.
     """
-
-    jobs: int | None = None
-    device: str | None = None
-    ray: str | None = None
-
-
-def probe_columns(
-    columns: Columns, problems: Problems, settings: ExecutionSettings
-) -> Iterator[tuple[Key, Probed]]:
-    """The probes of every column by category, as they are done.
-
-    Raises MissingExtraError if Ray is asked for and not installed, WorkerDiedError if workers die with the same
-    column or before they begin, and what a worker raises.
-    """
-    jobs = settings.jobs or 1
-    if settings.ray is None and jobs == 1:
+    if ray is None and (jobs or 1) == 1:
         for key, samples in columns:
-            yield key, _probe(samples, problems, settings.device)
+            yield key, _probe(samples, problems, device)
         return
-    pool = ProcessPool(fit_columns, problems, jobs) if settings.ray is None else RayPool(
-        fit_columns, problems, settings.ray, lambda cluster: [0] * (settings.jobs or max(1, int(cluster["CPU"])))
+    pool = ProcessPool(fit_columns, problems, jobs or 1) if ray is None else RayPool(
+        fit_columns, problems, ray, lambda cluster: [0] * (jobs or max(1, int(cluster["CPU"])))
     )  # fmt: skip
     # One column is read ahead, so that memory holds no more than that and those in work.
     queue = TaskQueue(((f"{key[1]} {key[0]}", (key, samples)) for key, samples in columns), "column")
@@ -175,11 +166,15 @@ def train_probes(
         "views": views, "permutations": permutations, "token_permutations": token_permutations, "folds": folds,
         "incomplete": incomplete, "seed": seed, "call": call, "window": window, "align_to": align_to,
     }  # fmt: skip
-    crew = ExecutionSettings(jobs, device, ray)
+    crew: dict[str, Any] = {"jobs": jobs, "device": device, "ray": ray, "progress": progress}
     for reader in filter(None, (run, untrained)):
         check_run(reader, categories)
-    sweep = Sweep.of(run, target, categories, crew, progress, **options)
-    _check_device_of(sweep.target, device)
+    sweep = Sweep.of(run, target, categories, **options)
+    if device is not None and sweep.target.task != "binary":
+        raise UsageError(
+            f"device {device!r} with {sweep.target.described}; ridge is solved by numpy, a device solves logistic "
+            "probes. Leave device out"
+        )
     sweep.check()
     settings = sweep.settings
     stored = Controls() if sweep.stored is None else sweep.stored.controls
@@ -190,12 +185,12 @@ def train_probes(
     if untrained is not None:
         check_same_source(run, untrained, sweep.samples, settings.is_side)
         same: Target | str = settings.target if settings.is_side else sweep.target
-        untrained_sweep = Sweep.of(untrained, same, settings.categories, crew, progress, **options)
+        untrained_sweep = Sweep.of(untrained, same, settings.categories, **options)
         check_untrained(run, untrained, sweep.samples, untrained_sweep.samples, settings.is_side, call)
         untrained_sweep.check()
-    results = add_controls(sweep.results(), sweep.problems, sweep.widths, prepared)
+    results = add_controls(sweep.results(**crew), sweep.problems, sweep.widths, prepared)
     if untrained_sweep is not None:
-        untrained_results = untrained_sweep.results()
+        untrained_results = untrained_sweep.results(**crew)
         results = add_untrained(results, untrained_results)
         untrained_sweep.keep(untrained_results, requested=False)
     return sweep.keep(results, requested=True)
@@ -225,14 +220,6 @@ def check_options(
         raise UsageError(f"views {', '.join(views) or 'none'}; expected one or more, each once, such as mean")
 
 
-def _check_device_of(target: Target, device: str | None) -> None:
-    if device is not None and target.task != "binary":
-        raise UsageError(
-            f"device {device!r} with {target.described}; ridge is solved by numpy, a device solves logistic "
-            "probes. Leave device out"
-        )
-
-
 def check_run(run: RunReader, categories: Sequence[str] | None) -> None:
     """Raise for a run without episodes or the categories, and for one in several wordings."""
     if len(run.episodes) == 0:
@@ -251,8 +238,7 @@ def probe_settings(
 
     Their key is that of the stored results. Nothing is fitted. Raises NoProbesError for a run without activations.
     """
-    crew = ExecutionSettings()
-    return Sweep.of(run, target, None, crew, None, views=views, permutations=permutations, seed=seed).settings
+    return Sweep.of(run, target, None, views=views, permutations=permutations, seed=seed).settings
 
 
 @dataclass(frozen=True)
@@ -263,8 +249,6 @@ class Sweep:
     target: Target
     samples: TargetSamples
     settings: ProbeSettings
-    crew: ExecutionSettings
-    progress: Progress | None
 
     @classmethod
     def of(
@@ -272,8 +256,6 @@ class Sweep:
         run: RunReader,
         target: Target | str,
         categories: Sequence[str] | None,
-        crew: ExecutionSettings,
-        progress: Progress | None,
         *,
         views: Sequence[str],
         permutations: int,
@@ -294,9 +276,20 @@ class Sweep:
         event = None if align_to is None else align_to.on(run)
         if categories is None:
             categories = tuple(dict.fromkeys(run.episodes["category"])) if target.is_side else (EVERYWHERE,)
-        _check_groups_named_once(target, folds)
-        _check_windows(target, window, event)
+        if folds != "groups" and (target.group_by or target.exchange_within):
+            raise UsageError(
+                f"folds={folds!r} with columns of groups ({target.group_by or target.exchange_within}); expected "
+                "one of both. Leave --folds, or --group-by and --exchange-within, out"
+            )
+        if target.is_side and (window is not None or event is not None):
+            option = f"window={window}" if window is not None else "align_to"
+            raise UsageError(f"{option} with the side {target.name!r}; it needs labels of single inferences")
         samples = target_samples(run, target, categories, call, window, event, incomplete)
+        grouping = ""
+        if not target.is_side:
+            ids = run.episodes["episode_id"].astype(str).tolist()
+            columns = (names.tolist() for names in groups_of(run, target))
+            grouping = sha256_json(sorted(zip(ids, *columns, strict=True)))
         settings = ProbeSettings(
             model=run.model,
             random_weights=run.random_weights,
@@ -319,11 +312,11 @@ class Sweep:
             label=target.sha256,
             group_by=target.group_by or "group_id",
             exchange_within=target.exchange_within or "",
-            grouping="" if target.is_side else _grouping(run, target),
+            grouping=grouping,
             window=samples.window,
             align_to="" if event is None else f"{event.name}#{event.sha256[:12]}",
         )
-        return cls(run, target, samples, settings, crew, progress)
+        return cls(run, target, samples, settings)
 
     @cached_property
     def stored(self) -> ProbeResults | None:
@@ -356,24 +349,15 @@ class Sweep:
         if self.stored is None:
             _ = self.keys, self.problems
 
-    def results(self) -> ProbeResults:
-        """Return those that are stored, or new ones that are not stored yet."""
-        return self._fit() if self.stored is None else self.stored
-
-    def keep(self, results: ProbeResults, *, requested: bool) -> ProbeResults:
-        """Store `results` and return them as loaded from the store."""
-        save_results(results, self.run.location, requested=requested)
-        SweepCheckpoint.of(self.run.location, self.settings.key).discard()
-        return load_results(self.run, self.settings.key)
-
-    def _fit(self) -> ProbeResults:
-        probes = self._probe_all()
+    def results(self, *, progress: Progress | None, **crew: Any) -> ProbeResults:
+        """Return those that are stored, or new ones that are not stored yet. crew: of `probe_columns`."""
+        if self.stored is not None:
+            return self.stored
+        probes = self._probe_all(progress or notebook_progress("sites probed"), crew)
         curves = {}
         for category, problem in self.problems.items():
             for view in self.settings.views:
-                of_view: dict[Site, SiteProbe] = {
-                    site: probe[category] for (name, site), probe in probes.items() if name == view
-                }
+                of_view = {site: probe[category] for (name, site), probe in probes.items() if name == view}
                 parts = tuple(str(self.run.streams[site.stream].part) for site in of_view)
                 curves[category, view] = problem.curve(of_view, parts)
         directions = {
@@ -382,47 +366,24 @@ class Sweep:
             for category, probe in of_site.items()
             if self.target.is_side
         }
-        return ProbeResults(
-            self.settings,
-            curves,
-            directions,
-            stamp=self.run.stamp,
-            label=self.run.label,
-            left_out=self.samples.left_out,
-        )
+        run, left_out = self.run, self.samples.left_out
+        return ProbeResults(self.settings, curves, directions, stamp=run.stamp, label=run.label, left_out=left_out)
 
-    def _probe_all(self) -> dict[Key, dict[str, SiteProbe]]:
+    def _probe_all(self, progress: Progress | None, crew: Mapping[str, Any]) -> dict[Key, Probed]:
         """Return every view and site, in order, for every category; columns of an interrupted sweep are loaded."""
         unfinished = SweepCheckpoint.of(self.run.location, self.settings.key, self.run.stamp)
         probes = {key: stored for key in self.keys if (stored := unfinished.read(*key)) is not None}
-        progress = self.progress or notebook_progress("sites probed")
         rows, inferences = self.samples.rows, self.samples.inferences
         columns = ((key, read_samples(self.run, *key, rows, inferences)) for key in self.keys if key not in probes)
-        for key, of_site in probe_columns(columns, self.problems, self.crew):
+        for key, of_site in probe_columns(columns, self.problems, **crew):
             unfinished.keep(*key, of_site)
             probes[key] = of_site
             if progress is not None:
                 progress(len(probes), len(self.keys), f"{key[1]} {key[0]}")
         return {key: probes[key] for key in self.keys}  # workers finish in any order
 
-
-def _check_windows(target: Target, window: int | None, align_to: Target | None) -> None:
-    if target.is_side and (window is not None or align_to is not None):
-        option = f"window={window}" if window is not None else "align_to"
-        raise UsageError(f"{option} with the side {target.name!r}; it needs labels of single inferences")
-
-
-def _check_groups_named_once(target: Target, folds: FoldUnit) -> None:
-    """Raise UsageError for folds of concepts beside columns that name groups or strata."""
-    if folds != "groups" and (target.group_by or target.exchange_within):
-        raise UsageError(
-            f"folds={folds!r} with columns of groups ({target.group_by or target.exchange_within}); expected one "
-            "of both. Leave --folds, or --group-by and --exchange-within, out"
-        )
-
-
-def _grouping(run: RunReader, target: Target) -> str:
-    """Return the sha256 of group and stratum of every episode."""
-    groups, strata = groups_of(run, target)
-    names = run.episodes["episode_id"].astype(str).tolist()
-    return sha256_json(sorted(zip(names, groups.tolist(), strata.tolist(), strict=True)))
+    def keep(self, results: ProbeResults, *, requested: bool) -> ProbeResults:
+        """Store `results` and return them as loaded from the store."""
+        save_results(results, self.run.location, requested=requested)
+        SweepCheckpoint.of(self.run.location, self.settings.key).discard()
+        return load_results(self.run, self.settings.key)

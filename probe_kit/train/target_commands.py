@@ -138,14 +138,12 @@ def _trials_of_a_column(target: "Target", task: str, column: "BuiltinColumn") ->
 
 def _refusal(run: "RunReader", target: "Target", categories: Sequence[str] | None) -> str:
     """Return why `train` refuses a target, by what it checks itself before any probe is fitted; empty if not."""
-    from probe_kit.train.probe_sweep import ExecutionSettings, Sweep
+    from probe_kit.train.probe_sweep import Sweep
 
     try:
         with catch_warnings():
             simplefilter("ignore")  # train says them where they matter
-            crew = ExecutionSettings()
-            sweep = Sweep.of(run, target, categories, crew, None, views=("mean",), permutations=0, seed=0)
-            _ = sweep.problems
+            _ = Sweep.of(run, target, categories, views=("mean",), permutations=0, seed=0).problems
     except ProbeKitError as error:
         # Lines of targets that are refused for one reason are printed as one.
         return str(error).removeprefix(f"label {target.name!r}: ")

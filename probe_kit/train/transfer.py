@@ -24,7 +24,6 @@ from probe_kit.train.crossval.site_probe import predict_once, probe_labels
 from probe_kit.train.crossval.task_scores import METRICS, balanced_scores, score_interval
 from probe_kit.train.probe_sweep import (
     TOKEN_PERMUTATIONS,
-    ExecutionSettings,
     Progress,
     Sweep,
     check_options,
@@ -182,10 +181,10 @@ def transfer_probes(
     of_other = target if other_target is None else other_target
     for reader in (run, other):
         check_run(reader, categories)
-    side = Sweep.of(run, target, pooled, ExecutionSettings(), None, window=window, permutations=0, **options)
+    side = Sweep.of(run, target, pooled, window=window, permutations=0, **options)
     run_window = side.samples.window if side.target.per_step else None
     options |= {"permutations": permutations, "token_permutations": token_permutations, "window": run_window}
-    other_side = Sweep.of(other, of_other, pooled, ExecutionSettings(), None, **options)
+    other_side = Sweep.of(other, of_other, pooled, **options)
     _check_alike(run, other, views, across_weights)
     train = make_problem(run, side.target, side.samples, EVERYWHERE, side.settings)
     if side.target.definition != other_side.target.definition:

@@ -208,7 +208,7 @@ def test_c_is_solved_in_parts_where_one_column_of_labels_does_not_fit(monkeypatc
     at_once = cross_validate_jointly(site, samples, COLUMNS, FOLDS)
     sizes = []
 
-    def solve(problems: mixed.Problems, start: np.ndarray) -> np.ndarray:
+    def solve(problems: JointProblems, start: np.ndarray) -> np.ndarray:
         sizes.append(len(problems))
         return mixed.solve(problems, start)
 

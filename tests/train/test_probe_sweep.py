@@ -31,7 +31,7 @@ from probe_kit.hooks import Site
 from probe_kit.statistics.label_permutations import flip_items
 from probe_kit.train import ArrayRun, train_probes
 from probe_kit.train.crossval.nested_folds import nested_folds
-from probe_kit.train.probe_sweep import ExecutionSettings, Key, Probed, probe_columns
+from probe_kit.train.probe_sweep import Key, Probed, probe_columns
 from probe_kit.train.problem import Problem
 from probe_kit.train.samples import Samples
 from probe_kit.train.target_samples import TargetSamples
@@ -250,8 +250,8 @@ def columns(read: list[Key]) -> Iterator[tuple[Key, Samples]]:
         yield key, Samples.pooled(np.random.default_rng(layer).standard_normal((20, 4)).astype(np.float32))
 
 
-def columns_of(settings: ExecutionSettings) -> dict[Key, Probed]:
-    return dict(probe_columns(columns([]), {"color": PROBLEM}, settings))
+def columns_of(**crew: Any) -> dict[Key, Probed]:
+    return dict(probe_columns(columns([]), {"color": PROBLEM}, **crew))
 
 
 def assert_same_numbers(alone: dict[Key, Probed], together: dict[Key, Probed]) -> None:
@@ -262,14 +262,14 @@ def assert_same_numbers(alone: dict[Key, Probed], together: dict[Key, Probed]) -
 
 
 def test_processes_give_the_same_numbers_as_this_one() -> None:
-    assert_same_numbers(columns_of(ExecutionSettings()), columns_of(ExecutionSettings(jobs=2)))
+    assert_same_numbers(columns_of(), columns_of(jobs=2))
 
 
 @pytest.mark.slow
 def test_what_a_process_raises_keeps_its_class() -> None:
     of_one_class = replace(PROBLEM, labels=np.ones(20, bool))
     with pytest.raises(TooFewGroupsError, match="same label"):
-        list(probe_columns(columns([]), {"color": of_one_class}, ExecutionSettings(jobs=2)))
+        list(probe_columns(columns([]), {"color": of_one_class}, jobs=2))
 
 
 @pytest.fixture
@@ -285,26 +285,26 @@ def test_a_column_whose_process_is_killed_is_fitted_by_another(deadly: Any) -> N
         r"worker \d ended with code -9; the column it held \(backbone\.\d\d\.residual mean\) will be tried again"
     )
     with pytest.warns(WorkerLostWarning, match=held):
-        together = dict(probe_columns(columns([]), {"color": deadly(1)}, ExecutionSettings(jobs=2)))
-    assert_same_numbers(columns_of(ExecutionSettings()), together)
+        together = dict(probe_columns(columns([]), {"color": deadly(1)}, jobs=2))
+    assert_same_numbers(columns_of(), together)
 
 
 @pytest.mark.filterwarnings("ignore::probe_kit._execution.executor.WorkerLostWarning")
 @pytest.mark.slow
 def test_a_column_that_kills_two_processes_is_named_with_a_way_out(deadly: Any) -> None:
     with pytest.raises(WorkerDiedError, match=r"column backbone\.00\.residual mean .*code -9.*fewer --jobs"):
-        list(probe_columns(islice(columns([]), 1), {"color": deadly(2)}, ExecutionSettings(jobs=2)))
+        list(probe_columns(islice(columns([]), 1), {"color": deadly(2)}, jobs=2))
 
 
 def test_an_address_without_a_cluster_is_a_wrong_usage() -> None:
     pytest.importorskip("ray", reason="Ray is not installed (extra `ray`)")
     with pytest.raises(UsageError, match=r"no Ray cluster answers at '127\.0\.0\.1:9'"):
-        columns_of(ExecutionSettings(ray="127.0.0.1:9"))
+        columns_of(ray="127.0.0.1:9")
 
 
 def test_columns_are_read_only_when_they_are_needed() -> None:
     read: list[Key] = []
-    probing = probe_columns(columns(read), {"color": PROBLEM}, ExecutionSettings())
+    probing = probe_columns(columns(read), {"color": PROBLEM})
     next(probing)
     assert len(read) == 1
 
@@ -312,7 +312,7 @@ def test_columns_are_read_only_when_they_are_needed() -> None:
 def test_without_ray_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(MissingExtraError, match=re.escape(install_command("ray"))):
-        columns_of(ExecutionSettings(ray="auto"))
+        columns_of(ray="auto")
 
 
 def test_ray_is_imported_for_ray_only() -> None:
@@ -333,9 +333,9 @@ def test_ray_gives_the_same_numbers_and_raises_what_a_task_raises() -> None:
         pytest.skip(f"Ray does not start here: {error}")
     of_one_class = replace(PROBLEM, labels=np.ones(20, bool))
     try:
-        assert_same_numbers(columns_of(ExecutionSettings()), columns_of(ExecutionSettings(ray="auto")))
+        assert_same_numbers(columns_of(), columns_of(ray="auto"))
         with pytest.raises(TooFewGroupsError, match="same label"):
-            list(probe_columns(columns([]), {"color": of_one_class}, ExecutionSettings(ray="auto", jobs=1)))
+            list(probe_columns(columns([]), {"color": of_one_class}, ray="auto", jobs=1))
         assert ray.is_initialized()  # a cluster that was started elsewhere stays
     finally:
         ray.shutdown()

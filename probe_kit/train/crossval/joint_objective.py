@@ -6,11 +6,11 @@ problem is given back before this gradient is below the tolerance. So float32 de
 never what it is.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import groupby
-from typing import Any, Protocol
+from itertools import groupby, pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,18 +89,25 @@ class JointSite:
         unclear = bool(((scale > 0.25 * rounding) & (scale < 4 * rounding)).any())
         scale[scale <= rounding] = np.inf
         turned = xp.empty(features.shape, dtype=xp.float32, device=mean.device)
-        moments, member = _Moments(), _members(folds, len(samples.counts))
+        member = np.zeros((len(training_sets(folds)), len(samples.counts)))
+        for number, members in enumerate(training_sets(folds)):
+            member[number, members] = 1
+        sums, squares = 0.0, 0.0
         for block in blocks:
             exact = (features.matrix[features.rows[block.rows]] - mean) / scale
             turned[block.rows] = exact
-            moments.add(exact, xp.asarray(member[:, block.episode], device=mean.device))
+            of_block = xp.asarray(member[:, block.episode], device=mean.device)
+            sums, squares = sums + of_block @ exact, squares + of_block @ exact**2
         counts = member @ samples.counts
+        size = xp.asarray(counts, device=mean.device)[:, None]
+        set_mean = sums / size
+        set_scale = xp.sqrt((squares / size - set_mean**2).clip(0.0))
         axes, variances = narrow_axes(_products(turned)), xp.zeros_like(mean)
         for block in blocks:
             turned[block.rows] = turned[block.rows] @ axes
             variances += xp.square(turned[block.rows]).sum(axis=0)
         outer = np.append(np.repeat(np.arange(len(folds)), [len(f.inner) for f in folds]), np.arange(len(folds)))
-        sets = TrainingSets(member.astype(np.float32), outer, counts, *moments.standard(counts))
+        sets = TrainingSets(member.astype(np.float32), outer, counts, set_mean, set_scale)
         return cls(features, blocks, mean, scale, unclear, sets, axes, variances, turned)
 
     @property
@@ -117,25 +124,6 @@ class JointSite:
         return self.features.matrix[self.features.rows[block.rows]] - self.mean
 
 
-@dataclass
-class _Moments:
-    """Sums over the rows seen so far, per training set: of every feature, and of its square."""
-
-    sums: Array = 0.0
-    squares: Array = 0.0
-
-    def add(self, exact: Array, member: Array) -> None:
-        self.sums = self.sums + member @ exact
-        self.squares = self.squares + member @ exact**2
-
-    def standard(self, counts: NDArray[np.float64]) -> tuple[Array, Array]:
-        """(F, D) mean and deviation of every training set."""
-        xp = array_namespace(self.sums)
-        size = xp.asarray(counts, device=self.sums.device)[:, None]
-        mean = self.sums / size
-        return mean, xp.sqrt((self.squares / size - mean**2).clip(0.0))
-
-
 def _products(rows: Array) -> Array:
     """(D, D) moments of (M, D) float32: they precondition only, so float32 will do, in half the time."""
     parts = (rows[start : start + ROWS_PER_PRODUCT] for start in range(0, len(rows), ROWS_PER_PRODUCT))
@@ -147,15 +135,6 @@ def training_sets(folds: Sequence[NestedFold]) -> list[NDArray[np.intp]]:
     return [inner.train for fold in folds for inner in fold.inner] + [fold.outer.train for fold in folds]
 
 
-def _members(folds: Sequence[NestedFold], episodes: int) -> NDArray[np.float64]:
-    """(F, E) 1 where an episode belongs to a training set."""
-    sets = training_sets(folds)
-    member = np.zeros((len(sets), episodes))
-    for number, members in enumerate(sets):
-        member[number, members] = 1
-    return member
-
-
 def _sorted(samples: Samples, folds: Sequence[NestedFold]) -> tuple[RowSubset, tuple[Block, ...]]:
     """Rows and blocks, the episodes that an outer fold tests together."""
     rows = samples.features if isinstance(samples.features, RowSubset) else RowSubset.all(samples.features)
@@ -163,17 +142,13 @@ def _sorted(samples: Samples, folds: Sequence[NestedFold]) -> tuple[RowSubset, t
     sorted_ = Samples(rows, samples.counts, samples.means).of(order)
     assert isinstance(sorted_.features, RowSubset)
     episode = np.repeat(order, sorted_.counts)
-    sizes = [samples.counts[fold.outer.test].sum() for fold in folds]
-    return sorted_.features, tuple(_blocks(sizes, episode))
-
-
-def _blocks(sizes: Iterable[int], episode: NDArray[np.intp]) -> Iterable[Block]:
-    first = 0
-    for fold, size in enumerate(sizes):
-        for start in range(first, first + size, ROWS_PER_BLOCK):
-            rows = slice(start, min(start + ROWS_PER_BLOCK, first + size))
-            yield Block(rows, episode[rows], fold)
-        first += size
+    ends = np.cumsum([0, *(samples.counts[fold.outer.test].sum() for fold in folds)]).tolist()
+    spans = [
+        (fold, slice(start, min(start + ROWS_PER_BLOCK, end)))
+        for fold, (first, end) in enumerate(pairwise(ends))
+        for start in range(first, end, ROWS_PER_BLOCK)
+    ]
+    return sorted_.features, tuple(Block(rows, episode[rows], fold) for fold, rows in spans)
 
 
 TOLERANCE = 1e-9
@@ -221,160 +196,6 @@ class NewtonState:
         """Put `states` in the place of some of the problems."""
         for part, other in zip(vars(self).values(), vars(states).values(), strict=True):
             part[mask] = other
-
-
-class Problems(Protocol):
-    """K logistic regressions, a row of R weights for each, the intercept last; `rows` (k,) are some of them.
-
-    Weights are on features, or turned along axes on which Hessians are nearly diagonal.
-    """
-
-    @property
-    def strength(self) -> NDArray[np.float64]:
-        """(K,) C."""
-
-    def point(self, weights: Array, rows: Rows, *, exact: bool) -> NewtonState:
-        """The objective at turned `weights` (k, R), in float32, or at ones on features, exactly: in float64.
-
-        Exact is on the data as they are, whatever the axes are.
-        """
-
-    def turned(self, weights: Array) -> Array:
-        """(k, R) weights on features, along axes."""
-
-    def turned_back(self, weights: Array) -> Array:
-        """(k, R) weights along axes, on features."""
-
-    def rounding(self, rows: Rows) -> Array:
-        """(k,) size of a gradient that is all rounding, in float64."""
-
-    def curved(self, directions: Array, curvature: Array, rows: Rows) -> Array:
-        """Hessian times `directions` (k, R) float32, by the curvature of a point."""
-
-    def diagonal(self, curvature: Array, rows: Rows) -> Array:
-        """(k, R) float32, about the Hessian's diagonal; its inverse preconditions."""
-
-    def exact_step(self, gradient: Array, curvature: Array, row: int) -> Array:
-        """(R,) Newton step of one problem, found by factorising its Hessian."""
-
-    def __len__(self) -> int: ...
-
-
-def solve(problems: Problems, start: Array) -> Array:
-    """Optimal weights (K, R) of all problems, found from `start` (K, R).
-
-    Raises ProbeNotConvergedError rather than return one that is not at its optimum.
-    """
-    search = _NewtonSolver(problems)
-    return search.refined(problems.turned_back(search.rough(problems.turned(start))))
-
-
-@dataclass(frozen=True)
-class _NewtonSolver:
-    problems: Problems
-
-    def rough(self, start: Array) -> Array:
-        """Turned `start` brought near the optimum in float32. The last step is not looked back at."""
-        solved, rows, weights = start + 0.0, np.arange(len(start)), start
-        point = self._at(weights, rows, exact=False)
-        for _ in range(MAX_ROUGH_STEPS):
-            moving = to_numpy(point.relative > TOLERANCE)
-            rows, weights, point = rows[moving], weights[moving], point.only(moving)
-            if not rows.size:
-                return solved
-            step = self._newton_step(point, rows)
-            near = to_numpy(point.relative <= NEAR)
-            solved[rows[near]] = weights[near] + step[near]
-            if near.all():
-                return solved
-            rows, weights, point, step = rows[~near], weights[~near], point.only(~near), step[~near]
-            slope = (point.gradient * step).sum(axis=1)
-            weights, point = self._moved(weights, point, rows, step, slope, exact=False)
-            solved[rows] = weights
-        return solved
-
-    def refined(self, start: Array) -> Array:
-        """`start` brought to the optimum, certified by float64 gradients."""
-        solved, rows, weights = array_namespace(start).empty_like(start), np.arange(len(start)), start
-        point = self._at(weights, rows, exact=True)
-        for _ in range(MAX_NEWTON_STEPS):
-            # Negated, so that NaN stays open and ends in an error.
-            open_ = to_numpy(~((point.relative <= TOLERANCE) | (point.size <= self.problems.rounding(rows))))
-            solved[rows[~open_]] = weights[~open_]
-            if not open_.any():
-                return solved
-            rows, weights, point = rows[open_], weights[open_], point.only(open_)
-            step = self._newton_step(point, rows)
-            slope = (point.gradient * step).sum(axis=1)
-            weights, point = self._moved(weights, point, rows, self.problems.turned_back(step), slope, exact=True)
-        strength = self.problems.strength[rows]
-        raise ProbeNotConvergedError(
-            f"{len(rows)} of {len(self.problems)} logistic problems (C from {strength.min():g} to "
-            f"{strength.max():g}) are not at their optimum after {MAX_NEWTON_STEPS} Newton steps: worst relative "
-            f"gradient {float(point.relative.max()):.1e}, expected at most {TOLERANCE:.0e}. Look for extreme "
-            "feature values."
-        )
-
-    def _at(self, weights: Array, rows: Rows, *, exact: bool) -> NewtonState:
-        return self.problems.point(weights, rows, exact=exact)
-
-    def _moved(
-        self, weights: Array, point: NewtonState, rows: Rows, step: Array, slope: Array, *, exact: bool
-    ) -> tuple[Array, NewtonState]:
-        """One step on, halved per problem until the objective falls enough. slope: (k,) of it along the step."""
-        length = array_namespace(step).ones_like(slope)
-        noise = (1e-11 if exact else 1e-6) * abs(point.value)
-        moved = weights + step
-        state = self._at(moved, rows, exact=exact)
-        for _ in range(MAX_HALVINGS):
-            too_far = to_numpy(state.value > point.value + 1e-4 * length * slope + noise)
-            if not too_far.any():
-                break
-            length[too_far] /= 2
-            moved[too_far] = weights[too_far] + length[too_far, None] * step[too_far]
-            state.replace(too_far, self._at(moved[too_far], rows[too_far], exact=exact))
-        return moved, state
-
-    def _newton_step(self, point: NewtonState, rows: Rows) -> Array:
-        """(k, R) float64: Hessian · step = −gradient, as precisely as the point is worth.
-
-        What conjugate gradients do not settle in time is solved by factorising.
-        """
-        xp = array_namespace(point.gradient)
-        size = xp.amax(abs(point.gradient), axis=1)[:, None].clip(TINY)
-        residual = xp.asarray(-point.gradient / size, dtype=xp.float32)
-        step, live, curvature = xp.zeros_like(point.gradient), np.arange(len(residual)), point.curvature
-        inverse = 1 / self.problems.diagonal(curvature, rows)
-        direction = inverse * residual
-        slope = (residual * direction).sum(axis=1)
-        goal = xp.asarray(_precision(point) ** 2, dtype=xp.float32) * slope
-        for _ in range(MAX_CG_STEPS):
-            product = self.problems.curved(direction, curvature, rows[live])
-            length = (slope / (direction * product).sum(axis=1))[:, None]
-            step[live] += length * direction
-            residual = residual - length * product
-            scaled = inverse * residual
-            previous, slope = slope, (residual * scaled).sum(axis=1)
-            keep = to_numpy(slope > goal)
-            if not keep.any():
-                return step * size
-            direction = scaled + (slope / previous)[:, None] * direction
-            if not keep.all():
-                live = live[keep]
-                slope, goal, residual, direction, inverse, curvature = (
-                    part[keep] for part in (slope, goal, residual, direction, inverse, curvature)
-                )
-        step = step * size
-        for position in live:
-            gradient, weight = point.gradient[position], point.curvature[position]
-            step[position] = self.problems.exact_step(gradient, weight, int(rows[position]))
-        return step
-
-
-def _precision(point: NewtonState) -> Array:
-    """(k,) the share of the gradient that a step may leave: a more precise step would be wasted."""
-    relative = point.relative
-    return array_namespace(relative).maximum(relative.clip(1e-4, 0.1), 0.5 * TOLERANCE / relative)
 
 
 Inside = Callable[[Array, Block, NDArray[np.intp]], Array]
@@ -582,3 +403,117 @@ def _losses(margins: Array) -> tuple[Array, Array, Array]:
     small = xp.exp(-abs(margins))
     slope = xp.where(margins > 0, small, xp.ones_like(small)) / (1 + small)
     return xp.log1p(small) + (-margins).clip(0.0), slope, small / (1 + small) ** 2
+
+
+def solve(problems: JointProblems, start: Array) -> Array:
+    """Optimal weights (K, R) of all problems, found from `start` (K, R).
+
+    Raises ProbeNotConvergedError rather than return one that is not at its optimum.
+    """
+    search = _NewtonSolver(problems)
+    return search.refined(problems.turned_back(search.rough(problems.turned(start))))
+
+
+@dataclass(frozen=True)
+class _NewtonSolver:
+    problems: JointProblems
+
+    def rough(self, start: Array) -> Array:
+        """Turned `start` brought near the optimum in float32. The last step is not looked back at."""
+        solved, rows, weights = start + 0.0, np.arange(len(start)), start
+        point = self.problems.point(weights, rows, exact=False)
+        for _ in range(MAX_ROUGH_STEPS):
+            moving = to_numpy(point.relative > TOLERANCE)
+            rows, weights, point = rows[moving], weights[moving], point.only(moving)
+            if not rows.size:
+                return solved
+            step = self._newton_step(point, rows)
+            near = to_numpy(point.relative <= NEAR)
+            solved[rows[near]] = weights[near] + step[near]
+            if near.all():
+                return solved
+            rows, weights, point, step = rows[~near], weights[~near], point.only(~near), step[~near]
+            slope = (point.gradient * step).sum(axis=1)
+            weights, point = self._moved(weights, point, rows, step, slope, exact=False)
+            solved[rows] = weights
+        return solved
+
+    def refined(self, start: Array) -> Array:
+        """`start` brought to the optimum, certified by float64 gradients."""
+        solved, rows, weights = array_namespace(start).empty_like(start), np.arange(len(start)), start
+        point = self.problems.point(weights, rows, exact=True)
+        for _ in range(MAX_NEWTON_STEPS):
+            # Negated, so that NaN stays open and ends in an error.
+            open_ = to_numpy(~((point.relative <= TOLERANCE) | (point.size <= self.problems.rounding(rows))))
+            solved[rows[~open_]] = weights[~open_]
+            if not open_.any():
+                return solved
+            rows, weights, point = rows[open_], weights[open_], point.only(open_)
+            step = self._newton_step(point, rows)
+            slope = (point.gradient * step).sum(axis=1)
+            weights, point = self._moved(weights, point, rows, self.problems.turned_back(step), slope, exact=True)
+        strength = self.problems.strength[rows]
+        raise ProbeNotConvergedError(
+            f"{len(rows)} of {len(self.problems)} logistic problems (C from {strength.min():g} to "
+            f"{strength.max():g}) are not at their optimum after {MAX_NEWTON_STEPS} Newton steps: worst relative "
+            f"gradient {float(point.relative.max()):.1e}, expected at most {TOLERANCE:.0e}. Look for extreme "
+            "feature values."
+        )
+
+    def _moved(
+        self, weights: Array, point: NewtonState, rows: Rows, step: Array, slope: Array, *, exact: bool
+    ) -> tuple[Array, NewtonState]:
+        """One step on, halved per problem until the objective falls enough. slope: (k,) of it along the step."""
+        length = array_namespace(step).ones_like(slope)
+        noise = (1e-11 if exact else 1e-6) * abs(point.value)
+        moved = weights + step
+        state = self.problems.point(moved, rows, exact=exact)
+        for _ in range(MAX_HALVINGS):
+            too_far = to_numpy(state.value > point.value + 1e-4 * length * slope + noise)
+            if not too_far.any():
+                break
+            length[too_far] /= 2
+            moved[too_far] = weights[too_far] + length[too_far, None] * step[too_far]
+            state.replace(too_far, self.problems.point(moved[too_far], rows[too_far], exact=exact))
+        return moved, state
+
+    def _newton_step(self, point: NewtonState, rows: Rows) -> Array:
+        """(k, R) float64: Hessian · step = −gradient, as precisely as the point is worth.
+
+        What conjugate gradients do not settle in time is solved by factorising.
+        """
+        xp = array_namespace(point.gradient)
+        size = xp.amax(abs(point.gradient), axis=1)[:, None].clip(TINY)
+        residual = xp.asarray(-point.gradient / size, dtype=xp.float32)
+        step, live, curvature = xp.zeros_like(point.gradient), np.arange(len(residual)), point.curvature
+        inverse = 1 / self.problems.diagonal(curvature, rows)
+        direction = inverse * residual
+        slope = (residual * direction).sum(axis=1)
+        goal = xp.asarray(_precision(point) ** 2, dtype=xp.float32) * slope
+        for _ in range(MAX_CG_STEPS):
+            product = self.problems.curved(direction, curvature, rows[live])
+            length = (slope / (direction * product).sum(axis=1))[:, None]
+            step[live] += length * direction
+            residual = residual - length * product
+            scaled = inverse * residual
+            previous, slope = slope, (residual * scaled).sum(axis=1)
+            keep = to_numpy(slope > goal)
+            if not keep.any():
+                return step * size
+            direction = scaled + (slope / previous)[:, None] * direction
+            if not keep.all():
+                live = live[keep]
+                slope, goal, residual, direction, inverse, curvature = (
+                    part[keep] for part in (slope, goal, residual, direction, inverse, curvature)
+                )
+        step = step * size
+        for position in live:
+            gradient, weight = point.gradient[position], point.curvature[position]
+            step[position] = self.problems.exact_step(gradient, weight, int(rows[position]))
+        return step
+
+
+def _precision(point: NewtonState) -> Array:
+    """(k,) the share of the gradient that a step may leave: a more precise step would be wasted."""
+    relative = point.relative
+    return array_namespace(relative).maximum(relative.clip(1e-4, 0.1), 0.5 * TOLERANCE / relative)

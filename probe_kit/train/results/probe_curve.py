@@ -1,6 +1,6 @@
 """The probes of one category in one view, with all that later statistics need."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -226,6 +226,12 @@ class ProbeCurve:
     def backbone_stream(self) -> str | None:
         """The stream of the vision-language model, None if none was probed."""
         return self.of_part("backbone")
+
+    def only(self, row: int) -> "ProbeCurve":
+        """Return the curve with a single one of its sites."""
+        members = ("decisions", "strengths", "null", "inner", "sample_scores")
+        arrays = {name: getattr(self, name)[[row]] for name in members if getattr(self, name) is not None}
+        return replace(self, sites=(self.sites[row],), parts=(self.parts[row],), **arrays)
 
     def best(self, stream: str) -> int:
         """Return the position of the site of a stream with the largest metric, the first one on ties."""

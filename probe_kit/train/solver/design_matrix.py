@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,39 +109,11 @@ WORTH_CONVERTING = 2**17
 """Entries from which on products in float32 gain more than their operands cost to convert: 1 MB of float64."""
 
 
-class Design(Protocol):
-    """N samples Z in R orthogonal coordinates, the last one all ones for the intercept."""
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """(N, R)."""
-
-    @property
-    def spectrum(self) -> Array:
-        """(R, 1) squared length of every column, or (R, K) where label columns have samples of their own."""
-
-    @property
-    def small(self) -> bool:
-        """Whether the moments of all label columns cost less than the many small calls of an iteration."""
-
-    def of(self, _columns: Array) -> "Design":
-        """Return the samples that the label columns of a mask (K,) need."""
-
-    def narrow(self) -> "Design":
-        """The same in float32 where its products gain more than their operands cost to convert, else itself."""
-
-    def __matmul__(self, weights: Array) -> Array:
-        """Z · weights, (N, K) for (R, K)."""
-
-    def gather(self, values: Array) -> Array:
-        """Zᵀ · values, (R, K) for (N, K)."""
-
-    def moments(self, weights: Array) -> Array:
-        """Zᵀ · diag(column) · Z per column of weights, (K, R, R) for (N, K)."""
-
-
 class _OfAllColumns:
-    """The same samples for every label column."""
+    """The same samples for every label column.
+
+    small: whether the moments of all label columns cost less than the many small calls of an iteration.
+    """
 
     small = False
 
@@ -202,7 +174,7 @@ class StackedDesign:
     small = True
 
     @classmethod
-    def of_folds(cls, folds: Sequence[Design], columns: int) -> "StackedDesign":
+    def of_folds(cls, folds: "Sequence[DenseDesign | StreamedDesign]", columns: int) -> "StackedDesign":
         """Return the stack of dense designs, each with so many label columns of its own."""
         dense = [fold.samples for fold in folds if isinstance(fold, DenseDesign)]
         xp, like = array_namespace(dense[0]), dense[0]
@@ -306,6 +278,10 @@ class StreamedDesign(_OfAllColumns):
         return array_namespace(self.axes).concatenate(parts)
 
 
+Design = DenseDesign | StackedDesign | StreamedDesign
+"""N samples Z in R orthogonal coordinates, the last one all ones for the intercept."""
+
+
 IN_MEMORY = 2**29
 """Bytes up to which training samples are turned to their axes once, in float64, rather than in every product."""
 
@@ -319,7 +295,7 @@ class Projection:
 
     standardise: Standardiser
     axes: Array
-    train: Design
+    train: DenseDesign | StreamedDesign
 
     @classmethod
     def fit(cls, features: Features) -> "Projection":

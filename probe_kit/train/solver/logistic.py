@@ -26,24 +26,14 @@ MAX_CG_STEPS = 100
 """Columns that need more are solved by factorising; another number changes times, not optima."""
 
 
-@dataclass(frozen=True)
-class NewtonSteps:
-    """Newton steps, (R, K), and what they change in the decisions: Z · step, (N, K), which costs no product more.
-
-    unsettled: numbers of the columns that were not found in time, and are nothing.
-    """
-
-    step: Array
-    change: Array
-    unsettled: Array
-
-
 def newton_steps(
     design: Design, penalty: Array, gradient: Array, curvature: Array, precision: Array
-) -> NewtonSteps:
+) -> tuple[Array, Array, Array]:
     """Solve (penalty + ZᵀSZ) step = −gradient per column, to relative `precision` (K,), in the design's precision.
 
-    penalty: (R, 1). gradient: (R, K). curvature: (N, K), the diagonals S.
+    penalty: (R, 1). gradient: (R, K). curvature: (N, K), the diagonals S. Returns the steps (R, K), what they
+    change in the decisions, Z · step (N, K), which costs no product more, and the numbers of the columns that were
+    not solved in time, whose steps are 0.
     """
     xp = array_namespace(gradient)
     # Scaled to length 1: `precision` is relative, and no square underflows in float32.
@@ -75,7 +65,7 @@ def newton_steps(
             if len(live) < len(size):
                 solved[:, live], changed[:, live] = step, change
                 step, change = solved, changed
-            return NewtonSteps(step * size, change * size, live[keep])
+            return step * size, change * size, live[keep]
         if not keep.all():
             solved[:, live[~keep]], changed[:, live[~keep]] = step[:, ~keep], change[:, ~keep]
             live, slope, precision = live[keep], slope[keep], precision[keep]
@@ -88,7 +78,7 @@ def newton_steps(
         direction *= slope / previous
         direction += scaled
     solved[:, live], changed[:, live] = 0.0, 0.0
-    return NewtonSteps(solved * size, changed * size, live)
+    return solved * size, changed * size, live
 
 
 def _dots(first: Array, second: Array) -> Array:
@@ -284,12 +274,12 @@ class LogisticSolver:
             return step, todo.samples @ step
         # More than the point has, or is asked, is wasted work.
         precision = self.xp.maximum(relative, (goal / relative).clip(min=FINEST)).clip(max=COARSEST)
-        steps = newton_steps(self._narrow, self.penalty, gradient, curvature, precision)
-        for column in steps.unsettled:  # one after another: all Hessians may be more than the memory holds
+        step, change, unsettled = newton_steps(self._narrow, self.penalty, gradient, curvature, precision)
+        for column in unsettled:  # one after another: all Hessians may be more than the memory holds
             problem = gradient[:, column, None], curvature[:, column, None]
-            steps.step[:, column] = self._exact_newton_steps(self.samples, *problem)[:, 0]
-            steps.change[:, column] = self.samples @ steps.step[:, column]
-        return steps.step, steps.change
+            step[:, column] = self._exact_newton_steps(self.samples, *problem)[:, 0]
+            change[:, column] = self.samples @ step[:, column]
+        return step, change
 
     @cached_property
     def _narrow(self) -> Design:
