@@ -274,26 +274,3 @@ class TargetOptions:
         name, equals, value = self.align_to.partition("=")
         event = Target.of_run(run, name) if self.file is None or is_builtin(name) else Target.read(self.file, name)
         return event.equal_to(value) if equals else event
-
-
-@dataclass(frozen=True)
-class TransferOptions:
-    """Options that name a run to score probes on."""
-
-    run: str
-    labels: Path | None
-    across_weights: bool
-
-    @classmethod
-    def of(
-        cls, run: str | None, labels: Path | None, across_weights: bool, target: TargetOptions
-    ) -> "TransferOptions | None":
-        """Return the options; None without `--test-on`. Raises UsageError where one needs another."""
-        if run is None:
-            if labels is not None or across_weights:
-                option = "--test-labels" if labels is not None else "--across-weights"
-                raise UsageError(f"{option} is for a transfer; give --test-on RUN too, or leave it out")
-            return None
-        if labels is not None and target.file is None:
-            raise UsageError("--test-labels with a built-in target; give --labels FILE too, or leave it out")
-        return cls(run, labels, across_weights)

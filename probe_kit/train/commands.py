@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from probe_kit.runs import Run
-    from probe_kit.train import ProbeResults, RunReader
-    from probe_kit.train.command_options import TargetOptions, TransferOptions
+    from probe_kit.train import ProbeResults, RunReader, Target
+    from probe_kit.train.command_options import TargetOptions
     from probe_kit.train.results.inventory import Inventory, StoredProbes
 
 
@@ -61,12 +61,16 @@ def train(
     """
     from probe_kit.runs import open_run
     from probe_kit.runs.direction_files import check_direction_file
-    from probe_kit.train.command_options import TargetOptions, TransferOptions
+    from probe_kit.train.command_options import TargetOptions
     from probe_kit.train.results.probe_results import write_direction_file
 
     target_options = TargetOptions(target, labels, task, group_by, exchange_within, align_to)
     target_options.check(window)
-    transfer = TransferOptions.of(test_on, test_labels, across_weights, target_options)
+    if test_on is None and (test_labels is not None or across_weights):
+        option = "--test-labels" if test_labels is not None else "--across-weights"
+        raise UsageError(f"{option} is for a transfer; give --test-on RUN too, or leave it out")
+    if test_labels is not None and labels is None:
+        raise UsageError("--test-labels with a built-in target; give --labels FILE too, or leave it out")
     opened = open_run(run, allow_partial=partial).in_wording(wording)
     options = {
         "views": views,
@@ -75,7 +79,7 @@ def train(
         "seed": seed,
         "window": window,
     }
-    if transfer is not None:
+    if test_on is not None:
         common.check_no_others(
             {
                 "--controls": controls is not None, "--suite": suite, "--jobs": jobs, "--ray": ray,
@@ -85,8 +89,10 @@ def train(
             },
             "a transfer",
         )  # fmt: skip
-        other = open_run(transfer.run, allow_partial=partial).in_wording(wording)
-        _transfer(opened, other, target_options, transfer, categories, call, options, details)
+        other = open_run(test_on, allow_partial=partial).in_wording(wording)
+        options |= {"across_weights": across_weights, "call": _only_call(call, opened, "a transfer")}
+        targets = target_options.read(opened, seed=seed), target_options.read(other, test_labels, seed)
+        _transfer(opened, other, targets, categories, options, details)
         return
     control = None if untrained is None else open_run(untrained, allow_partial=partial).in_wording(wording)
     options |= {
@@ -163,10 +169,8 @@ def _train(
 def _transfer(
     run: "Run",
     other: "Run",
-    target_options: "TargetOptions",
-    transfer: "TransferOptions",
+    targets: "tuple[Target, Target]",
     categories: Any,
-    call: str,
     options: Mapping[str, Any],
     details: bool,
 ) -> None:
@@ -174,25 +178,10 @@ def _transfer(
     from probe_kit.train import transfer_probes
     from probe_kit.train.transfer import transfer_sentences, transfer_table
 
-    number = _only_call(call, run, "a transfer")
-    fitted_on, scored_on = (
-        target_options.read(run, seed=options["seed"]),
-        target_options.read(other, transfer.labels, options["seed"]),
-    )
-    for contents in dict.fromkeys([fitted_on.contents, scored_on.contents]):
+    for contents in dict.fromkeys(target.contents for target in targets):
         out.print(contents, markup=False, highlight=False)
     with progress() as bar:
-        results = transfer_probes(
-            run,
-            other,
-            fitted_on,
-            scored_on,
-            categories,
-            call=number,
-            across_weights=transfer.across_weights,
-            progress=counter(bar, "sites"),
-            **options,
-        )
+        results = transfer_probes(run, other, *targets, categories, progress=counter(bar, "sites"), **options)
     out.print(transfer_table(results, splits=details))
     for sentence in transfer_sentences(results):
         out.print(sentence, markup=False, highlight=False)

@@ -307,7 +307,8 @@ def add_untrained(results: ProbeResults, untrained: ProbeResults) -> ProbeResult
         if other.episodes.tolist() != curve.episodes.tolist() or (other.labels != curve.labels).any():
             raise UsageError(
                 f"category {key[0]!r}: the untrained control {untrained.label!r} has {other.labels.size} "
-                f"episodes, this run {curve.labels.size}, and they are not the same. Extract both from the same suite."
+                f"episodes, this run {curve.labels.size}, and they are not the same. Extract both from the same "
+                "suite."
             )
         if curve.is_side:
             gains += _gains(key, curve, other, untrained)

@@ -1,6 +1,6 @@
 """Probes fitted on all of one run and scored on another: `transfer_probes`, its results, table and sentences."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -101,46 +101,43 @@ class TransferResults:
 
         return pd.DataFrame([row for view, curve in self.curves.items() for row in self._rows(view, curve)])
 
-    def _rows(self, view: str, curve: TransferCurve) -> list[dict[str, Any]]:
+    def _rows(self, view: str, curve: TransferCurve) -> Iterator[dict[str, Any]]:
         fitted, moved = curve.fitted, curve.recentred
         p, p_fwe, moved_p = pointwise_p(fitted.metric, fitted.null), fitted.p_fwe(), moved.p_fwe()
-        rows = []
+        deviations = (self.labels - self.labels.mean()) ** 2
         for row, (site, part) in enumerate(zip(fitted.sites, fitted.parts, strict=True)):
             low, high = score_interval(fitted.scores[row], self.labels, self.groups, self.task)
             low_refitted, high_refitted = score_interval(
-                curve.refitted[row], self.labels, self.groups, self.task, (self.labels - self.labels.mean()) ** 2
+                curve.refitted[row], self.labels, self.groups, self.task, deviations
             )
-            rows.append(
-                {
-                    "model": self.model,
-                    "other_model": self.other_model,
-                    "target": self.target,
-                    "task": self.task,
-                    "view": view,
-                    "site": str(site),
-                    "stream": site.stream,
-                    "part": part,
-                    "layer": site.layer,
-                    "iteration": site.iteration,
-                    "metric": METRICS[self.task],
-                    "score": fitted.metric[row],
-                    "ci_low": low,
-                    "ci_high": high,
-                    "chance": fitted.chance[row],
-                    "p": p[row],
-                    "p_fwe": p_fwe[row],
-                    "recentred": moved.metric[row],
-                    "recentred_chance": moved.chance[row],
-                    "recentred_p_fwe": moved_p[row],
-                    "refitted": float(curve.refitted[row].mean()),
-                    "refitted_ci_low": low_refitted,
-                    "refitted_ci_high": high_refitted,
-                    "penalty": float(fitted.penalties[row, 0]),
-                    "n": self.labels.size,
-                    "groups": np.unique(self.groups).size,
-                }
-            )
-        return rows
+            yield {
+                "model": self.model,
+                "other_model": self.other_model,
+                "target": self.target,
+                "task": self.task,
+                "view": view,
+                "site": str(site),
+                "stream": site.stream,
+                "part": part,
+                "layer": site.layer,
+                "iteration": site.iteration,
+                "metric": METRICS[self.task],
+                "score": fitted.metric[row],
+                "ci_low": low,
+                "ci_high": high,
+                "chance": fitted.chance[row],
+                "p": p[row],
+                "p_fwe": p_fwe[row],
+                "recentred": moved.metric[row],
+                "recentred_chance": moved.chance[row],
+                "recentred_p_fwe": moved_p[row],
+                "refitted": float(curve.refitted[row].mean()),
+                "refitted_ci_low": low_refitted,
+                "refitted_ci_high": high_refitted,
+                "penalty": float(fitted.penalties[row, 0]),
+                "n": self.labels.size,
+                "groups": np.unique(self.groups).size,
+            }
 
 
 _DIGITS = 12
@@ -318,17 +315,8 @@ def _codes(classes: Sequence[str], other_classes: Sequence[str]) -> Matrix | Non
     return np.array([other_classes.index(name) if name in other_classes else -1 for name in classes], np.float64)
 
 
-@dataclass(frozen=True)
-class _Transferred:
-    """One site. plain, moved: (m,) predictions as fitted, and on recentred features. refitted: (m,) scores of
-    a probe of the other run itself."""
-
-    plain: Matrix
-    moved: Matrix
-    scores: tuple[Matrix, Matrix]
-    null: tuple[Matrix, Matrix]
-    refitted: Matrix
-    strength: float
+_Transferred = tuple[list[tuple[Matrix, Matrix, Matrix]], Matrix, float]
+"""One site: predictions, scores (m,) and null (P,) as fitted and recentred, scores of the other's own, C or λ."""
 
 
 def _transfer(
@@ -344,13 +332,12 @@ def _transfer(
     predicted, strength = predict_once(samples, blank, train.task, fold)
     if code is not None:
         predicted = code[predicted.astype(np.intp)]
-    plain, moved = predicted[:other_count], predicted[other_count:]
     truth = np.column_stack([test.labels, test.permuted_for(other_samples)]).astype(np.float64)
-    of_plain, of_moved = (_scores(predictions, truth, test.task) for predictions in (plain, moved))
-    scores = probe_labels(other_samples, truth[:, :1], test.task, test.folds).scores
-    return _Transferred(
-        plain, moved, (of_plain[0], of_moved[0]), (of_plain[1], of_moved[1]), scores, strength
-    )  # fmt: skip
+    scored = [
+        (predictions, *_scores(predictions, truth, test.task))
+        for predictions in np.split(predicted, [other_count])
+    ]
+    return scored, probe_labels(other_samples, truth[:, :1], test.task, test.folds).scores, strength
 
 
 def _recentred(samples_to_move: Samples, run_samples: Samples) -> Samples:
@@ -380,7 +367,6 @@ def _curve(
     run: RunReader, test: Problem, view: str, transferred: dict[tuple[str, Site], _Transferred]
 ) -> TransferCurve:
     of_view = {site: result for (name, site), result in transferred.items() if name == view}
-    transferred_sites = list(of_view.values())
     plain, moved = (
         ProbeCurve(
             sites=tuple(of_view),
@@ -389,19 +375,19 @@ def _curve(
             items=test.items,
             groups=test.groups,
             fold_of=test.fold_of,
-            decisions=np.stack([(result.plain, result.moved)[at] for result in transferred_sites]),
-            strengths=np.array([[result.strength] for result in transferred_sites]),
-            null=np.stack([result.null[at] for result in transferred_sites]),
-            inner=np.zeros((len(transferred_sites), 0, 0), np.float32),
+            decisions=np.stack([scored[at][0] for scored, _, _ in of_view.values()]),
+            strengths=np.array([[strength] for _, _, strength in of_view.values()]),
+            null=np.stack([scored[at][2] for scored, _, _ in of_view.values()]),
+            inner=np.zeros((len(of_view), 0, 0), np.float32),
             parts=tuple(str(run.streams[site.stream].part) for site in of_view),
             task=test.task,
             is_side=False,
             classes=test.classes,
-            sample_scores=np.stack([result.scores[at] for result in transferred_sites]),
+            sample_scores=np.stack([scored[at][1] for scored, _, _ in of_view.values()]),
         )
         for at in (0, 1)
     )
-    return TransferCurve(plain, moved, np.stack([result.refitted for result in transferred_sites]))
+    return TransferCurve(plain, moved, np.stack([refitted for _, refitted, _ in of_view.values()]))
 
 
 _LEGEND = (

@@ -9,7 +9,7 @@ samples Z, test samples T and centred targets Y the predictions at penalty λ ar
 factorised once, so that every relabelling is a matrix product.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +19,7 @@ from probe_kit.errors import NonFiniteActivationError
 from probe_kit.statistics.folds import Fold
 from probe_kit.train.choices import Task
 from probe_kit.train.crossval.logistic_folds import cross_validate
-from probe_kit.train.crossval.nested_folds import FittedFold, InnerQuality, Matrix, NestedFold
+from probe_kit.train.crossval.nested_folds import InnerQuality, Matrix, NestedFold
 from probe_kit.train.crossval.task_scores import balanced_scores, correctness, explained_scores
 from probe_kit.train.samples import Samples
 from probe_kit.train.solver.arrays import Standardiser, to_numpy
@@ -67,56 +67,32 @@ class RidgeFold:
 
 
 Fitted = tuple[Matrix, Matrix, list[InnerQuality]]
-"""(E, K) held-out predictions, (F,) λ of the first column, and the inner quality of every outer fold."""
+"""(E, K) held-out class numbers or quantities, (F,) C or λ of the first column, and every fold's inner quality."""
 
 
-def predict_quantities(samples: Samples, labels: Matrix, folds: list[NestedFold]) -> Fitted:
-    """Return ridge predictions within the range of the training labels; λ by squared error."""
-    return _nested(
-        labels,
-        folds,
-        lambda fold: _quantities(samples, labels, fold),
-        lambda truth: lambda predicted: -((truth - predicted) ** 2),
-    )
+def _predict_by_ridge(samples: Samples, labels: Matrix, task: Task, folds: list[NestedFold]) -> Fitted:
+    """Return quantities within the range of the training labels, or the best class by ridge on class indicators.
 
-
-def predict_classes(samples: Samples, labels: Matrix, folds: list[NestedFold]) -> Fitted:
-    """Return the best class by ridge on class indicators; λ by balanced accuracy."""
-    classes = int(labels.max()) + 1
-
-    def gain(truth: Matrix) -> Gain:
-        worth = _worth(truth, classes)
-        return lambda predicted: (predicted == truth) * worth
-
-    return _nested(labels, folds, lambda fold: _best_classes(samples, labels, classes, fold), gain)
-
-
-Gain = Callable[[Matrix], Matrix]
-"""How good every one of (m, K) predictions of a test fold is."""
-
-
-def _nested(
-    labels: Matrix,
-    folds: list[NestedFold],
-    predict: Callable[[Fold], Iterator[Matrix]],
-    gain_of: Callable[[Matrix], Gain],
-) -> Fitted:
-    """Return held-out predictions, each column of an outer fold at the λ that is best in its inner folds.
-
-    predict: predictions (m, K) of a fold at each penalty.
+    Each column of an outer fold is predicted at the λ that is best in its inner folds: by squared error of
+    quantities, by balanced accuracy of classes; the larger λ on ties.
     """
+    classes = 0 if task == "continuous" else int(labels.max()) + 1
     predictions, penalties, qualities = np.empty_like(labels), [], []
     for fold in folds:
         quality = np.zeros((PENALTIES.size, labels.shape[1]))
         by_sample = np.zeros((PENALTIES.size, len(labels)))
         for inner in fold.inner:
-            gain = gain_of(labels[inner.test])
-            for step, predicted in enumerate(predict(inner)):
-                gains = gain(predicted)
+            truth, worth = labels[inner.test], np.ones((1, 1))
+            if classes:  # one over the number of samples of each one's class
+                counts = np.stack([(truth == number).sum(axis=0) for number in range(classes)])
+                worth = 1 / np.take_along_axis(counts, truth.astype(np.intp), axis=0)
+            for step, predicted in enumerate(_along_penalties(samples, labels, classes, inner)):
+                gains = (predicted == truth) * worth if classes else -((truth - predicted) ** 2)
                 quality[step] += gains.sum(axis=0)
                 by_sample[step, inner.test] = gains[:, 0]
-        best = _largest_of_best(quality)
-        for step, predicted in enumerate(predict(fold.outer)):
+        scale = np.abs(quality).max(axis=0) + 1e-300  # not zero
+        best = len(quality) - 1 - (quality / scale).round(12)[::-1].argmax(axis=0)
+        for step, predicted in enumerate(_along_penalties(samples, labels, classes, fold.outer)):
             columns = np.flatnonzero(best == step)
             predictions[np.ix_(fold.outer.test, columns)] = predicted[:, columns]
         penalties.append(PENALTIES[best[0]])
@@ -124,46 +100,27 @@ def _nested(
     return predictions, np.array(penalties), qualities
 
 
-def _quantities(samples: Samples, labels: Matrix, fold: Fold) -> Iterator[Matrix]:
-    """(m, K) predictions of one fold at each penalty."""
-    train = labels[fold.train]
-    # A linear probe extrapolates without bound, and one prediction far outside would decide R².
-    low, high = train.min(axis=0), train.max(axis=0)
-    for predicted in _fitted(samples, fold).predictions(samples.of(fold.train).repeat(train)):
-        yield predicted.clip(low, high)
+def _along_penalties(samples: Samples, labels: Matrix, classes: int, fold: Fold) -> Iterator[Matrix]:
+    """(m, K) predictions of one fold at each penalty. classes: their number, 0 of quantities.
 
-
-def _worth(truth: Matrix, classes: int) -> Matrix:
-    """(m, K) one over the number of samples of each one's class."""
-    counts = np.stack([(truth == number).sum(axis=0) for number in range(classes)])
-    worth: Matrix = 1 / np.take_along_axis(counts, truth.astype(np.intp), axis=0)
-    return worth
-
-
-def _best_classes(samples: Samples, labels: Matrix, classes: int, fold: Fold) -> Iterator[Matrix]:
-    """(m, K) most likely classes of one fold at each penalty; a class without training samples is never one."""
-    train = labels[fold.train]
+    Every token of the training episodes is a sample, and an episode decides by their mean.
+    """
+    train, training_samples = labels[fold.train], samples.of(fold.train)
+    ridge = RidgeFold.fit(training_samples.read(), to_numpy(samples.means)[fold.test])
+    if not classes:
+        # A linear probe extrapolates without bound, and one prediction far outside would decide R².
+        low, high = train.min(axis=0), train.max(axis=0)
+        for predicted in ridge.predictions(training_samples.repeat(train)):
+            yield predicted.clip(low, high)
+        return
     targets = [(train == number).astype(np.float64) for number in range(classes)]
     counts = np.stack([target.sum(axis=0) for target in targets])
     # Indicators of rare classes are larger, so that the largest prediction is not always the commonest class.
     scaled = np.hstack([target / np.sqrt(count.clip(1)) for target, count in zip(targets, counts, strict=True)])
-    absent = np.where(counts == 0, -np.inf, 0.0)
+    absent = np.where(counts == 0, -np.inf, 0.0)  # a class without training samples is never the best
     shape = (fold.test.size, classes, labels.shape[1])
-    for predicted in _fitted(samples, fold).predictions(samples.of(fold.train).repeat(scaled)):
+    for predicted in ridge.predictions(training_samples.repeat(scaled)):
         yield (predicted.reshape(shape) + absent).argmax(axis=1).astype(np.float64)
-
-
-def _largest_of_best(quality: Matrix) -> NDArray[np.intp]:
-    """(K,) position of the best of (L, K) along the grid, the larger penalty on ties."""
-    scale = np.abs(quality).max(axis=0) + 1e-300  # not zero
-    rounded = (quality / scale).round(12)[::-1]
-    best: NDArray[np.intp] = len(quality) - 1 - rounded.argmax(axis=0)
-    return best
-
-
-def _fitted(samples: Samples, fold: Fold) -> RidgeFold:
-    """Factorise a fold: every token of the training episodes is a sample, and an episode decides by their mean."""
-    return RidgeFold.fit(samples.of(fold.train).read(), to_numpy(samples.means)[fold.test])
 
 
 @dataclass(frozen=True)
@@ -203,7 +160,8 @@ def probe_site(
     check_non_finite(samples)
     columns = np.column_stack([labels, permuted_labels])
     fitted = cross_validate(samples, columns, folds)
-    decisions = _out_of_fold(fitted, folds)
+    tested = np.concatenate([fold.outer.test for fold in folds])
+    decisions = np.concatenate([fold.decisions for fold in fitted])[np.argsort(tested)]
     right = correctness(decisions, columns)
     return SiteProbe(
         decisions=decisions[:, 0],
@@ -264,19 +222,10 @@ def check_non_finite(samples: Samples) -> None:
         )
 
 
-def _predict(
-    samples: Samples, labels: Matrix, task: Task, folds: list[NestedFold]
-) -> tuple[Matrix, Matrix, list[InnerQuality]]:
-    """(E, K) held-out class numbers or quantities, (F,) C or λ of the first column, and the inner quality."""
-    if task == "binary":
-        return _predict_binary(samples, labels, folds)
-    return (predict_classes if task == "classes" else predict_quantities)(samples, labels, folds)
-
-
-def _predict_binary(
-    samples: Samples, labels: Matrix, folds: list[NestedFold]
-) -> tuple[Matrix, Matrix, list[InnerQuality]]:
-    """The side probes' logistic regression, without what its intercept learns from unequal classes."""
+def _predict(samples: Samples, labels: Matrix, task: Task, folds: list[NestedFold]) -> Fitted:
+    """Predict by ridge; of a binary label by the side probes' logistic regression, without its class shares."""
+    if task != "binary":
+        return _predict_by_ridge(samples, labels, task, folds)
     truth = labels == 1
     predictions, fitted = np.empty_like(labels), cross_validate(samples, truth, folds)
     for fold, probe in zip(folds, fitted, strict=True):
@@ -306,10 +255,3 @@ def _distinct(labels: Matrix) -> tuple[Matrix, NDArray[np.intp]]:
     column_of = [first.setdefault(column.tobytes(), len(first)) for column in labels.T.copy()]
     different = [column_of.index(number) for number in range(len(first))]
     return labels[:, different], np.array(column_of, np.intp)
-
-
-def _out_of_fold(fitted: list[FittedFold], folds: list[NestedFold]) -> Matrix:
-    """(E, K) decisions, each episode's from the fold that tests it."""
-    tested = np.concatenate([fold.outer.test for fold in folds])
-    decisions: Matrix = np.concatenate([fold.decisions for fold in fitted])[np.argsort(tested)]
-    return decisions

@@ -5,7 +5,7 @@ Results are there when their settings are, which are written last, with the hash
 
 import json
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields, replace
 from datetime import UTC, datetime
 from io import BytesIO
@@ -103,46 +103,36 @@ def save_results(results: ProbeResults, run: Path | Location, *, requested: bool
     requested: whether a user wants these probes, which `load_results` then prefers to all older ones, rather
     than needing them in passing, as the untrained control of another run.
     """
-    location = locate(run)
+    location, scores = locate(run), {SCORES: csv_of_frame(results.scores).encode()}
+    controls: dict[str, bytes] = {}
+    if results.controls != Controls():
+        controls = {CONTROLS: json.dumps(results.controls.to_json(), indent=2).encode()}
     if not is_stored(location, results.key):
-        files = {SCORES: _scores(results), DECISIONS: _decisions(results), DIRECTIONS: _directions(results)}
+        curves = _pack(results.curves)
+        files = scores | {
+            DECISIONS: _npz(lambda file: np.savez_compressed(file, allow_pickle=False, **curves)),
+            DIRECTIONS: _npz(lambda file: save_directions(results.directions, file)),
+        }
         head = {"settings": asdict(results.settings), "stamp": results.stamp, "left_out": dict(results.left_out)}
         times = {"created": results.created, "requested": _now() if requested else ""}
-        write_bundle(location, PROBES, results.key, head, files | _controls(results), times)
+        write_bundle(location, PROBES, results.key, head, files | controls, times)
         return
     stored = read_probes(location)
-    bundle, controls = stored[results.key], _controls(results)
+    bundle = stored[results.key]
     times = dict(bundle.times)
     if requested and bundle.key != max(stored.values(), key=_rank).key:
         times["requested"] = _now()
     if controls or times != bundle.times:
-        files = {**controls, SCORES: _scores(results)} if controls else {}
+        files = controls | scores if controls else {}
         write_bundle(location, PROBES, results.key, bundle.head, files, times)
     else:
         tidy_bundle(location, PROBES, results.key)
 
 
-def _scores(results: ProbeResults) -> bytes:
-    return csv_of_frame(results.scores).encode()
-
-
-def _decisions(results: ProbeResults) -> bytes:
+def _npz(write: Callable[[BytesIO], None]) -> bytes:
     file = BytesIO()
-    np.savez_compressed(file, allow_pickle=False, **_pack(results.curves))
+    write(file)
     return file.getvalue()
-
-
-def _directions(results: ProbeResults) -> bytes:
-    file = BytesIO()
-    save_directions(results.directions, file)
-    return file.getvalue()
-
-
-def _controls(results: ProbeResults) -> dict[str, bytes]:
-    """Return the controls of the probes, as a file; nothing without controls."""
-    if results.controls == Controls():
-        return {}
-    return {CONTROLS: json.dumps(results.controls.to_json(), indent=2).encode()}
 
 
 def is_stored(run: Location, key: str) -> bool:
@@ -174,13 +164,21 @@ def load_results(run: RunReader, key: str | None = None, target: str | None = No
     target, stored = target or CORRECT, read_probes(location)
     newest = newest_bundle(run, stored, target)
     if newest is None:
-        raise NoProbesError(_why_none(run, target, len(stored)))
+        if not run.streams:
+            raise NoProbesError(f"{location} has no activations to probe: of {run.model!r} no stream was stored.")
+        hint = f" (of {len(stored)} stored, none: other episodes or another target)" if stored else ""
+        advice = how_to_probe(run) if target in SIDES else f"Run `probe-kit train {location} --target {target}`."
+        raise NoProbesError(f"{location} has no probes for target {target!r} on its episodes{hint}. {advice}")
     return _read(run, newest)
 
 
 def newest_bundle(run: RunReader, stored: Mapping[str, Bundle], target: str) -> Bundle | None:
     """Return the results of a target that `load_results` reads without a key; None without any."""
-    of_target = [bundle for bundle in _current(run, stored).values() if _is_default(bundle, target)]
+    of_target = [
+        bundle
+        for bundle, settings in _current(run, stored)
+        if settings.target == target and not (settings.is_side and settings.call)
+    ]
     return max(of_target, key=_rank, default=None)
 
 
@@ -208,43 +206,25 @@ def load_side_results(run: RunReader, key: str | None = None) -> ProbeResults:
     return results
 
 
-def _is_default(bundle: Bundle, target: str) -> bool:
-    """Whether results are of a target, and of a side at its first captured inference."""
-    settings = settings_of(bundle)
-    return settings.target == target and not (settings.is_side and settings.call)
-
-
 def stored_targets(run: RunReader) -> dict[str, int]:
     """Return the targets but sides that the run has probes of on its present episodes, in alphabetical order.
 
     With each the number of different values that it had: every one of them was a test.
     """
-    settings = [settings_of(bundle) for bundle in _current(run, read_probes(run.location)).values()]
-    versions = {(probed.target, probed.label) for probed in settings if not probed.is_side}
+    current = _current(run, read_probes(run.location))
+    versions = {(settings.target, settings.label) for _, settings in current if not settings.is_side}
     return dict(sorted(Counter(target for target, _ in versions).items()))
 
 
-def _current(run: RunReader, stored: Mapping[str, Bundle]) -> dict[str, Bundle]:
-    episodes = run.settings_sha256, episodes_sha256(run)
-    settings = {name: settings_of(bundle) for name, bundle in stored.items()}
-    return {
-        name: stored[name]
-        for name, probed in settings.items()
-        if (probed.run_settings, probed.episodes) == episodes
-    }
+def _current(run: RunReader, stored: Mapping[str, Bundle]) -> list[tuple[Bundle, ProbeSettings]]:
+    current = run.settings_sha256, episodes_sha256(run)
+    pairs = [(bundle, settings_of(bundle)) for bundle in stored.values()]
+    return [pair for pair in pairs if (pair[1].run_settings, pair[1].episodes) == current]
 
 
 def is_current(settings: ProbeSettings, run: RunReader) -> bool:
     """Whether probes of these settings are of the episodes that the run has now."""
     return (settings.run_settings, settings.episodes) == (run.settings_sha256, episodes_sha256(run))
-
-
-def _why_none(run: RunReader, target: str, stored: int) -> str:
-    if not run.streams:
-        return f"{run.location} has no activations to probe: of {run.model!r} no stream was stored."
-    hint = f" (of {stored} stored, none: other episodes or another target)" if stored else ""
-    advice = how_to_probe(run) if target in SIDES else f"Run `probe-kit train {run.location} --target {target}`."
-    return f"{run.location} has no probes for target {target!r} on its episodes{hint}. {advice}"
 
 
 def how_to_probe(run: RunReader) -> str:
@@ -293,19 +273,15 @@ def _as_array(value: Any) -> Any:
 
 
 def _unpack(arrays: Mapping[str, Any]) -> dict[tuple[str, str], ProbeCurve]:
-    members: dict[tuple[str, str], dict[str, Any]] = {}
+    curves: dict[tuple[str, str], dict[str, Any]] = {}
     for name, value in arrays.items():
         category, view, member = name.rsplit("/", 2)  # from the right: a category of one's own may hold a slash
-        members.setdefault((category, view), {})[member] = value
-    return {key: ProbeCurve(**_members(stored)) for key, stored in members.items()}
-
-
-def _members(stored: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the members of a curve from their arrays."""
-    members = dict(stored)
-    members["sites"] = tuple(Site.parse(str(name)) for name in stored["sites"])
-    members |= {name: tuple(map(str, stored[name])) for name in _TEXTS}
-    return members | {name: stored[name].item() for name in _FACTS if name in stored}
+        curves.setdefault((category, view), {})[member] = value
+    for members in curves.values():
+        members["sites"] = tuple(Site.parse(str(name)) for name in members["sites"])
+        members |= {name: tuple(map(str, members[name])) for name in _TEXTS}
+        members |= {name: members[name].item() for name in _FACTS if name in members}
+    return {key: ProbeCurve(**members) for key, members in curves.items()}
 
 
 def read_probes(run: Location) -> dict[str, Bundle]:
@@ -342,7 +318,14 @@ def read_controls(bundle: Bundle) -> Controls:
 
 def _read(run: RunReader, bundle: Bundle) -> ProbeResults:
     settings = settings_of(bundle)
-    _check_foreign(run, bundle, settings)
+    stamp, now = str(bundle.head.get("stamp", "")), run.stamp
+    # Arrays in memory have no commits, and are compared by their settings.
+    is_foreign = stamp != now and bool(stamp and now)
+    if is_foreign and (settings.run_settings != run.settings_sha256 or is_current(settings, run)):
+        raise RunDamagedError(
+            f"{run.location}/{bundle.folder} holds probes of other activations than the run has: they were fitted "
+            f"to commits {stamp[:12]}, here are {now[:12]}. Remove it and run the same `probe-kit train` again"
+        )
     try:
         with open_arrays(bundle.read(DECISIONS)) as arrays:
             curves = _unpack(arrays)
@@ -357,24 +340,7 @@ def _read(run: RunReader, bundle: Bundle) -> ProbeResults:
         StoredDirections(bundle, DIRECTIONS),
         read_controls(bundle),
         bundle.times.get("created", ""),
-        _stamp(bundle),
+        stamp,
         run.label,
         dict(bundle.head.get("left_out", {})),
     )
-
-
-def _check_foreign(run: RunReader, bundle: Bundle, settings: ProbeSettings) -> None:
-    """Raise RunDamagedError for results of another run, or of these episodes as they are no more."""
-    stamp, now = _stamp(bundle), run.stamp
-    if stamp == now or not (stamp and now):  # arrays in memory have no commits, and are compared by their settings
-        return
-    if settings.run_settings != run.settings_sha256 or is_current(settings, run):
-        raise RunDamagedError(
-            f"{run.location}/{bundle.folder} holds probes of other activations than the run has: they were fitted "
-            f"to commits {stamp[:12]}, here are {now[:12]}. Remove it and run the same `probe-kit train` again"
-        )
-
-
-def _stamp(bundle: Bundle) -> str:
-    """Return the hash of the commits that probes were fitted to; empty for arrays in memory."""
-    return str(bundle.head.get("stamp", ""))
