@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from probe_kit.hashing import derive_seed
-from probe_kit.statistics.label_permutations import pointwise_p
+from probe_kit.statistics.label_permutations import p_value
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train import ArrayRun, ProbeSettings, Target
 from probe_kit.train.choices import TASKS, Task
@@ -93,8 +93,8 @@ def p_values(kind: str, task: Task, fitted: int, seed: int) -> tuple[float, floa
     metric, null = np.array([probe.scores.mean() for probe in probes]), np.stack([probe.null for probe in probes])
     every = np.column_stack([metric, null])
     excess = every - every.mean(axis=1, keepdims=True)
-    family = pointwise_p(excess.max(axis=0)[:1], excess.max(axis=0)[None, 1:])
-    return float(pointwise_p(metric, null)[0]), float(family[0])
+    family = p_value(excess.max(axis=0)[:1], excess.max(axis=0)[None, 1:])
+    return float(p_value(metric, null)[0]), float(family[0])
 
 
 def drawn(kind: str, task: Task, fitted: int, seed: int) -> tuple[float, float]:

@@ -27,7 +27,7 @@ from scipy.stats import binomtest
 from threadpoolctl import threadpool_limits
 
 from probe_kit.statistics.folds import OUTER_FOLDS, Fold, grouped_folds
-from probe_kit.statistics.label_permutations import flip_groups, flip_items, max_statistic_p, pointwise_p
+from probe_kit.statistics.label_permutations import flip_groups, flip_items, max_statistic_p, p_value
 from probe_kit.statistics.paired_tests import better_than_best, better_than_reference
 from probe_kit.train.control_features import LAYERS
 from probe_kit.train.crossval.nested_folds import nested_folds
@@ -112,7 +112,7 @@ def p_values(world: World, seed: int, by_item: bool = False, nested: bool = Fals
         outer = grouped_folds(labels, groups, OUTER_FOLDS, seed + OTHER)
         scores = np.stack([correctness(discriminant(x, columns, outer), columns).mean(axis=0) for x in layers])
         accuracy, null = scores[:, 0], scores[:, 1:]
-    return float(pointwise_p(accuracy, null)[0]), float(max_statistic_p(accuracy, null).min())
+    return float(p_value(accuracy, null)[0]), float(max_statistic_p(accuracy, null).min())
 
 
 def correlated(generator: np.random.Generator, sites: int, accuracy: float) -> NDArray[np.bool_]:

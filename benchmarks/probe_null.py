@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.stats import binomtest
 from threadpoolctl import threadpool_limits
 
-from probe_kit.statistics.label_permutations import flip_groups, max_statistic_p, pointwise_p
+from probe_kit.statistics.label_permutations import flip_groups, max_statistic_p, p_value
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.crossval.nested_folds import nested_folds
 from probe_kit.train.crossval.site_probe import probe_site
@@ -44,7 +44,7 @@ def p_values(seed: int) -> tuple[float, float]:
     probes = [probe_site(Samples.pooled(site), labels, permuted, folds) for site in sites]
     accuracy = np.array([correctness(probe.decisions, labels).mean() for probe in probes])
     null = np.stack([probe.null for probe in probes])
-    return float(pointwise_p(accuracy, null)[0]), float(max_statistic_p(accuracy, null).min())
+    return float(p_value(accuracy, null)[0]), float(max_statistic_p(accuracy, null).min())
 
 
 def main() -> None:

@@ -210,14 +210,6 @@ def shortage(least_p: float, permutations: int, tests: int = 1) -> Literal["", "
     return "groups" if least_p > 1.001 * smallest_p(permutations) else "permutations"
 
 
-def pointwise_p(observed: NDArray[np.float64], null: NDArray[np.float64]) -> NDArray[np.float64]:
-    """p-value of every site on its own, (S,), from observed scores (S,) and null scores (S, P).
-
-    NaN without a null.
-    """
-    return p_value(observed, null)
-
-
 def max_statistic_p(observed: NDArray[np.float64], null: NDArray[np.float64]) -> NDArray[np.float64]:
     """p-value of every site (S,) against the best of all: how often the maximum of a null curve is as high.
 
@@ -227,7 +219,10 @@ def max_statistic_p(observed: NDArray[np.float64], null: NDArray[np.float64]) ->
 
 
 def p_value(observed: NDArray[np.float64], null: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(S,) share of draws in `null` (S, P) or (1, P) that are as high as `observed` (S,), which counts as one."""
+    """(S,) share of draws in `null` (S, P) or (1, P) that are as high as `observed` (S,), which counts as one.
+
+    The p of every site on its own. NaN without a null.
+    """
     draws = null.shape[1]
     if draws == 0:
         return np.full(observed.shape, np.nan)

@@ -309,15 +309,12 @@ def frames_of_inferences(run: RunReader) -> Iterator[tuple[Any, int, list[int]]]
 
 def _sim_columns(run: RunReader) -> dict[str, tuple[Cell, ...]]:
     """The cells of all `sim.*` columns for every captured inference, without the prefix."""
-    rows = [[_finite(value(at)) for _, value in SIM_COLUMNS.values()] for at in _instants(run)]
-    return {name: tuple(cells[number] for cells in rows) for number, name in enumerate(SIM_COLUMNS)}
-
-
-def _instants(run: RunReader) -> Iterator[Instant]:
-    """Yield the instant of every captured inference."""
+    rows: list[list[Cell]] = []
     for trajectory, row, frames in frames_of_inferences(run):
         side = str(run.episodes["side_correct"].iloc[row])
-        yield from (Instant(trajectory, side, frame) for frame in frames)
+        instants = [Instant(trajectory, side, frame) for frame in frames]
+        rows += [[_finite(value(at)) for _, value in SIM_COLUMNS.values()] for at in instants]
+    return {name: tuple(cells[number] for cells in rows) for number, name in enumerate(SIM_COLUMNS)}
 
 
 def _finite(value: Cell) -> Cell:

@@ -14,7 +14,7 @@ from probe_kit.hooks.contract.sites import Site
 from probe_kit.runs.layout import DATASET
 from probe_kit.runs.reader import RunReader, full_name
 from probe_kit.statistics.intervals import Accuracy
-from probe_kit.statistics.label_permutations import pointwise_p
+from probe_kit.statistics.label_permutations import p_value
 from probe_kit.statistics.paired_tests import better_than_best, better_than_reference
 from probe_kit.train.choices import CONTROLS, EVERYWHERE
 from probe_kit.train.control_features import LAYERS, PICTURED, ControlInputs, why_impossible
@@ -158,7 +158,7 @@ def _layer_probes(inputs: ControlInputs, problem: Problem, width: int, seed: int
 def control_score(name: str, category: str, curve: ProbeCurve, stream: str = "", view: str = "") -> ControlScore:
     """Return the mean score of the probes of a control, with p where a single one has label permutations."""
     score, limits = curve.estimate(np.arange(len(curve.sites)))
-    p = float(pointwise_p(curve.metric.mean(keepdims=True), curve.null.mean(axis=0)[None, :])[0])
+    p = float(p_value(curve.metric.mean(keepdims=True), curve.null.mean(axis=0)[None, :])[0])
     chance = float(curve.chance.mean())
     by_step = (
         np.mean([curve.by_step(scores) for scores in curve.scores], axis=0) if not curve.is_side else np.empty(0)

@@ -39,22 +39,18 @@ def read_table(table: "Path | str | pd.DataFrame", requested: Sequence[str]) -> 
     that is no such table, or has no column `episode_id`; MissingExtraError for Parquet without pyarrow.
     """
     if not isinstance(table, str | Path):
-        return _of_frame(table, "DataFrame", requested)
+        frame = table.reset_index() if any(name is not None for name in table.index.names) else table
+        names = tuple(str(name) for name in frame.columns)
+        position_of = _places(names, requested, "DataFrame")
+        cells = {name: frame.iloc[:, number].tolist() for name, number in position_of.items()}
+        return _of_cells(cells, names, len(frame), "DataFrame")
     path = Path(table)
     if path.suffix.lower() in (".parquet", ".pq"):
-        _check_file(path)
+        try:
+            check_regular(path, MOST_BYTES)
+        except OSError as error:
+            raise UsageError(f"{path} cannot be read: {error.strerror}. Give a CSV or Parquet file") from error
         return _of_parquet(path, requested)
-    return _of_csv(path, requested)
-
-
-def _check_file(path: Path) -> None:
-    try:
-        check_regular(path, MOST_BYTES)
-    except OSError as error:
-        raise UsageError(f"{path} cannot be read: {error.strerror}. Give a CSV or Parquet file") from error
-
-
-def _of_csv(path: Path, requested: Sequence[str]) -> LabelTable:
     opened = open_table(path, (EPISODE, SOURCE))
     read = list(_places(opened.names, requested, str(path), opened.line))
     return LabelTable.of_lines(opened, opened.rows(read), read)
@@ -109,15 +105,6 @@ def _of_parquet(path: Path, requested: Sequence[str]) -> LabelTable:
         raise UsageError(f"{path} is no Parquet file: {reason}. Write it again, or give a CSV file") from error
     cells = {name: read.column(name).to_pylist() for name in position_of}
     return _of_cells(cells, tuple(names), len(read), str(path))
-
-
-def _of_frame(frame: "pd.DataFrame", source: str, requested: Sequence[str]) -> LabelTable:
-    if any(name is not None for name in frame.index.names):
-        frame = frame.reset_index()
-    names = [str(name) for name in frame.columns]
-    position_of = _places(names, requested, source)
-    cells = {name: frame.iloc[:, number].tolist() for name, number in position_of.items()}
-    return _of_cells(cells, tuple(names), len(frame), source)
 
 
 def _of_cells(cells: dict[str, list[Any]], names: tuple[str, ...], count: int, source: str) -> LabelTable:
@@ -202,7 +189,13 @@ def code_labels(cells: Sequence[Cell], task: Task | None, target: str) -> LabelV
     _check_task(fitting_task, distinct, target)
     if fitting_task == "continuous":
         numbers = np.array([np.nan if cell is None else float(cell) for cell in cells], np.float64)
-        _check_squares(numbers, target)
+        # Sums of their squares must stay in the range of float64.
+        largest, spread = float(np.nanmax(np.abs(numbers))), float(np.nanmax(numbers) - np.nanmin(numbers))
+        if largest > LARGEST or spread < 1 / LARGEST:
+            raise UsageError(
+                f"column {target!r} has values up to {largest:g}, and they differ by {spread:g}; expected at most "
+                f"{LARGEST:g}, and differences of at least {1 / LARGEST:g}. Correct the cell, or give another unit"
+            )
         return LabelValues(fitting_task, (), numbers)
     code = {value: number for number, value in enumerate(distinct)}
     codes = [np.nan if cell is None else code[_integer_if_whole(cell)] for cell in cells]
@@ -225,16 +218,6 @@ def _only_task(distinct: Sequence[Cell], target: str) -> Task:
             "classes or quantities. Say which with --task classes or --task continuous (task=…)"
         )
     return "continuous"
-
-
-def _check_squares(numbers: NDArray[np.float64], target: str) -> None:
-    """Raise UsageError for quantities whose sums of squares leave the range of float64."""
-    largest, spread = float(np.nanmax(np.abs(numbers))), float(np.nanmax(numbers) - np.nanmin(numbers))
-    if largest > LARGEST or spread < 1 / LARGEST:
-        raise UsageError(
-            f"column {target!r} has values up to {largest:g}, and they differ by {spread:g}; expected at most "
-            f"{LARGEST:g}, and differences of at least {1 / LARGEST:g}. Correct the cell, or give another unit"
-        )
 
 
 def _check_task(task: Task, distinct: Sequence[Cell], target: str) -> None:

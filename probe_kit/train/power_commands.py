@@ -130,19 +130,11 @@ def _print(estimates: "list[Power]") -> None:
         "± (standard error)",
         "red control from %",
     )
+    shares = ("above", "chance", "random_features", "untrained", "absent")
     rows = [
         (
             str(estimate.items),
-            *(
-                f"{100 * share:.0f}"
-                for share in (
-                    estimate.above,
-                    estimate.chance,
-                    estimate.random_features,
-                    estimate.untrained,
-                    estimate.absent,
-                )
-            ),
+            *(f"{100 * getattr(estimate, share):.0f}" for share in shares),
             f"{100 * estimate.spread:.1f}",
             f"{100 * detectable(estimate.items):.0f}",
         )

@@ -193,7 +193,13 @@ def _side_folds_and_permutations(
     # Permutations that leave a training fold with a single class have no probe.
     shares = np.array([drawn[inner.train].mean(axis=0) for fold in folds for inner in fold.inner])
     drawn = drawn[:, ((shares > 0) & (shares < 1)).all(axis=0)]
-    _check_power(drawn.shape[1], category, settings)
+    smallest = smallest_p(drawn.shape[1])
+    if shortage(smallest, settings.permutations) == "groups":
+        warnings.warn(
+            f"category {category!r}: its groups allow {drawn.shape[1]} label permutations, the smallest possible "
+            f"p is {smallest:.3f}: nothing can be below {SIGNIFICANCE}. Extract more items.",
+            stacklevel=3,
+        )
     return folds, drawn
 
 
@@ -242,17 +248,6 @@ def _why_fewer(episodes: int, call: int) -> str:
     return f"{number} got as far as captured inference {call}, counted from 0, and the others ended before"
 
 
-def _check_power(count: int, category: str, settings: ProbeSettings) -> None:
-    """Warn where the groups allow no result to be significant."""
-    smallest = smallest_p(count)
-    if shortage(smallest, settings.permutations) == "groups":
-        warnings.warn(
-            f"category {category!r}: its groups allow {count} label permutations, the smallest possible p is "
-            f"{smallest:.3f}: nothing can be below {SIGNIFICANCE}. Extract more items.",
-            stacklevel=4,
-        )
-
-
 # -- every other target ------------------------------------------------------------------------------------------
 
 
@@ -290,10 +285,28 @@ def _block_folds_and_permutations(
     source = exchange_blocks(blocks, kinds, permutations, derive_seed("label exchanges", settings.seed, *scope))
     columns = np.column_stack([labels, labels[source]])
     # An exchange that leaves a training fold with one value has no probe. The real labels are column 0, and stay.
-    columns = columns[:, _trainable(name, columns, folds)]
+    is_fit = np.ones(columns.shape[1], bool)
+    for fold in folds:
+        for split in (fold.outer, *fold.inner):
+            is_fit &= np.ptp(columns[split.train], axis=0) > 0
+    if not is_fit[0]:
+        raise TooFewGroupsError(
+            f"{name} is constant in a training fold, so there is nothing to learn; expected both "
+            "values in most groups. Label more groups, or draw other folds with --seed"
+        )
+    columns = columns[:, is_fit]
     smallest = smallest_p_of_labels(columns[:, 0], columns[:, 1:])
     if columns.shape[1] > 1 and (columns == columns[:, :1]).all():
-        _warn_of_one_pattern(name, classes, labels, blocks)
+        first = labels[next(iter(blocks.values()))].tolist()
+        listed = [classes[int(value)] if classes else f"{value:g}" for value in first[:4]]
+        more = ", …" if len(first) > len(listed) else ""
+        warnings.warn(
+            f"{name} is the same in every group: each of the {len(blocks)} groups holds "
+            f"{', '.join(listed)}{more} in this order. Exchanging labels between groups changes nothing, so every "
+            "p is 1. Give groups in which the label differs (--group-by; `groups` in Python), or a label that "
+            "differs between the groups",
+            stacklevel=3,
+        )
     elif shortage(smallest, permutations) == "groups":
         warnings.warn(
             f"{name}: its groups allow no p below {smallest:.3f}, so nothing can be below {SIGNIFICANCE}. Label "
@@ -301,21 +314,6 @@ def _block_folds_and_permutations(
             stacklevel=3,
         )
     return folds, columns[:, 1:]
-
-
-def _warn_of_one_pattern(
-    name: str, classes: tuple[str, ...], labels: Matrix, blocks: Mapping[str, NDArray[np.intp]]
-) -> None:
-    first = labels[next(iter(blocks.values()))].tolist()
-    listed = [classes[int(value)] if classes else f"{value:g}" for value in first[:4]]
-    more = ", …" if len(first) > len(listed) else ""
-    warnings.warn(
-        f"{name} is the same in every group: each of the {len(blocks)} groups holds "
-        f"{', '.join(listed)}{more} in this order. Exchanging labels between groups changes nothing, so every "
-        "p is 1. Give groups in which the label differs (--group-by; `groups` in Python), or a label that differs "
-        "between the groups",
-        stacklevel=4,
-    )
 
 
 def _check_groups(
@@ -367,17 +365,3 @@ def _blocks(
         stratum = str(samples.strata[blocks[group][0]])
         kinds[group] = stratum, tuple(tuple(look for look, _ in pairs) for pairs, _ in ordered)
     return blocks, kinds
-
-
-def _trainable(name: str, columns: Matrix, folds: list[NestedFold]) -> NDArray[np.bool_]:
-    """(1 + P,) whether a labelling leaves no training fold with a single value. Raises TooFewGroupsError."""
-    fine = np.ones(columns.shape[1], bool)
-    for fold in folds:
-        for split in (fold.outer, *fold.inner):
-            fine &= np.ptp(columns[split.train], axis=0) > 0
-    if not fine[0]:
-        raise TooFewGroupsError(
-            f"{name} is constant in a training fold, so there is nothing to learn; expected both "
-            "values in most groups. Label more groups, or draw other folds with --seed"
-        )
-    return fine

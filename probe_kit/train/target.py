@@ -114,12 +114,12 @@ class Target:
             name,
             code_labels([cells[row] for row in at], task, name),
             tuple(episodes[row] for row in at),
-            None if inferences is None else tuple(inferences[row] for row in at),
+            _rows_of(inferences, at),
             label_table.at(at),
             group_by,
             exchange_within,
-            None if groups is None else tuple(groups[row] for row in at),
-            None if strata is None else tuple(strata[row] for row in at),
+            _rows_of(groups, at),
+            _rows_of(strata, at),
             of_source,
         )
 
@@ -150,8 +150,8 @@ class Target:
             episodes=tuple(episode for episode, _ in flat),
             inferences=None if self.inferences is None else tuple(call for _, call in flat),
             table=self.table.at(at),
-            groups=None if self.groups is None else tuple(self.groups[number] for number in at),
-            strata=None if self.strata is None else tuple(self.strata[number] for number in at),
+            groups=_rows_of(self.groups, at),
+            strata=_rows_of(self.strata, at),
             of_source=False,
             unseen=sum(not matches for matches in keys),
         )
@@ -380,6 +380,10 @@ def _once(
             f"one out{'' if inferences is not None else f', or add a column {INFERENCE!r}'}"
         )
     return list(first.values())
+
+
+def _rows_of[T](column: Sequence[T] | None, rows: Sequence[int]) -> tuple[T, ...] | None:
+    return None if column is None else tuple(column[row] for row in rows)
 
 
 def _names(table: LabelTable, column: str | None) -> tuple[str, ...] | None:

@@ -14,7 +14,7 @@ from probe_kit._tables.table import Table
 from probe_kit._terminal import options as common
 from probe_kit._terminal.console import marked, out, say
 from probe_kit.errors import ProbeKitError, UsageError
-from probe_kit.train.choices import CORRECT, SIDES, Task
+from probe_kit.train.choices import CORRECT, SIDES
 
 if TYPE_CHECKING:
     from probe_kit.runs import Run
@@ -83,20 +83,16 @@ class ListedTarget(NamedTuple):
 def listed_targets(run: "RunReader") -> Iterator[ListedTarget]:
     """Yield every target of a run, those too that it cannot give."""
     from probe_kit.train.builtin_columns import BuiltinColumns
-    from probe_kit.train.target import Target
 
     columns = BuiltinColumns(run)
     for name in [*(SIDES if run.inputs is None else ()), *columns.names]:
         try:
-            if name in SIDES:
-                target, task = Target.of_run(run, name), "binary"
-                trials = dict(_trials_of_a_side(run, target))
-            elif (column := columns.read(name)).is_constant:
+            if name not in SIDES and (column := columns.read(name)).is_constant:
                 yield ListedTarget(name, CONSTANT, NONE, NONE)
                 continue
-            else:
-                target, task = _target_and_task(name, column)
-                trials = dict(_trials_of_a_column(target, task, column))
+            target, task, trials = (
+                _trials_of_a_side(run, name) if name in SIDES else _trials_of_a_column(name, column)
+            )
         except ProbeKitError as error:
             yield ListedTarget(name, NONE, NONE, str(error))
             continue
@@ -107,33 +103,42 @@ def listed_targets(run: "RunReader") -> Iterator[ListedTarget]:
         yield ListedTarget(name, task, per, target.values_in_words, options, refused)
 
 
-Trial = tuple["Target", Sequence[str] | None]
-"""A target and the categories that `train` would be given."""
+Trials = tuple["Target", str, dict[str, tuple["Target", Sequence[str] | None]]]
+"""A target, its task in words, and by the options of `train` the target and categories that these give."""
 
 
-def _trials_of_a_side(run: "RunReader", target: "Target") -> Iterator[tuple[str, Trial]]:
-    """Yield the options that train a side: of all categories, or of those with groups enough."""
+def _trials_of_a_side(run: "RunReader", name: str) -> Trials:
+    """Return the options that train a side: of all categories, or of those with groups enough."""
     from probe_kit.statistics.sufficiency import GROUPS_FOR_PROBES
+    from probe_kit.train.target import Target
 
-    name = "" if target.name == CORRECT else f" --target {target.name}"
-    yield name, (target, None)
+    target, option = Target.of_run(run, name), "" if name == CORRECT else f" --target {name}"
+    trials: dict[str, tuple[Target, Sequence[str] | None]] = {option: (target, None)}
     groups = run.episodes.groupby("category", sort=False)["group_id"].nunique()
     enough = [str(category) for category, count in groups.items() if count >= GROUPS_FOR_PROBES]
     if enough and len(enough) < len(groups):
-        yield f" --categories {','.join(enough)}{name}", (target, enough)
+        trials[f" --categories {','.join(enough)}{option}"] = target, enough
+    return target, "binary", trials
 
 
-def _trials_of_a_column(target: "Target", task: str, column: "BuiltinColumn") -> Iterator[tuple[str, Trial]]:
-    """Yield the options that train a column: with each task that a few integers may have."""
+def _trials_of_a_column(name: str, column: "BuiltinColumn") -> Trials:
+    """Return the options that train a column: with each task that a few integers may have."""
     from probe_kit.train.target import Target
 
-    if task != DOUBTFUL:
-        yield f" --target {target.name}", (target, None)
-        return
-    tasks: tuple[Task, ...] = ("classes", "continuous")
-    for typed in tasks:
-        of_task = Target.of_column(target.name, column, typed)
-        yield f" --target {target.name} --task {typed}", (of_task, None)
+    try:
+        target = Target.of_column(name, column)
+    except UsageError as error:
+        try:
+            classes = Target.of_column(name, column, "classes")
+        except UsageError:
+            raise error from None
+        quantities, option = Target.of_column(name, column, "continuous"), f" --target {name} --task"
+        return (
+            classes,
+            DOUBTFUL,
+            {f"{option} classes": (classes, None), f"{option} continuous": (quantities, None)},
+        )
+    return target, target.task, {f" --target {name}": (target, None)}
 
 
 def _refusal(run: "RunReader", target: "Target", categories: Sequence[str] | None) -> str:
@@ -148,20 +153,6 @@ def _refusal(run: "RunReader", target: "Target", categories: Sequence[str] | Non
         # Lines of targets that are refused for one reason are printed as one.
         return str(error).removeprefix(f"label {target.name!r}: ")
     return ""
-
-
-def _target_and_task(name: str, column: "BuiltinColumn") -> "tuple[Target, str]":
-    """Return the target of a built-in column, and its task in words."""
-    from probe_kit.train.target import Target
-
-    try:
-        target = Target.of_column(name, column)
-    except UsageError as error:
-        try:
-            return Target.of_column(name, column, "classes"), DOUBTFUL
-        except UsageError:
-            raise error from None
-    return target, target.task
 
 
 def labels(

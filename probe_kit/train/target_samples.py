@@ -1,6 +1,6 @@
 """The samples of a run that a target names: pairs of episode and captured inference, with groups and strata."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -77,7 +77,9 @@ def target_samples(
             f"episode. Use --window N for the first N inferences, or leave out the column {INFERENCE!r}"
         )
     check_call(run, call)
-    grid, reached, selected = _label_grid(run, target), reached_calls(run), _of_categories(run, categories)
+    grid, reached, selected = _label_grid(run, target), reached_calls(run), np.ones(len(run.episodes), bool)
+    if categories is not None and EVERYWHERE not in categories:
+        selected = run.episodes["category"].isin(list(categories)).to_numpy()
     start: NDArray[np.intp] = np.full(len(reached), call)
     left_out: dict[str, int] = {}
     if align_to is not None:
@@ -104,14 +106,13 @@ def target_samples(
     if not target.is_side:
         _check_groups(run, target, groups, strata, np.unique(rows))
     short = f"before inference {call + window - 1}" if align_to is None else f"within {window} inferences of it"
+    outside = int(np.isfinite(grid[reaching]).sum() - labelled[reaching].sum()) if target.per_step else 0
     left_out |= {
         f"episodes that end {short}": int((selected & (counts < window)).sum()),
         "episodes of items without their other layout": int((selected & (counts >= window) & ~complete).sum()),
         "episodes without a label": int((reaching & ~labelled.any(axis=1)).sum()),
         "inferences without a label": int((~labelled)[labelled.any(axis=1)].sum()),
-        f"labels outside the window of {window}": _outside(grid[reaching], labelled[reaching])
-        if target.per_step
-        else 0,
+        f"labels outside the window of {window}": outside,
         "labels of frames or episodes that the run does not show": target.unseen,
     }
     return TargetSamples(
@@ -150,11 +151,6 @@ def _complete(run: RunReader, reached: NDArray[np.bool_], incomplete: Incomplete
     return complete
 
 
-def _outside(table: NDArray[np.float64], labelled: NDArray[np.bool_]) -> int:
-    """Return how many labels (E, C) lie outside the windows of their episodes. labelled: (E, window) inside."""
-    return int(np.isfinite(table).sum() - labelled.sum())
-
-
 def _events(run: RunReader, target: Target, align_to: Target) -> NDArray[np.intp]:
     """(E,) the first inference at which `align_to` is true, -1 without one. Raises UsageError."""
     event = align_to.on(run)
@@ -167,13 +163,6 @@ def _events(run: RunReader, target: Target, align_to: Target) -> NDArray[np.intp
         )
     happened = _label_grid(run, event) == 1
     return np.where(happened.any(axis=1), happened.argmax(axis=1), -1)
-
-
-def _of_categories(run: RunReader, categories: Sequence[str] | None) -> NDArray[np.bool_]:
-    if categories is None or EVERYWHERE in categories:
-        return np.ones(len(run.episodes), bool)
-    selected: NDArray[np.bool_] = run.episodes["category"].isin(list(categories)).to_numpy()
-    return selected
 
 
 def _window(counts: NDArray[np.intp], most: int, requested: int | None) -> int:
@@ -250,16 +239,11 @@ def _check_groups(
         (run_groups, groups, f"--group-by {target.group_by} separates items that share a picture"),
         (groups, strata, f"--exchange-within {target.exchange_within} splits a group"),
     ):
-        for name, first, other in _split(inner[rows], outer[rows]):
-            raise UsageError(
-                f"{problem}: group {name!r} is in {first!r} and in {other!r}. Its episodes depend on each other, "
-                "so no p would be right. Give a column that is the same within a group, or leave the option out"
-            )
-
-
-def _split(inner: NDArray[np.str_], outer: NDArray[np.str_]) -> Iterator[tuple[str, str, str]]:
-    """Every name of `inner` that has two of `outer`, with both."""
-    first: dict[str, str] = {}
-    for name, other in zip(inner.tolist(), outer.tolist(), strict=True):
-        if first.setdefault(name, other) != other:
-            yield name, first[name], other
+        first: dict[str, str] = {}
+        for name, other in zip(inner[rows].tolist(), outer[rows].tolist(), strict=True):
+            if first.setdefault(name, other) != other:
+                raise UsageError(
+                    f"{problem}: group {name!r} is in {first[name]!r} and in {other!r}. Its episodes depend on "
+                    "each other, so no p would be right. Give a column that is the same within a group, or leave "
+                    "the option out"
+                )

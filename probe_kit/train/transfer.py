@@ -16,7 +16,7 @@ from probe_kit.errors import SettingsMismatchError, TooFewGroupsError, UsageErro
 from probe_kit.hooks.contract.sites import Site, label_of
 from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.folds import OUTER_FOLDS, Fold
-from probe_kit.statistics.label_permutations import pointwise_p
+from probe_kit.statistics.label_permutations import p_value
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.choices import EVERYWHERE, Task
 from probe_kit.train.crossval.nested_folds import NestedFold
@@ -103,7 +103,7 @@ class TransferResults:
 
     def _rows(self, view: str, curve: TransferCurve) -> Iterator[dict[str, Any]]:
         fitted, moved = curve.fitted, curve.recentred
-        p, p_fwe, moved_p = pointwise_p(fitted.metric, fitted.null), fitted.p_fwe(), moved.p_fwe()
+        p, p_fwe, moved_p = p_value(fitted.metric, fitted.null), fitted.p_fwe(), moved.p_fwe()
         deviations = (self.labels - self.labels.mean()) ** 2
         for row, (site, part) in enumerate(zip(fitted.sites, fitted.parts, strict=True)):
             low, high = score_interval(fitted.scores[row], self.labels, self.groups, self.task)

@@ -12,8 +12,8 @@ from probe_kit.statistics.label_permutations import (
     flip_items,
     max_statistic_p,
     movable_share,
+    p_value,
     permutations_for,
-    pointwise_p,
     shortage,
     smallest_p,
 )
@@ -87,7 +87,7 @@ def test_the_same_seed_gives_the_same_permuted_labels() -> None:
 
 def test_p_counts_the_real_labels_among_the_draws() -> None:
     null = np.array([[0.5, 0.6, 0.7], [0.4, 0.5, 0.5]])
-    assert pointwise_p(np.array([0.65, 0.9]), null).tolist() == [2 / 4, 1 / 4]
+    assert p_value(np.array([0.65, 0.9]), null).tolist() == [2 / 4, 1 / 4]
 
 
 def test_family_wise_p_compares_with_the_best_site() -> None:
@@ -96,7 +96,7 @@ def test_family_wise_p_compares_with_the_best_site() -> None:
 
 
 def test_p_is_missing_without_permuted_labels() -> None:
-    assert np.isnan(pointwise_p(np.array([0.9]), np.empty((1, 0)))).all()
+    assert np.isnan(p_value(np.array([0.9]), np.empty((1, 0)))).all()
     assert np.isnan(max_statistic_p(np.array([0.9]), np.empty((1, 0)))).all()
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.stats import binom
 
 from probe_kit.errors import TooFewGroupsError, UnbalancedEpisodesError, UsageError
-from probe_kit.statistics.label_permutations import flip_groups, max_statistic_p, pointwise_p
+from probe_kit.statistics.label_permutations import flip_groups, max_statistic_p, p_value
 from probe_kit.train import ArrayRun, Target
 from probe_kit.train.choices import TASKS, Task
 from probe_kit.train.crossval.nested_folds import STRENGTHS, nested_folds
@@ -199,10 +199,10 @@ def test_a_trend_over_the_episode_is_read_and_is_no_signal() -> None:
     probe = probe_labels(Samples.pooled(features), columns_of(problem), "continuous", problem.folds)
     assert probe.scores.mean() > 0.2, "the label can be predicted from the step"
     assert probe.null.mean() > 0.2, "so chance is not 0"
-    assert pointwise_p(np.array([probe.scores.mean()]), probe.null[None, :])[0] > 0.05
+    assert p_value(np.array([probe.scores.mean()]), probe.null[None, :])[0] > 0.05
     free = np.column_stack([problem.labels, *(draw.permutation(problem.labels) for _ in range(19))])
     shuffled = probe_labels(Samples.pooled(features), free, "continuous", problem.folds)
-    assert pointwise_p(np.array([shuffled.scores.mean()]), shuffled.null[None, :])[0] == 0.05, (
+    assert p_value(np.array([shuffled.scores.mean()]), shuffled.null[None, :])[0] == 0.05, (
         "as a null of frames has it"
     )
 
@@ -238,7 +238,7 @@ def test_labels_that_know_nothing_are_found_in_five_of_a_hundred(kind: str) -> N
         features = of_group + FRAME[:, None] + draw.normal(size=(GROUP.size, 4))
         problem = label_problem_of(values, 39)
         probe = probe_labels(Samples.pooled(features), columns_of(problem), "continuous", problem.folds)
-        found += int(pointwise_p(np.array([probe.scores.mean()]), probe.null[None, :])[0] <= 0.05)
+        found += int(p_value(np.array([probe.scores.mean()]), probe.null[None, :])[0] <= 0.05)
     assert found <= 12, "five are expected; 13 or more have a chance of 0.0015"
 
 
@@ -258,7 +258,7 @@ def p_values(seed: int, sites: int, permuted_labels: int) -> tuple[np.ndarray, n
     ]
     accuracy = np.array([correctness(probe.decisions, LABELS).mean() for probe in probes])
     null = np.stack([probe.null for probe in probes])
-    return pointwise_p(accuracy, null), max_statistic_p(accuracy, null)
+    return p_value(accuracy, null), max_statistic_p(accuracy, null)
 
 
 @pytest.mark.slow

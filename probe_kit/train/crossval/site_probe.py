@@ -82,7 +82,8 @@ def _predict_by_ridge(samples: Samples, labels: Matrix, task: Task, folds: list[
         quality = np.zeros((PENALTIES.size, labels.shape[1]))
         by_sample = np.zeros((PENALTIES.size, len(labels)))
         for inner in fold.inner:
-            truth, worth = labels[inner.test], np.ones((1, 1))
+            truth = labels[inner.test]
+            worth: Matrix = np.ones(1)
             if classes:  # one over the number of samples of each one's class
                 counts = np.stack([(truth == number).sum(axis=0) for number in range(classes)])
                 worth = 1 / np.take_along_axis(counts, truth.astype(np.intp), axis=0)

@@ -93,14 +93,10 @@ def inventory(run: Any) -> Inventory:
     )
 
 
-def _in_wordings(run: Any) -> list[Any]:
-    """The run in each of its wordings, which is what probes are fitted on; itself if it has none."""
-    return [run.in_wording(name) for name in run.wordings] or [run]
-
-
 def stored_probes(run: Any) -> list[StoredProbes]:
     """Return every set of probe results of a run, oldest first."""
-    readers, bundles = _in_wordings(run), read_probes(run.location)
+    # Probes are fitted on the run in one of its wordings, or on itself if it has none.
+    readers, bundles = [run.in_wording(name) for name in run.wordings] or [run], read_probes(run.location)
     newest = (newest_bundle(reader, bundles, CORRECT) for reader in readers)
     used = {bundle.key for bundle in newest if bundle is not None}
     probes = [_probes(readers, bundle, used) for bundle in bundles.values()]

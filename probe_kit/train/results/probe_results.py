@@ -21,7 +21,7 @@ from probe_kit.runs.reader import RunReader
 from probe_kit.runs.results import Bundle
 from probe_kit.statistics.folds import FoldUnit
 from probe_kit.statistics.intervals import effective_groups, group_shares, wilson_interval
-from probe_kit.statistics.label_permutations import permutations_for, pointwise_p, shortage
+from probe_kit.statistics.label_permutations import p_value, permutations_for, shortage
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.choices import SIDES, Incomplete, Task
 from probe_kit.train.crossval.task_scores import METRICS, fold_auc, fold_spearman, log_loss
@@ -196,7 +196,7 @@ def score_rows(
     """Yield the row of every site of a curve. key: its category and view. See `ProbeResults.scores`."""
     category, view = key
     score, low, high = _estimates(curve)
-    p, p_fwe, chance = pointwise_p(curve.metric, curve.null), curve.p_fwe(), curve.chance
+    p, p_fwe, chance = p_value(curve.metric, curve.null), curve.p_fwe(), curve.chance
     for row, (site, part) in enumerate(zip(curve.sites, curve.parts, strict=True)):
         exceeds = _exceeds(controls, key, site, float(p_fwe[row]), curve.is_side)
         yield {

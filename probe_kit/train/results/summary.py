@@ -10,7 +10,6 @@ from probe_kit.hooks.contract.sites import label_of
 from probe_kit.suite.categories import category_of
 from probe_kit.train.choices import EVERYWHERE
 from probe_kit.train.crossval.task_scores import METRICS
-from probe_kit.train.results.control_scores import ControlScore
 from probe_kit.train.results.probe_results import ProbeResults, best_sites, score_text, site_cells
 
 if TYPE_CHECKING:
@@ -43,12 +42,19 @@ def best_sites_table(fitted: Sequence[ProbeResults], splits: bool = True) -> Tab
         for row in _best(results):
             view = [str(row["view"])] * several_views
             name = " · ".join([_name(results, row["category"], row["stream"]), *view, *call])
-            rows.append((name, *_cells(results, row)))
+            met, missed = _exceeded(results, row)
+            parts = [", ".join(met)] * bool(met) + [f"not shown: {', '.join(missed)}"] * bool(missed)
+            begin = score_text(row["first"], first.is_side)
+            rows.append((name, *site_cells(row, first.is_side), "; ".join(parts) or "–", str(row["n"]), begin))
         for control in results.controls.scores if splits or not first.is_side else ():
             view = [control.view] * (several_views and bool(control.view))
             where = _name(results, control.category, control.stream)
             name = " · ".join(filter(None, [f"control {control.name}", where, *view, *call]))
-            rows.append((name, *_control_cells(control, first.is_side)))
+            score, low, high, chance = (
+                score_text(value, first.is_side) for value in (control.score, *control.ci, control.chance)
+            )
+            p = "–" if control.p is None else f"{p_text(control.p)} (this control alone)"
+            rows.append((name, "", f"{score} [{low}, {high}]", chance, p, "", str(control.n), ""))
     headings = (
         "category" if first.is_side else "stream",
         "best site",
@@ -87,26 +93,8 @@ def _name(results: ProbeResults, category: str, stream: str) -> str:
     return " · ".join(filter(None, ["" if pooled else str(category), label_of(stream) if stream else ""]))
 
 
-def _cells(results: ProbeResults, row: "pd.Series") -> tuple[str, ...]:
-    met, missed = _exceeded(results, row)
-    exceeds = "; ".join([", ".join(met)] * bool(met) + [f"not shown: {', '.join(missed)}"] * bool(missed))
-    return *site_cells(row, results.settings.is_side), exceeds or "–", str(row["n"]), _first(results, row)
-
-
 def _best(results: ProbeResults) -> "list[pd.Series]":
     return best_sites(results.scores, results.settings.is_side)
-
-
-def _first(results: ProbeResults, row: "pd.Series") -> str:
-    return score_text(row["first"], results.settings.is_side)
-
-
-def _control_cells(control: ControlScore, is_side: bool) -> tuple[str, ...]:
-    score, low, high, chance = (
-        score_text(value, is_side) for value in (control.score, *control.ci, control.chance)
-    )
-    p = "–" if control.p is None else f"{p_text(control.p)} (this control alone)"
-    return "", f"{score} [{low}, {high}]", chance, p, "", str(control.n), ""
 
 
 def _exceeded(results: ProbeResults, row: "pd.Series") -> tuple[list[str], list[str]]:
@@ -123,12 +111,18 @@ def best_sites_sentences(results: ProbeResults) -> list[str]:
 
     Of a side the first view alone, and whether the pictures alone decode it.
     """
-    sentences = _left_out(results)
+    sentences, settings = _left_out(results), results.settings
     for view, category, rows in _places(results):
         parts = "; ".join(_in_stream(results, row) for row in rows)
-        sentences.append(
-            f"{_subject(results, category, view, rows[0])} is {parts}.{_from_pictures(results, category)}"
-        )
+        if settings.is_side:
+            name, what = category_of(category).title, _SIDES[settings.target]
+            subject = f"{name} ({counted(rows[0]['n'], 'episode')}): {what}"
+        else:
+            facts = [counted(rows[0]["groups"], "group"), counted(rows[0]["n"], "sample")]
+            facts += [f"category {category}"] * (settings.categories != (EVERYWHERE,))
+            facts += [f"view {view}"] * (len(settings.views) > 1)
+            subject = f"{settings.target} ({', '.join(facts)})"
+        sentences.append(f"{subject} is {parts}.{_from_pictures(results, category)}")
     return sentences
 
 
@@ -181,17 +175,6 @@ def _findings(results: ProbeResults, rows: "Sequence[pd.Series]") -> Iterator[st
         yield f"decodable in {enumerated(decodable)}"
     for words, streams in open_.items():
         yield words.format(enumerated(streams))
-
-
-def _subject(results: ProbeResults, category: str, view: str, row: "pd.Series") -> str:
-    settings = results.settings
-    if settings.is_side:
-        return f"{category_of(category).title} ({counted(row['n'], 'episode')}): {_SIDES[settings.target]}"
-    facts = [counted(row["groups"], "group"), counted(row["n"], "sample")]
-    facts += [f"category {category}"] * (settings.categories != (EVERYWHERE,)) + [f"view {view}"] * (
-        len(settings.views) > 1
-    )
-    return f"{settings.target} ({', '.join(facts)})"
 
 
 def _in_stream(results: ProbeResults, row: "pd.Series") -> str:
