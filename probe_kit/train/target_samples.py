@@ -77,7 +77,8 @@ def target_samples(
             f"episode. Use --window N for the first N inferences, or leave out the column {INFERENCE!r}"
         )
     check_call(run, call)
-    grid, reached, selected = _label_grid(run, target), reached_calls(run), np.ones(len(run.episodes), bool)
+    grid, reached = _label_grid(run, target), reached_calls(run)
+    selected: NDArray[np.bool_] = np.ones(len(run.episodes), bool)
     if categories is not None and EVERYWHERE not in categories:
         selected = run.episodes["category"].isin(list(categories)).to_numpy()
     start: NDArray[np.intp] = np.full(len(reached), call)

@@ -1,6 +1,7 @@
 """Runs in memory with a signal planted where a test wants it."""
 
 from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -51,28 +52,32 @@ def episode_table(n_items: int, category: str, seed: int = 0) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-@pytest.fixture
-def planted_run(tmp_path: Path) -> PlantedRun:
-    """Makes a run: a backbone of 5 layers and an expert of 2 layers × 2 iterations, noise except where planted.
+def plant(
+    folder: Path,
+    planted: Mapping[Site, float] | None = None,
+    n_items: int = 40,
+    categories: tuple[str, ...] = ("color",),
+) -> ArrayRun:
+    """Make a run: a backbone of 5 layers and an expert of 2 layers × 2 iterations, noise except where planted.
 
     planted: per site, how strongly the side of the correct picture moves one feature.
     """
+    episodes = pd.concat([episode_table(n_items, name) for name in categories], ignore_index=True)
+    sign = np.where(episodes["side_correct"] == "left", 1.0, -1.0)
+    features = {}
+    for stream in (Stream("backbone", 5, 20), Stream("expert", 2, 8, iterations=2)):
+        for site in stream.sites():
+            noise = np.random.default_rng(derive_seed(str(site)))
+            array = noise.standard_normal((len(episodes), stream.width))
+            array[:, 3] += (planted or {}).get(site, 0.0) * sign
+            features[site, "mean"] = array
+    return ArrayRun(folder, "planted", "noise@1#0123456789ab", episodes, features)
 
-    def make(
-        planted: Mapping[Site, float] | None = None, n_items: int = 40, categories: tuple[str, ...] = ("color",)
-    ) -> ArrayRun:
-        episodes = pd.concat([episode_table(n_items, name) for name in categories], ignore_index=True)
-        sign = np.where(episodes["side_correct"] == "left", 1.0, -1.0)
-        features = {}
-        for stream in (Stream("backbone", 5, 20), Stream("expert", 2, 8, iterations=2)):
-            for site in stream.sites():
-                noise = np.random.default_rng(derive_seed(str(site)))
-                array = noise.standard_normal((len(episodes), stream.width))
-                array[:, 3] += (planted or {}).get(site, 0.0) * sign
-                features[site, "mean"] = array
-        return ArrayRun(tmp_path / "run", "planted", "noise@1#0123456789ab", episodes, features)
 
-    return make
+@pytest.fixture
+def planted_run(tmp_path: Path) -> PlantedRun:
+    """Makes runs, see `plant`."""
+    return partial(plant, tmp_path / "run")
 
 
 def problem_of(

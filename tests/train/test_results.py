@@ -33,16 +33,17 @@ from probe_kit.train.results.control_scores import (
 from probe_kit.train.results.inventory import inventory
 from probe_kit.train.results.probe_results import StoredDirections, best_sites, save_directions, site_cells
 from probe_kit.train.results.summary import best_sites_findings, best_sites_sentences, best_sites_table
-from tests.train.conftest import PlantedRun
+from tests.train.conftest import PlantedRun, plant
 
 SETTINGS = ProbeSettings(
     "m", False, None, "s@1#0", "s@1#0", "0", "0", ("color",), ("mean",), "side.correct", permutations=9, seed=0
 )
 
 
-@pytest.fixture
-def results(planted_run: PlantedRun) -> ProbeResults:
-    return train_probes(planted_run({Site("backbone", 3): 1.0}, categories=("color", "shape")), permutations=9)
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> ProbeResults:
+    run = plant(tmp_path_factory.mktemp("run"), {Site("backbone", 3): 2.0}, categories=("color", "public-info"))
+    return train_probes(run, permutations=39)
 
 
 def test_scores_follow_from_the_stored_decisions(results: ProbeResults) -> None:
@@ -67,8 +68,8 @@ def test_any_other_setting_is_another_key(name: str) -> None:
 
 
 @pytest.fixture
-def curve(planted_run: Callable[..., ArrayRun]) -> ProbeCurve:
-    return train_probes(planted_run({Site("backbone", 3): 2.0}), permutations=20).curves["color", "mean"]
+def curve(results: ProbeResults) -> ProbeCurve:
+    return results.curves["color", "mean"]
 
 
 def test_streams_are_families_of_their_own(curve: ProbeCurve) -> None:
@@ -76,7 +77,7 @@ def test_streams_are_families_of_their_own(curve: ProbeCurve) -> None:
     for stream in ("backbone", "expert"):
         rows = curve.stream(stream)
         best = curve.null[rows].max(axis=0)
-        expected = [(1 + (best >= accuracy[row]).sum()) / 21 for row in rows]
+        expected = [(1 + (best >= accuracy[row]).sum()) / 40 for row in rows]
         np.testing.assert_allclose(p[rows], expected)
 
 
@@ -230,22 +231,16 @@ def with_pixels(results: ProbeResults, p: float) -> ProbeResults:
     return replace(results, controls=results.controls.with_scores(scores))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("p", "is_named"), [(0.01, True), (0.2, False)])
-def test_pictures_that_decode_the_target_alone_are_named(
-    planted_run: PlantedRun, p: float, is_named: bool
-) -> None:
-    run = planted_run({Site("backbone", 3): 1.0}, categories=("color", "shape"))
-    results = train_probes(run, permutations=9)
+def test_pictures_that_decode_the_target_alone_are_named(results: ProbeResults, p: float, is_named: bool) -> None:
     sentences = [one for one in best_sites_sentences(with_pixels(results, p)) if "episodes): " in one]
     assert len(sentences) == 2
     assert all(("The pictures alone decode it too (81 %, 70 to 90)." in one) == is_named for one in sentences)
 
 
-def test_the_last_lines_are_short_sentences_of_two_numbers_without_brackets(planted_run: PlantedRun) -> None:
-    run = planted_run({Site("backbone", 3): 1.0}, categories=("color", "public-info"))
-    results = with_pixels(train_probes(run, permutations=39), 0.01)
-    lines = [line for line in best_sites_findings(results) if "was not run" not in line]
+def test_the_last_lines_are_short_sentences_of_two_numbers_without_brackets(results: ProbeResults) -> None:
+    findings = best_sites_findings(with_pixels(results, 0.01))
+    lines = [line for line in findings if "was not run" not in line]
     assert [line[:13] for line in lines] == ["Color        ", "Public Info  "]
     assert lines[0].startswith("Color        decodable in the backbone at ")
     for line in lines:
