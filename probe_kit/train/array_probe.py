@@ -195,7 +195,6 @@ _OF_RUNS = (
     "iteration", "episodes", "items", "settings",
 )  # fmt: skip
 """Columns of scores that arrays do not have."""
-_RESERVED = ("chance", "untrained", "random-features")
 
 
 @dataclass(frozen=True, repr=False)
@@ -309,6 +308,9 @@ def probe(
     networks = {"arrays": sites}
     if untrained is not None:
         networks["untrained"] = _sites(untrained, "untrained", count)
+    reserved = ("chance", "untrained", "random-features")
+    if wrong := [name for name in controls or {} if not isinstance(name, str) or not name or name in reserved]:
+        raise UsageError(f"a control is called {wrong[0]!r}; expected a text other than {', '.join(reserved)}")
     of_controls = {
         name: _matrix(array, f"controls[{name!r}]", count)[order] for name, array in (controls or {}).items()
     }
@@ -331,20 +333,13 @@ def probe(
             target=Target.read(table, "y", task, exchange_within=None if strata is None else "strata"),
             views=(VIEW,),
             permutations=permutations,
-            controls=tuple(_names(controls)),
+            controls=tuple(controls or ()),
             untrained=runs.get("untrained"),
             seed=seed,
             jobs=jobs,
         )
     classes = np.unique(np.asarray(y)) if results.curves[EVERYWHERE, VIEW].classes else np.empty(0)
     return ArrayProbes(tuple(sites), results, order, classes)
-
-
-def _names(controls: Mapping[str, ArrayLike] | None) -> list[str]:
-    names = list(controls or {})
-    if wrong := [name for name in names if not isinstance(name, str) or not name or name in _RESERVED]:
-        raise UsageError(f"a control is called {wrong[0]!r}; expected a text other than {', '.join(_RESERVED)}")
-    return names
 
 
 def _sites(arrays: Sites, what: str, count: int | None = None) -> dict[str, NDArray[np.float32]]:

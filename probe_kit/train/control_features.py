@@ -229,20 +229,14 @@ def random_layer(parts: Sequence[Features], width: int, seed: int) -> Features:
 
     A part that is the same for all samples, such as the state at the first frame, gives nothing.
     """
-    generator = np.random.default_rng(seed)
-    varying = [_standardised(part) for part in parts]
-    mixed = [
+    generator, mixed = np.random.default_rng(seed), []
+    for part in parts:
+        values = part.astype(np.float64)
+        spread = values.std(axis=0)
+        varying = (values - values.mean(axis=0))[:, spread > 0] / spread[spread > 0]
         # Divided by the root of its width, so that a thousand pixels do not drown ten words.
-        part @ generator.standard_normal((part.shape[1], width)) / max(1, part.shape[1]) ** 0.5
-        for part in varying
-    ]
+        mixed.append(
+            varying @ generator.standard_normal((varying.shape[1], width)) / max(1, varying.shape[1]) ** 0.5
+        )
     outputs: Features = np.tanh(sum(mixed)).astype(np.float32)
     return outputs
-
-
-def _standardised(columns: Features) -> NDArray[np.float64]:
-    """Columns that vary, with mean 0 and deviation 1."""
-    values = columns.astype(np.float64)
-    spread = values.std(axis=0)
-    centred: NDArray[np.float64] = (values - values.mean(axis=0))[:, spread > 0] / spread[spread > 0]
-    return centred

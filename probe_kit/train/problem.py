@@ -4,7 +4,7 @@ import warnings
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,9 +32,6 @@ from probe_kit.train.results.probe_results import ProbeSettings
 from probe_kit.train.samples import Samples
 from probe_kit.train.target import Target
 from probe_kit.train.target_samples import TargetSamples
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 # Choices, not measurements: stricter ones refuse runs with a few gaps, laxer ones give a p to few free labels.
 MOST_OF_ONE_SIDE = 0.75
@@ -175,8 +172,20 @@ def _side_folds_and_permutations(
         raise TooFewGroupsError(f"category {category!r}: {_why_fewer(0, settings.call)}")
     if target.null == "flip_groups":
         _check_balance(labels, category, settings.call)
+    seed = derive_seed("folds", settings.seed, category)
     try:
-        folds = _side_folds(target, table, labels, groups, derive_seed("folds", settings.seed, category))
+        if target.null == "flip_groups":
+            folds = nested_folds(labels, groups, seed)
+        else:
+            # Groups exchange their chosen sides, so folds that knew the real ones would make them easier than any
+            # exchange: these are balanced by layout.
+            folds = nested_folds(table["layout"].to_numpy(dtype=str), groups, seed, stratified_folds)
+            shares = [labels[inner.train].mean() for fold in folds for inner in fold.inner]
+            if min(shares) == 0 or max(shares) == 1:
+                raise TooFewGroupsError(
+                    f"{labels.sum()} of {labels.size} episodes chose the left side, and a training fold holds one "
+                    "side only; expected both in several groups. Extract more items of this category"
+                )
     except TooFewGroupsError as error:
         if settings.call > 0:
             reason = (
@@ -191,8 +200,8 @@ def _side_folds_and_permutations(
     else:
         drawn = flip_groups(labels, groups, count, seed)
     # Permutations that leave a training fold with a single class have no probe.
-    shares = np.array([drawn[inner.train].mean(axis=0) for fold in folds for inner in fold.inner])
-    drawn = drawn[:, ((shares > 0) & (shares < 1)).all(axis=0)]
+    permuted = np.array([drawn[inner.train].mean(axis=0) for fold in folds for inner in fold.inner])
+    drawn = drawn[:, ((permuted > 0) & (permuted < 1)).all(axis=0)]
     smallest = smallest_p(drawn.shape[1])
     if shortage(smallest, settings.permutations) == "groups":
         warnings.warn(
@@ -201,26 +210,6 @@ def _side_folds_and_permutations(
             stacklevel=3,
         )
     return folds, drawn
-
-
-def _side_folds(
-    target: Target, table: "pd.DataFrame", labels: NDArray[np.bool_], groups: NDArray[np.str_], seed: int
-) -> list[NestedFold]:
-    """Return folds that are balanced by side, for `side.chosen` by layout.
-
-    Groups exchange their chosen sides, so folds that knew the real ones would make them easier than any exchange.
-    Raises TooFewGroupsError as `nested_folds` does, and for a training side with a single class.
-    """
-    if target.null == "flip_groups":
-        return nested_folds(labels, groups, seed)
-    folds = nested_folds(table["layout"].to_numpy(dtype=str), groups, seed, stratified_folds)
-    shares = [labels[inner.train].mean() for fold in folds for inner in fold.inner]
-    if min(shares) == 0 or max(shares) == 1:
-        raise TooFewGroupsError(
-            f"{labels.sum()} of {labels.size} episodes chose the left side, and a training fold holds one side "
-            "only; expected both in several groups. Extract more items of this category"
-        )
-    return folds
 
 
 def _check_balance(labels: NDArray[np.bool_], category: str, call: int) -> None:

@@ -400,8 +400,18 @@ _LEGEND = (
 def transfer_table(results: TransferResults, splits: bool = True) -> Table:
     """A row per stream and view for its best site."""
     several, metric = len(results.curves) > 1, METRICS[results.task]
-    best = _best(results)
-    rows = [(" · ".join([label_of(row["stream"]), *[row["view"]] * several]), *_cells(row)) for row in best]
+    rows = [
+        (
+            " · ".join([label_of(row["stream"]), *[row["view"]] * several]),
+            str(row["site"]),
+            f"{row['score']:.3f} [{row['ci_low']:.3f}, {row['ci_high']:.3f}]",
+            score_text(row["chance"], is_side=False),
+            p_text(row["p_fwe"]),
+            score_text(row["recentred"], is_side=False),
+            f"{row['refitted']:.3f} [{row['refitted_ci_low']:.3f}, {row['refitted_ci_high']:.3f}]",
+        )
+        for row in _best(results)
+    ]
     title = [f"{results.target}: {metric}", f"{results.model} to {results.other_model}"]
     title += ["OTHER WEIGHTS"] * (not results.same_weights)
     headings = (
@@ -436,17 +446,6 @@ def _best(results: TransferResults) -> "list[pd.Series]":
     excess = scores["score"] - scores["chance"].fillna(0.0)
     best = excess.groupby([scores["view"], scores["stream"]], sort=False).idxmax()
     return [scores.loc[number] for number in best]
-
-
-def _cells(row: "pd.Series") -> tuple[str, ...]:
-    return (
-        str(row["site"]),
-        f"{row['score']:.3f} [{row['ci_low']:.3f}, {row['ci_high']:.3f}]",
-        score_text(row["chance"], is_side=False),
-        p_text(row["p_fwe"]),
-        score_text(row["recentred"], is_side=False),
-        f"{row['refitted']:.3f} [{row['refitted_ci_low']:.3f}, {row['refitted_ci_high']:.3f}]",
-    )
 
 
 def _verdict(row: "pd.Series") -> str:
