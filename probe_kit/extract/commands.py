@@ -158,56 +158,50 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
     from probe_kit.runs.writer import growth_at
 
     plan, identity, free = extraction.plan, extraction.identity(), location.free_bytes()
+    calibrated, measures = extraction.calibration, extraction.settings.machine.batch == "auto"
     growth = growth_at(location, plan.to_json()["episodes"])
     needed = in_units(sum(space_needed(extraction.further_plan(location), extraction.settings).values()))
     weights = "not read" if extraction.declared else (identity["weights_sha256"] or "scripted")[:12]
     source = f" ({extraction.declared}; the weights were not read)" if extraction.declared and plan.streams else ""
     rows = {
         "model": f"{identity['model']}  weights {weights}" + ("  RANDOM" if identity["random_weights"] else ""),
-        **_weights_row(extraction),
-        **_units_row(extraction.settings),
-        **_protocol_row(identity),
+        "weights": _weights(extraction),
+        "units": _units(extraction.settings),
+        "protocol": _protocol(identity),
         **extraction.source.describe(plan.episodes),
-        **({"grows": growth.words} if growth and growth.words else {}),
+        "grows": growth.words if growth else "",
         "streams": ("; ".join(_describe(s) for s in plan.streams) or "none") + source,
-        **_acts_row(identity, extraction.settings.source.subject),
+        "acts": _acts(identity, extraction.settings.source.subject),
         "activations": f"{plan.sites} sites, {plan.bytes / 1e6:,.1f} MB before compression",
         "disk": f"up to {needed} with columns, probes and report; "
         + ("no bound" if free is None else f"{in_units(free)} free"),
-        **_pace_row(extraction),
+        "pace": calibrated.words if calibrated else "batch auto: chosen when the model runs" if measures else "",
         "run": str(location),
     }
     table = Table(show_header=False, title="plan", box=None)
     table.add_column(no_wrap=True)
     table.add_column(overflow="fold")  # a path that is cut off is no path
     for name, value in rows.items():
-        table.add_row(marked("[dim]{}[/]", name), value)
+        if value:
+            table.add_row(marked("[dim]{}[/]", name), value)
     err.print(table)
 
 
-def _weights_row(extraction: "Extraction") -> dict[str, str]:
+def _weights(extraction: "Extraction") -> str:
     """Memory and download of a model whose size is known."""
     from probe_kit.extract.plan import weights_needed
 
-    settings, controller = extraction.settings, extraction.controller
-    model: Any = getattr(controller, "model", None)
-    loaded = None if model is None else model.card.parameters
-    requested = settings.model
-    words = weights_needed(requested.family, requested.checkpoint, requested.options, requested.dtype, loaded)
-    return {"weights": words} if words else {}
+    model: Any = getattr(extraction.controller, "model", None)
+    loaded, requested = None if model is None else model.card.parameters, extraction.settings.model
+    return weights_needed(requested.family, requested.checkpoint, requested.options, requested.dtype, loaded)
 
 
-def _units_row(settings: "Settings") -> dict[str, str]:
-    """The line about the units that actions get, of a family whose checkpoints have several."""
+def _units(settings: "Settings") -> str:
+    """The units that actions get, of a family whose checkpoints have several."""
     from probe_kit.hooks.registry import get_family
 
-    family = get_family(settings.model.family)
-    units = (
-        ""
-        if family is None
-        else family.whose_units(settings.model.checkpoint, settings.model.options, fetch=False)
-    )
-    return {"units": units} if units else {}
+    family, model = get_family(settings.model.family), settings.model
+    return "" if family is None else family.whose_units(model.checkpoint, model.options, fetch=False)
 
 
 def check_size(extraction: "Extraction", location: "Location", agreed: bool) -> None:
@@ -225,13 +219,11 @@ def check_size(extraction: "Extraction", location: "Location", agreed: bool) -> 
         )
 
 
-def _acts_row(identity: Mapping[str, Any], subject: str) -> dict[str, str]:
+def _acts(identity: Mapping[str, Any], subject: str) -> str:
     """Return why a model does not act. subject: of the source."""
-    if not identity.get("capture_only"):
-        return {}
     reasons = {"recordings": "recorded frames are shown", "pictures": "pictures are shown"}
     reason = reasons.get(subject, "only captured, once per episode")
-    return {"acts": f"no: {reason}; no success rate"}
+    return f"no: {reason}; no success rate" if identity.get("capture_only") else ""
 
 
 def print_sufficiency(extraction: "Extraction") -> None:
@@ -257,22 +249,13 @@ def print_sufficiency(extraction: "Extraction") -> None:
     err.print(table)
 
 
-def _pace_row(extraction: "Extraction") -> dict[str, str]:
-    """The line about what a calibration chose; nothing where batch and processes were typed."""
-    if extraction.calibration is not None:
-        return {"pace": extraction.calibration.words}
-    return (
-        {"pace": "batch auto: chosen when the model runs"} if extraction.settings.machine.batch == "auto" else {}
-    )
-
-
-def _protocol_row(identity: dict[str, Any]) -> dict[str, str]:
+def _protocol(identity: Mapping[str, Any]) -> str:
     if "protocol" not in identity:
-        return {}
+        return ""
     protocol = identity["protocol"]
     changed = ", ".join(f"{name}={run} instead of {was}" for name, (was, run) in protocol["deviations"].items())
     name = " ".join(filter(None, (protocol["name"], protocol.get("variant"))))
-    return {"protocol": name + (f", but {changed}" if changed else ", as released")}
+    return name + (f", but {changed}" if changed else ", as released")
 
 
 def _describe(stored: Any) -> str:

@@ -3,8 +3,8 @@
 import json
 import os
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from contextlib import closing
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -46,13 +46,16 @@ if TYPE_CHECKING:
 
 CheckCameras = Callable[[Sequence[str]], object]
 """Called with the names of the model's cameras that get a picture; raises UsageError."""
+Progress = Callable[[int, int, str], None]
+# If this many episodes were given up and none succeeded, something is wrong with all of them.
+HOPELESS = 3
 _OF_THE_CHECKPOINT = ("dtype", "execute", "random_weights", "captured_calls")
 """Settings whose value the loaded model may decide."""
 
 
 @dataclass(frozen=True)
-class Prepared:
-    """The beginning of a run: the source is open, the model is loaded and the plan is made.
+class Extraction:
+    """A prepared extraction, ready to run: the source is open, the model is loaded and the plan is made.
 
     source: as the model is shown it. card: the part of the identity that the loaded model decides. controller:
     None if the model is loaded again by workers elsewhere. calibration: what chose the batch, None if it was not
@@ -97,6 +100,80 @@ class Prepared:
         # Without the weights' hash there is no name yet.
         return self.settings.folder_name("…" if self.declared else sha256_json(hashed)[:8])
 
+    def worker(self, writer: RunWriter[Plan], episodes: int) -> Worker:
+        """A worker of this process, which plays so many episodes at most with the model that is loaded."""
+        assert self.controller is not None
+        return Worker(writer, self.settings, self.controller, self.source, episodes)
+
+    def run(self, out: Path | str | Location, force: bool = False, progress: Progress | None = None) -> Run:
+        """Play and commit every episode of the plan that is not committed yet, seal the run and open it.
+
+        A run that lacks episodes of the plan grows by them. One that has more than these stays as it is.
+        progress: called with (episodes done, episodes planned, outcome of the last one); by default a bar in a
+        notebook, nothing elsewhere.
+        Raises SettingsMismatchError or DiskSpaceError before anything is written, StoreError if `out` lies in an
+        object store that cannot be used, as one that ignores conditional puts, EpisodesFailedError at the end if
+        episodes were given up, and whatever is wrong with all episodes at once. Committed episodes stay; the same
+        call resumes after them.
+        """
+        location = locate(out)
+        if self.declared:
+            raise UsageError("this extraction was planned without its model; prepare it again with fetch=True")
+        with location.in_words():
+            self._check_settings(location)
+            if not force and (addition := self.further_plan(location)).episodes:
+                check_if_full(space_needed(addition, self.settings), location)
+            writer = self.writer(location)
+            with writer.owned():
+                check_exclusive(location, RUN_FILE)
+                if self.settings.label is not None:
+                    label_run(location, run_label(self.settings))
+                remaining = writer.remaining()
+                if remaining:
+                    writer.begin(self.settings.machine.allow_mixed)
+                    self._play(writer, remaining, progress or notebook_progress("episodes"))
+                seal(location)
+        return open_run(location)
+
+    def _check_settings(self, location: Location) -> None:
+        """Raise SettingsMismatchError if a run with other settings is there: before its plan is compared."""
+        if location.exists(RUN_FILE):
+            root = read_root(location)
+            root.check_continuable()
+            check_other_settings(root.own_settings, json.loads(canonical_json(self.identity())), str(location))
+
+    def further_plan(self, location: Location) -> Plan:
+        """The plan of the episodes that the run at `location` does not plan yet: all of them where there is none.
+
+        Raises SettingsMismatchError if the run there cannot grow by this plan, and RunDamagedError.
+        """
+        if not location.exists(RUN_FILE):
+            return self.plan
+        root = read_root(location)
+        root.check_continuable()
+        added = {
+            planned["episode_id"]
+            for planned in further_rows(root.plan, self.plan.to_json()["episodes"], str(location))
+        }
+        return self.plan.only(row for row in self.plan.episodes if row.episode_id in added)
+
+    def _play(self, writer: RunWriter[Plan], remaining: list[int], progress: Progress | None) -> None:
+        total, committed, given_up = len(self.plan.episodes), 0, list[Failed]()
+        with closing(play(self, writer, remaining)) as events:
+            for event in events:
+                if isinstance(event, Done):
+                    committed += 1
+                    if progress:
+                        progress(total - len(remaining) + committed, total, event.outcome["outcome"])
+                    continue
+                given_up.append(event)
+                writer.give_up(event.number, event.reason, event.traceback)
+                if len(given_up) >= HOPELESS and not committed:
+                    raise _failure(writer, given_up, committed)
+        if given_up:
+            seal(writer.location)
+            raise _failure(writer, given_up, committed)
+
 
 def load(
     settings: Settings,
@@ -105,7 +182,7 @@ def load(
     model: "Model | None" = None,
     fetch: bool = True,
     check_cameras: CheckCameras | None = None,
-) -> Prepared:
+) -> Extraction:
     """Open the source, load the model and plan the rows.
 
     rehearsed: whether the source was tried before. location: where it will be written, if that is known, so that
@@ -131,7 +208,11 @@ def load(
     if not fetch and (sizes := planned_sizes(settings, source.instructions)) is not None:
         settings = task.planned(settings, sizes)
         plan = _plan(settings, source, rows, sizes.streams, settings.task.execute or sizes.execute)
-        return Prepared(settings, source, plan, _declared_card(settings), None, declared=sizes.source)
+        requested = settings.model
+        card = {"model": requested.family, "random_weights": requested.random_weights, "weights_sha256": None}
+        declared = {"dtype": requested.dtype, "execute": settings.task.execute}
+        card |= {name: value for name, value in declared.items() if value is not None}
+        return Extraction(settings, source, plan, card, None, declared=sizes.source)
     settings, source, controller, calibration = task.fit(
         settings, source, task.load(settings) if model is None else model
     )
@@ -139,7 +220,7 @@ def load(
         check_cameras(cameras)
     rows = task.rows(settings, source)  # of the source as the model is shown it
     plan = _plan(settings, source, rows, controller.streams, controller.execute)
-    return Prepared(settings, source, plan, controller.identity, controller, calibration)
+    return Extraction(settings, source, plan, controller.identity, controller, calibration)
 
 
 def open_checked(
@@ -286,15 +367,7 @@ def _plan(
     )
 
 
-def _declared_card(settings: Settings) -> dict[str, Any]:
-    """The part of the identity of a model that was not loaded."""
-    requested: Mapping[str, Any] = {"dtype": settings.model.dtype, "execute": settings.task.execute}
-    declared = {name: value for name, value in requested.items() if value is not None}
-    model = {"model": settings.model.family, "random_weights": settings.model.random_weights}
-    return {**model, "weights_sha256": None, **declared}
-
-
-def play(prepared: Prepared, writer: RunWriter[Plan], numbers: list[int]) -> Generator[Event]:
+def play(prepared: Extraction, writer: RunWriter[Plan], numbers: list[int]) -> Generator[Event]:
     """Play episodes where the settings say; yields `Done` of each, or `Failed` once it is given up.
 
     In this process with the model that is loaded, else in workers with one of their own, to which only episode
@@ -321,34 +394,25 @@ def play(prepared: Prepared, writer: RunWriter[Plan], numbers: list[int]) -> Gen
 def play_episodes(
     setup: tuple[Settings, str], take: Callable[[], int | None], report: Callable[[Event], None]
 ) -> None:
-    """The work of a worker elsewhere: load the model, then play what is handed out."""
-    with load_worker(*setup) as worker:
-        while True:
-            for event in worker.run(take):
-                report(event)
+    """The work of a worker elsewhere: load the model, then play what is handed out of a run, which is held.
 
-
-@contextmanager
-def load_worker(settings: Settings, run: str) -> Iterator[Worker]:
-    """A worker for a run that exists, with a model of its own; the run is held while the body runs.
-
-    Raises SettingsMismatchError if they differ, or if this machine gives other numbers than those before it.
+    Raises SettingsMismatchError if this machine has other settings or gives other numbers than those before it.
     """
+    settings, run = setup
     prepared = load(settings, rehearsed=True)
-    assert prepared.controller is not None
     writer = prepared.writer(locate(run))
     with writer.joined():
         writer.begin(settings.machine.allow_mixed)
-        episodes = len(writer.remaining())
-        with Worker(writer, prepared.settings, prepared.controller, prepared.source, episodes) as worker:
-            yield worker
+        with prepared.worker(writer, len(writer.remaining())) as worker:
+            while True:
+                for event in worker.run(take):
+                    report(event)
 
 
 def _played_here(
-    prepared: Prepared, writer: RunWriter[Plan], queue: TaskQueue[int], episodes: int
+    prepared: Extraction, writer: RunWriter[Plan], queue: TaskQueue[int], episodes: int
 ) -> Iterator[tuple[int, Event]]:
-    assert prepared.controller is not None
-    with Worker(writer, prepared.settings, prepared.controller, prepared.source, episodes) as worker:
+    with prepared.worker(writer, episodes) as worker:
         while not queue.finished:
             yield from ((0, event) for event in worker.run(lambda: queue.take(0)))
 
@@ -368,84 +432,6 @@ def _gpus(settings: Settings, resources: Mapping[str, Any]) -> list[int]:
     """The GPUs of each actor: as many actors as GPUs, or as the settings say."""
     gpus = int(resources.get("GPU", 0)) if settings.machine.device.startswith("cuda") else 0
     return [1 if gpus else 0] * (settings.machine.workers or max(1, gpus))
-
-
-Progress = Callable[[int, int, str], None]
-# If this many episodes were given up and none succeeded, something is wrong with all of them.
-HOPELESS = 3
-
-
-class Extraction(Prepared):
-    """A prepared extraction, ready to run; so far nothing is written."""
-
-    def run(self, out: Path | str | Location, force: bool = False, progress: Progress | None = None) -> Run:
-        """Play and commit every episode of the plan that is not committed yet, seal the run and open it.
-
-        A run that lacks episodes of the plan grows by them. One that has more than these stays as it is.
-        progress: called with (episodes done, episodes planned, outcome of the last one); by default a bar in a
-        notebook, nothing elsewhere.
-        Raises SettingsMismatchError or DiskSpaceError before anything is written, StoreError if `out` lies in an
-        object store that cannot be used, as one that ignores conditional puts, EpisodesFailedError at the end if
-        episodes were given up, and whatever is wrong with all episodes at once. Committed episodes stay; the same
-        call resumes after them.
-        """
-        location = locate(out)
-        if self.declared:
-            raise UsageError("this extraction was planned without its model; prepare it again with fetch=True")
-        with location.in_words():
-            self._check_settings(location)
-            if not force and (addition := self.further_plan(location)).episodes:
-                check_if_full(space_needed(addition, self.settings), location)
-            writer = self.writer(location)
-            with writer.owned():
-                check_exclusive(location, RUN_FILE)
-                if self.settings.label is not None:
-                    label_run(location, run_label(self.settings))
-                remaining = writer.remaining()
-                if remaining:
-                    writer.begin(self.settings.machine.allow_mixed)
-                    self._play(writer, remaining, progress or notebook_progress("episodes"))
-                seal(location)
-        return open_run(location)
-
-    def _check_settings(self, location: Location) -> None:
-        """Raise SettingsMismatchError if a run with other settings is there: before its plan is compared."""
-        if location.exists(RUN_FILE):
-            root = read_root(location)
-            root.check_continuable()
-            check_other_settings(root.own_settings, json.loads(canonical_json(self.identity())), str(location))
-
-    def further_plan(self, location: Location) -> Plan:
-        """The plan of the episodes that the run at `location` does not plan yet: all of them where there is none.
-
-        Raises SettingsMismatchError if the run there cannot grow by this plan, and RunDamagedError.
-        """
-        if not location.exists(RUN_FILE):
-            return self.plan
-        root = read_root(location)
-        root.check_continuable()
-        added = {
-            planned["episode_id"]
-            for planned in further_rows(root.plan, self.plan.to_json()["episodes"], str(location))
-        }
-        return self.plan.only(row for row in self.plan.episodes if row.episode_id in added)
-
-    def _play(self, writer: RunWriter[Plan], remaining: list[int], progress: Progress | None) -> None:
-        total, committed, given_up = len(self.plan.episodes), 0, list[Failed]()
-        with closing(play(self, writer, remaining)) as events:
-            for event in events:
-                if isinstance(event, Done):
-                    committed += 1
-                    if progress:
-                        progress(total - len(remaining) + committed, total, event.outcome["outcome"])
-                    continue
-                given_up.append(event)
-                writer.give_up(event.number, event.reason, event.traceback)
-                if len(given_up) >= HOPELESS and not committed:
-                    raise _failure(writer, given_up, committed)
-        if given_up:
-            seal(writer.location)
-            raise _failure(writer, given_up, committed)
 
 
 def _failure(writer: RunWriter[Plan], given_up: list[Failed], committed: int) -> EpisodesFailedError:
@@ -476,15 +462,14 @@ def prepare(
     Raises what these raise: UnknownModelError, UnknownCategoryError, SuiteError, WeightsError …
     """
     location = None if out is None else locate(out)
+    load_with = partial(load, location=location, model=model, fetch=fetch, check_cameras=check_cameras)
     if not settings.machine.elsewhere:
-        prepared = load(settings, location=location, model=model, fetch=fetch, check_cameras=check_cameras)
-        return Extraction(**vars(prepared))
+        return load_with(settings)
     # This process only plans: the GPUs belong to the workers, and each of them calibrates on its own device.
     measures = {"batch": 1} if settings.machine.batch == "auto" else {}
-    on_cpu = settings.changed(device="cpu", **measures)
-    planned = load(on_cpu, location=location, model=model, fetch=fetch, check_cameras=check_cameras)
+    planned = load_with(settings.changed(device="cpu", **measures))
     for_workers = planned.settings.changed(device=settings.machine.device, batch=settings.machine.batch)
-    return Extraction(for_workers, planned.source, planned.plan, planned.card, None, declared=planned.declared)
+    return replace(planned, settings=for_workers, controller=None, calibration=None)
 
 
 def extract_run(settings: ExtractSettings, out: Path | str, progress: Progress | None = None) -> Run:

@@ -312,7 +312,7 @@ def show_dataset(
     if model is not None:
         with err.status("loading the model"):
             check_unloaded(settings, recording)
-            policy: Policy = task_of(settings).load(settings)  # type: ignore[assignment]  # scripts were refused
+            policy: Policy = task_of(settings).load(settings)  # scripts were refused
             recording, policy = recording.fitted(policy)
         facts |= recording.facts_of(policy)
     table = Table(show_header=False, box=None)

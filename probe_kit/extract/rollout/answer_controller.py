@@ -6,7 +6,7 @@ admissible answers where they stand.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,7 +34,7 @@ from probe_kit.suite.items import side_words
 
 if TYPE_CHECKING:
     from probe_kit.extract.rollout.capturing import EpisodeBuffers
-    from probe_kit.hooks import AnswerModel, Prompt, Reading, Roles
+    from probe_kit.hooks import AnswerModel, Prompt, Reading
 
 
 ANSWERED = "answered"
@@ -43,26 +43,15 @@ NO_OBJECT = Phrase("", "")
 """The phrase of a question that is the instruction itself."""
 
 
-@dataclass(frozen=True)
-class Form:
-    """A forced choice in words: the beginning of the answer, and its admissible continuations by meaning."""
-
-    begun: str
-    options: Mapping[str, Said]
-
-    @classmethod
-    def after(cls, begun: str, lead: str) -> "Form":
-        """Left, right or center behind `begun`, with `lead` in front of each."""
-        return cls(begun, {f"{lead}left": "left", f"{lead}right": "right", f"{lead}center": "center"})
+Form = tuple[str, Mapping[str, Said]]
+"""A forced choice in words: the beginning of the answer, and its admissible continuations by meaning."""
+Forced = tuple[dict[Said, float], float, bool]
+"""Logits of the admissible answers, one row: by what each says, their share, and whether rounding decides."""
 
 
-@dataclass(frozen=True)
-class Forced:
-    """Logits of the admissible answers, one row: by what each says, their share, and whether rounding decides."""
-
-    logits: dict[Said, float]
-    mass: float
-    near_tie: bool
+def _form(begun: str, lead: str) -> Form:
+    """Left, right or center behind `begun`, with `lead` in front of each."""
+    return begun, {f"{lead}left": "left", f"{lead}right": "right", f"{lead}center": "center"}
 
 
 class AnswerController(ModelController["AnswerModel", "Prompt"]):
@@ -89,7 +78,7 @@ class AnswerController(ModelController["AnswerModel", "Prompt"]):
         self._lens_stream = self._find_lens_stream() if self.template.lettered else None
         self._form = self._choose_form(blank)
         if self._form is not None:
-            self.identity["begun"] = self._form.begun
+            self.identity["begun"] = self._form[0]
 
     def infer(self, turns: Sequence[Turn]) -> list[Inference]:
         """Per turn the columns of its outcome; nothing is executed."""
@@ -190,19 +179,18 @@ class AnswerController(ModelController["AnswerModel", "Prompt"]):
         """The choice between the admissible answers; one in words takes a prefill of its own."""
         meaning: Mapping[str, Said] = self._spoken_options(order)
         if self._form is not None:
-            meaning = self._form.options
-            forced_questions = [
-                replace(question, options=tuple(meaning), begun=self._form.begun) for question in questions
-            ]
-            reading = self.model.read(forced_questions)
+            begun, meaning = self._form
+            reading = self.model.read(
+                [replace(question, options=tuple(meaning), begun=begun) for question in questions]
+            )
         if np.isnan(reading.option_logits).any():
             raise PolicyFailedError(
                 "the model gave NaN as the logit of an answer; expected numbers for all of them"
             )
         ties = self.model.near_ties(reading)
         return [
-            Forced(
-                {statement: float(logit) for statement, logit in zip(meaning.values(), row, strict=True)},
+            (
+                dict(zip(meaning.values(), map(float, row), strict=True)),
                 float(reading.option_mass[number]),
                 bool(ties[number]),
             )
@@ -238,7 +226,7 @@ class AnswerController(ModelController["AnswerModel", "Prompt"]):
             return self._statement(question, spoken[0], forced[0])
         episode = turn.row.content
         expected = side_expected(self._settings.task.query, episode.side_correct)
-        choice = Choice([forced_choice.logits for forced_choice in forced])
+        choice = Choice([logits for logits, _, _ in forced])
         columns: dict[str, Any] = {}
         for order, text in zip(self.template.orders, spoken, strict=True):
             read = read_answer(text, self.template, order)
@@ -251,10 +239,8 @@ class AnswerController(ModelController["AnswerModel", "Prompt"]):
                 f"parse{mark}": read.rule,
                 f"parse_tier{mark}": read.tier or "none",
             }
-        for order, forced_choice in zip(self.template.orders, forced, strict=True):
-            mark = "" if order == "original" else "_swapped"
-            columns |= {f"logit_{statement}{mark}": logit for statement, logit in forced_choice.logits.items()}
-            columns |= {f"option_mass{mark}": forced_choice.mass, f"near_tie{mark}": forced_choice.near_tie}
+        for order, choice_forced in zip(self.template.orders, forced, strict=True):
+            columns |= _forced_columns(choice_forced, "" if order == "original" else "_swapped")
         columns |= {
             f"margin{mark}": margin for mark, margin in zip(("", "_swapped"), choice.margins, strict=False)
         }
@@ -280,23 +266,18 @@ class AnswerController(ModelController["AnswerModel", "Prompt"]):
             "said": read.meaning,
             "parse": read.rule,
             "parse_tier": read.tier or "none",
-            **{f"logit_{statement}": logit for statement, logit in forced.logits.items()},
-            "option_mass": forced.mass,
-            "near_tie": forced.near_tie,
+            **_forced_columns(forced),
         }
 
     def _sizes(self, questions: Sequence["Prompt"]) -> list[dict[str, int]]:
         """The length of each prompt; its last position can lie outside the backbone's stream."""
         # Without `whole_prompt` the last position is the stream `answer`, and missing in the backbone's roles.
-        rows, after = self._backbone_roles(questions), int(not self.model.whole_prompt)
+        backbone = next(name for name, stream in self.model.streams.items() if stream.part == "backbone")
+        rows, after = self.model.asked_roles(questions)[backbone], int(not self.model.whole_prompt)
         return [
             {"prompt_tokens": int(row.valid.sum()) + after, "picture_tokens": int(row.mask("image").sum())}
             for row in rows
         ]
-
-    def _backbone_roles(self, questions: Sequence["Prompt"]) -> "list[Roles]":
-        backbone = next(name for name, stream in self.model.streams.items() if stream.part == "backbone")
-        return self.model.asked_roles(questions)[backbone]
 
     # -- beforehand --------------------------------------------------------------------------------------
 
@@ -331,13 +312,19 @@ class AnswerController(ModelController["AnswerModel", "Prompt"]):
             return None
         lead = self.model.lead
         begun = f"{lead}Yes," if self.template.yes_or_no else ""
-        forms = [Form.after(begun, " " if begun else lead), Form.after(f"{begun} " if begun else lead, "")]
+        forms = [_form(begun, " " if begun else lead), _form(f"{begun} " if begun else lead, "")]
         for number, form in enumerate(forms):
             try:
-                self.model.read([replace(questions[0], options=tuple(form.options), begun=form.begun)])
+                self.model.read([replace(questions[0], options=tuple(form[1]), begun=form[0])])
             except UsageError:  # an option merges with the prompt, or two begin alike
                 if number == len(forms) - 1:
                     raise
             else:
                 return form
         return None
+
+
+def _forced_columns(forced: Forced, mark: str = "") -> dict[str, Any]:
+    logits, mass, near_tie = forced
+    columns: dict[str, Any] = {f"logit_{statement}{mark}": logit for statement, logit in logits.items()}
+    return columns | {f"option_mass{mark}": mass, f"near_tie{mark}": near_tie}

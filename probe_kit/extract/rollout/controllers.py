@@ -5,13 +5,13 @@ does.
 """
 
 import warnings
-from abc import ABC
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from itertools import islice
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -258,7 +258,7 @@ class Inference:
     columns: Mapping[str, Any] = field(default_factory=dict)
 
 
-class Controller(Protocol):
+class Controller(ABC):
     """A task: act, capture or ask.
 
     script: for the player, None if the controller infers. execute: actions per inference, 0 for none. threads: of
@@ -268,52 +268,45 @@ class Controller(Protocol):
 
     identity: dict[str, Any]
     streams: list[StoredStream]
-    script: str | None
-    execute: int
-    threads: int | None
-    on_gpu: bool
+    script: str | None = None
+    execute: int = 0
+    threads: int | None = None
+    on_gpu: bool = False
 
+    @abstractmethod
     def infer(self, turns: Sequence[Turn]) -> list[Inference]:
         """One call of the model about all of these turns."""
 
     def instruction_ids(self, instruction: str) -> tuple[int, ...] | None:
         """The ids that the network is delivered as this instruction; None if it reads none or cannot say."""
+        del instruction
+        return None
 
     def certificate(self) -> dict[str, Any]:
         """Return the checks so far, for the run's certificate."""
+        return {"policy": self.identity}
 
 
-class ScriptedController:
+class ScriptedController(Controller):
     """A script plays by itself, looks at nothing and leaves no activations."""
 
+    execute = 1
+
     def __init__(self, name: str) -> None:
-        self.identity: dict[str, Any] = {"model": name, "random_weights": False, "weights_sha256": None}
-        self.streams: list[StoredStream] = []
-        self.script: str | None = name
-        self.execute = 1
-        self.threads: int | None = None
-        self.on_gpu = False
+        self.identity = {"model": name, "random_weights": False, "weights_sha256": None}
+        self.streams, self.script = [], name
 
     def infer(self, turns: Sequence[Turn]) -> list[Inference]:
         """Never asked: a scripted player plays to the end by itself."""
         raise AssertionError(f"a scripted player asked for {len(turns)} actions")
 
-    def instruction_ids(self, instruction: str) -> None:
-        """None: it reads no instruction."""
 
-    def certificate(self) -> dict[str, Any]:
-        """Nothing was loaded."""
-        return {"policy": self.identity}
-
-
-class ModelController[Loaded: "Model", Question](ABC):
+class ModelController[Loaded: "Model", Question](Controller):
     """A model that infers: its capture, its part of a run's identity, and what it certifies.
 
     outputs: of an inference, in a word.
     """
 
-    script: str | None = None
-    execute: int = 0
     outputs: ClassVar[str]
 
     def __init__(self, model: Loaded, settings: "Settings", streams: list[StoredStream]) -> None:
@@ -324,7 +317,7 @@ class ModelController[Loaded: "Model", Question](ABC):
         self._capturer = Capturer(model, streams, settings.capture.tokens == "all", self.outputs)
         self._input_check: dict[str, Reach] | None = None
         self._instruction_ids: dict[str, tuple[int, ...] | None] = {}
-        self.identity: dict[str, Any] = {
+        self.identity = {
             "model": settings.model.family,
             "random_weights": card.random_weights,
             "weights_sha256": card.weights_sha256,

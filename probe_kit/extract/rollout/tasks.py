@@ -1,9 +1,8 @@
-"""`Task`: what a model does with the observations of a source. It acts, is captured, or answers questions.
+"""Tasks: what a model does with the observations of a source. It acts or is captured, or answers questions.
 
 A task knows no particular source, and keeps nothing: all that is chosen is in the settings.
 """
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -33,68 +32,8 @@ Fitted = tuple[Settings, Source[Any], Controller, Calibration | None]
 """Settings and source as the model is shown them, what plays, and what chose a batch that was left open."""
 
 
-class Task[Chosen: Settings, Loaded: "Model"](ABC):
-    """A task, whose settings are of one class and whose models are of one kind.
-
-    names_all_items: whether it needs the whole suite besides the chosen items, for the names of other objects.
-    """
-
-    names_all_items: ClassVar[bool] = False
-
-    # -- before a model is loaded ----------------------------------------------------------------------
-
-    def check_meaningless(self, settings: Chosen) -> None:
-        """Raise UsageError for settings that have no effect in this task, with this source or model."""
-        del settings
-
-    @abstractmethod
-    def check_family(self, settings: Chosen, family: "Family | None") -> None:
-        """Raise UsageError for a family that is not made for the task. family: None for a script."""
-
-    def view_of(self, source: Source[Any]) -> Source[Any]:
-        """Return the source as the task shows it."""
-        return source
-
-    def rows(self, settings: Chosen, source: Source[Any]) -> tuple[Row, ...]:
-        """Return the rows of a plan, with what the task adds to them."""
-        return source.rows(settings.seed)
-
-    @abstractmethod
-    def texts(self, settings: Chosen, source: Source[Any]) -> Iterable[str]:
-        """Return the texts whose words a family must know, said before anything of its checkpoint is read."""
-
-    def early_checks(self, settings: Chosen, source: Source[Any], fetch: bool) -> list[Callable[[], object]]:
-        """Return checks against what the checkpoint's files declare. fetch: see `Family.check`."""
-        del settings, source, fetch
-        return []
-
-    def declared_cameras(self, settings: Chosen) -> tuple[str, ...] | None:
-        """Return the cameras that the files of the checkpoint declare; None where they do not say."""
-        del settings
-        return None
-
-    def planned(self, settings: Chosen, sizes: PlannedSizes) -> Chosen:
-        """Return the settings of a plan without a model. Raises CheckpointError for a model that cannot do it."""
-        del sizes
-        return settings
-
-    # -- with it ---------------------------------------------------------------------------------------
-
-    @abstractmethod
-    def load(self, settings: Chosen) -> Loaded | None:
-        """Load the model of some settings; None for a script."""
-
-    def check_loaded(self, settings: Chosen, model: Loaded) -> None:
-        """Raise UsageError for a model that was loaded already and is not that of the settings."""
-        del settings, model
-
-    @abstractmethod
-    def fit(self, settings: Chosen, source: Source[Any], model: Loaded | None) -> Fitted:
-        """Fit source, settings and model to each other. Raises what does not fit."""
-
-
-def task_of(settings: Settings) -> Task[Any, Any]:
-    """Return the task of some settings."""
+def task_of(settings: Settings) -> Any:
+    """Return the task of some settings: an `Act` or an `Ask`, whose methods take settings of their own class."""
     return Ask() if settings.asks else Act()
 
 
@@ -112,13 +51,11 @@ def load_of[Loaded: "Model"](load_by_name: Callable[..., Loaded], settings: Sett
     )
 
 
-def with_source[Chosen: Settings](settings: Chosen, source: Source[Any]) -> Chosen:
-    """Return the settings with those of a source that was fitted."""
-    return settings.changed(source=source.settings) if source.settings != settings.source else settings
+def fitted[Chosen: Settings](card: "ModelCard", settings: Chosen, source: Source[Any]) -> Chosen:
+    """Return the settings with those of a source that was fitted to a model.
 
-
-def check_fit(card: "ModelCard", settings: Settings, source: Source[Any]) -> None:
-    """Raise UsageError if a model takes smaller batches, or needs what the source does not show."""
+    Raises UsageError if the model takes smaller batches, or needs what the source does not show.
+    """
     # `auto` is measured after this check, and by `largest_batch` never exceeds the card.
     batch = settings.machine.batch if isinstance(settings.machine.batch, int) else 1
     if card.batch is not None and batch > card.batch:
@@ -131,6 +68,7 @@ def check_fit(card: "ModelCard", settings: Settings, source: Source[Any]) -> Non
             f"{card.family} reads {', '.join(lacking)}, which {settings.source.subject} do not show; observations "
             "have pictures and the state, in a scene also the intrinsics"
         )
+    return settings.changed(source=source.settings) if source.settings != settings.source else settings
 
 
 _SCRIPT_REFUSES = (
@@ -140,7 +78,34 @@ _SCRIPT_REFUSES = (
 _CAPTURE_REFUSES = ("captured_calls", "execute", "rotation", "video")
 
 
-class Act(Task[ExtractSettings, "Policy"]):
+class _Task:
+    """The parts of a task that only one of them has.
+
+    names_all_items: whether it needs the whole suite besides the chosen items, for the names of other objects.
+    """
+
+    names_all_items: ClassVar[bool] = False
+
+    def check_meaningless(self, *_: Any, **__: Any) -> None: ...
+
+    def check_loaded(self, *_: Any, **__: Any) -> None: ...
+
+    def declared_cameras(self, *_: Any, **__: Any) -> tuple[str, ...] | None: ...
+
+    def early_checks(self, *_: Any, **__: Any) -> list[Callable[[], object]]:
+        return []
+
+    def planned(self, settings: Any, _: PlannedSizes) -> Any:
+        return settings
+
+    def view_of(self, source: Source[Any]) -> Source[Any]:
+        return source
+
+    def rows(self, settings: Any, source: Source[Any]) -> tuple[Row, ...]:
+        return source.rows(settings.seed)
+
+
+class Act(_Task):
     """A policy acts, or is captured once per row; a script acts and has no activations."""
 
     def check_meaningless(self, settings: ExtractSettings) -> None:
@@ -244,8 +209,7 @@ class Act(Task[ExtractSettings, "Policy"]):
             check_misfit(settings, model.embodiment_mismatch(), model.card.checkpoint)
         # The source first: it may give the policy further cameras, and batch and needs are those of that card.
         source, policy = source.check(model, settings.machine.accept_units)
-        settings = with_source(settings, source)
-        check_fit(policy.card, settings, source)
+        settings = fitted(policy.card, settings, source)
         check_reachable(settings, policy.card, source)
         controller = PolicyController(policy, source, settings)
         settings, calibration = settings.with_every_call(controller.execute), None
@@ -300,7 +264,7 @@ def check_reachable(settings: ExtractSettings, card: "ModelCard", source: Source
         )
 
 
-class Ask(Task[AskSettings, "AnswerModel"]):
+class Ask(_Task):
     """A model answers one question a row, and its first inference may be captured."""
 
     names_all_items = True  # an object that is asked for may be that of any item
@@ -355,6 +319,5 @@ class Ask(Task[AskSettings, "AnswerModel"]):
         """Show the source to the model, and choose how its answers are read."""
         assert model is not None, "no script answers"
         source = source.watched(model.card.cameras)
-        settings = with_source(settings, source)
-        check_fit(model.card, settings, source)
+        settings = fitted(model.card, settings, source)
         return settings, source, AnswerController(model, source, settings), None

@@ -77,92 +77,57 @@ class Rollout:
         )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Failure:
-    """An episode that could not be played to its end. traceback: of the error that ended it."""
+@dataclass
+class Playing:
+    """An episode on its player.
+
+    ahead: whether the player began it by itself, when the one before it ended. seen: the observation that waits
+    for an inference, None while the player simulates. control_steps: actions before each inference so far. steps:
+    actions so far. seconds: of inference. flagged: inferences without a valid action, None where the policy cannot
+    tell. past: the chunks so far, for policies that average them. columns: of the outcome.
+    """
 
     planned: Row
-    reason: str
-    traceback: str
+    buffers: EpisodeBuffers
+    ahead: bool
+    seen: Observation | None = None
+    control_steps: list[int] = field(default_factory=list)
+    steps: int = 0
+    seconds: float = 0.0
+    flagged: int | None = None
+    instruction_ids: Sequence[int] | None = None
+    lost_words: int = 0
+    past: list[NDArray[np.float32]] = field(default_factory=list)
+    columns: Mapping[str, Any] = field(default_factory=dict)
 
-    @classmethod
-    def from_error(cls, planned: Row, error: ProbeKitError) -> "Failure":
-        """The failure of `planned` by `error`."""
-        return cls(planned, f"{type(error).__name__}: {error}", traceback_of(error))
+    def turn(self) -> Turn:
+        """The inference that is due."""
+        assert self.seen is not None
+        return Turn(self.seen, self.planned, len(self.control_steps), self.buffers, self.past)
+
+    def ended(self, ending: Ending) -> Rollout:
+        """The result, with the counts of flagged steps, where the policy can tell, and of lost words."""
+        counts = {} if self.flagged is None else {
+            "inferences": len(self.control_steps), "flagged_steps": self.flagged,
+        }  # fmt: skip
+        counts |= {"lost_words": self.lost_words} if self.lost_words else {}
+        return Rollout(
+            self.planned, {**ending.outcome, **self.columns, **counts}, self.buffers, ending.frames,
+            ending.small_frames, ending.trajectory, self.instruction_ids, self.control_steps,
+            Seconds(self.seconds, ending.seconds), ending.inputs,
+        )  # fmt: skip
 
 
 class EpisodeSlot:
     """One place in a batch: a player and the episode on it, if any.
 
-    planned: the row of that episode. following: the row that its player starts when the episode ends, while the
-    model infers for others. ahead: whether the player began the episode in that way. seen: the observation that
-    waits for an inference, None while the player simulates. control_steps: actions before each inference so far.
-    steps: actions so far. seconds: of inference. flagged: inferences without a valid action, None where the policy
-    cannot tell. past: the chunks so far, for policies that average them. columns: of the outcome.
+    following: the row that its player starts when the episode ends, while the model infers for others.
     """
 
     def __init__(self, player: AskablePlayer) -> None:
         self.player = player
-        self.planned: Row | None = None
+        self.playing: Playing | None = None
         self.following: Row | None = None
-        self.ahead = False
-        self.seen: Observation | None = None
-        self.control_steps: list[int] = []
-        self.steps = 0
-        self.seconds = 0.0
-        self.flagged: int | None = None
-        self.instruction_ids: Sequence[int] | None = None
-        self.lost_words = 0
-        self.past: list[NDArray[np.float32]] = []
-        self.columns: Mapping[str, Any] = {}
-
-    def start(self, planned: Row, buffers: EpisodeBuffers, begin: Request | None) -> None:
-        """Take an episode up; begin: the question that begins it, None if the player does so already."""
-        self.planned, self.buffers, self.seen = planned, buffers, None
-        self.control_steps, self.steps, self.seconds = [], 0, 0.0
-        self.flagged, self.instruction_ids, self.lost_words, self.past = None, None, 0, []
-        self.columns = {}
-        self.ahead = begin is None
-        if begin is not None:
-            self.player.ask(begin[0], *begin[1])
-
-    @property
-    def calls(self) -> int:
-        """Inferences of the episode so far."""
-        return len(self.control_steps)
-
-    def count_inference(self, seconds: float) -> None:
-        """Note an inference about what is seen. seconds: that it took."""
-        assert self.planned is not None
-        self.control_steps.append(self.planned.control_step(self.calls, self.steps))
-        self.seconds += seconds
-
-    def turn(self) -> Turn:
-        """The inference that is due."""
-        assert self.planned is not None
-        assert self.seen is not None
-        return Turn(self.seen, self.planned, self.calls, self.buffers, self.past)
-
-    def go_on(self, inference: Inference, then: Request | None) -> None:
-        """Execute the actions of an inference, or end the episode where it has none."""
-        self.seen, self.columns = None, inference.columns
-        if inference.actions is None:
-            self.player.ask("dismiss", then=then)
-            return
-        self.steps += len(inference.actions)
-        if inference.flagged is not None:
-            self.flagged = (self.flagged or 0) + inference.flagged
-        self.player.ask("advance", inference.actions, then=then)
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """The counts of the outcome record: flagged steps, where the policy can tell, and lost words."""
-        flagged = {} if self.flagged is None else {"inferences": self.calls, "flagged_steps": self.flagged}
-        return flagged | ({"lost_words": self.lost_words} if self.lost_words else {})
-
-    def leave(self) -> None:
-        """The episode is over."""
-        self.planned, self.seen = None, None
 
 
 class EpisodeLoop:
@@ -181,12 +146,12 @@ class EpisodeLoop:
         self._controller, self._pool = controller, ring
         self._next_episode, self._film = next_episode, film
 
-    def __iter__(self) -> Iterator[Rollout | Failure]:
+    def __iter__(self) -> Iterator[Rollout | Failed]:
         """Rollouts in the order they end."""
         for group in self._groups:
             for slot in group:
                 self._begin_next(slot)
-        while any(slot.planned for group in self._groups for slot in group):
+        while any(slot.playing for group in self._groups for slot in group):
             for group in self._groups:
                 yield from self._settle(group)
                 # Returns at once for the players: they simulate while the next turn belongs to the other group.
@@ -194,83 +159,80 @@ class EpisodeLoop:
 
     def _begin_next(self, slot: EpisodeSlot, *, ended: bool = False) -> None:
         """ended: whether the player came to an end by itself, and so began what follows if it knew of any."""
-        planned, begun = slot.following, ended
-        if planned is None:
-            planned, begun = self._next_episode(), False
-        slot.following = None
-        if planned is None:
-            slot.leave()
-        else:
+        begun = ended and slot.following is not None
+        planned, slot.following, slot.playing = slot.following or self._next_episode(), None, None
+        if planned is not None:
             # `take` waits while all buffers are being written: a model cannot outrun the disk.
-            slot.start(planned, self._pool.take(), None if begun else self._beginning(planned))
+            slot.playing = Playing(planned, self._pool.take(), begun)
+            if not begun:
+                slot.player.ask("begin", planned, self._film(planned))
 
-    def _beginning(self, planned: Row) -> Request:
-        return "begin", (planned, self._film(planned))
-
-    def _then(self, slot: EpisodeSlot) -> Request | None:
-        """The request that the slot's player is to begin with if its episode ends now."""
+    def _go_on(self, slot: EpisodeSlot, playing: Playing, inference: Inference) -> None:
+        """Execute the actions of an inference, or end the episode where it has none."""
         if slot.following is None:
             slot.following = self._next_episode()
-        return None if slot.following is None else self._beginning(slot.following)
+        # The player is to begin with it if its episode ends now.
+        row = slot.following
+        then: Request | None = None if row is None else ("begin", (row, self._film(row)))
+        playing.seen, playing.columns = None, inference.columns
+        if inference.actions is None:
+            slot.player.ask("dismiss", then=then)
+            return
+        playing.steps += len(inference.actions)
+        if inference.flagged is not None:
+            playing.flagged = (playing.flagged or 0) + inference.flagged
+        slot.player.ask("advance", inference.actions, then=then)
 
-    def _settle(self, group: list[EpisodeSlot]) -> Iterator[Rollout | Failure]:
+    def _settle(self, group: list[EpisodeSlot]) -> Iterator[Rollout | Failed]:
         """Collect answers until the group can take its turn together.
 
         If all its episodes ended at once, and no player has begun the next one, that is done during the other
         group's turn.
         """
-        while waiting := [slot for slot in group if slot.planned and not slot.seen]:
-            for slot in waiting:
-                assert slot.planned is not None
+        while waiting := [(slot, slot.playing) for slot in group if slot.playing and not slot.playing.seen]:
+            for slot, playing in waiting:
                 try:
                     answer = slot.player.answer()
                 except EPISODE_ERRORS as error:
-                    yield self._give_up(slot, error)
+                    yield self._give_up(slot, playing, error)
                     continue
                 if isinstance(answer, Observation):
-                    slot.seen = answer
+                    playing.seen = answer
                 else:
                     assert isinstance(answer, Ending)
-                    outcome = {**answer.outcome, **slot.columns, **slot.counts}
-                    yield Rollout(
-                        slot.planned, outcome, slot.buffers, answer.frames, answer.small_frames, answer.trajectory,
-                        slot.instruction_ids, slot.control_steps, Seconds(slot.seconds, answer.seconds),
-                        answer.inputs,
-                    )  # fmt: skip
+                    yield playing.ended(answer)
                     self._begin_next(slot, ended=True)
-            if not any(slot.seen or (slot.planned and slot.ahead) for slot in group):
+            if not any(slot.playing and (slot.playing.seen or slot.playing.ahead) for slot in group):
                 return
 
-    def _infer(self, group: list[EpisodeSlot]) -> Iterator[Failure]:
-        due = [slot for slot in group if slot.seen]
+    def _infer(self, group: list[EpisodeSlot]) -> Iterator[Failed]:
+        due = [(slot, slot.playing) for slot in group if slot.playing and slot.playing.seen]
         if not due:
             return
         # An error here is of the batch: which row caused it is unknown, so all rows are given up and played alone.
         try:
-            turns = [slot.turn() for slot in due]
+            turns = [playing.turn() for _, playing in due]
             started = perf_counter()
             inferences = self._controller.infer(turns)
             seconds = (perf_counter() - started) / len(turns)  # its share: a call serves all rows at once
-            for slot, turn in zip(due, turns, strict=True):
+            for (_, playing), turn in zip(due, turns, strict=True):
                 if turn.call == 0:
-                    slot.instruction_ids = self._controller.instruction_ids(turn.observation.instruction)
-                    slot.lost_words = count_lost_words(
-                        self._controller.instruction_ids, turn.observation.instruction
-                    )
+                    instruction = turn.observation.instruction
+                    playing.instruction_ids = self._controller.instruction_ids(instruction)
+                    playing.lost_words = count_lost_words(self._controller.instruction_ids, instruction)
         except EPISODE_ERRORS as error:
-            for slot in due:
-                yield self._give_up(slot, error)
+            for slot, playing in due:
+                yield self._give_up(slot, playing, error)
             return
-        for slot, inference in zip(due, inferences, strict=True):
-            slot.count_inference(seconds)
-            slot.go_on(inference, self._then(slot))
+        for (slot, playing), turn, inference in zip(due, turns, inferences, strict=True):
+            playing.control_steps.append(playing.planned.control_step(turn.call, playing.steps))
+            playing.seconds += seconds
+            self._go_on(slot, playing, inference)
 
-    def _give_up(self, slot: EpisodeSlot, error: ProbeKitError) -> Failure:
-        assert slot.planned is not None
-        failure = Failure.from_error(slot.planned, error)
-        self._pool.give_back(slot.buffers)
+    def _give_up(self, slot: EpisodeSlot, playing: Playing, error: ProbeKitError) -> Failed:
+        self._pool.give_back(playing.buffers)
         self._begin_next(slot)
-        return failure
+        return Failed(playing.planned.index, f"{type(error).__name__}: {error}", traceback_of(error))
 
 
 # Buffers beyond one per player: one is being written while another waits.
@@ -347,8 +309,8 @@ class Worker:
 
         playing = EpisodeLoop(self._players, self._controller, self._ring, next_episode, self._is_filmed)
         for played in playing:
-            if isinstance(played, Failure):
-                yield Failed(played.planned.index, played.reason, played.traceback)
+            if isinstance(played, Failed):
+                yield played
             else:
                 self._pending.append(self._thread.submit(self._write, played))
             yield from self._written(wait=False)

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import partial
 from importlib import import_module
 from itertools import islice
 from pathlib import Path
@@ -281,16 +281,6 @@ class EnvironmentSource(Source[EnvSource]):
             return cls(settings, environment.revision, [str(name) for name in environment.action_names], listed)
         finally:
             environment.close()
-
-    @property
-    def name(self) -> str:
-        """The name that the command has."""
-        return self.settings.name
-
-    @cached_property
-    def instructions(self) -> tuple[str, ...]:
-        """Every instruction once, in the order of their letters."""
-        return tuple(sorted({episode.instruction for _, episode in self.episodes}))
 
     def rows(self, seed: int) -> tuple[Row, ...]:
         """A row per episode."""

@@ -17,17 +17,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit._system.imports import require
-from probe_kit._system.parquet_files import open_parquet, read_parquet
+from probe_kit._system.parquet_files import read_parquet
 from probe_kit.errors import RecordingError, UsageError
 from probe_kit.extract.sources.lerobot_meta import (
-    EXTRA,
     HALF,
     IMAGE,
     KEYS,
     NUMERIC,
     EpisodeMeta,
-    HashedFiles,
     LeRobotMeta,
 )
 from probe_kit.extract.sources.recording import LeRobotSource
@@ -39,30 +36,8 @@ MOST_FRAMES = 64
 _COMMIT = re.compile(r"[0-9a-f]{40}")
 
 
-@dataclass(frozen=True)
-class LeRobotFolder:
-    """A data set that lies here. opened: its files by their hashes. repo, revision: of the hub, or None."""
-
-    path: Path
-    meta: LeRobotMeta
-    opened: HashedFiles
-    repo: str | None = None
-    revision: str | None = None
-
-    @property
-    def fps(self) -> float:
-        """Frames per second."""
-        return self.meta.fps
-
-    @property
-    def features(self) -> Mapping[str, Any]:
-        """Type, shape and names by feature."""
-        return self.meta.features
-
-    @property
-    def cameras(self) -> list[str]:
-        """Features that are colour pictures."""
-        return self.meta.cameras
+class LeRobotFolder(LeRobotMeta):
+    """A data set that lies here, its meta read."""
 
     @property
     def columns(self) -> list[str]:
@@ -87,7 +62,7 @@ class LeRobotFolder:
 
     def names(self, feature: str) -> list[str]:
         """The names of the numbers of a feature; their positions where the data set names none."""
-        return list(self.meta.names(feature) or map(str, range(self.width(feature) or 0)))
+        return list(self.feature_names(feature) or map(str, range(self.width(feature) or 0)))
 
     def picture_shape(self, feature: str) -> tuple[int, int]:
         """(height, width) of a camera."""
@@ -105,23 +80,15 @@ class LeRobotFolder:
     @cached_property
     def lengths(self) -> list[int]:
         """Frames of every episode."""
-        return [episode.length for episode in self.meta.episodes]
+        return [episode.length for episode in self.episodes]
 
     @cached_property
     def by_file(self) -> Mapping[Path, list[EpisodeMeta]]:
         """The episodes of every data file."""
         by_file: dict[Path, list[EpisodeMeta]] = {}
-        for episode in self.meta.episodes:
+        for episode in self.episodes:
             by_file.setdefault(self.path / episode.file, []).append(episode)
         return by_file
-
-    def episode(self, number: int) -> EpisodeMeta:
-        """The meta of an episode."""
-        return self.meta.episodes[number]
-
-    def task(self, number: int) -> str:
-        """The text of a task. Raises RecordingError for a number that `meta` does not name once."""
-        return self.meta.task(number)
 
     # -- files -----------------------------------------------------------------------------------------
 
@@ -136,8 +103,8 @@ class LeRobotFolder:
 
     def files(self, episode: int, cameras: Sequence[str]) -> list[Path]:
         """The files that hold an episode and the videos of some cameras."""
-        meta = self.episode(episode)
-        videos = [meta.videos[key].file for key in cameras if self.meta.is_video(key)]
+        meta = self.episodes[episode]
+        videos = [meta.videos[key].file for key in cameras if self.is_video(key)]
         return [self.path / file for file in (meta.file, *videos)]
 
     # -- checks ----------------------------------------------------------------------------------------
@@ -166,9 +133,7 @@ class LeRobotFolder:
     def _check_unnamed(self) -> None:
         """Raise RecordingError for a Parquet file of data that no episode is in; hidden files are none."""
         listed = set(self.by_file)
-        folders = {
-            self.path / episode.file.parts[0] for episode in self.meta.episodes if len(episode.file.parts) > 1
-        }
+        folders = {self.path / episode.file.parts[0] for episode in self.episodes if len(episode.file.parts) > 1}
         present = {path for folder in folders for path in folder.rglob("*.parquet") if path.name[0] != "."}
         if unnamed := sorted(present - listed - set((self.path / "meta").rglob("*.parquet"))):
             raise RecordingError(
@@ -184,15 +149,10 @@ def open_lerobot(source: LeRobotSource) -> LeRobotFolder:
     a revision that is none, MissingExtraError without the extra of recordings.
     """
     if source.is_local:
-        return _folder_at(Path(source.folder).expanduser().resolve())
+        return LeRobotFolder.read(Path(source.folder).expanduser().resolve())
     repo, _, revision = source.folder.partition("@")
     commit = resolved_commit(repo, revision)
-    return _folder_at(_download(repo, commit, ["meta/*", "meta/**/*"]), repo, commit)
-
-
-def _folder_at(path: Path, repo: str | None = None, revision: str | None = None) -> LeRobotFolder:
-    opened = HashedFiles(path)
-    return LeRobotFolder(path, LeRobotMeta.read(path, opened), opened, repo, revision)
+    return LeRobotFolder.read(_download(repo, commit, ["meta/*", "meta/**/*"]), repo, commit)
 
 
 def resolved_commit(repo: str, revision: str) -> str:
@@ -280,7 +240,7 @@ class LeRobotFrames:
         """(H, W, 3) uint8 by camera; of stored images the very bytes. Raises RecordingError."""
         return {
             camera: self._of_video(episode, frame, camera)
-            if self.folder.meta.is_video(camera)
+            if self.folder.is_video(camera)
             else self._of_image(episode, frame, camera)
             for camera in cameras
         }
@@ -303,8 +263,8 @@ class LeRobotFrames:
         """
         for episode in episodes:
             self.numbers(episode, ())
-            for camera in filter(self.folder.meta.is_video, cameras):
-                self._check_video(self.folder.episode(episode), camera)
+            for camera in filter(self.folder.is_video, cameras):
+                self._check_video(self.folder.episodes[episode], camera)
         for episode in episodes[:1]:
             for frame in {0, self.folder.lengths[episode] - 1}:
                 self.pictures(episode, frame, cameras)
@@ -313,7 +273,7 @@ class LeRobotFrames:
 
     def _rows(self, episode: int, columns: Sequence[str]) -> Any:
         """The table (T rows) of an episode. Row groups are kept until another one is read with these columns."""
-        meta, key = self.folder.episode(episode), tuple(columns)
+        meta, key = self.folder.episodes[episode], tuple(columns)
         data = self._data_file(self.folder.path / meta.file)
         first = data.first[episode]
         latest, begin = data.latest.get(key, (None, 0))
@@ -323,7 +283,7 @@ class LeRobotFrames:
 
     def _read(self, path: Path, columns: Sequence[str], first: int, end: int) -> tuple[Any, int]:
         """Row groups that hold rows `first` to `end`, or all where they are small, and the first row of them."""
-        with _parquet(self.folder, path) as parquet:
+        with self.folder.opened.parquet(path) as parquet:
             if missing := [name for name in columns if name not in parquet.schema_arrow.names]:
                 raise RecordingError(
                     f"{self._where(path)} has no column {missing[0]!r}, which meta/info.json names; it has "
@@ -338,7 +298,7 @@ class LeRobotFrames:
 
     def _scanned(self, path: Path) -> _DataFile:
         """A data file whose rows are those that meta says. Raises RecordingError for others."""
-        with _parquet(self.folder, path) as parquet:
+        with self.folder.opened.parquet(path) as parquet:
             if missing := [name for name in (_EPISODE, _INDEX) if name not in parquet.schema_arrow.names]:
                 raise RecordingError(
                     f"{self._where(path)} has no column {missing[0]!r}; expected the columns of format 3.0. Copy "
@@ -424,7 +384,7 @@ class LeRobotFrames:
         return np.asarray(decode_bytes(content, f"{where}:", RecordingError, "Copy the data set again.")).copy()
 
     def _of_video(self, episode: int, frame: int, camera: str) -> NDArray[np.uint8]:
-        meta = self.folder.episode(episode)
+        meta = self.folder.episodes[episode]
         part = meta.videos[camera]
         path = self.folder.path / part.file
         self.folder.opened.check(path)
@@ -490,20 +450,6 @@ def _quiet() -> Iterator[None]:
         yield
     finally:
         logging.disable(level)
-
-
-@contextmanager
-def _parquet(folder: LeRobotFolder, path: Path) -> Iterator[Any]:
-    """A data file, opened as the file that was hashed. Raises RecordingError for one that cannot be read."""
-    pa = require("pyarrow", EXTRA)
-    try:
-        with folder.opened.open(path) as opened, open_parquet(opened, EXTRA) as parquet:
-            yield parquet
-    except (pa.ArrowException, OSError) as error:
-        raise RecordingError(
-            f"{folder.path.name}: {path.relative_to(folder.path)} cannot be read: {str(error)[:300]}. Copy the "
-            "data set again"
-        ) from error
 
 
 def _size_of(metadata: Any, columns: Sequence[str]) -> int:

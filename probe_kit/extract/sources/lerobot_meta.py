@@ -3,6 +3,7 @@
 import os
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from hashlib import blake2b, file_digest
@@ -16,6 +17,22 @@ from probe_kit._system.imports import require
 from probe_kit._system.parquet_files import open_parquet, read_parquet
 from probe_kit.errors import RecordingError
 
+CONVERTER = "python -m lerobot.scripts.convert_dataset_v21_to_v30"
+EXTRA = "datasets"
+IMAGE, VIDEO = "image", "video"
+INFO, TASKS, EPISODES = "meta/info.json", "meta/tasks.parquet", "meta/episodes"
+PARQUET = "parquet"
+NUMERIC = ("float32", "float64", "int8", "int16", "int32", "int64", "uint8", "bool")
+KEYS = ("episode_index", "index", "task_index")
+"""Features of one number that lead to other tables."""
+HALF = 0.5
+"""Frames by which a time range of a video may differ from whole frames."""
+RATE_ROUNDING = 1e-3
+_NUMBER, _LENGTH, _FROM, _TO = "episode_index", "length", "dataset_from_index", "dataset_to_index"
+_CHUNK, _FILE = "data/chunk_index", "data/file_index"
+_TASK = "task"
+_UNNAMED_INDEX = "__index_level_0__"
+_AGAIN = "Copy the data set again, or repair its meta"
 _DIGITS = 16
 _MOST_BYTES = 1 << 40
 """Of a file, videos included: no bound but that of a disk."""
@@ -55,6 +72,17 @@ class HashedFiles:
             self._hashed[file] = now, stamp
         return opened
 
+    @contextmanager
+    def parquet(self, file: Path, remedy: str = "Copy the data set again") -> Iterator[Any]:
+        """A Parquet file, opened as the file that was hashed. Raises RecordingError for an unreadable one."""
+        pa = require("pyarrow", EXTRA)
+        try:
+            with self.open(file) as opened, open_parquet(opened, EXTRA) as parquet:
+                yield parquet
+        except (pa.ArrowException, OSError) as error:
+            where = f"{self._root.name}: {file.relative_to(self._root)}"
+            raise RecordingError(f"{where} cannot be read: {str(error)[:300]}. {remedy}") from error
+
     def check(self, file: Path) -> None:
         """Raise as `open`, for a file that a library reads by its name."""
         self.open(file).close()
@@ -88,24 +116,6 @@ def _stamp(opened: BinaryIO) -> _Stamp:
     return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
 
 
-CONVERTER = "python -m lerobot.scripts.convert_dataset_v21_to_v30"
-EXTRA = "datasets"
-IMAGE, VIDEO = "image", "video"
-INFO, TASKS, EPISODES = "meta/info.json", "meta/tasks.parquet", "meta/episodes"
-PARQUET = "parquet"
-NUMERIC = ("float32", "float64", "int8", "int16", "int32", "int64", "uint8", "bool")
-KEYS = ("episode_index", "index", "task_index")
-"""Features of one number that lead to other tables."""
-HALF = 0.5
-"""Frames by which a time range of a video may differ from whole frames."""
-RATE_ROUNDING = 1e-3
-_NUMBER, _LENGTH, _FROM, _TO = "episode_index", "length", "dataset_from_index", "dataset_to_index"
-_CHUNK, _FILE = "data/chunk_index", "data/file_index"
-_TASK = "task"
-_UNNAMED_INDEX = "__index_level_0__"
-_AGAIN = "Copy the data set again, or repair its meta"
-
-
 @dataclass(frozen=True)
 class VideoRange:
     """The part of a video file that shows an episode. begin, end: seconds in the file. file: in the data set."""
@@ -128,31 +138,43 @@ class EpisodeMeta:
 
 @dataclass(frozen=True)
 class LeRobotMeta:
-    """The content of `meta`. name: of the data set, for errors. tasks: (number, text) of each line."""
+    """The content of `meta`.
 
-    name: str
+    opened: the files of the data set by their hashes. tasks: (number, text) of each line. repo, revision: of the
+    hub, or None.
+    """
+
+    path: Path
+    opened: HashedFiles
     info: Mapping[str, Any]
     tasks: tuple[tuple[Any, Any], ...]
     episodes: tuple[EpisodeMeta, ...]
+    repo: str | None = None
+    revision: str | None = None
 
     @classmethod
-    def read(cls, root: Path, files: HashedFiles) -> Self:
+    def read(cls, root: Path, repo: str | None = None, revision: str | None = None) -> Self:
         """The meta of the data set in `root`.
 
         Raises RecordingError for another format, a missing file, and where two parts contradict each other;
         MissingExtraError without the libraries that read it.
         """
+        files = HashedFiles(root)
         info = _read_info(root, files)
         require("pyarrow", EXTRA)
         require("av", EXTRA)
         _check_info(root, info)
-        tasks = _read_tasks(root, files)
-        episodes = tuple(_read_episodes(root, files, info))
-        meta = cls(root.name, info, tasks, episodes)
+        tasks, episodes = _read_tasks(root, files), tuple(_read_episodes(root, files, info))
+        meta = cls(root, files, info, tasks, episodes, repo, revision)
         meta._check_totals()
         meta._check_names()
         meta._check_videos()
         return meta
+
+    @property
+    def name(self) -> str:
+        """The name of the folder, for errors."""
+        return self.path.name
 
     @cached_property
     def fps(self) -> float:
@@ -178,7 +200,7 @@ class LeRobotMeta:
         """Whether the pictures of a camera lie in video files."""
         return bool(self.features[feature]["dtype"] == VIDEO)
 
-    def names(self, feature: str) -> tuple[str, ...] | None:
+    def feature_names(self, feature: str) -> tuple[str, ...] | None:
         """The names of the numbers of a feature; None where the data set names none, or not all."""
         names = _flat_names(self.features[feature].get("names"))
         return names if names is not None and (len(names),) == tuple(self.features[feature]["shape"]) else None
@@ -244,7 +266,7 @@ class LeRobotMeta:
     def _check_names(self) -> None:
         """Raise RecordingError for a feature two of whose numbers have one name."""
         for feature in self.features:
-            names = self.names(feature) or ()
+            names = self.feature_names(feature) or ()
             if twice := [name for name, count in Counter(names).items() if count > 1]:
                 raise RecordingError(
                     f"{self.name}: {INFO} names two numbers of {feature} {twice[0]!r}; expected each name once. "
@@ -351,15 +373,10 @@ def _is_feature(feature: Any) -> bool:
 
 def _read_table(root: Path, files: HashedFiles, path: Path, columns: Sequence[str] | None = None) -> Any:
     """The table of a Parquet file of meta. Raises RecordingError for one that cannot be read or lacks a column."""
-    pa = require("pyarrow", EXTRA)
-    name = path.relative_to(root)
-    try:
-        with files.open(path) as opened, open_parquet(opened, EXTRA) as parquet:
-            if missing := [column for column in columns or () if column not in parquet.schema_arrow.names]:
-                raise RecordingError(f"{root.name}: {name} has no column {missing[0]!r}. {_AGAIN}")
-            return read_parquet(parquet, columns)
-    except (pa.ArrowException, OSError) as error:
-        raise RecordingError(f"{root.name}: {name} cannot be read: {str(error)[:300]}. {_AGAIN}") from error
+    with files.parquet(path, _AGAIN) as parquet:
+        if missing := [column for column in columns or () if column not in parquet.schema_arrow.names]:
+            raise RecordingError(f"{root.name}: {path.relative_to(root)} has no column {missing[0]!r}. {_AGAIN}")
+        return read_parquet(parquet, columns)
 
 
 def _read_tasks(root: Path, files: HashedFiles) -> tuple[tuple[Any, Any], ...]:

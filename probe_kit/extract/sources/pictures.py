@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import partial
 from hashlib import blake2b, sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
@@ -99,48 +99,11 @@ class PictureFolder(SourceSettings):
 
 @dataclass(frozen=True)
 class Line:
-    """A line of the table. content: hash of the picture's bytes. numbers: its cells as `Labels` codes them."""
+    """A line of the table. content: hash of the picture's bytes. numbers: its cells as `_coded` gives them."""
 
     picture: Path
     content: str
     numbers: tuple[float, ...]
-
-
-@dataclass(frozen=True)
-class Labels:
-    """The columns of a table that become labels, as numbers.
-
-    values: by column, a number per line; NaN where the cell is empty. truths: columns of true and false, as 1 and
-    0. classes: by column of texts, the texts in alphabetical order; a number is the position of one.
-    """
-
-    values: dict[str, list[float]]
-    truths: list[str]
-    classes: dict[str, list[str]]
-
-    @classmethod
-    def of(cls, table: TextTable, lines: Sequence[tuple[int, Cells]], names: Sequence[str]) -> Self:
-        """Read the columns by the rules of all labels. Raises UsageError for a cell that breaks one."""
-        read = LabelTable.of_lines(table, lines, names)
-        values: dict[str, list[float]] = {}
-        truths: list[str] = []
-        classes: dict[str, list[str]] = {}
-        for name in names:
-            cells = read.values(name)
-            if texts := sorted({cell for cell in cells if isinstance(cell, str)}):
-                classes[name] = texts
-            elif any(isinstance(cell, bool) for cell in cells):
-                truths.append(name)
-            code_of = {text: code for code, text in enumerate(texts)}
-            values[name] = [
-                np.nan if cell is None else float(code_of[cell] if isinstance(cell, str) else cell)
-                for cell in cells
-            ]
-        return cls(values, truths, classes)
-
-    def of_line(self, row: int) -> tuple[float, ...]:
-        """Return the numbers of a line."""
-        return tuple(column[row] for column in self.values.values())
 
 
 class PictureSource(Source[PictureFolder]):
@@ -150,10 +113,15 @@ class PictureSource(Source[PictureFolder]):
     groups = "groups of pictures"
 
     def __init__(
-        self, settings: PictureFolder, labels: Labels, lines: Sequence[tuple[Cells, Line]], digest: str
+        self,
+        settings: PictureFolder,
+        columns: Sequence[str],
+        names: Mapping[str, list[str]],
+        lines: Sequence[tuple[Cells, Line]],
+        digest: str,
     ) -> None:
-        self.settings, self.labels, self.lines = settings, labels, list(lines)
-        self.columns = tuple(labels.values)
+        """names: as a run stores them: of columns of truth values, and of the classes of columns of texts."""
+        self.settings, self.columns, self._names, self.lines = settings, tuple(columns), dict(names), list(lines)
         self._digest = digest
         self.cameras: list[str] = []
         self.prediction: tuple[int, int] = (0, 0)
@@ -173,9 +141,9 @@ class PictureSource(Source[PictureFolder]):
             raise UsageError(f"--table {table} has {columns}; expected the columns {PICTURE} and {INSTRUCTION}")
         names = [name for name in read.names if name and name not in (PICTURE, INSTRUCTION, ID, GROUP)]
         texts = _with_groups(read, list(read.rows()))
-        labels = Labels.of(read, texts, names)
+        values, coded_names = _coded(read, texts, names)
         lines = [
-            (text, _line(text, folder, read.where(number), labels.of_line(row)))
+            (text, _line(text, folder, read.where(number), tuple(column[row] for column in values)))
             for row, (number, text) in enumerate(texts)
         ]
         if not lines:
@@ -183,21 +151,11 @@ class PictureSource(Source[PictureFolder]):
         ids = [_id(text, number) for number, (text, _) in enumerate(lines)]
         if twice := [name for name, count in Counter(ids).items() if count > 1]:
             raise RecordingError(f"{table.name} has the id {twice[0]!r} twice; give each line its own")
-        return cls(settings, labels, lines, digest)
+        return cls(settings, names, coded_names, lines, digest)
 
     def decided(self) -> Mapping[str, Any]:
         """Return that the only inference of a picture is captured and nothing acts."""
         return {"captured_calls": 1, "capture_only": True, "frames": "none"}
-
-    @property
-    def name(self) -> str:
-        """The name of the folder."""
-        return self.settings.name
-
-    @cached_property
-    def instructions(self) -> tuple[str, ...]:
-        """Every instruction once, in the order of their letters."""
-        return tuple(sorted({text[INSTRUCTION] or "" for text, _ in self.lines}))
 
     def rows(self, seed: int) -> tuple[Row, ...]:
         """A row per line, with the columns of a recorded episode of one frame."""
@@ -273,10 +231,7 @@ class PictureSource(Source[PictureFolder]):
             "instruction": None,
             "inputs": shapes,
             "columns": list(self.columns),
-            "names": {
-                **({TRUTHS: self.labels.truths} if self.labels.truths else {}),
-                **{CLASSES + name: texts for name, texts in self.labels.classes.items()},
-            },
+            "names": self._names,
         }
         return {DATASET: data_set}
 
@@ -327,6 +282,31 @@ def read_picture(line: Line) -> NDArray[np.uint8]:
     if _digest(content) != line.content:
         raise RecordingError(f"{where} was changed after the run was planned; leave the pictures as they are")
     return np.asarray(decode_bytes(content, f"{where}:", RecordingError, "Write it again as PNG.")).copy()
+
+
+def _coded(
+    table: TextTable, lines: Sequence[tuple[int, Cells]], names: Sequence[str]
+) -> tuple[list[list[float]], dict[str, list[str]]]:
+    """The columns that become labels as numbers, and the names that a run stores of them.
+
+    NaN where the cell is empty; true and false as 1 and 0; of texts the position in alphabetical order.
+    Raises UsageError for a cell that breaks a rule of labels.
+    """
+    read = LabelTable.of_lines(table, lines, names)
+    values: list[list[float]] = []
+    truths: list[str] = []
+    classes: dict[str, list[str]] = {}
+    for name in names:
+        cells = read.values(name)
+        if texts := sorted({cell for cell in cells if isinstance(cell, str)}):
+            classes[CLASSES + name] = texts
+        elif any(isinstance(cell, bool) for cell in cells):
+            truths.append(name)
+        code_of = {text: code for code, text in enumerate(texts)}
+        values.append(
+            [np.nan if cell is None else float(code_of[cell] if isinstance(cell, str) else cell) for cell in cells]
+        )
+    return values, {**({TRUTHS: truths} if truths else {}), **classes}
 
 
 def _with_groups(table: TextTable, lines: list[tuple[int, Cells]]) -> list[tuple[int, Cells]]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from hashlib import blake2b
 from multiprocessing.connection import Connection
 from time import perf_counter
-from typing import Any, Protocol, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -236,34 +236,21 @@ Opens = Callable[[], Player]
 """What opens a player; a child process imports it by its name."""
 
 
-class AskablePlayer(Protocol):
-    """A player somewhere: asked first, answered later, so that several can work at a time."""
+class LocalPlayer:
+    """A player in this process, asked first and answered later: the work is done when the answer is wanted."""
+
+    def __init__(self, opens: Opens) -> None:
+        self._player = opens()
 
     def ask(self, method: str, *arguments: Any, then: Request | None = None) -> None:
         """Start `begin`, `advance` or `dismiss`.
 
         then: what to start at once where that ends the episode, and only there; its answer is the next one.
         """
-
-    def answer(self) -> Answer:
-        """Return what the last request gave; raise what it raised."""
-
-    def close(self) -> None:
-        """Free what it holds."""
-
-
-class LocalPlayer:
-    """A player in this process: the work is done when the answer is wanted."""
-
-    def __init__(self, opens: Opens) -> None:
-        self._player = opens()
-
-    def ask(self, method: str, *arguments: Any, then: Request | None = None) -> None:
-        """Remember the request."""
         self._request, self._then = (method, arguments), then
 
     def answer(self) -> Answer:
-        """Do the work."""
+        """Return what the last request gave; raise what it raised."""
         answer = self._player.answer(*self._request)
         if self._then is not None and isinstance(answer, Ending):
             self._request, self._then = self._then, None
@@ -275,7 +262,7 @@ class LocalPlayer:
 
 
 class ProcessPlayer:
-    """A player in a child process; a child that dies costs its episode and is replaced."""
+    """The same in a child process: several work at a time. One that dies costs its episode and is replaced."""
 
     def __init__(self, opens: Opens) -> None:
         self._opens = opens
@@ -310,6 +297,9 @@ class ProcessPlayer:
     def close(self) -> None:
         """End the child."""
         self._child.close()
+
+
+AskablePlayer = LocalPlayer | ProcessPlayer
 
 
 def serve(connection: Connection) -> None:

@@ -110,11 +110,6 @@ class RecordingSource(Source[LeRobotSource]):
         return {"source": self.settings, "captured_calls": calls, "capture_only": True, "frames": "none"}
 
     @property
-    def name(self) -> str:
-        """The name of the folder, or of the data set on the hub."""
-        return self.settings.name
-
-    @property
     def features(self) -> list[str]:
         """Pictures of the data set, in the order of the model's cameras."""
         return [feature for _, feature in self.settings.cameras]
@@ -277,7 +272,7 @@ class RecordingSource(Source[LeRobotSource]):
             return f"the policy predicts {predicted} numbers, the data set has {actions.shape[1]}"
         if policy.predicts_relative:
             return "the policy predicts changes relative to the state (use_relative_actions)"
-        if (reason := other_order(policy, self.folder.meta.names(ACTION) or ())) is not None:
+        if (reason := other_order(policy, self.folder.feature_names(ACTION) or ())) is not None:
             return reason
         shares = policy.unusual_actions(actions).mean(axis=0)
         if not (shares > MOST_UNUSUAL).any():

@@ -6,6 +6,7 @@ A source knows neither what a model does with its observations nor how runs are 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from importlib import import_module
 from pathlib import Path
 from types import MappingProxyType
@@ -158,9 +159,9 @@ class Source[Chosen: SourceSettings](ABC):
         return {}
 
     @property
-    @abstractmethod
     def name(self) -> str:
         """The name in tables."""
+        return self.settings.name
 
     @abstractmethod
     def rows(self, seed: int) -> "tuple[Row, ...]":
@@ -196,10 +197,10 @@ class Source[Chosen: SourceSettings](ABC):
     def example(self, instruction: str) -> "Observation":
         """A blank observation of the source's shapes, of which tokens are counted."""
 
-    @property
-    @abstractmethod
+    @cached_property
     def instructions(self) -> tuple[str, ...]:
         """Every instruction once, in the order of their letters."""
+        return tuple(sorted({row.instruction for row in self.rows(0)}))
 
     def early_checks(
         self, cameras: Sequence[str], state: int | None, checkpoint: str

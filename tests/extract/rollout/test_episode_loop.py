@@ -14,8 +14,8 @@ from probe_kit.env import SceneSpec
 from probe_kit.errors import ActionError
 from probe_kit.extract import ExtractSettings, prepare
 from probe_kit.extract.rollout.controllers import Inference
-from probe_kit.extract.rollout.worker import EpisodeLoop, Failure, Rollout
-from probe_kit.extract.sources.player import Ending, LocalPlayer, ProcessPlayer, Row
+from probe_kit.extract.rollout.worker import EpisodeLoop, Rollout
+from probe_kit.extract.sources.player import Ending, Failed, LocalPlayer, ProcessPlayer, Row
 from probe_kit.extract.sources.scene_source import ScenePlayer
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.suite import Suite, build_suite
@@ -78,7 +78,7 @@ class Thinking:
 
 def played(
     episodes: int, batch: int = 1, length: int = 1, bad: set[int] | None = None, capture_only: bool = False
-) -> tuple[list[Rollout | Failure], list[tuple[str, int]]]:
+) -> tuple[list[Rollout | Failed], list[tuple[str, int]]]:
     log: list[tuple[str, int]] = []
     left = iter([Row(number, {"policy_seed": number}) for number in range(episodes)])
     ring: Any = SimpleNamespace(take=lambda: object(), give_back=lambda _buffers: None)
@@ -113,7 +113,7 @@ def test_a_stage_asks_for_nothing_between_the_inferences_of_two_episodes() -> No
 @pytest.mark.parametrize("batch", [1, 2])
 def test_what_was_to_follow_a_failed_episode_is_played_all_the_same(batch: int) -> None:
     results, _ = played(12, batch, bad={0, 3, 4, 11})
-    failed = [result.planned.index for result in results if isinstance(result, Failure)]
+    failed = [result.number for result in results if isinstance(result, Failed)]
     kept = [result.planned.index for result in results if isinstance(result, Rollout)]
     assert sorted(failed) == [0, 3, 4, 11]
     assert sorted(failed + kept) == list(range(12)), "every episode once"

@@ -7,7 +7,7 @@ from probe_kit.env import SceneSpec
 from probe_kit.env.simulation import Camera
 from probe_kit.errors import UsageError
 from probe_kit.extract import ExtractSettings
-from probe_kit.extract.rollout.tasks import check_fit
+from probe_kit.extract.rollout.tasks import fitted
 from probe_kit.extract.sources.scene import SceneSettings
 from probe_kit.extract.sources.scene_source import SceneSource
 from probe_kit.hooks import ModelCard
@@ -35,8 +35,8 @@ def test_intrinsics_project_as_the_camera_does_whatever_the_picture_size() -> No
 
 def test_a_batch_that_changes_numbers_and_a_camera_that_is_not_there_are_refused(small_suite: Suite) -> None:
     source, two = SceneSource(SceneSettings(scene=SceneSpec()), small_suite), ExtractSettings("pi0", batch=2)
-    check_fit(replace(CARD, batch=1, needs=frozenset({"intrinsics", "state"})), two.changed(batch=1), source)
+    fitted(replace(CARD, batch=1, needs=frozenset({"intrinsics", "state"})), two.changed(batch=1), source)
     with pytest.raises(UsageError, match="--batch 2 with mine, which takes at most 1"):
-        check_fit(replace(CARD, batch=1), two, source)
+        fitted(replace(CARD, batch=1), two, source)
     with pytest.raises(UsageError, match=r"reads camera\.wrist"):
-        check_fit(replace(CARD, needs=frozenset({"camera.wrist"})), two, source)
+        fitted(replace(CARD, needs=frozenset({"camera.wrist"})), two, source)
