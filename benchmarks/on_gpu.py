@@ -24,7 +24,7 @@ from pathlib import Path
 HERE = Path(__file__).parent
 PARITY = (
     "tests/hooks/test_on_device.py", "tests/extract/test_extraction.py",
-    "tests/extract/rollout/test_episode_buffers.py", "tests/train/test_probe_sweep.py",
+    "tests/extract/rollout/test_episode_loop.py", "tests/train/test_probe_sweep.py",
 )  # fmt: skip
 ON_DEVICE = "device_changes and cuda or gpu"
 GOLDEN = "reproduces or reproduced or every_recorded or everything_recorded"

@@ -1,5 +1,6 @@
 """An error of a whole run keeps its class, exit code and words with every kind of worker."""
 
+import fcntl
 import os
 import shutil
 import subprocess
@@ -8,20 +9,17 @@ from collections.abc import Sequence
 from functools import partial
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from typer.testing import CliRunner
 
 from probe_kit._execution.ray_pool import RayWorker
+from probe_kit.cli import app
 from probe_kit.env import SceneSpec
-from probe_kit.errors import (
-    CaptureChangedActionError,
-    ProbeKitError,
-    SceneError,
-    SuiteError,
-    UsageError,
-)
+from probe_kit.errors import CaptureChangedActionError, ProbeKitError, SceneError, SuiteError, UsageError
 from probe_kit.extract import Extraction, ExtractSettings, extract_run, prepare
 from probe_kit.extract.extraction import play_episodes
 from probe_kit.extract.sources.player import LocalPlayer, ProcessPlayer
@@ -29,16 +27,13 @@ from probe_kit.extract.sources.scene_source import ScenePlayer
 from probe_kit.hooks import Observation
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.runs import open_run
+from probe_kit.runs.folder import Folder
+from probe_kit.runs.layout import RUN_FILE
 from probe_kit.runs.provenance import provenance_here, write_certificate
 from probe_kit.runs.store import locate
-from probe_kit.suite import Suite, build_suite
+from probe_kit.suite import Suite
 
 SHORT = SceneSpec(max_steps=2)
-
-
-@pytest.fixture(scope="module")
-def suite(tmp_path_factory: pytest.TempPathFactory) -> Suite:
-    return build_suite(tmp_path_factory.mktemp("suite") / "two", ["color"], 2)
 
 
 @pytest.mark.parametrize("stage_kind", [LocalPlayer, ProcessPlayer])
@@ -191,3 +186,93 @@ def test_errors_survive_the_way_through_a_pipe() -> None:
     error.add_note("in episode 3")
     back: ProbeKitError = pickle.loads(pickle.dumps(error))
     assert (type(back), str(back), back.exit_code, back.__notes__) == (SuiteError, str(error), 1, error.__notes__)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("items", "command"), [(4, "retention"), pytest.param(10, "train", marks=pytest.mark.slow)]
+)
+def test_probes_are_only_the_next_step_of_as_many_groups_as_they_have_folds(
+    items: int, command: str, small_suite: Suite, tmp_path: Path
+) -> None:
+    few = ("--categories", "color", "--items", str(items), "--suite", str(small_suite.folder))
+    fast = ("--no-act", "--env-workers", "0", "--out", str(tmp_path / "run"))
+    result = CliRunner().invoke(app, ["extract", "--model", "pi0-tiny", *few, *fast])
+    assert result.exit_code == 0, result.output
+    assert f"next: probe-kit {command} {tmp_path / 'run'}" in " ".join(result.stderr.split())
+
+
+EPISODES = [0, 1]
+
+
+@pytest.fixture
+def settings(small_suite: Suite) -> ExtractSettings:
+    scene = SceneSpec(max_steps=1)
+    return ExtractSettings(
+        "expert", suite=small_suite.folder, categories=("color",), items=2, scene=scene, env_workers=0
+    )
+
+
+@pytest.fixture
+def unheld(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Keys that were written without a lock on their run; the beginning of a run does not count."""
+    found: list[str] = []
+    for name in ("create", "write"):
+        _watch(monkeypatch, name, found)
+    return found
+
+
+def _watch(monkeypatch: pytest.MonkeyPatch, name: str, found: list[str]) -> None:
+    original = getattr(Folder, name)
+
+    def watched(self: Folder, key: str, content: bytes) -> Any:
+        with (self.path / RUN_FILE).open("rb") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                pass
+            else:
+                found.append(key)
+        return original(self, key, content)
+
+    monkeypatch.setattr(Folder, name, watched)
+
+
+def begun(settings: ExtractSettings, run: Path) -> str:
+    """A run whose owner was killed."""
+    return prepare(settings).writer(Folder(run)).location.address
+
+
+def test_an_extraction_in_one_process_holds_its_run(
+    settings: ExtractSettings, tmp_path: Path, unheld: list[str]
+) -> None:
+    extract_run(settings, tmp_path / "run")
+    assert unheld == []
+
+
+def test_a_worker_holds_the_run_itself(settings: ExtractSettings, tmp_path: Path, unheld: list[str]) -> None:
+    address = begun(settings, tmp_path / "run")
+    left, done = list(EPISODES), list[int]()
+
+    def take() -> int | None:
+        if len(done) == len(EPISODES):
+            raise EOFError  # the executor hung up
+        return left.pop(0) if left else None
+
+    with pytest.raises(EOFError):
+        play_episodes((settings, address), take, lambda event: done.append(event.number))
+    assert done == EPISODES
+    assert (tmp_path / "run" / "certificate.json").is_file()
+    assert unheld == []
+
+
+def test_a_worker_that_joins_forgets_no_failure(settings: ExtractSettings, tmp_path: Path) -> None:
+    writer = prepare(settings).writer(Folder(tmp_path / "run"))
+    with writer.owned():
+        writer.give_up(3, "it fell over")
+        with writer.joined():
+            pass
+    with writer.joined():
+        assert list(writer.location.read_all("failed", ".json"))
+    with writer.owned():
+        assert not list(writer.location.read_all("failed", ".json"))

@@ -117,6 +117,7 @@ class EnvSource(SourceSettings):
         "environment": "The run's environment, if its module was moved or renamed.",
         "options": "Argument of the environment beside those of the run; repeatable.",
     }
+    played: ClassVar[str] = "in"
     subject: ClassVar[str] = "environments"
     loads: ClassVar[str] = "environment"
     refuses: ClassVar[tuple[str, ...]] = (
@@ -131,10 +132,6 @@ class EnvSource(SourceSettings):
     def name(self) -> str:
         """The name in tables."""
         return self.environment
-
-    def marks(self) -> list[str]:
-        """The part of a run's label that names the source."""
-        return [f"in {self.name}"]
 
     def files(self) -> dict[str, Path]:
         """Return the folder from which the module of the environment was imported, if no package installed it."""

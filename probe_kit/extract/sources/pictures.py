@@ -21,7 +21,13 @@ from probe_kit._tables.label_table import LabelTable
 from probe_kit.errors import RecordingError, UsageError
 from probe_kit.extract.sources.player import SIDE, Answer, InputsPlayer, Opens, Row
 from probe_kit.extract.sources.recording import Pixels
-from probe_kit.extract.sources.source import Played, Source, SourceSettings, predicted_once
+from probe_kit.extract.sources.source import (
+    REFUSED_WITHOUT_ACTING,
+    Played,
+    Source,
+    SourceSettings,
+    predicted_once,
+)
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.observation import ARM_NUMBERS, Observation
 from probe_kit.hooks.contract.sites import CAMERA
@@ -71,12 +77,11 @@ class PictureFolder(SourceSettings):
         "folder": "Folder of the run's pictures, if it was moved.",
         "table": "Table of the run's pictures, if it was moved.",
     }
+    played: ClassVar[str] = "on"
     subject: ClassVar[str] = "pictures"
     loads: ClassVar[str] = "pictures"
     decides: ClassVar[tuple[str, ...]] = ("captured_calls",)
-    refuses: ClassVar[tuple[str, ...]] = (
-        "protocol", "rotation", "video", "batch=auto", "execute", "later_views", "edits",
-    )  # fmt: skip
+    refuses: ClassVar[tuple[str, ...]] = REFUSED_WITHOUT_ACTING
 
     def __init__(self, folder: str | Path, table: str | Path | None = None, **choices: Any) -> None:
         if table is None:
@@ -91,10 +96,6 @@ class PictureFolder(SourceSettings):
     def files(self) -> dict[str, Path]:
         """Return the folder of the pictures, and the table."""
         return {"folder": Path(self.folder).expanduser(), "table": Path(self.table).expanduser()}
-
-    def marks(self) -> list[str]:
-        """The part of a run's label that names the source."""
-        return [f"on {self.name}"]
 
 
 @dataclass(frozen=True)

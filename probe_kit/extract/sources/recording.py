@@ -10,7 +10,7 @@ import typer
 from pydantic import BeforeValidator, Field
 
 from probe_kit.errors import UsageError
-from probe_kit.extract.sources.source import SourceSettings
+from probe_kit.extract.sources.source import REFUSED_WITHOUT_ACTING, SourceSettings
 from probe_kit.hooks.families.shared.kinds import IMAGES
 
 TURNS = (90, 180, 270)
@@ -168,12 +168,11 @@ class LeRobotSource(SourceSettings):
     command: ClassVar[str] = "--dataset FOLDER"
     opens: ClassVar[str] = "probe_kit.extract.sources.recording_source:RecordingSource"
     moves: ClassVar[Mapping[str, str]] = {"folder": "Folder of the run's recordings, if it was moved."}
+    played: ClassVar[str] = "on"
     subject: ClassVar[str] = "recordings"
     loads: ClassVar[str] = "recordings"
     decides: ClassVar[tuple[str, ...]] = ("captured_calls",)
-    refuses: ClassVar[tuple[str, ...]] = (
-        "protocol", "rotation", "video", "batch=auto", "execute", "later_views", "edits",
-    )  # fmt: skip
+    refuses: ClassVar[tuple[str, ...]] = REFUSED_WITHOUT_ACTING
     shows: ClassVar[str] = "--dataset, which shows recorded frames and executes no action"
 
     def __init__(self, folder: str | Path, **choices: Any) -> None:
@@ -202,7 +201,3 @@ class LeRobotSource(SourceSettings):
     def files(self) -> dict[str, Path]:
         """Return the folder of recordings that lie here."""
         return {"folder": Path(self.folder).expanduser()} if self.is_local else {}
-
-    def marks(self) -> list[str]:
-        """The part of a run's label that names the source."""
-        return [f"on {self.name}"]

@@ -27,6 +27,12 @@ if TYPE_CHECKING:
     from probe_kit.suite import Suite
 
 
+REFUSED_WITHOUT_ACTING = (
+    "protocol", "rotation", "video", "batch=auto", "execute", "later_views", "edits",
+)  # fmt: skip
+"""Fields of other parts that do not apply to a source that shows what was recorded."""
+
+
 class SourceSettings(Part):
     """Settings of a source, which open it.
 
@@ -35,7 +41,8 @@ class SourceSettings(Part):
     other sources do not apply. subject, loads: what its options are about, and what is loaded of it, in words.
     decides: fields of other parts that are the source's
     own. refuses: fields of other parts that do not apply, some with the only value that does not. moves: fields
-    that a later command may give anew, with what it says of them, because a file or module lies elsewhere.
+    that a later command may give anew, with what it says of them, because a file or module lies elsewhere. played:
+    the word before the name in a run's label; empty for a label without it.
     """
 
     kind: str
@@ -48,6 +55,7 @@ class SourceSettings(Part):
     decides: ClassVar[tuple[str, ...]] = ()
     refuses: ClassVar[tuple[str, ...]] = ()
     moves: ClassVar[Mapping[str, str]] = MappingProxyType({})
+    played: ClassVar[str] = ""
 
     @property
     def name(self) -> str:
@@ -108,7 +116,7 @@ class SourceSettings(Part):
 
     def marks(self) -> list[str]:
         """Return the parts of a run's label that name the source."""
-        return []
+        return [f"{self.played} {self.name}"] if self.played else []
 
 
 @dataclass(frozen=True)

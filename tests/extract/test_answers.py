@@ -1,10 +1,18 @@
-"""The parsing table: what may be read as an answer, and why everything else is not."""
+"""Answers in words and by logits: what is read of them, and what it scores."""
 
 import pytest
 
 from probe_kit.extract.prompts import P1, SEEN, Order, Template
-from probe_kit.extract.rollout.answers import Said, read_answer
-from tests.extract.vqa.answer_cases import (
+from probe_kit.extract.rollout.answers import (
+    Choice,
+    Said,
+    likeliest,
+    outcome_of,
+    read_answer,
+    side_expected,
+    side_said,
+)
+from tests.extract.answer_cases import (
     AFTER_AUDIT,
     AUDIT_LETTERED,
     AUDIT_SEEN,
@@ -151,3 +159,48 @@ def test_a_side_that_is_read_has_a_tier_and_nothing_else_has() -> None:
 )
 def test_strict_is_an_option_or_a_side_and_nothing_else(text: str, tier: str) -> None:
     assert read_answer(text, P1).tier == tier
+
+
+def test_outcomes_are_right_wrong_or_unread() -> None:
+    assert [outcome_of(said, "left") for said in ("left", "right", "center", "yes", "no", "none")] == [
+        "correct", "wrong", "oob", "oob", "oob", "oob",
+    ]  # fmt: skip
+    assert [outcome_of(said, None) for said in ("no", "left", "center", "yes", "none")] == [
+        "correct", "wrong", "wrong", "wrong", "oob",
+    ]  # fmt: skip
+    assert [side_said(said) for said in ("left", "right", "center", "no")] == ["left", "right", "none", "none"]
+
+
+def test_where_the_asked_object_lies() -> None:
+    assert [side_expected(asked, "left") for asked in ("target", "distractor", "absent")] == [
+        "left",
+        "right",
+        None,
+    ]
+
+
+def test_a_tie_is_no_answer_and_never_the_first_option() -> None:
+    assert likeliest({"left": 1.5, "right": 1.5}) == "none"
+    assert likeliest({"left": 1.5, "right": 1.0, "center": 1.5}) == "none"
+    assert likeliest({"left": 1.0, "right": 1.5, "center": 1.4}) == "right"
+
+
+@pytest.mark.parametrize(("content", "bias"), [(0.75, 2.0), (-0.25, 0.5), (0.0, -1.0)])
+def test_letter_bias_and_content_are_separated(content: float, bias: float) -> None:
+    """A is left in the first pass and right in the second; a preference for A applies in both."""
+    first = {"left": 3 + content / 2 + bias, "right": 3 - content / 2}
+    second = {"left": 1 + content / 2, "right": 1 - content / 2 + bias}
+    choice = Choice([first, second])
+    assert choice.margins == [content + bias, content - bias]
+    assert (choice.content, choice.letter_bias) == (content, bias)
+    assert choice.debiased == ("none" if content == 0 else "left" if content > 0 else "right")
+    assert choice.likeliest == ("left" if content + bias > 0 else "right")
+
+
+def test_one_order_cannot_tell_a_bias() -> None:
+    choice = Choice([{"left": 2.0, "right": 1.0}])
+    assert (choice.content, choice.letter_bias, choice.debiased) == (1.0, None, "left")
+
+
+def test_of_an_absent_object_the_margin_is_no_minus_yes() -> None:
+    assert Choice([{"yes": 1.0, "no": 3.0}]).content == 2.0
