@@ -81,7 +81,7 @@ class Rollout:
 class Playing:
     """An episode on its player.
 
-    ahead: whether the player began it by itself, when the one before it ended. seen: the observation that waits
+    ahead: whether the player began it by itself, when the one before it ended. observation: the one that waits
     for an inference, None while the player simulates. control_steps: actions before each inference so far. steps:
     actions so far. seconds: of inference. flagged: inferences without a valid action, None where the policy cannot
     tell. past: the chunks so far, for policies that average them. columns: of the outcome.
@@ -90,7 +90,7 @@ class Playing:
     planned: Row
     buffers: EpisodeBuffers
     ahead: bool
-    seen: Observation | None = None
+    observation: Observation | None = None
     control_steps: list[int] = field(default_factory=list)
     steps: int = 0
     seconds: float = 0.0
@@ -102,8 +102,8 @@ class Playing:
 
     def turn(self) -> Turn:
         """The inference that is due."""
-        assert self.seen is not None
-        return Turn(self.seen, self.planned, len(self.control_steps), self.buffers, self.past)
+        assert self.observation is not None
+        return Turn(self.observation, self.planned, len(self.control_steps), self.buffers, self.past)
 
     def ended(self, ending: Ending) -> Rollout:
         """The result, with the counts of flagged steps, where the policy can tell, and of lost words."""
@@ -174,7 +174,7 @@ class EpisodeLoop:
         # The player is to begin with it if its episode ends now.
         row = slot.following
         then: Request | None = None if row is None else ("begin", (row, self._film(row)))
-        playing.seen, playing.columns = None, inference.columns
+        playing.observation, playing.columns = None, inference.columns
         if inference.actions is None:
             slot.player.ask("dismiss", then=then)
             return
@@ -189,7 +189,7 @@ class EpisodeLoop:
         If all its episodes ended at once, and no player has begun the next one, that is done during the other
         group's turn.
         """
-        while waiting := [(slot, slot.playing) for slot in group if slot.playing and not slot.playing.seen]:
+        while waiting := [(slot, slot.playing) for slot in group if slot.playing and not slot.playing.observation]:
             for slot, playing in waiting:
                 try:
                     answer = slot.player.answer()
@@ -197,16 +197,16 @@ class EpisodeLoop:
                     yield self._give_up(slot, playing, error)
                     continue
                 if isinstance(answer, Observation):
-                    playing.seen = answer
+                    playing.observation = answer
                 else:
                     assert isinstance(answer, Ending)
                     yield playing.ended(answer)
                     self._begin_next(slot, ended=True)
-            if not any(slot.playing and (slot.playing.seen or slot.playing.ahead) for slot in group):
+            if not any(slot.playing and (slot.playing.observation or slot.playing.ahead) for slot in group):
                 return
 
     def _infer(self, group: list[EpisodeSlot]) -> Iterator[Failed]:
-        due = [(slot, slot.playing) for slot in group if slot.playing and slot.playing.seen]
+        due = [(slot, slot.playing) for slot in group if slot.playing and slot.playing.observation]
         if not due:
             return
         # An error here is of the batch: which row caused it is unknown, so all rows are given up and played alone.
