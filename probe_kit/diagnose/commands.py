@@ -19,7 +19,6 @@ from probe_kit.extract.settings import ExtractSettings
 from probe_kit.intervene.commands import PairTable
 
 if TYPE_CHECKING:
-    from probe_kit.diagnose.results import Diagnosis
     from probe_kit.extract.extraction import Extraction
     from probe_kit.extract.sources.player import Row
     from probe_kit.intervene import ReplaySource
@@ -101,7 +100,7 @@ def diagnose(
     """
     from probe_kit.diagnose.diagnosis import diagnose_run
     from probe_kit.diagnose.inputs import names_of, read_paraphrases
-    from probe_kit.diagnose.results import check_names
+    from probe_kit.diagnose.results import check_names, diagnosis_table
     from probe_kit.intervene.places import read_pairs
     from probe_kit.train.command_options import TargetOptions
 
@@ -133,7 +132,10 @@ def diagnose(
             pairs=table,
             progress=lambda text: status.update(text),
         )
-    _print(diagnosis, output_format)
+    if output_format == "json":
+        print_json(diagnosis.to_json())
+    else:
+        print_table(diagnosis_table(diagnosis), output_format)
     if html is not None:
         from probe_kit.diagnose.page import write_page
 
@@ -157,13 +159,6 @@ class _Request(NamedTuple):
         from probe_kit.diagnose.results import check_names
 
         check_names(self.require, names_of(cameras))
-
-    @property
-    def drawn(self) -> tuple[int, int | None]:
-        """The number of frames, and of pairs of a table; None where donors are drawn."""
-        if not self.pairs:
-            return self.frames, None
-        return len({name for row in self.pairs for name in (row[:2], row[2:])}), len(self.pairs)
 
 
 def _replay_source(run: "Run", typed: Mapping[str, Any]) -> "ReplaySource":
@@ -283,16 +278,9 @@ def _say_cost(planned: Planned, request: _Request, inside: bool) -> None:
     # Keys and values are of every block of the backbone, which has one residual site more.
     handed_over = layers["backbone"] - 1 if declared is not None and declared.interventions.prompt_kv else 0
     sites = sum(layers.values()) + handed_over if inside else 0
-    (frames, pairs), base = request.drawn, request.base is not None
+    frames, pairs, base = request.frames, len(request.pairs) or None, request.base is not None
+    if request.pairs:
+        frames = len({name for row in request.pairs for name in (row[:2], row[2:])})
     most = count_inferences(frames, len(inputs), sites, base, pairs)
     words = ", ".join(dict.fromkeys(inputs))
     say(f"at most {most:,} inferences: {frames} frames, {words}, {sites} sites" + ", and a base" * base)
-
-
-def _print(diagnosis: "Diagnosis", output_format: str) -> None:
-    from probe_kit.diagnose.results import diagnosis_table
-
-    if output_format == "json":
-        print_json(diagnosis.to_json())
-    else:
-        print_table(diagnosis_table(diagnosis), output_format)

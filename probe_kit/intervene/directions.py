@@ -31,7 +31,7 @@ from probe_kit.intervene.erasers import (
 )
 from probe_kit.intervene.outcomes import items_of
 from probe_kit.intervene.patching.patch import Cell
-from probe_kit.intervene.places import Pair, SiteGroup, names_one_place, resolve_all, token_mask
+from probe_kit.intervene.places import Pair, SiteGroup, resolve_all, token_mask
 from probe_kit.intervene.sessions import ReplaySession
 from probe_kit.runs.direction_files import FileDirection
 from probe_kit.runs.run import Run
@@ -185,7 +185,7 @@ class PassedOver:
 
     def __init__(self, session: ReplaySession, patterns: Sequence[str]) -> None:
         self._session = session
-        self._required = resolve_all([name for name in patterns if names_one_place(name)], session.policy)
+        self._required = resolve_all([name for name in patterns if "*" not in name], session.policy)
         self._cells: set[Cell] = set()
         self._last: NoDirectionError | None = None
 

@@ -91,13 +91,15 @@ def read_pairs(path: Path) -> tuple[PairRow, ...]:
         raise UsageError(f"{path} has no column {missing[0]!r}; expected {', '.join(PAIR_COLUMNS)}")
     rows = []
     for line, cells in table.rows(PAIR_COLUMNS):
-        texts = [cells[name] or "" for name in PAIR_COLUMNS]
-        for column, text in zip(PAIR_COLUMNS[1::2], texts[1::2], strict=True):
-            if not text.isdecimal():
+        for column in PAIR_COLUMNS[1::2]:
+            if not (text := cells[column] or "").isdecimal():
                 raise UsageError(
                     f"{table.where(line, column)} is {text!r}; expected the number of a frame, from 0"
                 )
-        rows.append((_episode(texts[0]), int(texts[1]), _episode(texts[2]), int(texts[3])))
+        clean, frame, donor, donor_frame = (cells[name] or "" for name in PAIR_COLUMNS)
+        # A recorded episode may be called by its number.
+        clean, donor = (f"episode-{int(name):06d}" if name.isdecimal() else name for name in (clean, donor))
+        rows.append((clean, int(frame), donor, int(donor_frame)))
     if not rows:
         raise UsageError(f"{path} names no pair; expected a line per pair")
     return tuple(rows)
@@ -114,11 +116,6 @@ def check_pairs(table: Sequence[PairRow], frames: Collection[tuple[str, int]]) -
             raise UsageError(
                 f"the run has no frame {number} of {episode!r}, which the table of pairs names; it has {its}"
             )
-
-
-def _episode(text: str) -> str:
-    """Return the id of a recorded episode that is named by its number."""
-    return f"episode-{int(text):06d}" if text.isdecimal() else text
 
 
 TILE_ROLES = ("image.left", "image.right")
@@ -292,17 +289,6 @@ def resolve_all(patterns: Sequence[str], policy: "Model") -> dict[str, SiteGroup
     return {site_group.name: site_group for pattern in patterns for site_group in resolve_sites(pattern, policy)}
 
 
-def parse_pattern(pattern: str) -> dict[str, str | None] | None:
-    """Stream, layer, quantity, head, first and last iteration of a pattern; None for what names no place."""
-    match = _PATTERN.fullmatch(pattern)
-    return None if match is None else match.groupdict()
-
-
-def names_one_place(pattern: str) -> bool:
-    """Whether a pattern has no wildcard, so that its place was meant by name."""
-    return "*" not in pattern
-
-
 def _site_group(stream: "Stream", name: PlaceName) -> SiteGroup:
     quantities = (name.quantity,) if name.quantity else KV if stream.name == KV_STREAM else (RESIDUAL,)
     low, high = name.iterations or (0, 0)
@@ -367,7 +353,7 @@ def unread_places(
     """
     places = []
     for pattern in patterns:
-        parts = parse_pattern(pattern)
+        parts = _PATTERN.fullmatch(pattern)
         if parts is None or parts["stream"] not in interventions.unread or parts["stream"] not in streams:
             continue
         last, quantity = streams[parts["stream"]].layers - 1, parts["quantity"] or ""

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit._tables.numbers import number
 from probe_kit.errors import UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.observation import Observation
@@ -246,7 +247,7 @@ def describe_void(rows: Sequence[AttributionEffect]) -> str:
 def _first(rows: Sequence[AttributionEffect]) -> str:
     """Return the largest estimates of one kind; empty for the anchors, which have no rank."""
     first = [
-        f"{row.name} {_two(row.estimate)}{'' if row.exact is None else f', exact {_two(row.exact)}'}"
+        f"{row.name} {number(row.estimate)}{'' if row.exact is None else f', exact {number(row.exact)}'}"
         for row in rows
         if row.rank is not None and row.rank <= FIRST
     ]
@@ -254,12 +255,7 @@ def _first(rows: Sequence[AttributionEffect]) -> str:
 
 
 def _compared(anchor: AttributionEffect) -> str:
-    return f"gradients give {_two(anchor.estimate)} where the patch gives {_two(anchor.exact)} ({anchor.name})"
-
-
-def _two(value: float | None) -> str:
-    """Return two digits, and zero without a sign."""
-    return "–" if value is None else f"{round(value, 2) + 0.0:.2f}"  # -0.0 + 0.0 is 0.0
+    return f"gradients give {number(anchor.estimate)} where the patch gives {number(anchor.exact)} ({anchor.name})"
 
 
 # -- in Python -----------------------------------------------------------------------------------------------
@@ -339,6 +335,8 @@ def attribute_cells(model: "Policy", pairs: Sequence[Pair], cells: Sequence[Cell
     one with a backward pass, and one per anchor. Raises UnsupportedInterventionError, before any inference, for a
     family without gradients; UsageError without pairs or cells, and for pairs of questions.
     """
+    import torch
+
     screened = tuple(dict.fromkeys(cells))
     model.interventions.check("gradients", model.card.family)
     if not pairs or not screened:
@@ -348,15 +346,9 @@ def attribute_cells(model: "Policy", pairs: Sequence[Pair], cells: Sequence[Cell
     anchors = complete_cuts(model, list(dict.fromkeys(cell.site_group for cell in screened)))
     every = (*anchors, *(cell for cell in screened if cell not in anchors))
     estimates = np.array([estimate_patches(model, pair, every, metric)[2] for pair in pairs]).T
-    exact = sweep_cells(model, pairs, anchors, lambda actions, _: _number(metric, actions))
+    exact = sweep_cells(model, pairs, anchors, lambda actions, _: float(metric(torch.from_numpy(actions))))
     rows = [_row(cell, moved, exact, anchors) for cell, moved in zip(every, estimates, strict=True)]
     return Screen(tuple(order_cells(rows)), {str(cell): cell for cell in every})
-
-
-def _number(metric: Slope, actions: NDArray[np.float32]) -> float:
-    import torch
-
-    return float(metric(torch.from_numpy(actions)))
 
 
 def _row(cell: Cell, moved: NDArray[np.float64], exact: Sweep, anchors: Sequence[Cell]) -> AttributionEffect:
