@@ -251,19 +251,14 @@ def _scored(stream: Stream) -> tuple[float, Matrix]:
     of_resample = np.zeros(RESAMPLES)
     for fold in range(stream.guide.shape[1]):
         tested = stream.fold_of == fold
-        shares = _shared_choice(stream.guide[:, fold] @ times)
+        # Sites of the largest quality share the choice of every resample, (S, R).
+        best = _are_best(stream.guide[:, fold] @ times)
+        shares: Matrix = best / best.sum(axis=0)
         of_group[tested] = shares.mean(axis=1) @ sums[:, tested]
         of_resample += sums[:, tested].sum(axis=1) @ shares
     score = float(of_group.sum() / sizes.sum())
     by_choice = _influence_on_choice(times, of_resample / sizes.sum())
     return score, (of_group - score * sizes) / sizes.sum() + by_choice
-
-
-def _shared_choice(quality: Matrix) -> Matrix:
-    """(S, R) shares of the sites in the choice of every resample: equal among those of the largest quality."""
-    best = _are_best(quality)
-    shares: Matrix = best / best.sum(axis=0)
-    return shares
 
 
 def _are_best(quality: Matrix) -> NDArray[np.bool_]:

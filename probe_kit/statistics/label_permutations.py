@@ -49,19 +49,13 @@ def flip_groups(labels: NDArray[np.bool_], groups: ArrayLike, count: int, seed: 
     elif names.size < ENUMERATED_BELOW:
         flips = generator.permutation(_every_flip(surplus), axis=1)
     else:
-        flips = _drawn_flips(surplus, count, generator)
+        flips = generator.random((names.size, count)) < 0.5
+        for size in np.unique(np.abs(surplus[surplus != 0])):  # groups of one surplus exchange their signs
+            alike = np.flatnonzero(np.abs(surplus) == size)
+            signs = np.repeat(surplus[alike, None] > 0, count, axis=1)
+            flips[alike] = generator.permuted(signs, axis=0) != signs
     flipped: NDArray[np.bool_] = labels[:, None] ^ flips[group_of]
     return flipped
-
-
-def _drawn_flips(surplus: NDArray[np.int64], count: int, generator: np.random.Generator) -> NDArray[np.bool_]:
-    """(G, count) flips by chance; groups of one surplus exchange their signs."""
-    flips = generator.random((surplus.size, count)) < 0.5
-    for size in np.unique(np.abs(surplus[surplus != 0])):
-        alike = np.flatnonzero(np.abs(surplus) == size)
-        signs = np.repeat(surplus[alike, None] > 0, count, axis=1)
-        flips[alike] = generator.permuted(signs, axis=0) != signs
-    return flips
 
 
 def _every_flip(surplus: NDArray[np.int64]) -> NDArray[np.bool_]:

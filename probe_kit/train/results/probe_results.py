@@ -25,7 +25,7 @@ from probe_kit.statistics.label_permutations import p_value, permutations_for, s
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.choices import SIDES, Incomplete, Task
 from probe_kit.train.crossval.task_scores import METRICS, fold_auc, fold_spearman, log_loss
-from probe_kit.train.results.control_scores import Controls, Exceeds, has_signal
+from probe_kit.train.results.control_scores import Controls, has_signal
 from probe_kit.train.results.probe_curve import Matrix, ProbeCurve
 from probe_kit.train.samples import is_token_view
 
@@ -198,7 +198,11 @@ def score_rows(
     score, low, high = _estimates(curve)
     p, p_fwe, chance = p_value(curve.metric, curve.null), curve.p_fwe(), curve.chance
     for row, (site, part) in enumerate(zip(curve.sites, curve.parts, strict=True)):
-        exceeds = _exceeds(controls, key, site, float(p_fwe[row]), curve.is_side)
+        exceeds = {
+            name: better
+            for name, better in controls.exceeds(*key, site, float(p_fwe[row])).items()
+            if curve.is_side or name == "chance" or better is not None
+        }
         yield {
             "model": settings.model,
             "random_weights": settings.random_weights,
@@ -246,11 +250,6 @@ def _estimates(curve: ProbeCurve) -> tuple[Matrix, Matrix, Matrix]:
         return shares, low, high
     limits = np.array([curve.estimate(np.array([row]))[1] for row in range(len(curve.sites))])
     return curve.metric, limits[:, 0], limits[:, 1]
-
-
-def _exceeds(controls: Controls, key: tuple[str, str], site: Site, p_fwe: float, is_side: bool) -> Exceeds:
-    exceeds = controls.exceeds(*key, site, p_fwe)
-    return {name: better for name, better in exceeds.items() if is_side or name == "chance" or better is not None}
 
 
 def _of_side(curve: ProbeCurve, row: int, accuracy: float) -> dict[str, Any]:
