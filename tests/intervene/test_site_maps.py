@@ -41,8 +41,6 @@ if TYPE_CHECKING:
     from probe_kit.hooks import Policy
 
 
-pytestmark = pytest.mark.slow  # `tests/acceptance` holds what a user sees of it
-
 LAST = 3
 
 
@@ -57,11 +55,13 @@ def whole(copy: Run, source: ReplaySource, twin: "Policy") -> InterventionResult
     return run_intervention(copy, intervention, source, load=lambda *_: twin)
 
 
+@pytest.mark.slow
 def test_all_tokens_of_the_first_layer_are_the_whole_exchange(whole: InterventionResult) -> None:
     outcomes = whole.outcomes
     np.testing.assert_allclose(outcomes.of("backbone.00|all"), outcomes.of("image_swap"), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_site_that_nothing_reads_leaves_every_action_bit_for_bit(whole: InterventionResult) -> None:
     """The ledger tells it from hooks that missed: they fired, and moved what passed."""
     (row,) = (row for row in whole.effects if (row.place, row.role) == ("backbone.03", "all"))
@@ -71,18 +71,21 @@ def test_a_site_that_nothing_reads_leaves_every_action_bit_for_bit(whole: Interv
     assert row.p_fwe == 1.0
 
 
+@pytest.mark.slow
 def test_words_are_the_same_before_and_after_the_exchange(whole: InterventionResult) -> None:
     """In the embeddings only pictures differ, so that taking the words over moves nothing."""
     said = whole.certificate["edits"]["backbone.00|language"]
     assert (said["fires"], said["no_op_fires"], said["max_action_change"]) == (4.0, 4.0, 0.0)
 
 
+@pytest.mark.slow
 def test_an_expert_is_changed_at_every_iteration_that_is_named(whole: InterventionResult) -> None:
     said = whole.certificate["edits"]["expert.02@0-1|all"]
     assert said["fires"] == 2 * 4
     assert "expert.02@0-1|language" not in whole.certificate["edits"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("sites", "roles", "role"),
     [
@@ -107,6 +110,7 @@ def test_a_role_that_nothing_plays_there_is_refused_and_nothing_is_stored(
     assert Interchange.keys_in_use(copy) == before
 
 
+@pytest.mark.slow
 def test_it_is_read_back_beside_what_else_is_stored(copy: Run, whole: InterventionResult) -> None:
     assert load_effects(copy, kind="interchange").to_csv() == whole.to_csv()
     assert {row.place for row in stored_site_effects(copy)["color"]} == {
@@ -116,6 +120,7 @@ def test_it_is_read_back_beside_what_else_is_stored(copy: Run, whole: Interventi
     }
 
 
+@pytest.mark.slow
 def test_an_interchange_along_a_direction_takes_no_maps_place(
     copy: Run, source: ReplaySource, twin: "Policy", whole: InterventionResult
 ) -> None:
@@ -126,6 +131,7 @@ def test_an_interchange_along_a_direction_takes_no_maps_place(
     assert {row.key for row in stored_site_effects(copy)["color"]} == {whole.key}
 
 
+@pytest.mark.slow
 def test_steering_by_nothing_changes_nothing_and_controls_move_as_far(
     copy: Run, source: ReplaySource, twin: "Policy"
 ) -> None:
@@ -146,6 +152,7 @@ def test_steering_by_nothing_changes_nothing_and_controls_move_as_far(
 # -- along what ----------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_mean_difference_is_found_without_the_episode_it_is_used_on(copy: Run) -> None:
     """Where it lies is planted; a probe's weights and controls are of length 1 as well."""
     axes = fit_directions(copy, Site("backbone", 2), "image", "mean-difference", 3, seed=0)
@@ -169,11 +176,13 @@ def test_the_mean_difference_is_found_without_the_episode_it_is_used_on(copy: Ru
         assert abs(float(vector @ unit)) < 1e-5
 
 
+@pytest.mark.slow
 def test_a_direction_that_does_not_exist_is_refused(copy: Run) -> None:
     with pytest.raises(UsageError, match="expected one of mean-difference, probe"):
         fit_directions(copy, Site("backbone", 2), "image", "mean-difference:1", 0, seed=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("direction", ["mean-difference", "probe"])
 @pytest.mark.parametrize("role", ["all", "image", "language"])
 def test_the_networks_input_has_no_direction(copy: Run, direction: str, role: str) -> None:
@@ -182,6 +191,7 @@ def test_the_networks_input_has_no_direction(copy: Run, direction: str, role: st
         fit_directions(copy, Site("backbone", 0), role, direction, 1, seed=0)
 
 
+@pytest.mark.slow
 def test_the_probes_direction_is_another_one(copy: Run) -> None:
     episode = str(copy.episodes["episode_id"][0])
     mean, probe = (
@@ -191,6 +201,7 @@ def test_the_probes_direction_is_another_one(copy: Run) -> None:
     assert 0 < float(mean @ probe) < 0.999
 
 
+@pytest.mark.slow
 def test_along_every_direction_is_the_whole_and_along_none_is_nothing() -> None:
     import torch
 
@@ -210,6 +221,7 @@ def test_along_every_direction_is_the_whole_and_along_none_is_nothing() -> None:
     np.testing.assert_allclose(rank_one.numpy() @ basis[1], taken.numpy() @ basis[1], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_what_fires_moved_is_summed_whatever_their_shapes() -> None:
     """Two fires of one shape, one of another; the second moves nothing. By hand."""
     import torch
@@ -230,6 +242,7 @@ def test_what_fires_moved_is_summed_whatever_their_shapes() -> None:
 # -- where ---------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_places_are_layers_or_layers_over_iterations(twin: "Policy") -> None:
     assert [place.name for place in resolve_sites("backbone.*", twin)] == [
         f"backbone.{n:02d}" for n in range(LAST + 1)
@@ -245,12 +258,14 @@ def test_places_are_layers_or_layers_over_iterations(twin: "Policy") -> None:
         _ = memory.only_site
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pattern", ["backbone.9", "backbone.00@1", "expert.01@9-12", "brain.01", "backbone", ""])
 def test_places_that_are_none_are_refused(twin: "Policy", pattern: str) -> None:
     with pytest.raises(UnknownSiteError):
         resolve_sites(pattern, twin)
 
 
+@pytest.mark.slow
 def test_roles_that_no_token_plays_are_refused(session: ReplaySession, copy: Run) -> None:
     (replay_input, _) = session.pairs(str(copy.episodes["item_id"][0]))
     assert token_mask(session.policy, replay_input.clean, "backbone", "image").sum() > 1
@@ -258,6 +273,7 @@ def test_roles_that_no_token_plays_are_refused(session: ReplaySession, copy: Run
         token_mask(session.policy, replay_input.clean, "backbone", "smell")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "intervention",
     [

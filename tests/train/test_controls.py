@@ -325,8 +325,6 @@ def test_the_reference_is_the_mean_of_five_layers_by_scikit_learns_accuracy(suit
     assert [one.reference for one in results.controls.comparisons] == pytest.approx([np.mean(accuracies)] * 3)
 
 
-pytestmark = pytest.mark.slow  # `tests/acceptance` holds what a user sees of it
-
 TARGET = "dataset.state.x"
 
 
@@ -339,6 +337,7 @@ def probed_label(run: Run, **further: Any) -> ProbeResults:
     return train_probes(run, target=Target.of_run(run, TARGET), permutations=59, controls=(), **further)
 
 
+@pytest.mark.slow
 def test_a_site_that_an_untrained_network_has_too_is_no_signal(run: Run, tmp_path: Path) -> None:
     blind = write_recorded_run(tmp_path / "blind", weights="1" * 64, planted=False)
     seeing = write_recorded_run(tmp_path / "seeing", weights="2" * 64)
@@ -356,6 +355,7 @@ def test_a_site_that_an_untrained_network_has_too_is_no_signal(run: Run, tmp_pat
     assert results.key == load_results(run, target=TARGET).key
 
 
+@pytest.mark.slow
 def test_the_comparison_is_stored_and_not_made_again(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -376,6 +376,7 @@ def test_the_comparison_is_stored_and_not_made_again(
     assert "control untrained" in answer.stdout
 
 
+@pytest.mark.slow
 def test_other_frames_are_refused(run: Run, tmp_path: Path, labelled_run: Path) -> None:
     with pytest.raises(UsageError, match="cannot be its own untrained control"):
         probed_label(run, untrained=open_run(run.path))
@@ -389,6 +390,7 @@ def test_other_frames_are_refused(run: Run, tmp_path: Path, labelled_run: Path) 
         probed_label(run, untrained=fewer)
 
 
+@pytest.mark.slow
 def test_later_inferences_of_networks_that_acted_are_refused(small_suite: Suite, tmp_path: Path) -> None:
     suite = small_suite.select([small_suite.categories[0]])
     run = write_labelled_run(tmp_path / "run", suite)

@@ -21,7 +21,7 @@ Array = Any
 
 def array_namespace(array: Array) -> Any:
     """The module that made `array`: numpy or torch."""
-    return import_module(type(array).__module__.partition(".")[0])
+    return np if isinstance(array, np.ndarray) else import_module("torch")
 
 
 def to_device(array: NDArray[Any], device: "str | torch.device | None") -> Array:

@@ -158,8 +158,6 @@ def test_the_best_cell_is_the_last_located_place_in_its_narrowest_role() -> None
     assert best_cell(rows[3:]) is None
 
 
-pytestmark = pytest.mark.slow
-
 ASKED = ClosedLoop(
     categories=("color",),
     items=1,
@@ -198,6 +196,7 @@ def row_of(effects: InterventionResult, place: str, direction: str = "") -> dict
     return row.to_json()
 
 
+@pytest.mark.slow
 def test_dose_zero_is_the_stored_run_bit_for_bit_with_every_hook_in_place(effects: InterventionResult) -> None:
     check = effects.certificate["replay"]
     assert check == {
@@ -208,6 +207,7 @@ def test_dose_zero_is_the_stored_run_bit_for_bit_with_every_hook_in_place(effect
     assert [note for note in effects.notes if "of items no p" not in note] == []
 
 
+@pytest.mark.slow
 def test_edits_are_in_force_at_every_inference(effects: InterventionResult) -> None:
     edits = effects.certificate["edits"]
     assert edits["backbone.00|all"]["fires"] == 2 * CALLS
@@ -215,6 +215,7 @@ def test_edits_are_in_force_at_every_inference(effects: InterventionResult) -> N
     assert edits["backbone.00|all"]["no_op_fires"] == 0
 
 
+@pytest.mark.slow
 def test_what_nothing_reads_changes_no_episode_and_what_all_reads_is_the_whole_exchange(
     effects: InterventionResult,
 ) -> None:
@@ -226,6 +227,7 @@ def test_what_nothing_reads_changes_no_episode_and_what_all_reads_is_the_whole_e
     np.testing.assert_array_equal(outcomes.episode_outcomes[2], outcomes.episode_outcomes[1])  # type: ignore[index]
 
 
+@pytest.mark.slow
 def test_it_is_stored_apart_from_other_kinds_and_read_back(run: Run, effects: InterventionResult) -> None:
     assert load_effects(run, kind="closed-loop").to_json() == effects.to_json()
     assert load_effects(run).to_csv() == effects.to_csv()
@@ -235,6 +237,7 @@ def test_it_is_stored_apart_from_other_kinds_and_read_back(run: Run, effects: In
     assert set(effects.table["finding"]) <= {"identity patch", "control", "not confirmed", "task disrupted"}
 
 
+@pytest.mark.slow
 def test_another_outcome_stops_before_anything_is_stored(
     run: Run, effects: InterventionResult, source: ReplaySource, twin: "Policy", tmp_path: Path
 ) -> None:
@@ -269,6 +272,7 @@ def test_killed_and_resumed_gives_the_same_bytes(
     assert all(said["fires"] == 2 * 2 for said in edits.values())
 
 
+@pytest.mark.slow
 def test_every_inference_has_its_own_state_and_the_pictures_exchanged(
     run: Run, source: ReplaySource, twin: "Policy"
 ) -> None:
@@ -289,6 +293,7 @@ def test_every_inference_has_its_own_state_and_the_pictures_exchanged(
         assert (own.image != other.image).any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "intervention",
     [
@@ -302,6 +307,7 @@ def test_what_cannot_be_asked_is_refused(intervention: object) -> None:
         intervention()  # type: ignore[operator]
 
 
+@pytest.mark.slow
 def test_another_rule_and_no_located_place_are_refused(run: Run) -> None:
     with pytest.raises(UsageError, match="by the rule 'box'"):
         ASKED.categories_in(run.under("box"))

@@ -39,8 +39,6 @@ if TYPE_CHECKING:
     from probe_kit.hooks import Policy
 
 
-pytestmark = pytest.mark.slow
-
 ASKED = ConceptErasure(categories=("color",), items=6, sites=("backbone.02", "backbone.03"), controls=1)
 EPISODES = 12
 
@@ -55,6 +53,7 @@ def row_of(effects: InterventionResult, place: str, direction: str) -> ErasureEf
     return row
 
 
+@pytest.mark.slow
 def test_writing_back_what_is_there_changes_no_action_bit_for_bit(effects: InterventionResult) -> None:
     row = row_of(effects, "backbone.02", "none")
     assert (row.finding, row.max_action_change, row.fires, row.no_op_fires) == (
@@ -65,6 +64,7 @@ def test_writing_back_what_is_there_changes_no_action_bit_for_bit(effects: Inter
     )
 
 
+@pytest.mark.slow
 def test_what_is_erased_is_moved_and_what_nothing_reads_is_not_missed(effects: InterventionResult) -> None:
     for name in ("leace", "control-1"):
         read, unread = (row_of(effects, place, name) for place in ("backbone.02", "backbone.03"))
@@ -76,6 +76,7 @@ def test_what_is_erased_is_moved_and_what_nothing_reads_is_not_missed(effects: I
         assert unread.net == 0.0
 
 
+@pytest.mark.slow
 def test_the_certificate_says_what_a_fresh_probe_reads(effects: InterventionResult) -> None:
     said = effects.certificate["probe_accuracy"]
     assert set(said) == {
@@ -90,6 +91,7 @@ def test_the_certificate_says_what_a_fresh_probe_reads(effects: InterventionResu
     )
 
 
+@pytest.mark.slow
 def test_it_is_stored_apart_from_other_kinds_and_read_back(copy: Run, effects: InterventionResult) -> None:
     assert load_effects(copy, kind="erase").to_json() == effects.to_json()
     assert stored_image_swaps(copy) == {}
@@ -136,6 +138,7 @@ def erased_answers(own: float, beside: float, base: str = "follower") -> Conditi
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("own", "beside", "base", "finding"),
     [
@@ -161,6 +164,7 @@ def test_what_is_lost_is_lost_beyond_the_controls(own: float, beside: float, bas
     assert row.right == (own > 0)
 
 
+@pytest.mark.slow
 def test_a_loss_in_one_group_is_no_evidence() -> None:
     outcomes = erased_answers(1.0, 1.0)
     one = outcomes.groups == outcomes.groups[0]
@@ -171,6 +175,7 @@ def test_a_loss_in_one_group_is_no_evidence() -> None:
     assert row.p >= 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "intervention",
     [
@@ -185,6 +190,7 @@ def test_what_cannot_be_asked_is_refused(intervention: object) -> None:
         intervention()  # type: ignore[operator]
 
 
+@pytest.mark.slow
 def test_ways_are_one_key_however_they_are_written() -> None:
     assert ConceptErasure(sites=("backbone.02",), method="inlp") == ConceptErasure(
         sites=("backbone.02",), method="inlp:5"
