@@ -15,7 +15,7 @@ start).
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from difflib import get_close_matches
 from types import MappingProxyType
@@ -473,15 +473,22 @@ def check_rule(name: str) -> str:
 
 def rule_of(name: str, scene: Mapping[str, Any]) -> OutcomeRule:
     """The rule of this name with the sizes of a scene, `SceneSpec.to_json()`. Raises UsageError."""
-    if check_rule(name) == Disc.name:
-        return Disc(scene["epsilon"])
-    if name == ReleasedOnTile.name:
-        return ReleasedOnTile(scene["tile_side"] / 2)
+    return _MAKERS[check_rule(name)](scene)
+
+
+def _box(scene: Mapping[str, Any]) -> OutcomeRule:
     # Scoring side and margins are newer than some scenes that are still read.
     side, margin, height = (
         scene.get(field, _DEFAULT[field].default) for field in ("scoring_side", "box_margin", "box_height")
     )
     return Box(side / 2 + margin, height)
+
+
+_MAKERS: dict[str, Callable[[Mapping[str, Any]], OutcomeRule]] = {
+    Disc.name: lambda scene: Disc(scene["epsilon"]),
+    Box.name: _box,
+    ReleasedOnTile.name: lambda scene: ReleasedOnTile(scene["tile_side"] / 2),
+}
 
 
 Choice = Literal["correct", "wrong", "none"]
