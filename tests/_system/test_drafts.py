@@ -61,6 +61,7 @@ def test_what_a_killed_process_left_is_removed_by_the_next(make: Callable[[Path]
     assert list(tmp_path.iterdir()) == [path]
 
 
+@pytest.mark.slow
 def test_an_export_that_was_killed_is_removed_by_the_next(little_runs: Path, tmp_path: Path) -> None:
     out = tmp_path / "run.safetensors"
     leave_a_draft(out)

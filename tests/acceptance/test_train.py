@@ -65,6 +65,7 @@ def table(played: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return file
 
 
+@pytest.mark.slow
 def test_the_side_is_scored_at_every_site_with_its_interval_and_its_p(sides: pd.DataFrame, played: Path) -> None:
     run = pk.open_run(played)
     iterations = {name: stream.iterations or 1 for name, stream in run.streams.items()}
@@ -80,6 +81,7 @@ def test_the_side_is_scored_at_every_site_with_its_interval_and_its_p(sides: pd.
     assert backbone.loc[3] > 0.85, "the embedded policy knows Color"
 
 
+@pytest.mark.slow
 def test_one_accuracy_is_that_of_scikit_learn_in_the_same_folds(sides: pd.DataFrame, played: Path) -> None:
     run = pk.open_run(played)
     curve = pk.load_results(run).curves["color", "mean"]
@@ -97,6 +99,7 @@ def test_one_accuracy_is_that_of_scikit_learn_in_the_same_folds(sides: pd.DataFr
         assert row["accuracy"] == pytest.approx(balanced_accuracy_score(left, answers))
 
 
+@pytest.mark.slow
 def test_every_control_of_the_side_is_stored_and_the_untrained_network_is_compared(
     trained: Path, untrained: Path
 ) -> None:
@@ -111,28 +114,28 @@ def test_every_control_of_the_side_is_stored_and_the_untrained_network_is_compar
     assert (signal["exceeds_untrained"] & signal["exceeds_random_features"] & (signal["p_fwe"] < 0.05)).all()
 
 
-def test_a_later_inference_has_probes_of_its_own(trained: Path) -> None:
+def test_a_later_inference_has_probes_of_its_own(played: Path) -> None:
     text = probe_kit(
-        *("train", trained, "--permutations", "5", "--controls", "none", "--call", "1", "--views", "mean:language")
+        *("train", played, "--permutations", "5", "--controls", "none", "--call", "1", "--views", "mean:language")
     ).text
     assert "color" in text
-    refused = probe_kit("train", trained, "--call", "7", "--permutations", "5", code=2)
+    refused = probe_kit("train", played, "--call", "7", "--permutations", "5", code=2)
     assert "7" in refused.text
 
 
 @pytest.mark.parametrize("target", ["side.chosen", "side.shuffled"])
-def test_the_chosen_and_the_shuffled_side_are_targets_too(trained: Path, target: str) -> None:
-    run = pk.open_run(trained)
+def test_the_chosen_and_the_shuffled_side_are_targets_too(played: Path, target: str) -> None:
+    run = pk.open_run(played)
     scores = pk.train_probes(run, target=target, permutations=3, controls=(), views=("mean:language",)).scores
     assert (scores["target"] == target).all()
     if target == "side.chosen":
         assert scores["accuracy"].max() > 0.85
 
 
-def test_single_tokens_are_probed_in_a_token_view(trained: Path) -> None:
+def test_single_tokens_are_probed_in_a_token_view(played: Path) -> None:
     typed = ("--views", "tokens:language", "--token-permutations", "3", "--controls", "none")
-    assert "tokens:language" in probe_kit("train", trained, *typed).text
-    scores = pk.load_results(pk.open_run(trained)).scores
+    assert "tokens:language" in probe_kit("train", played, *typed).text
+    scores = pk.load_results(pk.open_run(played)).scores
     assert set(scores["view"]) == {"tokens:language"}
     assert (scores["stream"] == "backbone").all()
     assert scores.set_index("layer")["accuracy"].loc[3] > 0.75
@@ -147,11 +150,11 @@ def test_single_tokens_are_probed_in_a_token_view(trained: Path) -> None:
     ],
 )
 def test_a_label_of_a_users_table_is_decoded_by_its_task(
-    trained: Path, table: Path, target: str, task: str, metric: str, top: float
+    played: Path, table: Path, target: str, task: str, metric: str, top: float
 ) -> None:
     typed = ("--labels", table, "--target", target, "--permutations", "5", "--controls", "instruction")
-    assert target in probe_kit("train", trained, *typed).text
-    run = pk.open_run(trained)
+    assert target in probe_kit("train", played, *typed).text
+    run = pk.open_run(played)
     scores = pk.train_probes(
         run, target=pk.Target.read(table, target), permutations=5, controls=("instruction",)
     ).scores
@@ -164,12 +167,12 @@ def test_a_label_of_a_users_table_is_decoded_by_its_task(
         assert scores["score"].min() >= 0
 
 
-def test_a_built_in_label_by_inference_is_decoded_beside_its_controls(trained: Path) -> None:
+def test_a_built_in_label_by_inference_is_decoded_beside_its_controls(played: Path) -> None:
     typed = ("--target", "sim.tool_y", "--permutations", "3", "--controls", ",".join(sorted(LABEL_CONTROLS)))
-    text = probe_kit("train", trained, *typed).text
+    text = probe_kit("train", played, *typed).text
     for control in LABEL_CONTROLS:
         assert control in text
-    run = pk.open_run(trained)
+    run = pk.open_run(played)
     results = pk.train_probes(
         run, target=pk.Target.of_run(run, "sim.tool_y"), permutations=3, controls=("step", "state")
     )
@@ -177,7 +180,7 @@ def test_a_built_in_label_by_inference_is_decoded_beside_its_controls(trained: P
     assert best > 0.5
     assert best <= 1
     assert (results.scores["n"] == 48).all(), "two inferences of every episode"
-    table = probe_kit("retention", trained, "--target", "sim.tool_y").text
+    table = probe_kit("retention", played, "--target", "sim.tool_y").text
     assert "sim.tool_y" in table
 
 
@@ -190,17 +193,17 @@ def test_a_built_in_label_by_inference_is_decoded_beside_its_controls(trained: P
         (("--controls", "luck"), "position"),
     ],
 )
-def test_a_wrong_name_is_refused_with_the_possible_ones(trained: Path, typed: tuple[str, ...], named: str) -> None:
-    assert named in probe_kit("train", trained, *typed, code=2).text
+def test_a_wrong_name_is_refused_with_the_possible_ones(played: Path, typed: tuple[str, ...], named: str) -> None:
+    assert named in probe_kit("train", played, *typed, code=2).text
 
 
 def test_a_table_with_a_key_that_the_run_lacks_is_refused_by_its_line(
-    trained: Path, table: Path, tmp_path: Path
+    played: Path, table: Path, tmp_path: Path
 ) -> None:
     lines = table.read_text(encoding="utf-8").splitlines()
     lines[3] = lines[3].replace(lines[3].split(",")[0], "no-such-episode")
     (tmp_path / "wrong.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
-    refused = probe_kit("train", trained, "--labels", tmp_path / "wrong.csv", "--target", "end_y", code=None)
+    refused = probe_kit("train", played, "--labels", tmp_path / "wrong.csv", "--target", "end_y", code=None)
     assert refused.code in (1, 2, 3)
     assert "no-such-episode" in refused.text
     assert "4" in refused.text

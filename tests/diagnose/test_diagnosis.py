@@ -118,6 +118,7 @@ def never(*_: object, **__: object) -> Policy:
     raise AssertionError("no model is loaded for a request that is wrong")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("option", [("--require", "picture.wrist"), ("--base", "nowhere"), ("--pairs", "{pairs}")])
 def test_what_is_wrong_with_a_new_run_is_said_before_it_is_played(
     option: tuple[str, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -138,6 +139,7 @@ def test_what_is_wrong_with_a_new_run_is_said_before_it_is_played(
     assert reason[option[0]] in " ".join(answer.output.split())
 
 
+@pytest.mark.slow
 def test_pairs_of_a_table_are_the_ones_that_are_exchanged(run: Run) -> None:
     first = run.episodes.groupby("item_id", sort=False).first().reset_index()
     names = [str(name) for name in first["episode_id"]]
@@ -179,6 +181,7 @@ def test_settings_of_a_new_run_are_refused_for_a_stored_one(folder: Path) -> Non
     assert "--categories is a setting of a new run" in answer.output
 
 
+@pytest.mark.slow
 def test_a_plan_says_how_many_inferences_it_takes_and_plays_nothing(tmp_path: Path) -> None:
     new = ("--categories", "color", "--out", tmp_path / "run", "--dry-run")
     answer = run_command("pi0-tiny", *new)
@@ -187,6 +190,7 @@ def test_a_plan_says_how_many_inferences_it_takes_and_plays_nothing(tmp_path: Pa
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [(), ("--dry-run",), ("--require", "picture")], ids=" ".join)
 def test_a_scripted_policy_has_nothing_to_diagnose(
     options: tuple[str, ...], small_suite: Suite, tmp_path: Path

@@ -154,6 +154,7 @@ def turned_around(chance: float, alike: float, seed: int, design: tuple[int, int
     return Exchanges(exchanged, np.zeros(count), every, names, frame_of, repeated, exchanged, np.ones(frame_count))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("design", [SCENE, RECORDED], ids=["scene", "recorded"])
 @pytest.mark.parametrize("alike", [0.3, 0.9])
 def test_an_input_that_changes_half_as_much_as_all_decides_in_five_of_a_hundred_draws(

@@ -145,6 +145,7 @@ def test_pushing_the_cube_moves_it(shared_env):
     assert not outcome.is_grasped
 
 
+@pytest.mark.slow
 def test_early_stop_ends_five_actions_after_the_release(make_env, play):
     late, early = play(make_env(), seed=0), play(make_env(early_stop=True), seed=0)
     assert (late.steps, late.truncation_reason) == (60, "max_steps")
@@ -160,6 +161,7 @@ def test_early_stop_waits_for_a_cube_that_was_never_grasped(make_env):
     assert ends == [(False, False)] * 11 + [(False, True)]
 
 
+@pytest.mark.slow
 def test_the_flags_follow_the_cube_through_an_episode(make_env):
     from probe_kit.env import ScriptedExpert
 
@@ -298,6 +300,7 @@ def test_both_pictures_are_fully_seen_in_the_first_frame(preset, tile_side, arm,
     assert min(visibility.values()) >= 0.99
 
 
+@pytest.mark.slow
 def test_a_cube_that_starts_elsewhere_hides_no_picture_either(make_env):
     env = make_env(start_jitter=0.02, start_jitter_yaw=0.8)
     for seed in range(5):
@@ -412,6 +415,7 @@ def test_closing_an_environment_that_was_never_used_is_fine():
     Act2AnswerEnv().close()
 
 
+@pytest.mark.slow
 def test_two_environments_in_one_process_are_independent(make_env):
     moving, still = make_env(), make_env()
     moving.reset(seed=0)
@@ -431,6 +435,7 @@ def test_worker_processes_give_the_same_observations_as_the_parent(shared_env):
         np.testing.assert_array_equal(image, expected)
 
 
+@pytest.mark.slow
 def test_the_documented_line_makes_the_environment_without_an_import_of_ours():
     page = (Path(__file__).parents[2] / "docs" / "environment.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)

@@ -91,6 +91,7 @@ def test_tiles_lie_as_far_from_the_edge_of_the_picture_as_in_the_release(side, l
     np.testing.assert_allclose(margins(side), (left, right), atol=1.0)
 
 
+@pytest.mark.slow
 def test_most_of_both_pictures_is_seen_in_the_first_frame(arm_env):
     visible = arm_env.reset(seed=0)[1]["tile_visibility"]
     assert visible["left"] == pytest.approx(0.958, abs=0.02)
@@ -121,6 +122,7 @@ def test_the_gripper_stays_shut_for_fifteen_actions_whatever_is_asked(env):
     assert env.scene.cube_state().position[2] < 0.03
 
 
+@pytest.mark.slow
 def test_an_episode_has_eighty_actions_and_nothing_clips_them(env):
     env.reset(seed=0)
     for step in range(80):
@@ -219,6 +221,7 @@ def test_a_hundred_episodes_of_the_expert_are_all_correct(arm, changes, make_env
     assert max(o.distance_correct for o in outcomes) < 0.010
 
 
+@pytest.mark.slow
 def test_the_idle_policy_leaves_the_cube_inside_the_box_of_the_right_tile(arm_env):
     """It answers under the rule of the release and under none of the others."""
     arm_env.reset(seed=0)

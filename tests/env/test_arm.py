@@ -236,6 +236,7 @@ def test_the_fingers_stay_symmetric(arm, arm_env):
     assert left == pytest.approx(right, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_a_description_of_ones_own_takes_the_place_of_ours(make_env, play):
     theirs = ARMS["panda"].urdf(None)
     assert play(make_env(arm_urdf=theirs, early_stop=True), seed=0) == play(make_env(early_stop=True), seed=0)

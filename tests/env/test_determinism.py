@@ -60,6 +60,7 @@ def test_a_reload_of_the_whole_scene_changes_nothing(env, reference):
     assert episode_digest.digest(env, seed=3) == reference
 
 
+@pytest.mark.slow
 def test_another_environment_in_the_same_process_changes_nothing(env, reference):
     neighbour = episode_digest.make_env()
     neighbour.reset(seed=9)
@@ -77,6 +78,7 @@ def test_a_new_process_gives_the_same_episode(reference):
         env.close()
 
 
+@pytest.mark.slow
 def test_the_seed_moves_the_cube_and_nothing_else_does(env):
     starts = [env.reset(seed=seed)[1]["cube_xy"].tolist() for seed in (1, 2, 1)]
     assert starts[0] == starts[2] != starts[1]

@@ -56,6 +56,7 @@ def test_tile_visibility_is_the_share_of_pixels_that_nothing_hides(scene, side):
     assert 0.75 < hidden < 0.98
 
 
+@pytest.mark.slow
 def test_a_picture_that_leaves_the_screen_counts_as_partly_hidden(make_env):
     turned = CameraSpec(forward=(1.0, 0.85, -1.085))
     visibility = make_env(camera=turned).reset(seed=0)[1]["tile_visibility"]
@@ -86,6 +87,7 @@ def test_a_state_that_is_not_finite_is_noticed_and_healed(own_scene):
     np.testing.assert_allclose(own_scene.cube_state().position, START, atol=5e-4)
 
 
+@pytest.mark.slow
 def test_a_spent_texture_budget_reloads_the_scene(own_scene):
     own_scene.reset(PLAIN, START, 0.0)
     before = own_scene.picture(own_scene.frame())

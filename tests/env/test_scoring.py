@@ -212,6 +212,7 @@ def test_a_cube_that_is_still_held_was_not_released() -> None:
     assert Events.of(trajectory(reaching(), held=list(range(4, FRAMES)))).release is None
 
 
+@pytest.mark.slow
 def test_the_scripted_expert_sets_off_grasps_chooses_a_side_and_lets_go(shared_env) -> None:
     from probe_kit.env import ScriptedExpert
     from probe_kit.env.act2answer import Recorder

@@ -76,6 +76,7 @@ def test_the_expert_stays_within_the_action_space(shared_env):
     assert shared_env.outcome().clipped == 0
 
 
+@pytest.mark.slow
 def test_the_reward_comes_once_with_the_last_action(make_env):
     env = make_env(early_stop=True)
     env.reset(seed=0)

@@ -74,11 +74,13 @@ def test_pictures_arrive_as_arrays():
 SIMULATES = "from probe_kit.env import Act2AnswerEnv; env = Act2AnswerEnv(); env.reset(seed=0); env.close()"
 
 
+@pytest.mark.slow
 def test_the_simulator_starts_in_silence_on_both_streams():
     done = run([sys.executable, "-c", SIMULATES], capture_output=True, check=True)
     assert (done.stdout, done.stderr) == (b"", b"")
 
 
+@pytest.mark.slow
 def test_what_others_say_while_it_is_imported_is_passed_on(tmp_path):
     (tmp_path / "pybullet.py").write_text(
         "import os, sys\nos.write(2, b'pybullet build time: today\\nby C\\n')\nsys.stderr.write('by Python\\n')\n",
@@ -89,6 +91,7 @@ def test_what_others_say_while_it_is_imported_is_passed_on(tmp_path):
     assert done.stderr == b"by C\nby Python\n"
 
 
+@pytest.mark.slow
 def test_it_can_be_imported_by_a_process_without_stderr():
     code = (
         "import os; os.close(2); from probe_kit.env.simulation import BulletClient; BulletClient(); print('there')"
@@ -167,6 +170,7 @@ def test_the_layered_picture_equals_the_naive_rendering_bit_for_bit(preset, make
         np.testing.assert_array_equal(layered, naive)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("level", [0.7, 1.3])
 def test_the_light_level_scales_the_brightness_of_the_table(level, make_env):
     plain, changed = make_env(), make_env(light_level=level)
@@ -226,6 +230,7 @@ def test_no_file_is_left_behind(client, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("preset", ["bridge", "frontal"])
 def test_pictures_lie_upright_and_unmirrored(preset, make_env):
     picture = Image.new("RGB", (2, 2))
@@ -255,11 +260,13 @@ def test_our_table_is_the_same_every_time_and_not_uniform():
     assert picture.std() > 10
 
 
+@pytest.mark.slow
 def test_our_table_follows_the_camera():
     near, far = CameraSpec(), CameraSpec(eye=(-0.3, -0.16, 0.6))
     assert np.abs(wooden_table(Camera(near)).astype(int) - wooden_table(Camera(far))).mean() > 3
 
 
+@pytest.mark.slow
 def test_visual_matching_changes_the_table_and_nothing_on_it(make_env):
     raw, matched = make_env(), make_env(rendering="visual-matching")
     pictures = [env.reset(seed=0)[0]["pixels"]["image"] for env in (raw, matched)]
@@ -307,6 +314,7 @@ def test_a_small_picture_equals_the_whole_drawing_bit_for_bit(preset, make_env):
         np.testing.assert_array_equal(env.scene.small_picture(HEIGHT), whole_drawing(env.scene))
 
 
+@pytest.mark.slow
 def test_other_pictures_sizes_and_pushed_tiles_are_drawn_anew(make_env):
     env = make_env("act2answer", arm="panda")
     env.reset(seed=0)
@@ -345,6 +353,7 @@ def alternating_frames(env, count):
     return [env.scene.frame().rgb for _ in range(count)]
 
 
+@pytest.mark.slow
 def test_neither_small_pictures_nor_former_episodes_change_a_bit_of_the_frames_of_a_policy(make_env):
     env = make_env()
     alone = alternating_frames(env, 3)

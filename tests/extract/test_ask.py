@@ -131,6 +131,7 @@ def test_worker_processes_give_the_same_commits(settings: AskSettings, asked: Ru
         assert (run.path / "commits" / path.name).read_bytes() == path.read_bytes()
 
 
+@pytest.mark.slow
 def test_an_episode_that_cannot_be_asked_is_given_up_and_the_others_stay(
     settings: AskSettings, tmp_path: Path
 ) -> None:
@@ -282,6 +283,7 @@ def ask(suite: Suite, folder: Path, *arguments: str) -> Result:
     return CliRunner().invoke(app, ["ask", *model, *few, *arguments])
 
 
+@pytest.mark.slow
 def test_a_run_per_prompt_and_size_is_planned_and_nothing_is_written(
     small_suite: Suite, folder: Path, tmp_path: Path
 ) -> None:
@@ -294,6 +296,7 @@ def test_a_run_per_prompt_and_size_is_planned_and_nothing_is_written(
     assert not out.exists()
 
 
+@pytest.mark.slow
 def test_it_says_how_answers_came_and_what_to_do_next(small_suite: Suite, folder: Path, tmp_path: Path) -> None:
     result = ask(small_suite, folder, "--prompt", "p1", "--picture", "none", "--out", str(tmp_path))
     assert result.exit_code == 0, result.output

@@ -194,6 +194,7 @@ def test_an_inference_that_was_not_captured_is_refused(run: Run, call: int) -> N
         train_probes(run, permutations=0, call=call)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*classes are not balanced")
 def test_probes_are_of_the_inference_that_was_asked_for(run: Run) -> None:
     by_call = [train_probes(run, ("all",), permutations=5, call=call) for call in range(CALLS)]
@@ -206,6 +207,7 @@ def test_probes_are_of_the_inference_that_was_asked_for(run: Run) -> None:
     assert len({results.key for results in by_call}) == CALLS
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*classes are not balanced")
 def test_tables_are_of_the_first_inference_unless_a_key_says_otherwise(run: Run) -> None:
     first = train_probes(run, permutations=5)
@@ -232,6 +234,7 @@ def test_calls_that_were_fitted_alike_make_a_curve(run: Run) -> None:
     assert f"{run.location.name}-calls" in [exhibit.name for exhibit in exhibits]
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*classes are not balanced")
 def test_token_views_of_a_later_inference_are_probed_too(run: Run) -> None:
     results = train_probes(run, ("all",), ("tokens:language",), permutations=0, token_permutations=0, call=2)

@@ -113,6 +113,7 @@ def sizes(streams: Any) -> dict[str, tuple[Any, ...]]:
     return {own.name: (own.layers, own.width, own.iterations, own.quantities, own.part) for own in streams}
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("nowhere")
 @pytest.mark.parametrize("name", families(DECLARING))
 def test_a_checkpoint_whose_configuration_is_in_the_cache_is_planned_with_its_own_sizes(

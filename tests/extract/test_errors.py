@@ -243,6 +243,7 @@ def begun(settings: ExtractSettings, run: Path) -> str:
     return prepare(settings).writer(Folder(run)).location.address
 
 
+@pytest.mark.slow
 def test_an_extraction_in_one_process_holds_its_run(
     settings: ExtractSettings, tmp_path: Path, unheld: list[str]
 ) -> None:

@@ -83,6 +83,7 @@ def test_a_folder_that_is_no_run_is_left_alone(suite: Suite, tmp_path: Path) -> 
     assert (tmp_path / "thesis.txt").read_text(encoding="utf-8") == "do not touch"
 
 
+@pytest.mark.slow
 def test_a_crash_while_the_folder_was_made_leaves_nothing_in_the_way(
     suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -107,6 +108,7 @@ def test_a_nan_action_stops_the_run_and_commits_nothing(
     assert open_run(tmp_path / "run", allow_partial=True).episodes.empty
 
 
+@pytest.mark.slow
 def test_a_policy_that_does_nothing_leaves_a_run_in_which_nothing_was_moved(suite: Suite, tmp_path: Path) -> None:
     scene = SceneSpec.preset("act2answer", arm="panda", rendering="raw", max_steps=3)
     run = extract_run(ExtractSettings("idle", suite=suite.folder, scene=scene), tmp_path / "run")
@@ -334,6 +336,7 @@ def test_an_item_has_one_content_in_all_of_its_wordings(small_suite: Suite) -> N
 # -- control steps ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_every_inference_has_the_control_step_it_was_made_at(acted: Run) -> None:
     assert acted.control_steps.dtype == np.int64
     assert acted.control_steps.tolist() == [[0, 3, 6]] * 4
@@ -456,6 +459,7 @@ def test_a_lost_label_and_one_of_another_run_are_damage_that_a_new_label_repairs
         open_run(place)
 
 
+@pytest.mark.slow
 def test_an_asked_run_has_all_of_it_too(small_suite: Suite, tmp_path: Path) -> None:
     settings = AskSettings(
         "vlm-tiny", random_weights=True, suite=small_suite.folder, categories=("color",), items=2

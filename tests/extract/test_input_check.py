@@ -123,6 +123,7 @@ def by_length(question: str, option: str) -> float:
     return float(len(question) if option == "A" else 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("liking", "reaches"),
     [

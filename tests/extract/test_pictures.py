@@ -251,6 +251,7 @@ def test_a_run_names_the_table_that_was_read_even_if_it_is_changed_later(folder:
     assert changed.identity(1) != before
 
 
+@pytest.mark.slow
 def test_the_next_step_is_a_target_that_can_be_probed_and_one_of_few_integers_has_its_task(
     run: pk.Run, folder: Path, tmp_path: Path
 ) -> None:

@@ -400,6 +400,7 @@ def test_other_writers_interpreters_and_processes_are_no_other_numbers(
     assert len(run.provenances) == 2
 
 
+@pytest.mark.slow
 def test_a_finished_run_opens_by_its_command_wherever_that_is(
     suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -408,6 +409,7 @@ def test_a_finished_run_opens_by_its_command_wherever_that_is(
     assert extract_run(expert(suite), tmp_path / "run").mixed == ()
 
 
+@pytest.mark.slow
 def test_provenance_is_stored_once_and_every_commit_names_it(suite: Suite, tmp_path: Path) -> None:
     run = extract_run(expert(suite), tmp_path / "run")
     (record,) = (run.path / "provenance").glob("*.json")

@@ -90,6 +90,7 @@ def test_one_wording_of_a_run_is_read_like_a_run(ladder):
     assert (ladder.in_wording("named").column(site) != ladder.in_wording("knowledge").column(site)).any()
 
 
+@pytest.mark.slow
 def test_a_wording_that_was_not_asked_is_refused_by_name(ladder):
     with pytest.raises(UsageError, match=r"no wording 'side'; it has knowledge, named"):
         ladder.in_wording("side")

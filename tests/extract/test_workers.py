@@ -223,6 +223,7 @@ def test_a_policy_that_takes_one_observation_is_calibrated_to_the_same_bytes(
         assert open_run(tmp_path / "run").location.read(key) == plain.location.read(key)
 
 
+@pytest.mark.slow
 def test_what_it_chooses_is_refused_beside_it(small_suite: Suite) -> None:
     asked = ["extract", "--model", "pi0-tiny", "--suite", str(small_suite.folder), "--batch", "auto", "--dry-run"]
     result = CliRunner().invoke(app, [*asked, "--env-workers", "2"])

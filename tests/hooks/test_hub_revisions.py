@@ -141,6 +141,7 @@ PARTS: dict[str, tuple[str, Callable[..., dict[str, bytes]], str, str, str]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", list(PARTS))
 def test_the_card_has_the_commits_of_the_repositories_that_a_checkpoint_names_and_a_repetition_reads_them(
     kind: str, server: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -109,6 +109,7 @@ def test_the_name_of_a_module_is_refused_because_the_package_would_hide_it(
     assert not (tmp_path / "mine").exists()
 
 
+@pytest.mark.slow
 def test_a_name_that_is_taken_and_a_folder_that_is_full_are_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="already"):
         write_adapter("pi0", tmp_path / "mine")

@@ -138,6 +138,7 @@ def test_patterns_of_half_precision_are_those_of_the_same_weights_in_full(family
         torch.testing.assert_close(found[0][site], found[1][site], rtol=0, atol=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the model put out tokens")
 @pytest.mark.parametrize(
     "family", ["pi0", "pi05", "pi0-fast", "smolvla", "openvla", "spatialvla", "magma", "xiaomi-r0"]

@@ -83,6 +83,7 @@ def test_every_recorded_quantity_is_reproduced(folder: str) -> None:
     assert sum(own.status == "ok" for own in verification.comparisons) == count
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("folder", REFERENCES)
 def test_a_wrong_number_in_any_quantity_is_noticed(folder: str, tmp_path: Path) -> None:
     """In the first and the last place, of which padding leaves out one at most."""

@@ -263,6 +263,7 @@ def last_linear(network: nn.Module) -> str:
     ][-1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", families())
 def test_an_adapter_is_added_to_the_weights_of_the_base_in_every_family(family: str, tmp_path: Path) -> None:
     write, options = WRITERS[family]
@@ -311,6 +312,7 @@ def test_the_hash_covers_the_base_the_factors_and_how_they_are_scaled(folders: t
     assert hashes[0] == hashes[3]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fields", [{"use_rslora": True}, {"use_dora": True}, {"alpha_pattern": {"q_proj": 3}}])
 def test_the_other_ways_of_scaling_give_what_peft_computes(
     folders: tuple[Path, Path], tmp_path: Path, fields: dict[str, Any]
@@ -519,6 +521,7 @@ STATISTICS: dict[str, tuple[str, Callable[[Path], Any]]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the model put out tokens")
 @pytest.mark.parametrize("family", list(STATISTICS))
 def test_statistics_in_the_folder_of_an_adapter_replace_its_bases(family: str, tmp_path: Path) -> None:
@@ -532,6 +535,7 @@ def test_statistics_in_the_folder_of_an_adapter_replace_its_bases(family: str, t
     np.testing.assert_allclose(chunk(family, alone, options), 2 * first, rtol=1e-4, atol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", ["pi05", "molmoact2", "smolvla"])
 @pytest.mark.parametrize("with_steps", [True, False])
 def test_tensors_of_processors_in_the_folder_of_an_adapter_replace_its_bases(

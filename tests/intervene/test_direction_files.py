@@ -95,6 +95,7 @@ def test_probes_directions_are_written_for_the_sites_and_weights_that_they_are_o
         Interchange(sites=(SITE,), direction=str(path)).conditions(session)
 
 
+@pytest.mark.slow
 def test_a_file_has_the_directions_of_one_captured_inference(labelled_run: Path, tmp_path: Path) -> None:
     file = tmp_path / "probes.npz"
     options = ["--call", "all", "--directions", str(file)]
@@ -188,6 +189,7 @@ def test_another_width_model_or_site_is_refused(
         asked.conditions(session)
 
 
+@pytest.mark.slow
 def test_patching_within_the_whole_space_is_patching_in_full(session: SceneSession, tmp_path: Path) -> None:
     path = written(tmp_path / "all.npz", {"all": np.eye(WIDTH)})
     within = Interchange(sites=(SITE,), roles=("image",), direction=str(path))

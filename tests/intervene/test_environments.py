@@ -121,6 +121,7 @@ def test_another_version_of_the_environment_is_refused(
         open_session(played, ReplaySource(), lambda *_: pi0_tiny)
 
 
+@pytest.mark.slow
 def test_an_environment_whose_module_was_moved_is_given_by_the_option_of_extract(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pi0_tiny: "Pi0"
 ) -> None:

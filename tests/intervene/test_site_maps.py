@@ -371,6 +371,7 @@ def test_where_a_block_of_keys_and_values_carries_it_the_block_is_named(run: Arr
     assert OPEN not in line(run)
 
 
+@pytest.mark.slow
 def test_where_no_layer_carries_it_no_place_to_steer_is_named(run: ArrayRun) -> None:
     train_probes(run, permutations=50, controls=())
     store(run, dict.fromkeys(PASSES, 0.0))

@@ -209,6 +209,7 @@ def test_displacements_are_shares_of_the_source_and_flat_numbers_do_not_count() 
     assert not toward[0].any()
 
 
+@pytest.mark.slow
 def test_a_table_and_a_command_give_the_same_rows(shown: Run, table: Path, twin: "Policy") -> None:
     result = run_intervention(shown, ImageSwap(pairs=read_pairs(table)), load=lambda *_: twin)
     answer = CliRunner().invoke(app, ["intervene", str(shown.path), "--pairs", str(table), "--format", "json"])

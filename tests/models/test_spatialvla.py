@@ -153,6 +153,7 @@ def test_cached_steps_choose_what_one_pass_over_prompt_and_actions_would_choose(
     assert torch.equal(decoded.ids, whole.argmax(dim=-1))
 
 
+@pytest.mark.slow
 @torch.inference_mode()
 def test_padding_and_other_rows_change_nothing(built: SpatialVLANetwork) -> None:
     rows = [prompt(3, seed=1), prompt(8, seed=2)]
@@ -233,6 +234,7 @@ def test_attention_without_the_soft_cap_is_refused() -> None:
     assert torch.isfinite(made(torch.ones(1, 3, 32), mask).logits).all()
 
 
+@pytest.mark.slow
 @torch.inference_mode()
 def test_the_soft_cap_is_in_force() -> None:
     values = config_values()
@@ -289,6 +291,7 @@ def test_constants_are_the_same_with_and_without_memory() -> None:
         torch.testing.assert_close(buffer, constants[name])
 
 
+@pytest.mark.slow
 @torch.inference_mode()
 def test_bfloat16_runs_with_pictures_and_depth_in_float32() -> None:
     made = network().to(torch.bfloat16)
@@ -311,6 +314,7 @@ def test_the_full_size_has_the_released_number_of_parameters() -> None:
 # -- the recorded original -------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @torch.inference_mode()
 def test_hidden_states_logits_and_ids_are_the_originals(golden_spatialvla: Path) -> None:
     folder = golden_spatialvla / "checkpoint"
@@ -355,6 +359,7 @@ def divided() -> SpatialVLANetwork:
     return made
 
 
+@pytest.mark.slow
 @torch.inference_mode()
 def test_a_picture_has_the_depth_it_has_alone_whatever_else_is_in_the_batch(divided: SpatialVLANetwork) -> None:
     zoe = divided.vision_zoe_model
@@ -366,6 +371,7 @@ def test_a_picture_has_the_depth_it_has_alone_whatever_else_is_in_the_batch(divi
         torch.testing.assert_close(together.metres[row], single.metres[0], rtol=0, atol=1e-5)
 
 
+@pytest.mark.slow
 @torch.inference_mode()
 def test_the_originals_vote_gives_the_minority_another_head(divided: SpatialVLANetwork) -> None:
     zoe = divided.vision_zoe_model
@@ -376,6 +382,7 @@ def test_the_originals_vote_gives_the_minority_another_head(divided: SpatialVLAN
     assert (own.raw[minority] - voted.raw[minority]).abs().max() > 1e-3
 
 
+@pytest.mark.slow
 @torch.inference_mode()
 def test_a_depth_network_of_one_head_needs_no_vote() -> None:
     values = network().config.depth.to_dict()

@@ -130,6 +130,7 @@ def probed_again(run: ArrayRun, **changes: object) -> ProbeResults:
     return other
 
 
+@pytest.mark.slow
 def test_figures_and_report_draw_the_probes_of_the_table_not_the_newest(probed_run: ProbedRun) -> None:
     run = probed_run({"color": SIGNAL})
     older = load_results(run)

@@ -160,6 +160,7 @@ def test_the_maps_of_one_figure_share_one_scale(probed_run: ProbedRun) -> None:
     assert [(norm.vmin, norm.vmax) for norm in norms] == [(50, 100)] * 2
 
 
+@pytest.mark.slow
 def test_role_curves_have_a_line_per_view(probed_run: ProbedRun) -> None:
     results = load_results(probed_run({"color": SIGNAL}))
     display = RoleCurvesDisplay.from_results(results, "color", "expert")
@@ -230,6 +231,7 @@ def test_black_text_is_readable_on_every_heat_colour(value: float) -> None:
 # -- behaviour -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_gap_has_a_point_per_category_and_marks_those_without_signal(probed_run: ProbedRun) -> None:
     table = retention_table([probed_run({"color": SIGNAL, "shape": NOISE})])
     display = KnowledgeActionDisplay.from_table(table)

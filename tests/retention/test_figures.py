@@ -145,6 +145,7 @@ def test_iterations_choose_the_lines_in_figures_as_they_do_in_tables(
     display.plot()
 
 
+@pytest.mark.slow
 def test_the_figures_of_a_table_show_the_iterations_of_the_table(probed_run: ProbedRun) -> None:
     run = probed_run({"color": SIGNAL})
     for iterations, wanted in (("all", 4), ("best", 0), ("last", 0), (2, 0)):
@@ -159,6 +160,7 @@ def test_the_figures_of_a_table_show_the_iterations_of_the_table(probed_run: Pro
         LayerCurveDisplay.from_results(load_results(run), "color", iterations=7)
 
 
+@pytest.mark.slow
 def test_layers_are_whole_numbers_and_the_backbone_stands_beside_the_action(results: ProbeResults) -> None:
     figure = layer_curve(results)
     figure.draw_without_rendering()
@@ -175,6 +177,7 @@ def test_layers_are_whole_numbers_and_the_backbone_stands_beside_the_action(resu
         assert len(band) == 1, "the band of probes of permuted labels"
 
 
+@pytest.mark.slow
 def test_every_site_that_ties_at_the_peak_is_marked(results: ProbeResults) -> None:
     display = LayerCurveDisplay.from_results(results, "color")
     backbone, expert = display.streams

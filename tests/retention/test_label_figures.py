@@ -85,6 +85,7 @@ def test_the_layer_curve_has_the_best_site_of_a_layer_its_own_null_and_the_best_
         LayerCurveDisplay.from_results(results, view="last")
 
 
+@pytest.mark.slow
 def test_without_enough_permutations_there_is_no_band_and_without_any_no_chance(run: Run) -> None:
     for permutations, chance in ((9, True), (0, False)):
         train_probes(run, target=Target.of_run(run, "sim.tool_z"), permutations=permutations, controls=())
@@ -181,6 +182,7 @@ def test_predicted_values_are_held_out_and_coloured_by_group(run: Run) -> None:
         PredictedValuesDisplay.from_results(load_results(run, target="sim.phase"))
 
 
+@pytest.mark.slow
 def test_every_figure_of_a_table_is_drawn_unclipped_and_says_what_it_is_of(run: Run) -> None:
     table = retention_table([run], target=["sim.tool_y", "sim.phase", "a/b: <i>"])
     exhibits = collect_figures([run], table)
@@ -255,6 +257,7 @@ def results(run: Run) -> ProbeResults:
     return load_results(run, target="sim.tool_y")
 
 
+@pytest.mark.slow
 def test_a_run_without_an_action_stream_shows_what_its_backbone_holds_and_says_what_is_missing(
     tmp_path: Path,
 ) -> None:

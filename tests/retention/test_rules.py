@@ -79,6 +79,7 @@ def test_doing_nothing_scores_a_half_by_the_released_rule_and_nothing_by_the_oth
         )
 
 
+@pytest.mark.slow
 def test_tables_name_the_rule_and_say_what_it_gives_away(idle: Run) -> None:
     for rule, why in (("box", "already lies in the zone of the right picture"), ("disc", "lies in neither zone")):
         table = retention_table([idle], rule=rule)

@@ -92,6 +92,7 @@ def test_accuracies_have_one_axis_in_every_figure_alone_and_together(
     assert set.union(*map(limits, figures)) == {(20.0, 109.0)}
 
 
+@pytest.mark.slow
 def test_depth_and_knowledge_have_fixed_axes(
     probed_run: ProbedRun, known: ProbeResults, guessed: ProbeResults
 ) -> None:
@@ -111,6 +112,7 @@ def test_what_the_axis_does_not_reach_is_marked_with_its_number(probed_run: Prob
     assert words >= {"10", "5"}
 
 
+@pytest.mark.slow
 def test_side_by_side_every_run_has_a_line_and_a_map_of_its_own(
     known: ProbeResults, guessed: ProbeResults
 ) -> None:

@@ -67,6 +67,7 @@ def test_parquet_holds_a_row_per_pooled_vector(labelled_run: Path, tmp_path: Pat
         np.testing.assert_array_equal(np.stack(vectors["vector"]), expected)
 
 
+@pytest.mark.slow
 def test_parquet_holds_a_row_per_token_of_a_role(recorded_run: Run, tmp_path: Path) -> None:
     out = export_run(
         recorded_run.path, "parquet", tmp_path / "run", sites=["backbone.01.residual"], view="tokens:image"
@@ -79,6 +80,7 @@ def test_parquet_holds_a_row_per_token_of_a_role(recorded_run: Run, tmp_path: Pa
     np.testing.assert_array_equal(np.stack(table["vector"]), values[rows, table["token"].to_numpy(int)])
 
 
+@pytest.mark.slow
 def test_recordings_keep_episode_and_frame_of_their_data_set(shown_run: Run, tmp_path: Path) -> None:
     table = pd.read_parquet(export_run(shown_run.path, "parquet", tmp_path / "run.parquet", sites=["backbone.00"]))
     rows = table["episode_id"].map(rows_of(shown_run)).to_numpy()
@@ -107,6 +109,7 @@ def test_a_memory_map_holds_the_stored_bits_and_its_index_leads_back(recorded_ru
     assert norms.sum(axis=1).mean() == pytest.approx(values.shape[2], rel=1e-9)
 
 
+@pytest.mark.slow
 def test_pooled_memory_maps_are_rounded_as_torch_does_and_share_one_order(
     recorded_run: Run, tmp_path: Path
 ) -> None:
@@ -174,6 +177,7 @@ def test_what_is_not_stored_is_refused_with_what_is(labelled_run: Path, tmp_path
 FIRST_SITE = Site("expert", 3, iteration=7)
 
 
+@pytest.mark.slow
 def test_safetensors_hold_the_numbers_and_true_bfloat16(recorded_run: Run, tmp_path: Path) -> None:
     out = export_run(recorded_run.path, "safetensors", tmp_path / "run.safetensors")
     with safe_open(out, "pt") as file:
@@ -185,6 +189,7 @@ def test_safetensors_hold_the_numbers_and_true_bfloat16(recorded_run: Run, tmp_p
     np.testing.assert_array_equal(tokens[:, 0, 7, 3].float().numpy()[mask], values[mask])
 
 
+@pytest.mark.slow
 def test_h5_holds_the_numbers_and_the_episodes(recorded_run: Run, tmp_path: Path) -> None:
     h5py = pytest.importorskip("h5py", reason="h5py is not installed")
     with h5py.File(export_run(recorded_run.path, "h5", tmp_path / "run.h5")) as file:
@@ -252,6 +257,7 @@ def filmed(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Run:
     return open_run(writer.location)
 
 
+@pytest.mark.slow
 def test_a_run_without_all_frames_has_no_data_set(small_suite: Suite, tmp_path: Path) -> None:
     run = write_little_run(tmp_path / "run", small_suite, episodes=EPISODES)
     with pytest.raises(UsageError, match="with --frames all"):

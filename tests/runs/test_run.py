@@ -70,6 +70,7 @@ def test_every_site_has_finite_rows_that_differ_between_episodes(recorded_run: R
     assert np.abs(last - last[0]).max(axis=1)[1:].min() > 1e-4
 
 
+@pytest.mark.slow
 def test_pooled_views_equal_what_the_stored_tokens_give(recorded_run: Run) -> None:
     """Up to the rounding of tokens to bfloat16."""
     for site in (Site("backbone", 2), Site("expert", 3, iteration=7)):
@@ -148,6 +149,7 @@ def test_a_folder_without_a_run_is_refused(tmp_path: Path) -> None:
         open_run(tmp_path)
 
 
+@pytest.mark.slow
 def test_a_run_shows_the_first_items_of_some_categories(recorded_run: Run) -> None:
     part = recorded_run.only(["color"], 4)
     whole = recorded_run.episodes
@@ -183,6 +185,7 @@ def test_a_selection_that_a_run_does_not_hold_is_refused(
         recorded_run.only(categories, items)
 
 
+@pytest.mark.slow
 def test_a_part_of_a_run_has_probes_of_its_own(little_runs: Path, tmp_path: Path) -> None:
     run = open_run(shutil.copytree(little_runs / "run", tmp_path / "run"))
     part, stored = run.only(items=10), load_results(run).key
@@ -290,6 +293,7 @@ def test_a_changed_bit_is_found_on_reading_and_by_verification(copy: Path) -> No
     assert any("trajectory/c/3/0/0" in problem for problem in problems)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("together", [1, 5, 99])
 def test_trajectories_that_are_read_together_are_those_that_are_read_alone(
     recorded_run: Run, copy: Path, monkeypatch: pytest.MonkeyPatch, together: int
@@ -519,6 +523,7 @@ def test_a_run_of_scenes_has_no_recorded_actions(labelled_run: Path) -> None:
         compare_actions(open_run(labelled_run))
 
 
+@pytest.mark.slow
 def test_the_command_prints_a_line_per_number_and_json_every_episode(
     tmp_path: Path,
 ) -> None:

@@ -164,6 +164,7 @@ def test_reports_take_first_and_last_frame_out_of_a_sheet(filmed: Run) -> None:
         )
 
 
+@pytest.mark.slow
 def test_a_commit_with_another_number_of_frames_is_damage(filmed: Run) -> None:
     path = filmed.path / "commits" / "00000001.json"
     stored = path.read_bytes()

@@ -72,6 +72,7 @@ def test_a_stored_stream_gives_back_all_that_the_model_declared() -> None:
     assert stored.stream == declared
 
 
+@pytest.mark.slow
 def test_a_block_of_padding_and_an_empty_row_are_stored_and_not_merely_missing(writer: RunWriter) -> None:
     full, empty = rollout(writer, 0, 20), rollout(writer, 1, 20)
     empty.buffers.clear()
@@ -187,6 +188,7 @@ def test_equal_numbers_of_two_processes_leave_the_first_commit(
     assert (tmp_path / "run" / commit_key(0)).stat().st_ino == seen[0] == seen[1]
 
 
+@pytest.mark.slow
 def test_work_goes_on_while_another_process_clears_the_same_unfinished_work(tmp_path: Path) -> None:
     """The one that is done first discards the pieces that both of them keep."""
     pieces = Pieces.of(locate(tmp_path), "probes", "0123456789ab", "stamp", "redo")

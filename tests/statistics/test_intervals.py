@@ -128,6 +128,7 @@ WORLDS: dict[str, tuple[Bounds, dict[float, float]]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("world", WORLDS)
 def test_intervals_of_groups_that_are_mostly_alike_cover_the_truth(world: str) -> None:
     count = 12

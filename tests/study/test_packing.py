@@ -66,11 +66,13 @@ def test_an_archive_holds_no_picture_no_activation_and_no_name_of_this_machine(
     assert {f"tables/{name}.{end}" for name in played.study.tables for end in ("json", "md", "tex")} <= set(names)
 
 
+@pytest.mark.slow
 def test_the_same_study_gives_the_same_bytes(played: LoadedStudy, archive: Path, tmp_path: Path) -> None:
     pack_study(played, tmp_path / "again.zip")
     assert (tmp_path / "again.zip").read_bytes() == archive.read_bytes()
 
 
+@pytest.mark.slow
 def test_an_archive_without_trajectories_judges_by_their_absence_and_with_them_as_before(
     played: LoadedStudy, archive: Path, tmp_path: Path
 ) -> None:
@@ -88,6 +90,7 @@ def test_an_archive_without_trajectories_judges_by_their_absence_and_with_them_a
         run.trajectory(0)
 
 
+@pytest.mark.slow
 def test_what_was_changed_or_lost_is_named(played: LoadedStudy, tmp_path: Path) -> None:
     folder = tmp_path / "pack"
     pack_study(played, folder)
@@ -110,6 +113,7 @@ def test_what_was_changed_or_lost_is_named(played: LoadedStudy, tmp_path: Path) 
         load_study(tmp_path / "broken.zip")
 
 
+@pytest.mark.slow
 def test_missing_runs_are_refused_or_named(played: LoadedStudy, tmp_path: Path) -> None:
     file = tmp_path / "more.toml"
     text = played.file.read_text(encoding="utf-8").replace("light_level = 0.7", "light_level = 0.6")
@@ -133,6 +137,7 @@ def test_a_table_is_the_same_after_its_record(played: LoadedStudy) -> None:
     assert json.dumps(again.numbers) == json.dumps(made.numbers)
 
 
+@pytest.mark.slow
 def test_a_run_is_whole_without_what_an_archive_leaves_out(little_runs: Path, tmp_path: Path) -> None:
     """With probes, whose directions stay behind as activations do."""
     copy = tmp_path / "copy"
@@ -168,6 +173,7 @@ def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[Hub]:
         yield found
 
 
+@pytest.mark.slow
 def test_the_data_set_holds_every_episode_table_and_hash(played: LoadedStudy, folder: Path) -> None:
     table = pd.read_parquet(folder / "episodes.parquet")
     runs = {cell.name: open_run(cell.location(played.study.folder)) for cell in played.cells}
@@ -247,6 +253,7 @@ def test_options_that_do_not_go_together_are_refused_before_anything_is_written(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_the_command_writes_the_folder_first_and_never_over_another(played: LoadedStudy, tmp_path: Path) -> None:
     out = tmp_path / "set"
     arguments = ["study", "pack", str(played.file), "--out", str(out), "--data-set"]

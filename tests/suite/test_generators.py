@@ -265,6 +265,7 @@ def test_shapes_are_what_they_are_called_when_measured() -> None:
             assert overlap >= 0.93 if concept.name == "symmetric" else overlap <= 0.80
 
 
+@pytest.mark.slow
 def test_both_kinds_of_shapes_have_the_same_widths_on_either_side() -> None:
     for tile in tiles("symmetry"):
         assert sorted(tile.one_side) == sorted(tile.other_side)

@@ -172,6 +172,7 @@ def test_pictures_give_the_answer_away_if_only_one_polarity_is_asked(category: s
     assert not found["statistics"].ok or (category == "state" and not found["pixels"].ok)
 
 
+@pytest.mark.slow
 def test_text_gives_the_answer_away_if_a_layout_is_tied_to_it(embedded: Suite) -> None:
     """Both layouts protect the text; the position baseline cannot leave one half either."""
     tied = part(embedded.select(["state"]), lambda item: (item.polarity == "pos") == (item.correct_side == "left"))

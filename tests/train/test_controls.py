@@ -94,6 +94,7 @@ def named(run: ArrayRun, model: str, **changes: object) -> ArrayRun:
     return ArrayRun(**{name: value for name, value in members.items() if name in known})
 
 
+@pytest.mark.slow
 def test_baselines_of_a_fair_suite_are_at_chance_and_stored(planted_run: PlantedRun) -> None:
     run = planted_run({PLANTED: 2.0})
     train_probes(run, permutations=40, controls=("position", "instruction"))
@@ -169,6 +170,7 @@ def test_a_run_is_not_its_own_untrained_control(planted_run: PlantedRun) -> None
         train_probes(run, permutations=0, untrained=run)
 
 
+@pytest.mark.slow
 def test_the_probes_of_an_untrained_network_are_read_only_where_no_others_were_asked_for(
     planted_run: PlantedRun,
 ) -> None:

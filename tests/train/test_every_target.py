@@ -89,6 +89,7 @@ def test_ridge_on_tokens_is_ridge_of_scikit_learn_on_every_token(run: ArrayRun) 
         np.testing.assert_allclose(curve.decisions[1, fold.test], expected, atol=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("target", ["side.correct", "label"])
 def test_categories_are_probed_one_by_one_or_pooled(run: ArrayRun, target: str) -> None:
     of = "side.correct" if target == "side.correct" else target_of(run, "continuous")
@@ -178,6 +179,7 @@ def stored(labelled_run: Path, tmp_path: Path) -> Run:
     return open_run(tmp_path / "stored")
 
 
+@pytest.mark.slow
 def test_a_label_of_whole_episodes_is_decoded_from_each_captured_inference(stored: Run) -> None:
     typed = ["train", str(stored.path), "--target", "item.category", "--call", "all", "--permutations", "0"]
     done = CliRunner().invoke(app, [*typed, "--controls", "none", "--task", "binary"], env={"COLUMNS": "200"})

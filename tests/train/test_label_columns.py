@@ -188,6 +188,7 @@ def test_a_heading_of_a_million_columns_is_read_for_the_few_that_are_asked_for(t
     assert labels.coded.values.tolist() == [0, 1 / 3, 2 / 3]
 
 
+@pytest.mark.slow
 def test_a_heading_of_a_million_columns_without_a_key_is_refused_in_a_line(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="line 1 lacks the key column") as refused:
         Target.read(written(tmp_path, ",".join(f"x{number}" for number in range(10**6))), "x1")
@@ -487,6 +488,7 @@ def test_a_constant_or_unknown_column_is_refused_by_name(labelled_run: Path) -> 
         Target.of_run(run, "sim.tool_w")
 
 
+@pytest.mark.slow
 def test_a_target_has_options_exactly_where_train_accepts_it(labelled_run: Path, tmp_path: Path) -> None:
     shutil.copytree(labelled_run, tmp_path / "run")
     run = open_run(tmp_path / "run")

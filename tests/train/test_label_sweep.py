@@ -62,6 +62,7 @@ def test_a_planted_quantity_is_found_where_it_was_planted_and_is_no_signal_beyon
     assert planted["n"] == CALLS * planted["episodes"] == CALLS * (len(run.episodes) - 1)
 
 
+@pytest.mark.slow
 def test_without_a_control_that_explains_it_a_planted_quantity_is_a_signal(run: Run) -> None:
     labels = Target.of_run(run, "sim.tool_y")
     results = train_probes(run, target=labels, permutations=59, controls=("step", "instruction"))
@@ -69,6 +70,7 @@ def test_without_a_control_that_explains_it_a_planted_quantity_is_a_signal(run: 
     assert signal[signal].index.tolist() == ["backbone.01.residual"]
 
 
+@pytest.mark.slow
 def test_what_is_stored_is_loaded_and_controls_are_added_without_a_second_fit(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -109,6 +111,7 @@ def test_probes_of_sides_keep_key_and_bytes_and_neither_kind_reads_the_other(run
         load_results(run, target="other")
 
 
+@pytest.mark.slow
 def test_another_value_group_stratum_or_window_is_another_key(run: Run) -> None:
     frame = by_group(run, lambda draw: float(draw.normal()))
     frame["half"] = run.episodes["group_id"].map(lambda name: int(name[-1], 16) % 2)
@@ -132,6 +135,7 @@ def test_step_and_group_labels_of_the_run_have_the_null_that_keeps_them(run: Run
     assert not results.scores["signal"].any()
 
 
+@pytest.mark.slow
 def test_classes_with_a_planted_site_are_found(run: Run, small_suite: Suite) -> None:
     y = np.stack([run.trajectory(row).tool[0, 1] for row in range(len(run.episodes))])
     names = np.array(["low", "middle", "high"])[np.digitize(y, np.quantile(y, [1 / 3, 2 / 3]))]
@@ -235,6 +239,7 @@ def test_the_command_prints_one_table_and_a_sentence(run: Run, tmp_path: Path) -
     assert load_results(run, target="y").settings.target == "y"
 
 
+@pytest.mark.slow
 def test_the_command_prints_the_classes_once_with_their_counts(run: Run, tmp_path: Path) -> None:
     file = tmp_path / "own.csv"
     by_group(run, lambda draw: str(draw.choice(["Yes", "no"]))).to_csv(file, index=False)
@@ -358,6 +363,7 @@ def test_what_is_no_event_is_refused(events_run: Run) -> None:
     assert "--align-to is for labels of your own" in " ".join(said.stderr.split())
 
 
+@pytest.mark.slow
 def test_the_event_is_part_of_the_results_key(events_run: Run, tmp_path: Path) -> None:
     copy = open_run(shutil.copytree(events_run.path, tmp_path / "run"))
     labels, event = Target.of_run(copy, "sim.tool_y"), Target.of_run(copy, "sim.held")
@@ -484,6 +490,7 @@ def test_a_column_that_the_data_set_lacks_is_named_with_those_it_has(shown_run: 
         Target.of_run(open_run(labelled_run), "dataset.next.done")
 
 
+@pytest.mark.slow
 def test_fewer_than_five_recorded_episodes_are_refused(tmp_path: Path) -> None:
     run = write_recorded_run(tmp_path / "run", 4)
     with pytest.raises(Exception, match=r"4 groups \(group_id\) have labels; expected at least 5"):

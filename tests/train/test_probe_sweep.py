@@ -159,6 +159,7 @@ def test_the_number_of_token_permuted_labels_matters_only_for_token_views(plante
     assert tokens[0] != tokens[1]
 
 
+@pytest.mark.slow
 def test_selectivity_is_the_accuracy_above_random_labels_of_items(planted_run: PlantedRun) -> None:
     results = train_probes(planted_run({PLANTED: 2.0}), permutations=20)
     control = results.curves["color", "mean"].null.mean(axis=1)
@@ -167,6 +168,7 @@ def test_selectivity_is_the_accuracy_above_random_labels_of_items(planted_run: P
     assert train_probes(planted_run(), permutations=0).scores["selectivity"].isna().all()
 
 
+@pytest.mark.slow
 def test_a_device_changes_neither_numbers_nor_key(planted_run: PlantedRun, device: str) -> None:
     pytest.importorskip("torch").set_num_threads(1)
     run = planted_run({PLANTED: 2.0}, n_items=24)  # of fewer groups every label permutation would be made
@@ -261,6 +263,7 @@ def assert_same_numbers(alone: dict[Key, Probed], together: dict[Key, Probed]) -
         np.testing.assert_array_equal(probes["color"].null, together[key]["color"].null)
 
 
+@pytest.mark.slow
 def test_processes_give_the_same_numbers_as_this_one() -> None:
     assert_same_numbers(columns_of(), columns_of(jobs=2))
 
@@ -280,6 +283,7 @@ def deadly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[int], A
     return lambda kills: kind(PROBLEM, tmp_path, kills)
 
 
+@pytest.mark.slow
 def test_a_column_whose_process_is_killed_is_fitted_by_another(deadly: Any) -> None:
     held = (
         r"worker \d ended with code -9; the column it held \(backbone\.\d\d\.residual mean\) will be tried again"

@@ -130,6 +130,7 @@ def test_a_run_is_told_by_all_that_it_was_to_have_whatever_is_left_of_it(tmp_pat
         assert suite_of(run).items == part.items
 
 
+@pytest.mark.slow
 def test_the_folder_of_the_extraction_is_found_from_anywhere_as_long_as_it_holds_the_suite(
     cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -216,6 +217,7 @@ def test_the_same_questions_with_other_twins_or_another_version_are_another_suit
         suite_of(run, changed.folder)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("filled")
 def test_a_damaged_suite_in_the_cache_and_another_suite_are_errors(tmp_path: Path) -> None:
     suite = extracted_suite()

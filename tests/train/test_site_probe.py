@@ -188,6 +188,7 @@ def test_kept_weights_give_the_held_out_decisions_from_raw_features(samples: Sam
 # -- torch -----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "samples",
     [Samples.pooled(FEATURES), TOKENS],
@@ -472,6 +473,7 @@ def test_a_binary_label_is_predicted_as_by_scikit_learn_without_the_prior_of_the
     assert probe.scores.mean() == pytest.approx(balanced_accuracy_score(y, decisions > prior), abs=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", ["binary", "classes", "continuous"])
 def test_inner_qualities_are_those_by_which_penalties_are_chosen_above_the_permutations(task: str) -> None:
     """Of every outer fold, by the same loops over scikit-learn, at the penalty that was chosen."""

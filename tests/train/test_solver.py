@@ -158,6 +158,7 @@ def test_steps_in_float32_lead_to_the_same_optimum_and_cost_no_more_steps(monkey
     assert not exact, "conjugate gradients settle in float32 as they do in float64"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 11, 39])
 def test_steps_that_are_not_looked_back_at_never_go_in_circles(seed: int) -> None:
     """One enormous sample: guessed wrong it has no curvature, and a whole step is far too long."""

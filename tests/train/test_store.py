@@ -83,6 +83,7 @@ def test_what_a_killed_training_left_is_cleared_by_the_next_one(planted_run: Pla
     assert {path.name for path in probes.rglob("*")} == whole
 
 
+@pytest.mark.slow
 def test_the_newest_results_for_the_target_are_loaded(planted_run: PlantedRun) -> None:
     run = planted_run()
     train_probes(run, permutations=1)
@@ -152,6 +153,7 @@ def test_results_of_another_format_are_refused_by_its_name(
             read(run)
 
 
+@pytest.mark.slow
 def test_probes_that_are_asked_for_again_are_the_newest(planted_run: PlantedRun) -> None:
     run = planted_run()
     first = train_probes(run, permutations=1)
@@ -161,6 +163,7 @@ def test_probes_that_are_asked_for_again_are_the_newest(planted_run: PlantedRun)
     assert load_results(run).key == first.key
 
 
+@pytest.mark.slow
 def test_results_are_loaded_by_their_key_beside_damaged_ones(planted_run: PlantedRun) -> None:
     run = planted_run()
     intact, damaged = (train_probes(run, permutations=count).key for count in (0, 1))
@@ -180,6 +183,7 @@ def test_the_beginning_of_a_key_will_do(planted_run: PlantedRun) -> None:
         load_results(run, "")
 
 
+@pytest.mark.slow
 def test_probes_of_all_categories_together_do_not_hide_those_by_category(planted_run: PlantedRun) -> None:
     run = planted_run({Site("backbone", 1): 1.0}, categories=("color", "shape"))
     by_category = train_probes(run, permutations=2, controls=())

@@ -189,6 +189,7 @@ def test_other_weights_sites_and_definitions_are_refused() -> None:
         transfer_probes(run, whole, labels, labels_of(whole, there, "z"))
 
 
+@pytest.mark.slow
 def test_the_command_prints_the_transfer_beside_the_other_runs_own_score(
     small_suite: Suite, tmp_path: Path
 ) -> None:

@@ -454,6 +454,7 @@ def source_catalogue(recorded: Run) -> Catalogue:
     return Catalogue([recorded])
 
 
+@pytest.mark.slow
 def test_a_run_of_recordings_opens_with_the_views_that_need_no_side(source_catalogue: Catalogue) -> None:
     _, run = read_payload(source_catalogue.script("run/run"))
     assert (run["sides"], run["views"]) == (False, ["overview", "map", "episodes"])
@@ -476,6 +477,7 @@ def test_what_is_stored_is_shown_as_the_tables_of_the_commands(source_catalogue:
     assert [row[0]["text"] for row in kinds["predicted actions"]["rows"]] == ["dx", "grip"]
 
 
+@pytest.mark.slow
 def test_a_diagnosis_of_another_version_is_refused_and_the_other_results_are_shown(tmp_path: Path) -> None:
     run = write_recorded_run(tmp_path / "run")
     keys = diagnose(run), diagnose(run, "probe_kit diagnosis 1")
@@ -517,6 +519,7 @@ def test_an_episode_shows_every_inference_and_predicted_beside_recorded_actions(
     np.testing.assert_allclose(decoded.mean(axis=(1, 2)), pixels.mean(axis=(1, 2)), atol=8)
 
 
+@pytest.mark.slow
 def test_an_export_of_recordings_is_the_same_bytes_again(recorded: Run, tmp_path: Path) -> None:
     contents = []
     for name in ("a", "b"):

@@ -90,6 +90,7 @@ def test_the_icon_needs_no_cookie_because_the_page_that_leads_in_has_none_yet(se
     assert newcomer.ask("/favicon.ico", Host="example.org")[0] == 400
 
 
+@pytest.mark.slow
 def test_the_page_and_the_payloads_are_those_of_an_export(server: Client, exported: Path) -> None:
     folder = exported.parent
     files = ["app/page.js", "app/page.css", "data/run/episodes.js", "data/run/e/00003.js", "data/run/f/00001.webp"]
@@ -270,6 +271,7 @@ def test_what_a_browser_has_of_a_former_server_is_sent_again(server: Client, lit
     assert (status, again[:20]) == (200, content[:20])
 
 
+@pytest.mark.slow
 def test_episodes_that_are_committed_while_the_page_is_open_are_followed(
     small_suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -337,6 +339,7 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
+@pytest.mark.slow
 def test_the_same_runs_give_the_same_bytes(little_runs: Path, exported: Path, tmp_path: Path) -> None:
     again = write_viewer([open_run(little_runs / name) for name in ("run", "other")], tmp_path / "again")
     first = contents(exported.parent)
@@ -347,6 +350,7 @@ def test_the_same_runs_give_the_same_bytes(little_runs: Path, exported: Path, tm
     ]
 
 
+@pytest.mark.slow
 def test_an_export_names_neither_folders_nor_users_of_this_machine(little_runs: Path, tmp_path: Path) -> None:
     place = tmp_path / "home" / "jane-doe" / "secret project"
     shutil.copytree(little_runs / "run", place / "run")
@@ -356,6 +360,7 @@ def test_an_export_names_neither_folders_nor_users_of_this_machine(little_runs: 
             assert word.encode() not in content, name
 
 
+@pytest.mark.slow
 def test_an_export_replaces_a_former_one_and_no_other_folder(little_runs: Path, tmp_path: Path) -> None:
     run = open_run(little_runs / "run")
     folder = tmp_path / "out"
@@ -372,6 +377,7 @@ def test_an_export_replaces_a_former_one_and_no_other_folder(little_runs: Path, 
         write_viewer([run], folder / "thesis.tex")
 
 
+@pytest.mark.slow
 def test_an_export_of_some_categories_holds_no_other(little_runs: Path, tmp_path: Path) -> None:
     run = open_run(little_runs / "run")
     with pytest.raises(UnknownCategoryError, match="no run has the category 'shape'; they have color"):
@@ -380,6 +386,7 @@ def test_an_export_of_some_categories_holds_no_other(little_runs: Path, tmp_path
     assert len(list((page.parent / "data" / "run" / "e").iterdir())) == len(run.episodes)
 
 
+@pytest.mark.slow
 def test_the_command_prints_the_page(little_runs: Path, tmp_path: Path) -> None:
     arguments = ["view", str(little_runs / "run"), "--export", str(tmp_path / "out"), "--without-frames"]
     done = CliRunner().invoke(app, arguments)

@@ -82,6 +82,7 @@ def test_facts_are_labels_and_a_run_without_sides_refuses_them(played: Run, tmp_
         Target.of_run(played, "env.absent")
 
 
+@pytest.mark.slow
 def test_facts_of_a_run_that_captured_the_first_inference_alone_are_missed_with_the_way_to_get_them(
     pi0_tiny: Pi0, tmp_path: Path
 ) -> None:

@@ -250,6 +250,7 @@ def test_a_run_of_questions_is_repeated_from_its_own_settings(home: Path) -> Non
     assert "repeat it with `probe-kit ask --config" in " ".join(refused.stderr.split())
 
 
+@pytest.mark.slow
 def test_activations_are_those_of_the_model_itself_and_numbers_of_the_table_are_probed(home: Path) -> None:
     options, _ = ASKED["pictures"]
     assert ask(*options, "--tokens", "pooled", "--out", "asked").exit_code == 0
@@ -367,6 +368,7 @@ def test_a_run_is_repeated_from_any_folder_and_its_files_are_found_again(
     np.testing.assert_array_equal(before.column(site, "mean"), after.column(site, "mean"))
 
 
+@pytest.mark.slow
 def test_a_file_that_is_gone_is_named_before_anything_is_made(
     made: tuple[str, Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -389,6 +391,7 @@ AGAIN = {
 """The options that give what was moved; a module is imported from where the command is typed."""
 
 
+@pytest.mark.slow
 def test_an_option_takes_the_place_of_every_file_that_was_moved(
     made: tuple[str, Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -257,6 +257,7 @@ def test_a_policy_that_draws_from_global_numbers_is_refused(
         extract_run(settings, tmp_path / "run")
 
 
+@pytest.mark.slow
 def test_what_a_policy_prints_is_text_on_stderr(
     settings: ExtractSettings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -436,6 +437,7 @@ def test_what_a_policy_does_wrong_gives_its_episodes_up_by_name(
     assert len(open_run(tmp_path / "run", allow_partial=True).episodes) == 1
 
 
+@pytest.mark.slow
 def test_a_failure_is_stored_with_the_traceback_of_the_policys_own_code(
     suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -134,6 +134,7 @@ def stage(request: pytest.FixtureRequest) -> Iterator[LocalPlayer | ProcessPlaye
     made.close()
 
 
+@pytest.mark.slow
 def test_a_stage_goes_on_by_itself_where_an_episode_ends_and_only_there(
     stage: LocalPlayer | ProcessPlayer, suite: Suite
 ) -> None:

@@ -165,6 +165,7 @@ def test_what_is_not_honoured_is_refused_by_name(changed: Changed, change: dict[
         _ = changed(**change).state_units
 
 
+@pytest.mark.slow
 def test_fields_of_training_change_nothing(changed: Changed) -> None:
     training = {
         "state_dropout_prob": 0.8, "random_rotation_angle": 5, "color_jitter_params": {"hue": 0.1},
@@ -197,6 +198,7 @@ def test_lerobots_resizing_is_another_one_and_can_be_chosen(changed: Changed) ->
     assert np.abs(plain.astype(int) - other).max() > 10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("where", ["file", "option"])
 def test_letterbox_puts_black_bars_above_and_below(changed: Changed, where: str) -> None:
     white = np.full((48, 80, 3), 255, np.uint8)
@@ -340,6 +342,7 @@ def test_everything_that_the_expert_reads_passes_the_end_of_the_bridge(
     assert plain[expert[1]].shape == (1, 1 + HORIZON, 24)
 
 
+@pytest.mark.slow
 def test_blocks_attend_by_turns_to_words_to_themselves_and_to_pictures(
     groot: Groot, seen: list[Observation]
 ) -> None:
@@ -385,6 +388,7 @@ def test_roles_name_pictures_and_the_instruction_as_lerobot_writes_it(
     assert groot.token_ids(["Put the cube on the star!"]) == groot.token_ids(["put the cube on the star"])
 
 
+@pytest.mark.slow
 def test_two_cameras_are_told_apart_in_the_checkpoints_order(tmp_path: Path, seen: list[Observation]) -> None:
     policy = Groot.load(str(write_groot(tmp_path, cameras=("image", "wrist")))).with_cameras(["image", "wrist"])
     one = replace(seen[0], cameras={"wrist": seen[0].image[:, ::-1].copy()})
@@ -432,6 +436,7 @@ def test_actions_relative_to_the_state_are_captured_and_not_carried_out(
     assert policy.infer_without_acting(seen, [0]).shape == (1, CHUNK, 7)
 
 
+@pytest.mark.slow
 def test_the_embodiment_of_nvidias_layout_must_be_chosen_and_be_there(folder: Path) -> None:
     with pytest.raises(UsageError, match="libero_sim, other"):
         Groot.load(str(folder / "base"))

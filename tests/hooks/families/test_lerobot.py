@@ -580,6 +580,7 @@ def test_a_smaller_picture_is_brought_to_the_size_the_crop_was_chosen_on() -> No
 LEROBOTS = ("pi0", "pi05", "pi0-fast", "molmoact2", "groot", "xvla", "eo1", "smolvla")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LEROBOTS)
 def test_a_text_that_does_not_fit_is_refused_and_never_cut_also_without_the_weights(
     name: str, tmp_path: Path

@@ -64,6 +64,7 @@ def _without_clamps(steps: list[dict[str, Any]]) -> None:
     steps[:] = [step for step in steps if "clamp" not in step["registry_name"]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fields", "change"),
     [

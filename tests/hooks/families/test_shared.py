@@ -157,6 +157,7 @@ def test_a_meaningless_temperature_is_refused(temperature: float) -> None:
         chooser(temperature, [])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("top", [1, 5, 50])
 def test_what_can_be_drawn_is_what_transformers_keeps_ties_of_the_last_one_included(top: int) -> None:
     """In bfloat16 many ids are as likely as the last of the kept ones."""

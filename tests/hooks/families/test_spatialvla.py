@@ -150,6 +150,7 @@ def test_the_camera_of_the_scene_reaches_the_network_scaled_to_the_models_pictur
     assert torch.equal(residuals[0][:, patches:], residuals[1][:, patches:])
 
 
+@pytest.mark.slow
 def test_the_training_camera_may_stand_in_for_the_scenes(
     folder: Path, plain: SpatialVLA, seen: list[Observation]
 ) -> None:
@@ -202,6 +203,7 @@ def test_an_executed_step_that_names_no_action_is_flagged_and_said(
     assert plain.flagged.tolist() == [False, True]
 
 
+@pytest.mark.slow
 def test_decoding_within_slots_always_names_an_action_and_says_so(
     plain: SpatialVLA, chunked: SpatialVLA, seen: list[Observation]
 ) -> None:
@@ -254,6 +256,7 @@ def test_the_released_variants_differ_in_bins_and_statistics_only(
     assert len({s["action_bins"] for s in settings}) == 2
 
 
+@pytest.mark.slow
 def test_the_statistics_key_is_an_option_with_a_suggestion(tmp_path: Path) -> None:
     own = processor_values()["statistics"]["bridge_orig/1.0.0"]
     checkpoint = str(write_checkpoint(tmp_path, processor={"statistics": {"my_arm": own, FRACTAL: own}}))
@@ -264,6 +267,7 @@ def test_the_statistics_key_is_an_option_with_a_suggestion(tmp_path: Path) -> No
         load_spatialvla(checkpoint)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("statistics", "said"),
     [({}, "has no statistics"), ({"arm": {"action": {"q01": [0.0] * 8, "q99": [1.0] * 8}}}, "8 dimensions")],
@@ -273,6 +277,7 @@ def test_statistics_that_cannot_be_used_are_refused(tmp_path: Path, statistics: 
         load_spatialvla(str(write_checkpoint(tmp_path, processor={"statistics": statistics})))
 
 
+@pytest.mark.slow
 def test_a_longer_chunk_has_more_tokens(tmp_path: Path, seen: list[Observation]) -> None:
     checkpoint = str(write_checkpoint(tmp_path, processor={"action_chunk_size": 2}))
     policy = load_spatialvla(checkpoint, iterations="chunk", unnorm_key="bridge_orig/1.0.0")

@@ -45,6 +45,7 @@ def test_what_fine_tuning_wrote_stands_alone_and_the_only_set_needs_no_name(fami
             load_policy(family, str(place), unnorm_key=name, **FAMILIES[family])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", ["openvla", "spatialvla", "internvla-m1"])
 def test_several_sets_have_to_be_chosen_from_before_anything_is_loaded(family: str, tmp_path: Path) -> None:
     other = next(iter(DEFAULTS[family].values()))

@@ -111,6 +111,7 @@ def test_pictures_are_padded_as_the_configuration_says_or_squashed_as_the_author
     assert any("squashed to 64 x 64" in note for note in squashed.card.notes)
 
 
+@pytest.mark.slow
 def test_a_checkpoint_that_resizes_nothing_can_be_given_either_way(
     tmp_path: Path, seen: list[Observation]
 ) -> None:

@@ -99,6 +99,7 @@ def test_one_cell_alone_is_the_interchange_at_its_place_bit_for_bit(
             )
 
 
+@pytest.mark.slow
 def test_all_cells_but_one_are_the_other_cells_together(result: InterventionResult) -> None:
     """Block 2 was not named: everything that is patched and left out is known."""
     changed = dict(zip(result.outcomes.conditions, result.outcomes.max_action_change, strict=True))

@@ -183,6 +183,7 @@ def test_a_cell_of_the_backbone(pi0_tiny: Pi0, pair: pt.Pair, role: str) -> None
     np.testing.assert_array_equal(pt.patch_cells(pi0_tiny, pair, cell), expected)
 
 
+@pytest.mark.slow
 def test_a_joint_place_of_keys_and_values_in_two_blocks(pi0_tiny: Pi0, pair: pt.Pair) -> None:
     cells = pt.find_cells(pi0_tiny, "kv.00|image", "kv.02|image")
     assert isinstance(pair.clean, Observation)
@@ -193,6 +194,7 @@ def test_a_joint_place_of_keys_and_values_in_two_blocks(pi0_tiny: Pi0, pair: pt.
     assert (expected != pt.patch_cells(pi0_tiny, pair, cells[0])).any()
 
 
+@pytest.mark.slow
 def test_iterations_are_patched_where_they_are_named(pi0_tiny: Pi0, pair: pt.Pair) -> None:
     every, none, some = (pt.find_cells(pi0_tiny, f"expert.01{own}")[0] for own in ("", "@0", "@0-9"))
     by_all = pt.patch_cells(pi0_tiny, pair, every)
@@ -209,6 +211,7 @@ def test_everything_at_the_first_layer_is_the_source(pi0_tiny: Pi0, pair: pt.Pai
     np.testing.assert_array_equal(pt.patch_cells(pi0_tiny, pair, cell), source)
 
 
+@pytest.mark.slow
 def test_a_subspace_and_the_rest_of_it_are_parts_of_the_whole(pi0_tiny: Pi0, pair: pt.Pair) -> None:
     (cell,) = pt.find_cells(pi0_tiny, "backbone.02|image")
     whole, clean = pt.patch_cells(pi0_tiny, pair, cell), pi0_tiny.act([pair.clean], [pair.seed])[0]  # type: ignore[list-item]

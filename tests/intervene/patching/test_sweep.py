@@ -109,6 +109,7 @@ def test_pairs_without_a_group_are_independent(wired: WiredSession) -> None:
 # -- sets --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_one_copy_is_read_here_and_nothing_is_needed_elsewhere(wired: WiredSession) -> None:
     found = pt.compare_alone_and_without(
         wired.policy,
@@ -121,6 +122,7 @@ def test_one_copy_is_read_here_and_nothing_is_needed_elsewhere(wired: WiredSessi
     assert found.loc["kv.01 language", "needed"] == pytest.approx(1, abs=0.05)
 
 
+@pytest.mark.slow
 def test_of_a_majority_of_blocks_no_single_one_carries_anything_and_two_carry_all(wired: WiredSession) -> None:
     pairs, cells = pt.find_pairs(wired, "blocks"), pt.find_cells(wired.policy, "kv.*|language", "kv.01|state")
     found = pt.compare_alone_and_without(wired.policy, pairs, cells, wired.lateral_displacement)

@@ -216,6 +216,7 @@ def unkeyed(value: Any) -> Any:
     return value
 
 
+@pytest.mark.slow
 def test_every_quantity_is_of_what_it_is_about(run: ArrayRun) -> None:
     seen = read(run)
     verdict = seen["verdicts"]["color"]
@@ -244,6 +245,7 @@ def test_every_quantity_is_of_what_it_is_about(run: ArrayRun) -> None:
     assert seen["targets"] == ("backbone.02|image",)
 
 
+@pytest.mark.slow
 def test_those_of_which_nothing_is_read_are_listed_so(run: ArrayRun) -> None:
     made_in(run, [*(name for name in POOL if name != "map"), "map"])
     names = {key_of(settings_of(run, name)): name for name in POOL}
@@ -252,6 +254,7 @@ def test_those_of_which_nothing_is_read_are_listed_so(run: ArrayRun) -> None:
     assert {name for name, state in states.items() if state == "other"} == {*others, "attention, a role"}
 
 
+@pytest.mark.slow
 def test_the_verdict_says_first_chunk_and_whole_episode_whichever_is_asked_for(run: ArrayRun) -> None:
     """Color follows in the first chunk; the stored episodes along which each step was evaluated do not move."""
     for name, readout in (("image-swap", "first-chunk"), ("follow, shadow", "per-step")):

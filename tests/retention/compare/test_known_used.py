@@ -260,6 +260,7 @@ def test_bars_are_the_counts_of_the_join(tmp_path: Path) -> None:
     ]
 
 
+@pytest.mark.slow
 def test_the_report_of_an_asked_and_an_acting_run_holds_their_join(tmp_path: Path) -> None:
     vlm, policy = pair(tmp_path)
     runs = [vlm, policy]
@@ -275,6 +276,7 @@ def test_the_report_of_an_asked_and_an_acting_run_holds_their_join(tmp_path: Pat
     assert section.count("<img") == 1
 
 
+@pytest.mark.slow
 def test_runs_that_saw_other_frames_are_not_joined_and_the_report_says_so(tmp_path: Path) -> None:
     vlm, policy = pair(tmp_path)
     policy.episodes["first_frame_sha256"] = "other"

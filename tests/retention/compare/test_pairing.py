@@ -147,6 +147,7 @@ def pairs(table: RetentionTable) -> list[tuple[str, str]]:
     return list(dict.fromkeys((row.group, row.minus) for row in table.differences))
 
 
+@pytest.mark.slow
 def test_every_other_run_is_compared_with_the_first_or_with_the_one_named(tmp_path: Path) -> None:
     runs = [run(tmp_path / name, hits(0.5, at)) for at, name in enumerate("abc")]
     assert pairs(retention_table(runs)) == [("b", "a"), ("c", "a")]
@@ -318,6 +319,7 @@ def test_groups_are_pairs_on_the_items_that_most_of_their_runs_have(tmp_path: Pa
     assert table.unpaired[0].startswith("x and y are compared on the items in common: 18 of 20 in color.")
 
 
+@pytest.mark.slow
 def test_asked_runs_are_compared_with_asked_ones_and_acting_with_acting(tmp_path: Path) -> None:
     vlms = [asked(tmp_path / str(at), hits(0.7, at), f"vlm-{at}") for at in range(2)]
     policies = [run(tmp_path / f"policy-{at}", hits(0.5, at)) for at in range(2)]
@@ -517,6 +519,7 @@ def table_model_groups(probed_run: ProbedRun) -> RetentionTable:
     return retention_table({"first": runs[:3], "second": runs[3:]})
 
 
+@pytest.mark.slow
 def test_three_models_against_three_cannot_be_below_one_tenth(table_model_groups: RetentionTable) -> None:
     assert len(table_model_groups.differences) == 3
     for row in table_model_groups.differences:
@@ -526,6 +529,7 @@ def test_three_models_against_three_cannot_be_below_one_tenth(table_model_groups
             assert test.p >= test.smallest_p - 1e-12
 
 
+@pytest.mark.slow
 def test_every_format_shows_the_p_over_models_and_the_least_possible_one(
     table_model_groups: RetentionTable,
 ) -> None:
@@ -541,6 +545,7 @@ def test_every_format_shows_the_p_over_models_and_the_least_possible_one(
         assert "(0.100)" in text
 
 
+@pytest.mark.slow
 def test_runs_of_one_model_are_no_further_models(probed_run: ProbedRun) -> None:
     """Seeds of two models against seeds of two others: four models, whatever the number of seeds."""
     runs = [
@@ -563,6 +568,7 @@ def sisters(probed_run: ProbedRun) -> list[ArrayRun]:
     ]
 
 
+@pytest.mark.slow
 def test_models_of_one_origin_are_averaged_first(probed_run: ProbedRun) -> None:
     runs = sisters(probed_run)
     origins = {str(run.location): origin for run, origin in zip(runs[:3], ("base", "base", "other"), strict=True)}

@@ -175,6 +175,7 @@ def test_runs_of_one_name_prompt_and_size_have_a_line_each_however_many(tmp_path
     assert len({cells[0] for cells in sizes.texts}) == len(sizes.texts) == 4
 
 
+@pytest.mark.slow
 def test_every_format_shows_answers_sizes_and_gaps(runs: list[SaidRun], tmp_path: Path) -> None:
     larger = asked(tmp_path / "large", by_chance(5, 0.7), called="large", picture_size="560x480")
     other = asked(tmp_path / "other", by_chance(6, 0.7), called="other", prompt="seen")
@@ -263,6 +264,7 @@ def test_runs_of_before_whose_cards_hold_a_family_only_are_unknown(tmp_path: Pat
     assert grew_from(acted(tmp_path / "p", RIGHT), vlm(tmp_path, QWEN_4B)) == "unknown"
 
 
+@pytest.mark.slow
 def test_the_embedded_policies_grew_from_the_embedded_vlm_and_only_from_it(tmp_path: Path) -> None:
     own = vlm(tmp_path / "r", load_model("vlm-tiny").card)
     untrained = vlm(tmp_path / "t", load_model("vlm-tiny", random_weights=True).card)

@@ -272,6 +272,7 @@ def test_one_table_has_a_binary_label_one_of_classes_and_a_continuous_one_and_no
         assert all(name.replace("_", "") in done.stdout.replace("\\", "").replace("_", "") for name in NAMES)
 
 
+@pytest.mark.slow
 def test_trap_9_the_table_says_how_many_labels_were_tried_and_corrects_them_by_holm(three: Run) -> None:
     alone = retention_table([three], target=NAMES)
     assert (
@@ -311,6 +312,7 @@ def test_a_site_that_is_above_chance_alone_may_not_be_among_several_labels() -> 
     assert corrected.retention.value == found.retention.value
 
 
+@pytest.mark.slow
 def test_stored_probes_are_chosen_by_key_for_one_target_that_they_are_of(three: Run) -> None:
     labels = Target.of_run(three, "sim.tool_y")
     other = train_probes(three, target=labels, permutations=19, controls=("step",))
@@ -345,6 +347,7 @@ def test_stored_probes_are_chosen_by_key_for_one_target_that_they_are_of(three: 
 # -- recordings --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_recordings_have_a_table_and_a_page_though_they_have_no_success_rate(tmp_path: Path) -> None:
     run = write_recorded_run(tmp_path / "run", expert=True)
     train_probes(

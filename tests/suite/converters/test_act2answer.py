@@ -69,6 +69,7 @@ def test_transparency_lies_over_white(tmp_path: Path) -> None:
     assert (seen == 255).all()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not BOARDS.is_dir(), reason=f"no real boards at {BOARDS}")
 def test_the_authors_boards_are_upright_as_their_scene_turns_them() -> None:
     """They are stored transposed and lie there unturned; VL-Think's converter knows that, this one reads it."""
@@ -268,6 +269,7 @@ def test_options_that_cannot_be_meant_are_refused(original: Path, tmp_path: Path
             convert("act2answer", original, tmp_path / "suite", **options)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not REAL.is_dir(), reason=f"no real set at {REAL}")
 def test_the_authors_own_set_with_generated_tiles(tmp_path: Path) -> None:
     """Their `pairs.json` and `model_db.json` byte for byte; their pictures could not be had."""

@@ -32,6 +32,7 @@ def test_pairs_are_kept_and_half_of_them_negated(compbench_root: Path, tmp_path:
     assert Counter(item.correct_side for item in suite.items) == {"left": 6, "right": 6}
 
 
+@pytest.mark.slow
 def test_the_answered_picture_is_the_target_and_the_other_one_if_negated(
     compbench_root: Path, tmp_path: Path
 ) -> None:
@@ -46,11 +47,13 @@ def test_the_answered_picture_is_the_target_and_the_other_one_if_negated(
         assert target.endswith(answered) == (item.polarity == "pos")
 
 
+@pytest.mark.slow
 def test_the_papers_polarity_can_be_kept(compbench_root: Path, tmp_path: Path) -> None:
     suite = convert("mllm-compbench", compbench_root, tmp_path / "s", categories=["emotion"], paper_polarity=True)
     assert {item.polarity for item in suite.items} == {"pos"}
 
 
+@pytest.mark.slow
 def test_split_files_are_united_and_types_sorted_into_state_and_attribute(
     compbench_root: Path, tmp_path: Path
 ) -> None:
@@ -69,6 +72,7 @@ def test_a_whole_file_is_preferred_to_its_parts(compbench_root: Path, tmp_path: 
     assert sum(suite.card["counts"].values()) == 2
 
 
+@pytest.mark.slow
 def test_faces_are_declared_and_may_be_small_only_where_the_source_is(
     compbench_root: Path, tmp_path: Path
 ) -> None:
@@ -114,6 +118,7 @@ def test_a_tree_without_annotations_is_refused_with_what_was_looked_for(tmp_path
         convert("mllm-compbench", tmp_path, tmp_path / "suite")
 
 
+@pytest.mark.slow
 def test_the_command_counts_by_name_what_it_leaves_out(compbench_root: Path, tmp_path: Path) -> None:
     path = compbench_root / "Labeled_data/fer2013_label/fer2013_0_720_rebalanced.json"
     records = json.loads(path.read_text(encoding="utf-8"))
@@ -315,6 +320,7 @@ def test_a_picture_that_is_cut_or_of_another_format_is_refused_with_its_row(
         converted(mmbench_root, tmp_path)
 
 
+@pytest.mark.slow
 def test_a_picture_in_several_lines_of_base64_is_read(mmbench_root: Path, tmp_path: Path) -> None:
     before = converted(mmbench_root, tmp_path / "before")
     rewritten(
@@ -432,6 +438,7 @@ def test_real_hearts_stand_on_their_tip(real: Path) -> None:
     assert upper.sum() > 1.3 * lower.sum()
 
 
+@pytest.mark.slow
 def test_every_two_signs_are_asked_both_ways(vlthink_root: Path, tmp_path: Path) -> None:
     suite = convert("vl-think", vlthink_root, tmp_path / "suite", categories=["traffic"])
     assert len(suite.items) == 5 * 4
@@ -458,6 +465,7 @@ def test_real_colours_are_eight_and_eleven_when_repainted(real: Path, tmp_path: 
     assert {item.construction for item in recolored.items} == {"cross_item", "recolored"}
 
 
+@pytest.mark.slow
 def test_real_signs_of_the_laundry_are_made_on_request(real: Path, tmp_path: Path) -> None:
     suite = convert("vl-think", real, tmp_path / "s", categories=["public-info"], n=20, extra_boards=["laundry"])
     assert suite.card["counts"] == {"public-info": 20}

@@ -24,6 +24,7 @@ def test_another_seed_gives_another_sample(vlthink_root: Path, tmp_path: Path) -
     assert {item.pair_id for item in one.items} != {item.pair_id for item in other.items}
 
 
+@pytest.mark.slow
 def test_a_converted_suite_is_valid_and_says_nobody_looked(compbench_root: Path, tmp_path: Path) -> None:
     suite = convert("mllm-compbench", compbench_root, tmp_path / "suite")
     assert load_suite(suite.folder) == suite

@@ -96,6 +96,7 @@ def test_accepting_a_question_without_wording_is_refused(
         review(accept_unworded)
 
 
+@pytest.mark.slow
 def test_every_row_names_its_previews(compbench_root: Path, tmp_path: Path) -> None:
     path = tmp_path / "review.jsonl"
     convert("mllm-compbench", compbench_root, tmp_path / "suite", emit_curation=path)
@@ -121,6 +122,7 @@ def test_a_spreadsheet_does_as_well(compbench_root: Path, tmp_path: Path) -> Non
     assert len(convert("mllm-compbench", compbench_root, tmp_path / "reviewed", curation=path).items) == 1
 
 
+@pytest.mark.slow
 def test_pairs_that_wait_for_a_person_are_written_out_even_if_no_item_is(okvqa_root: Path, tmp_path: Path) -> None:
     path = tmp_path / "review.jsonl"
     with pytest.raises(SuiteError, match="no item left to write"):

@@ -254,6 +254,7 @@ def service() -> Iterator[Service]:
     running.server.server_close()
 
 
+@pytest.mark.slow
 def test_a_proposal_waits_for_a_person_unless_models_are_trusted(
     service: Service, compbench_root: Path, tmp_path: Path
 ) -> None:
@@ -270,6 +271,7 @@ def test_a_proposal_waits_for_a_person_unless_models_are_trusted(
     assert service.requests[0]["temperature"] == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "reply",
     ["no object", {**GOOD, "keep": False}, {**GOOD, "instruction": "Take the calmer sky"}, {**GOOD, "object": ""}],
