@@ -3,6 +3,7 @@
 import ast
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -14,6 +15,7 @@ import pytest
 from probe_kit.suite import Suite
 
 ROOT = Path(__file__).parents[1]
+OPENS = re.compile(r"_text\b|open\b|NamedTemporaryFile|text=|universal_newlines")
 OURS = ("probe_kit", "tests", "scripts", "benchmarks", "docs")
 COMMANDS = r"""
 import io, json, locale, sys
@@ -47,8 +49,9 @@ def test_every_text_is_opened_with_its_encoding() -> None:
 
 
 def calls(path: Path) -> Iterator[ast.Call]:
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    return (node for node in ast.walk(tree) if isinstance(node, ast.Call))
+    source = path.read_text(encoding="utf-8")
+    if OPENS.search(source):  # most modules open nothing
+        yield from (node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call))
 
 
 def is_text(call: ast.Call) -> bool:

@@ -95,9 +95,14 @@ FOLDERS = ("benchmarks", "scripts", "tests", "probe_kit")
 
 
 def test_no_comment_and_no_docstring_uses_a_word_that_the_project_avoids() -> None:
-    modules = {path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")}
+    paths = {path for folder in FOLDERS for path in (ROOT / folder).rglob("*.py")}
+    # Only a module that has such a word anywhere, also in code, is taken apart: that takes most of the time.
+    suspects = [
+        path for path in sorted(paths) if PATTERN.search(" ".join(path.read_text(encoding="utf-8").split()))
+    ]
+    assert suspects, "this file lists the words"
     found = avoided_words(
-        remark for path in sorted(modules) for remark in remarks_of_module(path, path.relative_to(ROOT).as_posix())
+        remark for path in suspects for remark in remarks_of_module(path, path.relative_to(ROOT).as_posix())
     )
     assert not found, "\n".join(found)
 

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from markdown_it import MarkdownIt
 from rich.console import Console
 
+from probe_kit._system.escaping import without_places
 from probe_kit._tables.formats import names, render
 from probe_kit._tables.formats.latex import _SPECIAL, MOST_COLUMNS
 from probe_kit._tables.table import Cell, Heading, Row, Table, grouped
@@ -136,7 +137,8 @@ def test_html_holds_the_cells_as_text_and_no_element_of_theirs(table: Table) -> 
     ordered = [*(row for row in table.rows if not row.is_mean), *(row for row in table.rows if row.is_mean)]
     cells = [words(text).replace("\u00a0", "") for text in reader.cells[len(table.headings) :]]
     assert sorted("".join(sorted(cell)) for cell in cells) == sorted(
-        "".join(sorted(words(cell.text))) for row in ordered for cell in row.cells
+        # A page names no folder of this machine: of a path, it has the last part.
+        "".join(sorted(words(without_places(cell.text)))) for row in ordered for cell in row.cells
     )
 
 
