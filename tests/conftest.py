@@ -35,6 +35,7 @@ CHECKOUT = Path(__file__).parents[1]
 GOLDEN = Path(__file__).parent / "golden"
 FENCE = Path(__file__).parent / "acceptance"
 SHARED = Path(os.environ.get("PROBE_KIT_SHARED", CHECKOUT.parent / "shared"))
+WAITING = ("test_intervene.py", "test_train.py")
 _CHANGED = pytest.StashKey[str]()
 
 
@@ -125,7 +126,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Sort long files first, so that no core ends up alone with one.
 
     The files of `acceptance/stored` share runs that one process makes. Only one of them comes early, because a
-    second process would wait for it.
+    second process would wait for it. So would `WAITING` for the run of `acceptance/test_extract.py`.
     """
     tests = Path(__file__).parent
     first = [tests / "acceptance" / "stored" / "test_error_codes.py", tests / "acceptance" / "test_fence.py"]
@@ -133,7 +134,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     def rank(item: pytest.Item) -> int:
         if item.path in first:
             return first.index(item.path)
-        if item.path.parent == first[0].parent:
+        if item.path.parent == first[0].parent or item.path.name in WAITING:
             return len(first) + 2
         return len(first) + (item.path.parent != tests)
 

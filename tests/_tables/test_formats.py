@@ -80,6 +80,7 @@ def test_markdown_is_one_table_of_the_same_cells(table: Table) -> None:
 ALLOWED = {"text", "text_special", "strong_open", "strong_close", "softbreak"}
 
 
+@pytest.mark.slow
 @SETTINGS
 @given(tables())
 def test_latex_has_a_line_per_row_whose_cells_read_back(table: Table) -> None:
@@ -138,7 +139,9 @@ def test_html_holds_the_cells_as_text_and_no_element_of_theirs(table: Table) -> 
     cells = [words(text).replace("\u00a0", "") for text in reader.cells[len(table.headings) :]]
     assert sorted("".join(sorted(cell)) for cell in cells) == sorted(
         # A page names no folder of this machine: of a path, it has the last part.
-        "".join(sorted(words(without_places(cell.text)))) for row in ordered for cell in row.cells
+        "".join(sorted(words(without_places(cell.text))))
+        for row in ordered
+        for cell in row.cells
     )
 
 

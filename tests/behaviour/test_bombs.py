@@ -79,6 +79,7 @@ def test_notes_and_profiles_of_a_picture_are_not_unpacked(kind: bytes, head: byt
         decode_bytes(content, "x:")
 
 
+@pytest.mark.slow
 def test_pixels_beyond_those_that_the_header_states_are_not_unpacked() -> None:
     assert decode_bytes(png(16, deflated(LARGE)), "x:").size == (16, 16)
 
@@ -310,6 +311,7 @@ def large_chunk(metadata: dict[str, dict[str, dict[str, list[int]]]]) -> None:
     metadata["chunk_grid"]["configuration"]["chunk_shape"][-1] = 10**12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
@@ -343,6 +345,7 @@ def test_a_sparse_file_in_a_run_is_refused_by_its_size(name: str, run: Path) -> 
         assert verify_run(run, deep=True).problems
 
 
+@pytest.mark.slow
 def test_threads_that_open_arrays_at_once_do_not_take_each_others_codecs(run: Path) -> None:
     opened = open_run(run)
     with ThreadPoolExecutor(8) as threads:

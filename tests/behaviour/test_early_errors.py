@@ -218,6 +218,7 @@ def test_a_command_prints_one_table_and_ends_on_a_sentence(
     assert len(last.splitlines()) < LAST
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [80, 120])
 @pytest.mark.parametrize("name", ["train", "intervene"])
 def test_columns_that_do_not_fit_are_named_and_details_prints_them(
@@ -235,6 +236,7 @@ def test_columns_that_do_not_fit_are_named_and_details_prints_them(
         assert heading in " ".join(whole.split())
 
 
+@pytest.mark.slow
 def test_the_demo_fits_summary_and_sentences_on_its_last_lines(
     run: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
 ) -> None:

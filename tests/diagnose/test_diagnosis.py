@@ -78,6 +78,7 @@ def test_words_and_pictures_decide_color_and_pass_by_one_block(diagnosis: dict[s
     assert "kv.02" in inputs["picture"]["where"]
 
 
+@pytest.mark.slow
 def test_the_same_command_reads_what_is_stored_and_the_run_stays_sound(folder: Path, run: Run) -> None:
     answer = run_command(folder / "run", *FRAMES, "--format", "json")
     assert answer.exit_code == 0
@@ -165,6 +166,7 @@ def test_a_pair_of_an_unknown_frame_is_refused_before_the_model_is_loaded(run: R
         diagnose_run(run, inputs=["words"], load=never)
 
 
+@pytest.mark.slow
 def test_a_table_of_few_groups_and_one_beside_a_number_of_frames_are_refused(folder: Path, tmp_path: Path) -> None:
     first, second = pk.open_run(folder / "run").episodes["episode_id"].astype(str)[:2]
     pairs = tmp_path / "pairs.csv"
@@ -318,6 +320,7 @@ def test_what_fine_tuning_lost_is_found_in_the_same_pairs_of_the_base(run_of_man
     assert compared.exit_code() == 1
 
 
+@pytest.mark.slow
 def test_a_base_with_another_state_or_camera_is_refused() -> None:
     tuned, base = load_pi0_tiny(), load_pi0_tiny()
     assert with_inputs_of(tuned, base) is base

@@ -115,6 +115,7 @@ def test_a_policy_that_its_seed_decides_is_moved_by_its_inputs_at_most() -> None
     assert found["instruction"] in ("moves", "open")
 
 
+@pytest.mark.slow
 def test_nothing_matters_where_every_change_moves_as_much() -> None:
     policy = linear_policy([0.0, 0.0, 0.0], wandering=1.0)
     draws = [InputExchange(policy, frames(16, 8, seed), seed).measure() for seed in range(20)]
@@ -250,6 +251,7 @@ def change_of(tuned: Sequence[float], base: Sequence[float]) -> dict[str, str]:
     return {diagnosed.name: diagnosed.base.change for diagnosed in compared if diagnosed.base is not None}
 
 
+@pytest.mark.slow
 def test_a_base_says_what_was_lost_gained_or_never_there() -> None:
     changes = change_of([0.0, 1.0, 1.0], [1.0, 1.0, 0.0])
     assert changes["instruction"] == "lost in fine-tuning"

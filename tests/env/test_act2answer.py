@@ -251,6 +251,7 @@ def test_exchanged_pictures_are_the_other_layouts_bit_for_bit_and_leave_no_trace
     assert watched.outcome().to_json() == alone.outcome().to_json()
 
 
+@pytest.mark.slow
 def test_step_is_advance_and_observe(make_env):
     stepped, advanced = make_env(), make_env()
     action = np.array([0.03, 0.02, -0.05, 0, 0, 0.1, 0])

@@ -260,6 +260,7 @@ def test_what_cannot_be_asked_is_refused_before_a_model_is_loaded(
         prepare(settings.changed(**change))
 
 
+@pytest.mark.slow
 def test_several_runs_of_one_model_are_checked_before_the_first_is_asked(
     settings: AskSettings, asked: Run, tmp_path: Path
 ) -> None:

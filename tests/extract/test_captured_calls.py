@@ -116,6 +116,7 @@ def test_probes_of_later_inferences_read_the_mean_and_no_other_view(mean_run: Ru
         train_probes(mean_run, ("color",), ("last",), permutations=0, call=1, controls=())
 
 
+@pytest.mark.slow
 def test_an_export_and_a_copy_know_of_later_inferences_that_keep_the_mean(mean_run: Run, tmp_path: Path) -> None:
     with safe_open(export_run(mean_run.location, "safetensors", tmp_path / "one"), framework="numpy") as file:
         assert file.get_slice("backbone.pooled").get_shape() == [48, 1, 2, 3, 8]
@@ -157,6 +158,7 @@ def test_bytes_of_a_run_count_what_later_inferences_keep() -> None:
     assert STREAM.raw_bytes(False, CALLS, "mean") == cells * 3 * 4 + (CALLS - 1) * cells * 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sealed", [False, True])
 def test_every_inference_is_read_apart_and_missing_ones_are_nan(run: Run, sealed: bool) -> None:
     if sealed:
@@ -259,6 +261,7 @@ def test_a_real_policy_is_captured_at_every_inference(small_suite: Suite, tmp_pa
     np.testing.assert_array_equal(fewer.column(site, "mean", 1), in_bfloat16(run.column(site, "mean", 1)))
 
 
+@pytest.mark.slow
 def test_more_inferences_than_an_episode_can_have_are_refused(small_suite: Suite) -> None:
     settings = ExtractSettings(
         "pi0-tiny", suite=small_suite.folder, scene=SceneSpec(max_steps=4), execute=2, captured_calls=3

@@ -143,6 +143,7 @@ def test_a_folder_is_planned_with_its_own_sizes(tmp_path: Path, small_suite: Sui
     assert sizes(planned.plan.streams) == sizes(load_model("pi05", str(folder)).streams.values())
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("nowhere")
 def test_its_own_configuration_says_whether_a_checkpoint_acts_here(
     tmp_path: Path, small_suite: Suite, monkeypatch: pytest.MonkeyPatch
@@ -179,6 +180,7 @@ def test_a_configuration_whose_backbone_is_not_in_the_cache_is_planned_with_the_
     assert [own.layers for own in planned.plan.streams] == [17, 17]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("nowhere")
 def test_an_adapter_in_the_cache_is_planned_with_the_sizes_of_its_base(
     tmp_path: Path, small_suite: Suite, monkeypatch: pytest.MonkeyPatch

@@ -119,6 +119,7 @@ def test_the_exit_code_of_a_missing_extra_is_that_of_a_wrong_usage(
     assert (ran.returncode, "SceneError" in ran.stderr) == (2, True), ran.stderr
 
 
+@pytest.mark.slow
 def test_a_scene_in_which_no_episode_can_start_is_refused_at_once(suite: Suite, tmp_path: Path) -> None:
     spec = SceneSpec(home=(0.49, 0.29, 0.39))
     with pytest.raises(SceneError):
@@ -174,6 +175,7 @@ def test_what_means_nothing_to_a_scripted_policy_is_refused(suite: Suite, change
         prepare(ExtractSettings("expert", suite=suite.folder, **change))
 
 
+@pytest.mark.slow
 def test_more_actions_than_a_chunk_has_are_refused(suite: Suite) -> None:
     with pytest.raises(UsageError, match="gives 16 actions per inference"):
         prepare(ExtractSettings("pi0-tiny", suite=suite.folder, execute=17))
@@ -251,6 +253,7 @@ def test_an_extraction_in_one_process_holds_its_run(
     assert unheld == []
 
 
+@pytest.mark.slow
 def test_a_worker_holds_the_run_itself(settings: ExtractSettings, tmp_path: Path, unheld: list[str]) -> None:
     address = begun(settings, tmp_path / "run")
     left, done = list(EPISODES), list[int]()

@@ -134,6 +134,7 @@ def test_both_layouts_of_an_item_start_from_the_same_scene_with_their_own_noise(
     assert first.policy_seed != second.policy_seed
 
 
+@pytest.mark.slow
 def test_seeds_do_not_depend_on_which_other_episodes_are_run(small_suite: Suite) -> None:
     whole = prepare(ExtractSettings("expert", suite=small_suite.folder)).plan.episodes
     part = prepare(ExtractSettings("expert", suite=small_suite.folder, categories=("shape",))).plan.episodes
@@ -301,6 +302,7 @@ def test_a_plan_names_the_content_of_every_item_and_the_suite_it_was_selected_fr
     assert acted.suite_parent != acted.settings["suite"]["content_sha256"]
 
 
+@pytest.mark.slow
 def test_a_whole_suite_has_no_parent(small_suite: Suite, tmp_path: Path) -> None:
     settings = ExtractSettings("idle", suite=small_suite.folder, scene=SceneSpec(max_steps=1), env_workers=0)
     plan = make_plan(load_suite(small_suite.folder), [], 0, 1, False)
@@ -386,6 +388,7 @@ def test_runs_that_took_other_seconds_and_were_resumed_are_equal_in_every_other_
     assert files_of(again.path, but=()) != files_of(acted.path, but=())
 
 
+@pytest.mark.slow
 def test_all_seconds_may_be_deleted_and_one_alone_is_damage(acted: Run, tmp_path: Path) -> None:
     place = Path(shutil.copytree(acted.path, tmp_path / "run"))
     (place / "times/00000002.json").unlink()

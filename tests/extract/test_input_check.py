@@ -142,6 +142,7 @@ def test_a_run_that_stores_nothing_is_checked_by_outputs_alone(
     assert "another picture changes no number of the first output" in input_notes(run.certificate)
 
 
+@pytest.mark.slow
 def test_a_scripted_answer_that_reads_nothing_is_refused_without_a_word_of_layers(
     small_suite: Any, tmp_path: Path
 ) -> None:

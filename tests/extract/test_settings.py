@@ -445,6 +445,7 @@ def test_who_plans_for_gpus_elsewhere_needs_none(monkeypatch: pytest.MonkeyPatch
     assert (record["device"], record["device_name"], record["dtype"]) == ("cuda", None, "bfloat16")
 
 
+@pytest.mark.slow
 def test_allowing_a_mix_is_no_part_of_the_identity(suite: Suite) -> None:
     plain, allowed = prepare(expert(suite)), prepare(expert(suite).changed(allow_mixed=True))
     assert plain.identity() == allowed.identity()

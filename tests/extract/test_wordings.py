@@ -46,6 +46,7 @@ def test_every_item_is_planned_in_every_wording_that_it_has_on_the_same_seeds(su
         assert (row["scene_seed"], row["policy_seed"]) == (own.columns["scene_seed"], own.policy_seed)
 
 
+@pytest.mark.slow
 def test_a_run_without_the_option_is_what_it_was(suite):
     plain = prepare(ExtractSettings("expert", suite=suite.folder, scene=SHORT))
     assert "wordings" not in plain.plan.selection

@@ -77,6 +77,7 @@ def test_a_commit_is_read_again_without_the_network_although_the_branch_went_on(
         checkpoint_folder(f"{REPO}@{'c' * 40}")
 
 
+@pytest.mark.slow
 def test_the_card_and_a_repetition_have_the_commit(
     server: Hub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -121,6 +121,7 @@ def test_patterns_of_fused_attention_are_those_of_transformers_eager_attention(
         torch.testing.assert_close(patterns[site], expected.float(), rtol=1e-4, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("family", ["pi0-tiny", "vlm-tiny"])
 def test_patterns_of_half_precision_are_those_of_the_same_weights_in_full(family: str) -> None:
     """Each is checked with the values of its own call, within what half precision rounds."""

@@ -157,6 +157,7 @@ def test_a_damaged_checkpoint_is_refused_by_tensor_name(reference: tuple[str, Pa
     assert caught.value.exit_code == 3
 
 
+@pytest.mark.slow
 def test_a_key_of_another_shape_is_named(reference: tuple[str, Path], tmp_path: Path) -> None:
     family, folder = reference
     other = {"model.state_proj.bias": {"shape": [7], "dtype": "float32"}}
@@ -203,6 +204,7 @@ def write_keys(source: Path, file: Path, gone: tuple[str, ...] = (), **added: ob
     return file
 
 
+@pytest.mark.slow
 def test_a_tensor_that_is_not_recorded_is_named(golden_vlm: Path, tmp_path: Path) -> None:
     gone = ("model.vision_tower.encoder.layer.3.lambda_1", "lm_head.weight")
     file = write_keys(golden_vlm / "internvl/real_keys.8B.json.gz", tmp_path / "keys.json", gone)
@@ -211,6 +213,7 @@ def test_a_tensor_that_is_not_recorded_is_named(golden_vlm: Path, tmp_path: Path
     assert all(f"{name}: not recorded" in verification.comparisons[0].note for name in gone)
 
 
+@pytest.mark.slow
 def test_tensors_that_the_family_declares_may_be_missing_and_no_other(golden_magma: Path, tmp_path: Path) -> None:
     source = golden_magma / "real_keys.json.gz"
     left_out = verify_keys("magma", source).comparisons[1]

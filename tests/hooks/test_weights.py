@@ -110,6 +110,7 @@ def test_the_hash_names_every_bit(checkpoint: Path) -> None:
     assert read_weights(checkpoint).sha256() != before
 
 
+@pytest.mark.slow
 def test_the_random_mark_travels_in_the_weights_file(checkpoint: Path) -> None:
     save_file(load_file(checkpoint / WEIGHTS_FILE), checkpoint / WEIGHTS_FILE, metadata=RANDOM)
     assert Pi0.load(str(checkpoint)).card.random_weights

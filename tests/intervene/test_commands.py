@@ -41,6 +41,7 @@ def test_the_table_says_what_follows(run: Run) -> None:
     assert "47 of 48 clean inferences" in said
 
 
+@pytest.mark.slow
 def test_what_was_stored_is_said_to_be_read_back_whatever_policy_was_named(run: Run) -> None:
     code, _, said = ask(run, "--checkpoint", "/nowhere", "--suite", "/nowhere")
     assert code == 0
@@ -113,6 +114,7 @@ def test_options_of_another_kind_are_refused(run: Run, options: tuple[str, ...],
     assert words in " ".join(said.split())
 
 
+@pytest.mark.slow
 def test_a_closed_loop_needs_a_located_place_or_a_named_one(run: Run) -> None:
     for options, words in (
         ((), "--kind interchange"),

@@ -63,6 +63,7 @@ def test_a_pair_has_the_picture_of_another_group_and_all_else_of_its_own(session
             assert source.instruction == clean.instruction
 
 
+@pytest.mark.slow
 def test_the_first_action_of_every_episode_is_inferred_again_bit_for_bit(
     played: Run, session: ObservedSession
 ) -> None:

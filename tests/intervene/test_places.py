@@ -285,6 +285,7 @@ def test_all_pixels_are_seen_by_all_patches_but_the_padding_and_none_by_none(
         role_token_mask(session.policy, nothing, "backbone", "image.left", {})
 
 
+@pytest.mark.slow
 def test_both_tiles_are_held_against_the_same_plain_patches(
     session: ReplaySession, copy: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:

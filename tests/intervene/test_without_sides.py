@@ -148,6 +148,7 @@ def test_what_needs_sides_or_another_input_is_refused_by_name(
     assert named in " ".join(answer.stderr.split())
 
 
+@pytest.mark.slow
 def test_a_frame_with_two_donors_is_read_toward_each_of_them(shown: Run, table: Path, twin: "Policy") -> None:
     choice = ImageSwap(pairs=(*read_pairs(table), ("episode-000000", 0, "episode-000004", 0)))
     with open_session(shown, ReplaySource(), lambda *_: twin, choice) as opened, opened.ready():

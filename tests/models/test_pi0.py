@@ -28,6 +28,7 @@ def test_the_policy_is_lerobots_own_class_in_eval_mode() -> None:
     assert not policy.training
 
 
+@pytest.mark.slow
 def test_a_seed_means_the_same_weights_every_time() -> None:
     first, second, other = (build_pi0(_config(), SIZE) for _ in range(3))
     for policy, seed in ((first, 1), (second, 1), (other, 2)):
@@ -37,6 +38,7 @@ def test_a_seed_means_the_same_weights_every_time() -> None:
     assert not torch.equal(first.state_dict()[name], other.state_dict()[name])
 
 
+@pytest.mark.slow
 def test_full_size_has_the_recorded_names_and_shapes(golden_pi0: Path) -> None:
     """On the meta device: nothing is allocated."""
     recorded = json.loads(gzip.decompress((golden_pi0 / "real_keys.json.gz").read_bytes()))["keys"]

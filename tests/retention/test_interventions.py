@@ -120,6 +120,7 @@ def test_where_nothing_carries_it_inside_the_place_is_open_and_the_behaviour_is_
     assert used(rows["shape"]).behaviour == "not used"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("is_memory_last", [False, True])
 def test_a_memory_and_a_map_are_read_beside_each_other(run: ArrayRun, is_memory_last: bool) -> None:
     """Whichever was stored last took the other's place in verdict and figure."""
@@ -137,6 +138,7 @@ def test_a_memory_and_a_map_are_read_beside_each_other(run: ArrayRun, is_memory_
     assert (display.passes["all"].percent.tolist(), display.read.percent.tolist()) == ([100, 100], [100, 0])
 
 
+@pytest.mark.slow
 def test_the_tie_is_of_the_layers_at_which_a_probe_is_significant(run: ArrayRun) -> None:
     """Layer 1 is read by probes: unread if nothing passes there, read if the probe's direction carries it."""
 

@@ -119,6 +119,7 @@ def test_a_run_by_another_rule_leaves_the_run_as_it_was(idle: Run) -> None:
     assert idle.episodes["never_moved"].all()
 
 
+@pytest.mark.slow
 def test_a_table_with_its_report_reads_every_trajectory_once(idle: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     run, read = open_run(idle.path), Counter[bytes]()
     decode = Trajectory.of_frames

@@ -146,6 +146,7 @@ def test_views_and_keys_that_are_not_there_are_errors(probed_run: ProbedRun) -> 
 UNDEFINED = ([0.5, 0.5, 0.5], [[0.54, 0.5]])
 
 
+@pytest.mark.slow
 def test_undefined_is_nan_in_every_frame_and_shares_stay_floats(probed_run: ProbedRun) -> None:
     """An SR that happens to be 0 or 1 everywhere is no integer, and a ratio without meaning no number."""
     probed = probed_run({"color": SIGNAL, "counting": NONE, "shape": UNDEFINED})

@@ -216,6 +216,7 @@ def copy(recorded_run: Run, tmp_path: Path) -> Path:
     return Path(shutil.copytree(recorded_run.path, tmp_path / "run"))
 
 
+@pytest.mark.slow
 def test_columns_hold_exactly_the_numbers_of_the_rows(recorded_run: Run, copy: Path) -> None:
     assert recorded_run.sealed
     shutil.rmtree(copy / "columns.zarr")
@@ -296,11 +297,13 @@ def test_role_codes_name_every_token_position(recorded_run: Run) -> None:
     assert names[0] == "padding"
 
 
+@pytest.mark.slow
 def test_the_labelled_dataset_is_the_same_with_and_without_columns(recorded_run: Run, copy: Path) -> None:
     shutil.rmtree(copy / "columns.zarr")
     assert recorded_run.xarray().identical(open_run(copy).xarray())
 
 
+@pytest.mark.slow
 def test_token_blocks_put_together_are_the_tokens(recorded_run: Run) -> None:
     for site in SITES:
         values, mask = recorded_run.tokens(site)

@@ -143,6 +143,7 @@ def test_the_backbone_begins_as_the_vlm_weight_by_weight(actor: Actor) -> None:
     assert all(torch.equal(tensor, backbone[name]) for name, tensor in vlm.items())
 
 
+@pytest.mark.slow
 def test_what_is_said_behind_an_instruction_is_where_the_vlm_would_put_the_cube(actor: Actor) -> None:
     """The VLM knew it before any training of the policy: a wrong position or prompt would leave chance."""
     torch.manual_seed(0)
@@ -151,6 +152,7 @@ def test_what_is_said_behind_an_instruction_is_where_the_vlm_would_put_the_cube(
     assert said < 0.3 * np.log(2) / 3
 
 
+@pytest.mark.slow
 def test_training_leaves_the_dimensions_deaf_that_are_not_decided(actor: Actor, tmp_path: Path) -> None:
     stages = (Stage(2, 1e-3, Acts(0.5, 0.2, "random"), warm_up=1),)
     before = actor.network.action_in_proj.weight.detach().clone()

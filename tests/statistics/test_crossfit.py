@@ -179,6 +179,7 @@ def test_every_fold_is_scored_at_the_site_that_its_own_inner_folds_choose() -> N
     assert fitted(stream).above[0] == pytest.approx((2 * 0.5 + 8 * 1.0) / 10 - 0.5)
 
 
+@pytest.mark.slow
 def test_without_signal_the_score_is_zero_on_average_however_high_the_peak() -> None:
     fits = [fitted(stream_of(drawn(seed, np.full(40, 0.5), 12), np.arange(40))) for seed in range(250)]
     assert abs(np.mean([fit.above[0] for fit in fits])) < 0.01
@@ -227,6 +228,7 @@ def test_with_one_site_the_variance_is_that_of_a_mean_over_groups() -> None:
     assert fit.covariance[0, 0] == pytest.approx(np.var(sums.sums[0] / 4, ddof=1) / 30)
 
 
+@pytest.mark.slow
 def test_the_variance_is_that_of_the_score_over_data_sets() -> None:
     fits = [fitted(backbone(seed), expert(seed + 1000, 0.15)) for seed in range(200)]
     actual = np.var([fit.above for fit in fits], axis=0, ddof=1)

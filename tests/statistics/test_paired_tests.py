@@ -277,6 +277,7 @@ def runs(tmp_path: Path) -> list[SaidRun]:
     return [*vlms, *policies]
 
 
+@pytest.mark.slow
 def test_gaps_are_one_family_over_categories_and_pairs_and_means_another(runs: list[SaidRun]) -> None:
     found = retention_table(runs, vlm_vla=True).vlm_vla
     assert len({(gap.group, gap.minus) for gap in found}) == 6

@@ -159,6 +159,7 @@ def test_a_name_that_is_a_file_and_a_folder_at_once_is_refused(packed: Path) -> 
 # -- sizes ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_zip_file_that_unpacks_to_a_thousand_times_its_size_is_refused(packed: Path) -> None:
     file = zipped(packed, ("runs/zeros", bytes(80 << 20)))
     assert file.stat().st_size < 1 << 20

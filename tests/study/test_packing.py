@@ -204,6 +204,7 @@ def test_an_upload_sends_every_file_once_and_tags_the_version(folder: Path, serv
     assert len(data_set_version(folder)) == 12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("failures", [[429], [0, 503]], ids=["too many requests", "cut connection"])
 def test_what_fails_for_now_is_tried_again(folder: Path, server: Hub, failures: list[int]) -> None:
     server.failures = list(failures)

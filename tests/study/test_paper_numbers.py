@@ -132,6 +132,7 @@ def test_8_of_204_cells_change_their_regime_between_episodes_and_items(
     assert different == derived["regimes_that_differ"]
 
 
+@pytest.mark.slow
 def test_46_of_48_means_of_left_and_right_are_the_printed_rate(tables: dict[str, Any]) -> None:
     other = {}
     for name, sides in tables["left_right"]["values"].items():

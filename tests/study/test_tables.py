@@ -247,6 +247,7 @@ def test_a_report_is_one_page_with_state_tables_figures_and_the_file(played: Loa
     assert "· dark is missing: not played yet" in page.read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_a_dry_run_finds_changed_bytes_and_runs_that_the_file_does_not_use(
     played: LoadedStudy, tmp_path: Path
 ) -> None:

@@ -166,6 +166,7 @@ def test_glyphs_are_at_least_a_fifth_of_the_tile() -> None:
     assert min(placement.scale for tile in tiles("counting", 120) for placement in tile.placements) >= 0.2
 
 
+@pytest.mark.slow
 def test_neither_ink_nor_glyph_size_gives_the_number_away() -> None:
     def spread(values: Sequence[float]) -> float:
         return max(values) / min(values)
@@ -235,6 +236,7 @@ def test_levels_are_a_good_way_apart_and_in_the_order_that_is_asked_for() -> Non
         assert 0 <= level["neg"] < level["pos"] <= 1
 
 
+@pytest.mark.slow
 def test_a_smaller_scale_never_makes_up_for_a_larger_level() -> None:
     """What is bigger must cover more of its tile, whatever its placement."""
     for couple in couples("attribute", 200):
@@ -244,6 +246,7 @@ def test_a_smaller_scale_never_makes_up_for_a_larger_level() -> None:
             assert ink[0] > 1.3 * ink[1]
 
 
+@pytest.mark.slow
 def test_the_two_states_of_a_thing_look_different() -> None:
     for thing in TWO_STATES:
         drawn = []

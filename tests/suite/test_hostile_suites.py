@@ -180,6 +180,7 @@ def test_text_gives_the_answer_away_if_a_layout_is_tied_to_it(embedded: Suite) -
     assert found["instruction"] == found["position"] == 0.5
 
 
+@pytest.mark.slow
 def test_folds_never_separate_layouts_or_twins(embedded: Suite, monkeypatch: pytest.MonkeyPatch) -> None:
     from probe_kit.suite import validate as baselines
 

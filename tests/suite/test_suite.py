@@ -277,6 +277,7 @@ def texts(item, layout="original"):
     return {name: None if episode is None else episode.item.instruction for name, episode in worded.items()}
 
 
+@pytest.mark.slow
 def test_an_item_is_asked_by_what_it_means_by_what_it_shows_by_where_it_lies_and_by_nothing(suite):
     item = of_category(suite, "color")
     found = texts(item)
@@ -368,6 +369,7 @@ def test_wordings_change_no_suites_identity(suite):
     assert suite.content_sha256_of(replace(item, wordings={}) for item in suite.items) == suite.content_sha256
 
 
+@pytest.mark.slow
 def test_no_plainer_words_name_a_side_though_a_right_triangle_is_drawn(tmp_path):
     drawn = build_suite(tmp_path / "color", ["color"], 60)
     triangles = [i for i in drawn.items if i.gen[i.correct_side]["outline"] == "right triangle"]

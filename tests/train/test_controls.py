@@ -115,6 +115,7 @@ def test_a_suite_that_keeps_the_answer_on_one_side_is_found_out(planted_run: Pla
     assert score.above_chance
 
 
+@pytest.mark.slow
 def test_controls_are_added_to_stored_probes_without_fitting_those_again(planted_run: PlantedRun) -> None:
     run = planted_run()
     first = train_probes(run, permutations=5, controls=("position",))
@@ -124,6 +125,7 @@ def test_controls_are_added_to_stored_probes_without_fitting_those_again(planted
     assert "instruction" in again.controls.of_category("color")
 
 
+@pytest.mark.slow
 def test_the_untrained_network_is_subtracted_per_site_and_per_peak(planted_run: PlantedRun) -> None:
     trained, untrained = planted_run({PLANTED: 2.0}), named(planted_run(), "random", random_weights=True)
     results = train_probes(trained, permutations=5, untrained=untrained)
@@ -215,6 +217,7 @@ def test_what_is_wrong_is_said_before_any_work_and_leaves_what_retention_reads(
     assert sorted(run.path.rglob("*")) == files
 
 
+@pytest.mark.slow
 def test_a_sweep_that_fails_late_leaves_finished_sites_and_no_probes(
     planted_run: PlantedRun, monkeypatch: pytest.MonkeyPatch
 ) -> None:

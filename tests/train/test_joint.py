@@ -159,6 +159,7 @@ def test_steps_that_go_too_far_are_halved_for_the_problems_that_make_them() -> N
     assert min(problems.evaluated[number] for number in sets[::2]) > often
 
 
+@pytest.mark.slow
 def test_a_feature_that_one_training_set_never_sees_vary_is_left_to_axes_of_its_own() -> None:
     features = NOISE + 0.2 * SIGNS
     held_out = np.isin(np.repeat(np.arange(60), COUNTS), FOLDS[0].outer.test)

@@ -525,6 +525,7 @@ def test_a_run_that_did_not_act_has_no_chosen_side(labelled_run: Path) -> None:
         Target.of_run(run, "side.chosen")
 
 
+@pytest.mark.slow
 def test_a_target_is_added_by_the_entry_that_contributing_shows(
     labelled_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

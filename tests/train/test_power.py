@@ -27,6 +27,7 @@ def test_without_a_signal_power_is_the_false_alarm_rate() -> None:
     assert max(found.chance, found.random_features, found.untrained) <= 0.05 + 3 * (0.05 * 0.95 / 200) ** 0.5
 
 
+@pytest.mark.slow
 def test_nothing_is_called_absent_with_many_items_and_hardly_with_few() -> None:
     """Whatever the signal of the stream that is tested."""
     few, many = simulate(24, 0.25, draws=40), simulate(300, 0.25, draws=20)

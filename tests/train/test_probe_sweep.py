@@ -71,6 +71,7 @@ def test_every_site_has_a_complete_row(planted_run: PlantedRun) -> None:
     assert len(best["C"].split()) == len(best["fold_accuracy"].split()) == 5
 
 
+@pytest.mark.slow
 def test_chosen_leaves_out_episodes_placed_nowhere(planted_run: PlantedRun) -> None:
     run = planted_run()
     results = train_probes(run, permutations=10, target="side.chosen")
@@ -117,6 +118,7 @@ def test_an_interrupted_sweep_continues_after_the_last_finished_site(planted_run
     assert not list((run.path / "probes").glob(".*"))
 
 
+@pytest.mark.slow
 def test_the_same_settings_are_read_back_and_others_are_fitted(planted_run: PlantedRun) -> None:
     run = planted_run()
     first = train_probes(run, permutations=2)

@@ -301,6 +301,7 @@ def decisions(samples: np.ndarray | torch.Tensor, labels: np.ndarray) -> np.ndar
     return np.stack([np.asarray(inside @ weights) for weights in path])
 
 
+@pytest.mark.slow
 @given(**SHAPES)
 @settings(max_examples=15, deadline=None)
 def test_labels_solved_together_equal_labels_solved_alone(count: int, width: int, seed: int) -> None:

@@ -318,6 +318,7 @@ def test_what_no_p_can_show_says_whether_permutations_or_groups_are_too_few(
     assert line.count(sentence.rpartition(": ")[2]) == 2, line
 
 
+@pytest.mark.slow
 def test_a_run_lists_its_probes_oldest_first_and_which_are_used(planted_run: PlantedRun) -> None:
     run = planted_run({Site("backbone", 1): 1.0})
     assert inventory(run).probes == ()

@@ -117,6 +117,7 @@ def test_a_suite_of_fewer_items_that_was_built_elsewhere_is_drawn_again(tmp_path
     assert suite_of(run).content_sha256 == suite.content_sha256
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("cache")
 def test_a_run_is_told_by_all_that_it_was_to_have_whatever_is_left_of_it(tmp_path: Path) -> None:
     """Unfinished, and in a wording that not every item has."""

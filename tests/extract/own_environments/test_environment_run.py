@@ -132,6 +132,7 @@ def test_what_does_not_fit_the_model_is_refused_before_anything_is_written(pi0_t
         prepare(settings().changed(model="expert"))
 
 
+@pytest.mark.slow
 def test_an_environment_that_fails_costs_its_episode_and_says_where(pi0_tiny: Pi0, tmp_path: Path) -> None:
     from probe_kit.errors import EpisodesFailedError
 
@@ -157,6 +158,7 @@ def test_options_of_scenes_and_recordings_are_refused_with_an_environment() -> N
     assert typed.most_inferences(4) == 3
 
 
+@pytest.mark.slow
 def test_a_run_of_more_than_64_gb_begins_with_yes_only(tmp_path: Path) -> None:
     """30,000 episodes of the released pi0, planned without its weights."""
     source = EnvSource(HOME + "ReachEnv", {"count": "30000"})  # type: ignore[arg-type]

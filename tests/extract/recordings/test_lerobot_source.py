@@ -269,6 +269,7 @@ def test_activations_are_those_of_the_model_itself_and_numbers_of_the_table_are_
     assert np.isfinite(results.scores["score"]).all()
 
 
+@pytest.mark.slow
 def test_yes_and_no_are_read_where_the_prompt_asks_for_them(home: Path) -> None:
     (home / "seen.txt").write_text("{instruction}. Do you see the cube? Answer yes or no.", encoding="utf-8")
     options, count = ASKED["pictures"]

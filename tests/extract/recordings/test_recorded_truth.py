@@ -519,6 +519,7 @@ def test_a_data_set_is_not_described_where_extract_would_refuse_it(
         shown_by_command({"instruction": "Put the cube on the red shape"}, copy)
 
 
+@pytest.mark.slow
 def test_a_data_set_in_other_units_is_shown_and_then_refused_unless_accepted(
     copy: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

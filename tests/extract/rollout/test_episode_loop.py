@@ -188,6 +188,7 @@ class Called(TorchDispatchMode):
         return [name for name in self.names if name in WAITING]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("with_tokens", [False, True])
 def test_capture_adds_nothing_to_an_inference_that_waits_for_the_device(
     pi0_tiny: Pi0, observation: Observation, with_tokens: bool

@@ -310,6 +310,7 @@ def test_the_stored_precision_is_kept(run_folder: Path, tmp_path: Path) -> None:
     assert load_internvla(str(copy), dtype="float32", unnorm_key="bridge_dataset").card.dtype == "float32"
 
 
+@pytest.mark.slow
 def test_a_converted_folder_is_whole_and_has_the_same_hash_and_actions(
     run_folder: Path, tmp_path: Path, observation: Observation
 ) -> None:

@@ -256,6 +256,7 @@ def test_pi0_fast_acts_as_lerobots_own_select_action(
     assert not ours.flagged.any()
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the model put out tokens")
 def test_pi0_fast_decodes_broken_chunks_as_lerobot_does_and_flags_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -176,6 +176,7 @@ def test_other_statistics_give_other_units_for_the_same_tokens(golden_openvla: P
     assert policies[0].card.settings["action_statistics"] != policies[1].card.settings["action_statistics"]
 
 
+@pytest.mark.slow
 def test_statistics_that_fine_tuning_wrote_are_found_beside_the_weights(folder: Path, tmp_path: Path) -> None:
     copy = Path(shutil.copytree(folder, tmp_path / "tuned"))
     mine = {"my_arm": {"action": {"q01": [-1.0] * 7, "q99": [1.0] * 7}}}

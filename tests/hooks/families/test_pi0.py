@@ -149,6 +149,7 @@ def seen() -> Observation:
     return Observation(image, state, "Put the cube on the red shape")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("openness", ["measured", "release"])
 def test_actions_are_those_of_the_bare_network_in_the_evaluations_units(
     folder: Path, statistics: Path, policy: Pi0, seen: Observation, openness: str

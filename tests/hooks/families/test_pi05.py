@@ -144,6 +144,7 @@ def test_the_weights_of_a_pi0_are_refused(folder: Path, tmp_path: Path) -> None:
         Pi05.load(str(tmp_path))
 
 
+@pytest.mark.slow
 def test_the_released_size_has_the_tensors_of_lerobots_policy() -> None:
     """On the meta device: gates add no parameter."""
     ours = network.full_size_pi05().state_dict()

@@ -328,6 +328,7 @@ def test_head_and_embedding_may_be_stored_as_one(untrained: Pi0Fast, tmp_path: P
     assert torch.equal(loaded[left_out], tensors[kept])
 
 
+@pytest.mark.slow
 def test_the_released_size_has_the_tensors_of_lerobots_policy(monkeypatch: pytest.MonkeyPatch) -> None:
     """On the meta device; lerobot's tokenizers are on the hub, and have no parameter."""
     for name in ("AutoProcessor", "AutoTokenizer"):

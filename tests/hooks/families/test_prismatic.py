@@ -228,6 +228,7 @@ def test_a_head_with_other_numbers_than_the_embedding_that_it_is_tied_to_is_refu
 # -- LoRA --------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_an_adapter_is_merged_exactly_where_it_belongs(base: Path, adapter: Path) -> None:
     """Every changed weight is W + (alpha / r) B A, computed here from the files."""
     merged, original = load(adapter).state_dict(), load_file(base / "model.safetensors")
@@ -364,6 +365,7 @@ def plain(folder: Path) -> Prismatic:
     return load_prismatic(str(folder))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("towers_inside", [False, True])
 def test_a_model_of_the_release_is_the_same_model(
     cache: Path, tmp_path: Path, observation: Observation, towers_inside: bool

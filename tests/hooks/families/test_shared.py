@@ -130,6 +130,7 @@ def test_draws_come_from_a_rows_own_seed_whatever_stands_beside_it() -> None:
     assert len({int(draw(row)[0]) for _ in range(20)}) > 1
 
 
+@pytest.mark.slow
 def test_draws_follow_the_distribution_among_the_likeliest() -> None:
     row = logits(1)
     draw = chooser(0.7, [5])
@@ -211,6 +212,7 @@ def test_files_under_the_names_of_todays_transformers_load_too(tmp_path: Path) -
     assert all(torch.equal(state[name], other[name]) for name in state)
 
 
+@pytest.mark.slow
 def test_nothing_stays_on_the_meta_device(tmp_path: Path) -> None:
     for family, write in (
         ("qwen2.5-vl", write_qwen2_5_vl), ("qwen3-vl", write_qwen3_vl), ("internvl", write_internvl),

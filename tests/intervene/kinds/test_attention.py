@@ -240,6 +240,7 @@ def test_it_is_marked_as_no_cause_and_enters_no_verdict(copy: Run, attention_rec
     assert set(stored_attention(copy)) == {"color"}
 
 
+@pytest.mark.slow
 def test_the_command_shows_a_table_json_and_csv(copy: Run, attention_records: InterventionResult) -> None:
     def ask(style: str) -> str:
         options = ["--kind", "attention", "--categories", "color", "--items", "2", "--format", style]

@@ -131,6 +131,7 @@ def test_no_combination_of_rate_streams_and_swap_lacks_a_word_or_a_number() -> N
         assert not re.search(r"None|–|nan|  |\.\.|;\.|: \.|\(\)|^; ", text), text
 
 
+@pytest.mark.slow
 def test_the_answer_is_named_before_a_pronoun_stands_for_it() -> None:
     for *_, row in ALL:
         text = describe_category(row)
@@ -139,6 +140,7 @@ def test_the_answer_is_named_before_a_pronoun_stands_for_it() -> None:
         assert pronoun is None or 0 <= named < pronoun.start(), text
 
 
+@pytest.mark.slow
 def test_each_effect_of_a_swap_has_its_own_words() -> None:
     words = {
         "follows": "the action follows a swap of the pictures in 92 % of episodes (net of reversals 60 to 100 %)",
@@ -172,6 +174,7 @@ def test_use_is_concluded_from_a_swap_and_knowledge_never_beside_an_interval_tha
             assert is_untested or verdict(row).split(",")[0] in ("absent", "not shown"), text
 
 
+@pytest.mark.slow
 def test_a_rate_that_is_no_knowledge_beside_an_interval_without_one_half_says_by_which_margin() -> None:
     said = {
         "little above": "66 %, 56 to 76, 16.0 points above one half, less than the 20.0 that guessing can reach",

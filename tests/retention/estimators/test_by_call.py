@@ -112,6 +112,7 @@ def test_aligned_accuracies_pool_the_calls_at_one_distance_from_the_event(
     assert (times.event, times.median, times.low, times.high, times.share) == ("grasp", 1.0, 0.0, 2.0, 1.0)
 
 
+@pytest.mark.slow
 def test_a_run_without_trajectories_has_curves_and_no_events(
     by_call: dict[int, ProbeResults], tmp_path: Path
 ) -> None:

@@ -404,6 +404,7 @@ def test_a_stream_whose_best_site_never_changes_is_scored_by_that_site(
     assert (low, high) == pytest.approx(tuple(wanted))
 
 
+@pytest.mark.slow
 def test_the_best_of_sites_that_guess_scores_one_half_where_its_peak_does_not(
     curve_of: CurveOf, outcome_table: Outcomes
 ) -> None:

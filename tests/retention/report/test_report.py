@@ -123,6 +123,7 @@ def test_a_report_without_runs_is_an_error() -> None:
         report_html([])
 
 
+@pytest.mark.slow
 def test_a_report_is_written_whole_and_replaces_an_older_one(tmp_path: Path, outcome_table: Any) -> None:
     run = plain_run(tmp_path / "run", outcome_table(6, 4, 2))
     path = tmp_path / "new" / "report.html"
@@ -260,6 +261,7 @@ def test_the_citation_names_weights_and_suite(probed_run: ProbedRun) -> None:
     assert "2606.19297" in bibtex
 
 
+@pytest.mark.slow
 def test_the_citation_of_recordings_names_neither_the_scene_nor_its_protocol(tmp_path: Path) -> None:
     sentence, bibtex = citation([write_recorded_run(tmp_path / "run")])
     assert "probe_kit" in sentence

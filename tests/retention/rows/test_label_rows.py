@@ -186,6 +186,7 @@ def trained(labelled_run: Path, tmp_path: Path) -> Run:
     return run
 
 
+@pytest.mark.slow
 def test_what_was_planted_in_the_backbone_alone_does_not_reach_the_action(trained: Run) -> None:
     table = retention_table([trained], target="sim.tool_y")
     (found,) = table.rows
@@ -206,6 +207,7 @@ def test_what_was_planted_in_the_backbone_alone_does_not_reach_the_action(traine
         retention_table([trained], ["last"], target="sim.tool_y")
 
 
+@pytest.mark.slow
 def test_the_command_prints_it_in_every_format_and_names_what_a_label_does_not_have(trained: Run) -> None:
     place = str(trained.path)
     for style in ("table", "json", "csv", "markdown", "latex"):
