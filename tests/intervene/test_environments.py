@@ -79,7 +79,7 @@ def test_the_first_action_of_every_episode_is_inferred_again_bit_for_bit(
 @pytest.mark.parametrize(
     ("intervention", "rows"),
     [
-        (ImageSwap(), 1),
+        pytest.param(ImageSwap(), 1, marks=pytest.mark.slow),
         pytest.param(InstructionSwap(), 1, marks=pytest.mark.slow),
         pytest.param(ImageSwap(vary="state"), 1, marks=pytest.mark.slow),
         (Interchange(sites=("backbone.01", "kv.*"), roles=("image",)), 4),

@@ -200,6 +200,7 @@ def test_iterations_get_darker_one_by_one(results: ProbeResults) -> None:
     assert (np.diff(lightness) < -5).all()
 
 
+@pytest.mark.slow
 def test_filled_and_open_markers_mean_the_same_in_every_figure(drawn: Drawn) -> None:
     """Wherever a line or point has an open marker, the legend says what that is, in the same words."""
     seen = 0

@@ -37,6 +37,7 @@ def archive(played: LoadedStudy, tmp_path_factory: pytest.TempPathFactory) -> Pa
     return out
 
 
+@pytest.mark.slow
 def test_every_table_is_the_same_from_the_archive_alone(
     played: LoadedStudy, archive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

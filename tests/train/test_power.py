@@ -22,6 +22,7 @@ def test_power_grows_with_items_and_with_the_signal() -> None:
     assert simulate(150, 0.25, draws=60).untrained > 0.9
 
 
+@pytest.mark.slow
 def test_without_a_signal_power_is_the_false_alarm_rate() -> None:
     found = simulate(60, 0.0, draws=200)
     assert max(found.chance, found.random_features, found.untrained) <= 0.05 + 3 * (0.05 * 0.95 / 200) ** 0.5

@@ -63,6 +63,7 @@ def weighed(attention_records: InterventionResult) -> AttentionShares:
     return AttentionShares.from_bytes(attention_records.measurement.read(ATTENTION_FILE))
 
 
+@pytest.mark.slow
 def test_it_is_what_the_policy_tells_by_block_iteration_and_head(
     session: ReplaySession, weighed: AttentionShares
 ) -> None:

@@ -109,6 +109,7 @@ def test_all_cells_but_one_are_the_other_cells_together(result: InterventionResu
     assert fires["every-cell"] == 4 * fires["alone|kv.00|image"] == 4 / 3 * fires["without|kv.00|image"]
 
 
+@pytest.mark.slow
 def test_it_is_stored_listed_and_shown(copy: Run, result: InterventionResult) -> None:
     rows = stored_joint_places(copy)["color"]
     assert [row.cells for row in rows if row.part == "cell"] == [
