@@ -86,6 +86,7 @@ def test_a_command_typed_again_plays_nothing_and_other_settings_in_its_folder_ar
     assert "seed" in refused.text
 
 
+@pytest.mark.slow
 def test_a_captured_run_has_activations_of_the_same_first_frames_and_no_success_rate(
     run: pk.Run, tmp_path: Path
 ) -> None:

@@ -110,6 +110,7 @@ def test_attribution_screens_places_and_patches_its_anchors_exactly(
     assert {row["place"] for row in rows if not row["is_anchor"]} >= {"kv.00", "kv.01", "kv.02"}
 
 
+@pytest.mark.slow
 def test_steering_without_strength_changes_nothing_and_with_it_moves_tokens_as_far_as_its_control(
     intervened: Path, answers: dict[str, Answer]
 ) -> None:
@@ -147,6 +148,7 @@ def test_an_erased_answer_is_compared_with_an_equally_large_random_subspace(
     assert control["right"] == 1
 
 
+@pytest.mark.slow
 def test_shares_of_attention_are_shares(intervened: Path, answers: dict[str, Answer]) -> None:
     rows = effects("attention", intervened, answers)
     shares = np.array([row["share"] for row in rows])
