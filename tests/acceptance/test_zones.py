@@ -41,9 +41,8 @@ def rules(run: pk.Run, *words: object) -> dict[str, Any]:
     return held
 
 
-@pytest.mark.parametrize(
-    ("model", "inside"), [("expert", "correct"), pytest.param("expert-mirrored", "wrong", marks=pytest.mark.slow)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("model", "inside"), [("expert", "correct"), ("expert-mirrored", "wrong")])
 def test_a_cube_is_placed_up_to_the_radius_and_not_beyond_it(model: str, inside: str, tmp_path: Path) -> None:
     run = stopped(tmp_path / "measured", SEVEN_CM, model=model)
     away = distances(run, mirrored=model == "expert-mirrored")

@@ -68,6 +68,7 @@ def test_another_environment_in_the_same_process_changes_nothing(env, reference)
     neighbour.close()
 
 
+@pytest.mark.slow
 def test_a_new_process_gives_the_same_episode(reference):
     command = [sys.executable, episode_digest.__file__, "3"]
     output = run(command, capture_output=True, encoding="utf-8", check=True).stdout

@@ -440,6 +440,7 @@ def every(count: int, ills: Sequence[str], method: str = "") -> Callable[[str, s
     return lambda kind, _path: next(turns) if kind.startswith(method) and next(asked) % count == 0 else None
 
 
+@pytest.mark.slow
 def test_what_a_server_does_now_and_then_changes_no_byte(
     server_suite: Suite, whole_run: dict[str, bytes], bad_server: BadServer
 ) -> None:

@@ -191,6 +191,7 @@ def test_without_a_name_all_tables_are_printed_and_their_tests_are_counted(
     assert run.invoke(app, ["study", "table", str(file)]).exit_code != 0
 
 
+@pytest.mark.slow
 def test_a_table_is_also_rows_of_csv_with_both_ends_of_intervals(played: LoadedStudy) -> None:
     run = CliRunner()
     numbers = make_table(played, "score").numbers
