@@ -99,6 +99,7 @@ def test_a_captured_run_has_activations_of_the_same_first_frames_and_no_success_
     assert np.array_equal(captured.column(LAST, "mean"), run.column(LAST, "mean")[rows])
 
 
+@pytest.mark.slow
 def test_asking_stores_the_answers_to_the_same_first_frames(run: pk.Run, tmp_path: Path) -> None:
     asked = probe_kit("ask", "--model", "vlm-tiny", *FEW, "--prompt", "p1,seen", "--out", tmp_path / "asked")
     folders = sorted(path for path in (tmp_path / "asked").iterdir() if path.is_dir())

@@ -193,6 +193,7 @@ def test_errors_of_predicted_actions_are_those_of_the_stored_numbers(shown: Path
     assert "NaN" not in json.dumps(rows)
 
 
+@pytest.mark.slow
 def test_a_recorded_number_is_decoded_with_the_recorded_action_as_a_control(shown: Path) -> None:
     probe_kit(
         *("train", shown, "--target", "dataset.state.s1", "--permutations", "5", "--task", "continuous"),
@@ -247,6 +248,7 @@ def test_episodes_of_an_environment_are_the_same_when_they_are_played_again(
     assert np.array_equal(again.column(LAST, "mean", 1), run.column(LAST, "mean", 1)[:2])
 
 
+@pytest.mark.slow
 def test_a_fact_of_the_environment_is_decoded(acted: Path) -> None:
     probe_kit(
         "train", acted, "--target", "env.left", "--permutations", "5", "--controls", "instruction,step,state"

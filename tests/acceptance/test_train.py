@@ -167,6 +167,7 @@ def test_a_label_of_a_users_table_is_decoded_by_its_task(
         assert scores["score"].min() >= 0
 
 
+@pytest.mark.slow
 def test_a_built_in_label_by_inference_is_decoded_beside_its_controls(played: Path) -> None:
     typed = ("--target", "sim.tool_y", "--permutations", "3", "--controls", ",".join(sorted(LABEL_CONTROLS)))
     text = probe_kit("train", played, *typed).text

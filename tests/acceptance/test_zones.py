@@ -56,6 +56,7 @@ def test_a_cube_is_placed_up_to_the_radius_and_not_beyond_it(model: str, inside:
         assert rules(scored)["sr_by_rule"]["disc"] == (expected == "correct"), "judged again from the trajectory"
 
 
+@pytest.mark.slow
 def test_radii_of_a_table_are_metres_from_the_middle_of_the_correct_picture(tmp_path: Path) -> None:
     run = stopped(tmp_path / "run", SEVEN_CM)
     assert run.episodes["distance_correct"].to_numpy() == pytest.approx(distances(run), abs=1e-6)
