@@ -20,7 +20,7 @@ from itertools import count
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, NoReturn
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator
 
 from probe_kit.errors import ActivationsLeftOutError, RunDamagedError, RunNotFoundError, UsageError
 from probe_kit.hashing import sha256_json
@@ -189,7 +189,15 @@ _CHUNKS = "/c/"
 """Between the name of an array and the position of a chunk in a key of Zarr v3."""
 
 
+def _distinct(names: list[str]) -> list[str]:
+    """The names. Raises ValueError if one stands twice."""
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise ValueError(f"{', '.join(twice)} stands twice; expected each name once")
+    return names
+
+
 _Count = Annotated[int, Field(gt=0)]
+_Names = Annotated[list[str], AfterValidator(_distinct)]
 
 
 class StreamEntry(BaseModel):
@@ -201,10 +209,10 @@ class StreamEntry(BaseModel):
     width: _Count
     iterations: _Count | None
     tokens: _Count = 1
-    views: list[str]
+    views: _Names
     part: Part | None
     label: str
-    quantities: list[str]
+    quantities: _Names
     probed: bool
     sums: bool
 
@@ -218,6 +226,12 @@ class Card(Record):
     settings_sha256: str
     streams: list[StreamEntry]
     objects: Sums
+
+    @field_validator("streams")
+    @classmethod
+    def _check_names(cls, streams: list[StreamEntry]) -> list[StreamEntry]:
+        _distinct([stream.name for stream in streams])
+        return streams
 
 
 class LeftOut(Record):

@@ -7,9 +7,10 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from hashlib import blake2b
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -138,6 +139,28 @@ def test_a_run_of_another_schema_is_refused_by_its_schema(tmp_path: Path, schema
     (tmp_path / "run.json").write_bytes(as_record(card) if with_hash else json.dumps(card).encode())
     with pytest.raises(RunDamagedError, match=rf"run\.json has schema {schema}; .* reads schema 6"):
         read_root(locate(tmp_path))
+
+
+def name_a_stream_twice(streams: list[dict[str, Any]]) -> None:
+    streams.append(streams[0])
+
+
+def name_a_view_twice(streams: list[dict[str, Any]]) -> None:
+    streams[0]["views"].append(streams[0]["views"][0])
+
+
+@pytest.mark.parametrize("change", [name_a_stream_twice, name_a_view_twice])
+def test_a_name_that_stands_twice_in_a_card_is_refused_though_its_hash_is_right(
+    change: Callable[[list[dict[str, Any]]], None], little_runs: Path, tmp_path: Path
+) -> None:
+    """Of two arrays of one name, only one could be read."""
+    run = Path(shutil.copytree(little_runs / "run", tmp_path / "run"))
+    card = json.loads((run / "run.json").read_text(encoding="utf-8"))
+    del card[HASH]
+    change(card["streams"])
+    (run / "run.json").write_bytes(as_record(card))
+    with pytest.raises(RunDamagedError, match=r"run\.json .* stands twice"):
+        open_run(run)
 
 
 @pytest.mark.parametrize("error", [errno.ENOSPC, errno.EDQUOT, errno.EFBIG])
