@@ -257,7 +257,6 @@ def assert_no_traceback(run: Path, path: Path, cases: list[tuple[str, bytes]]) -
     assert not wrong, "\n".join(wrong)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("pattern", RECORDS)
 def test_a_malformed_record_with_a_right_hash_is_damage_and_no_traceback(run: Path, pattern: str) -> None:
     path = the_record(run, pattern)
@@ -265,7 +264,6 @@ def test_a_malformed_record_with_a_right_hash_is_damage_and_no_traceback(run: Pa
     assert_no_traceback(run, path, Random(pattern).sample(cases, 6))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("pattern", RECORDS)
 def test_no_malformed_record_with_a_right_hash_ends_in_a_traceback(run: Path, pattern: str) -> None:
     path = the_record(run, pattern)
@@ -311,12 +309,10 @@ def assert_none_is_silent(stored: Stored, seeds: range) -> None:
     assert not wrong, "\n".join(wrong)
 
 
-@pytest.mark.slow
 def test_no_changed_byte_of_a_real_run_is_silent(real: Stored) -> None:
     assert_none_is_silent(real, range(30))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("start", range(0, 2000, 100))
 def test_two_thousand_changed_bytes_of_a_real_run_are_not_silent(real: Stored, start: int) -> None:
     assert_none_is_silent(real, range(start, start + 100))

@@ -237,7 +237,6 @@ def test_reasons_of_failures_are_protected(run: Path) -> None:
 # -- pictures ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_whoever_wants_no_pictures_may_delete_all_of_them(run: Path, little_runs: Path) -> None:
     shutil.rmtree(run / "frames")
     assert read_thumbnail(run, 0) is None
@@ -290,7 +289,6 @@ def test_probes_of_activations_that_are_no_more_are_found(run: Path) -> None:
         load_results(open_run(run))
 
 
-@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*is not sealed")
 def test_an_interrupted_sweep_is_continued_only_from_what_it_left(run: Path) -> None:
     opened = open_run(run)
@@ -375,7 +373,6 @@ def test_a_pipe_or_a_device_in_the_place_of_a_file_is_not_waited_for(run: Path, 
 # -- nothing -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 def test_copies_that_lie_about_change_nothing_and_are_named(run: Path, little_runs: Path) -> None:
     (settings,) = (run / "sealed").iterdir()
     probes = stored_probes(run)[0]
@@ -411,6 +408,5 @@ def test_no_file_of_a_run_is_without_protection(little_runs: Path) -> None:
     assert unprotected(open_run(little_runs / "run")) == set()
 
 
-@pytest.mark.slow
 def test_no_file_of_a_real_run_is_without_protection(recorded_run: Run) -> None:
     assert unprotected(recorded_run) == set()

@@ -73,7 +73,6 @@ def test_nothing_moved_and_the_run_says_so(capture_run: Run) -> None:
     assert capture_run.certificate["hooks_on_equals_hooks_off"]
 
 
-@pytest.mark.slow
 def test_success_rates_are_not_there_in_any_table(capture_run: Run, recorded_run: Run, tmp_path: Path) -> None:
     table = retention_table([capture_run, recorded_run])
     rows = [row for row in json.loads(table.to_json()) if row["run"]["capture_only"]]
@@ -122,7 +121,6 @@ def test_a_checkpoint_of_another_arm_is_refused_for_acting_with_the_way_out(
         prepare(settings)
 
 
-@pytest.mark.slow
 def test_a_checkpoint_of_another_arm_is_captured(base: Path, small_suite: Suite, tmp_path: Path) -> None:
     settings = ExtractSettings(
         "pi0", str(base), suite=small_suite.folder, categories=("color",), items=2, capture_only=True, batch=3

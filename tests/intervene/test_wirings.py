@@ -235,7 +235,6 @@ def test_what_opposes_the_effect_is_read_too(wired: WiredSession) -> None:
     assert describe_remainder(list(rows.values())) == "opposed at kv.02 language"
 
 
-@pytest.mark.slow
 def test_what_acts_against_the_answer_reads_it_where_all_others_do(wired: WiredSession) -> None:
     """Joint places, screens and sweeps test the direction that the swap itself takes."""
     rows = joint(wired, "against")
@@ -303,7 +302,6 @@ def tie_of(session: WiredSession, name: str, layer: int, called: str = "mean-dif
     return tie_at_site(layer[0], [row for row in along if not row.is_control], layer)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "ties"),
     [

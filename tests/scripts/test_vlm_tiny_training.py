@@ -42,7 +42,6 @@ def pairs(banks: list[PictureBank]) -> Pairs:
     return Pairs(banks, {"color": 0.5, "state": 0.5})
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("preset", PRESETS)
 def test_a_painted_first_frame_looks_like_a_rendered_one(preset: str, surfaces: dict[str, Surface]) -> None:
     env = Act2AnswerEnv(SceneSpec.preset(preset))

@@ -241,7 +241,6 @@ drift = "training"
 KNOWN_TRUTH = {"color": "kept", "state": "kept", "traffic": "forgotten", "counting": "not shown in either"}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_training_keeps_what_it_used_and_forgets_traffic(seed: int, tmp_path: Path) -> None:
     suite = build_suite(tmp_path / "suite", list(KNOWN_TRUTH), items_per_category=24, seed=seed)
@@ -335,7 +334,6 @@ categories = ["color"]
 """
 
 
-@pytest.mark.slow
 def test_a_file_names_pairs_and_an_archive_prints_their_table_without_activations(tmp_path: Path) -> None:
     file = tmp_path / "study.toml"
     file.write_text(TEXT.format(out=tmp_path / "out"), encoding="utf-8")

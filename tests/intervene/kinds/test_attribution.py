@@ -79,7 +79,6 @@ def test_a_screen_is_void_where_a_decision_has_no_slope(wired: WiredSession, nam
     assert said in str(AttributionPatching.table(rows, context(found)).title)
 
 
-@pytest.mark.slow
 def test_nothing_is_ordered_where_the_swap_moves_nothing(wired: WiredSession) -> None:
     rows = AttributionPatching.effects(screened(wired, "noise"))
     assert {(row.finding, row.rank, row.estimate) for row in rows} == {("n/a", None, None)}
@@ -107,7 +106,6 @@ def test_cells_are_ordered_among_their_kind_alone() -> None:
     ]  # fmt: skip
 
 
-@pytest.mark.slow
 def test_both_ends_are_the_mean_of_two_gradients(wired: WiredSession) -> None:
     """Where the action is linear they are one."""
     clean, both = (

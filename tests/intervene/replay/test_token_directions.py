@@ -128,7 +128,6 @@ def test_they_are_the_leading_differences_of_class_means_of_the_other_folds(
     np.testing.assert_allclose(control @ basis.T, 0, atol=1e-5)
 
 
-@pytest.mark.slow
 def test_tokens_are_taken_over_along_them_and_along_controls(
     copy: Run, source: ReplaySource, twin: "Policy"
 ) -> None:
