@@ -11,7 +11,7 @@ from probe_kit._terminal import options as common
 from probe_kit._terminal.console import counter, err, marked, out, print_json, progress, say
 from probe_kit._terminal.field_options import command_with
 from probe_kit._terminal.options import Names, read_size
-from probe_kit.errors import UsageError
+from probe_kit.errors import DiskSpaceError, UsageError
 from probe_kit.extract.config_files import read_config
 from probe_kit.extract.parts import stored_option
 from probe_kit.extract.settings import AskSettings, ExtractSettings
@@ -206,7 +206,6 @@ def _units(settings: "Settings") -> str:
 
 def check_size(extraction: "Extraction", location: "Location", agreed: bool) -> None:
     """Raise DiskSpaceError for more than 64 GB, unless that was agreed to."""
-    from probe_kit.errors import DiskSpaceError
     from probe_kit.extract.plan import space_needed
     from probe_kit.runs.run_folders import in_units
 

@@ -14,7 +14,7 @@ from probe_kit._terminal.console import err, marked, out, print_json, print_text
 from probe_kit._terminal.field_options import command_with
 from probe_kit._terminal.options import LISTED, AsJson, Names, Partial, RunFolder, check_no_others
 from probe_kit.errors import UsageError
-from probe_kit.extract.parts import ActMachine, ModelSettings
+from probe_kit.extract.parts import SCRIPTED, ActMachine, ModelSettings
 from probe_kit.extract.settings import ExtractSettings
 from probe_kit.extract.sources.environment import EnvOptions
 from probe_kit.extract.sources.recording import LeRobotSource
@@ -81,7 +81,6 @@ def models(
 
 
 def _print_words(name: str | None, run: str | None, as_json: bool) -> None:
-    from probe_kit.extract.parts import SCRIPTED
     from probe_kit.hooks.registry import find_family, own_families
 
     check_no_others({"--run": run is not None}, "--words")
@@ -122,7 +121,6 @@ def _ready(family: "Family") -> str:
 
 
 def _model_rows(name: str | None) -> list[dict[str, Any]]:
-    from probe_kit.extract.parts import SCRIPTED
     from probe_kit.extract.plan import weights_needed
     from probe_kit.hooks.registry import find_family, own_families, third_party_families
 

@@ -6,11 +6,12 @@ option of the command line, and study files have the same fields.
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
 from functools import partial
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import typer
-from pydantic import BeforeValidator, Field, PlainSerializer
+from pydantic import BeforeValidator, Field, PlainSerializer, TypeAdapter
 
 from probe_kit._terminal import options as common
 from probe_kit._terminal.console import whole_number
@@ -373,15 +374,11 @@ class AskMachine(Machine):
 
 
 def _plain_scene(scene: Any) -> dict[str, Any]:
-    from dataclasses import asdict
-
     return asdict(scene)
 
 
 def _scene(value: Any) -> Any:
     """A scene from what a file has of it; one that is a scene is returned as it is."""
-    from pydantic import TypeAdapter
-
     from probe_kit.env import SceneSpec
 
     return value if isinstance(value, SceneSpec) else TypeAdapter(SceneSpec).validate_python(value)

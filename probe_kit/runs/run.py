@@ -505,7 +505,7 @@ class Run:
     def judged(self, rule: str, last_steps: int = 1) -> pd.DataFrame:
         """A row per episode with the fields of `Judgement`: what an outcome rule says of it.
 
-        rule: a name of `probe_kit.env.scoring.rules.RULES`. last_steps: control steps at the end that count; the
+        rule: a name of `probe_kit.env.scoring.RULES`. last_steps: control steps at the end that count; the
         released evaluation averages over 11. Raises UsageError for an unknown rule, NoTrajectoryError.
         """
         if last_steps == 1:
@@ -523,7 +523,7 @@ class Run:
 
     @cached_property
     def behaviour(self) -> pd.DataFrame:
-        """A row per episode: its id, then what hand and cube did, see `probe_kit.env.scoring.behaviour`.
+        """A row per episode: its id, then what hand and cube did, see `probe_kit.env.scoring.Behaviour`.
 
         Raises NoTrajectoryError if the run keeps no trajectories.
         """

@@ -3,7 +3,7 @@
     data.zarr/trajectory   float32 (episode, frame, channel); frames behind the end of an episode are not numbers
 
 One array beside the streams, one chunk per episode, named in the episode's commit. Frames and channels are
-those of `probe_kit.env.scoring.trajectory`.
+those of `probe_kit.env.scoring.Trajectory`.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence

@@ -7,7 +7,7 @@ weights, wordings and suite.
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import chain, combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -89,18 +89,19 @@ def check_same_weights(runs: Sequence[tuple[Cell, "Run"]]) -> None:
 
 def differences(run: "Run", cell: Cell) -> Iterator[str]:
     """Yield the settings in which a run is not one of `cell`, in words, stored value first."""
-    changes = [
-        *changed_settings(run.root.own_settings, cell),
-        ("wordings", list(run.wordings), list(cell.settings.wordings or ())),
-        *_weights(run, cell),
-    ]
+    changes = chain(
+        changed_settings(run.root.own_settings, cell),
+        [("wordings", list(run.wordings), list(cell.settings.wordings or ()))],
+        _weights(run, cell),
+    )
     for name, stored, expected in changes:
         if stored != expected:
             yield f"{name}: stored {_short(stored)}, expected {_short(expected)}"
-    contents = cell.suite.contents  # empty where they are not known
+    contents = cell.suite.contents
+    if not contents:  # they are not known, and the run's items are not read
+        return
     hashes = dict(zip(run.items["item_id"], run.items["content_sha256"], strict=True))
-    changed = [name for name, content in hashes.items() if contents and contents.get(name) != content]
-    if changed:
+    if changed := [name for name, content in hashes.items() if contents.get(name) != content]:
         state = "changed" if changed[0] in contents else "is not in the suite"
         yield f"item {changed[0]!r} {state} since it was played ({len(changed)} of {len(hashes)} items)"
 

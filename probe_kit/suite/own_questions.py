@@ -18,13 +18,12 @@ from probe_kit.suite.categories import check_slug
 from probe_kit.suite.items import Item, Side, instruction_for, side_words, with_groups
 from probe_kit.suite.manifest import check_foreign_folder, save_suite
 from probe_kit.suite.pictures import RESTORE, load_picture
-from probe_kit.suite.rules import LOADING_RULES, listing, pictures_unchanged
+from probe_kit.suite.rules import LOADING_RULES, SIDES, listing, pictures_unchanged
 from probe_kit.suite.suite import Picture, Suite, make_item, new_suite, squared_picture
 
 COLUMNS = ("instruction", "correct", "wrong")
 FURTHER = ("group", "category", "object", "other_object")
 DEFAULT_CATEGORY = "questions"
-_SIDES: tuple[Side, Side] = ("left", "right")
 
 
 @dataclass(frozen=True)
@@ -183,7 +182,7 @@ def suite_from_pictures(
         left, right = both if number % 2 == 0 else both[::-1]
         content = sorted((phrase, picture.pixels_sha256) for picture, phrase in both)
         pair_id = questions.pair_id(pair.category, content)
-        for side, correct, wrong in zip(_SIDES, (left, right), (right, left), strict=True):
+        for side, correct, wrong in zip(SIDES, (left, right), (right, left), strict=True):
             instruction = instruction_for(correct[1], "the")
             questions.ask(f"{pair_id}-{side}", pair_id, pair.category, instruction, "the", side, correct, wrong)
     return questions.save({"pairs": len(pairs)})

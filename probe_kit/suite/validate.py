@@ -27,7 +27,7 @@ from probe_kit.statistics.folds import OUTER_FOLDS, assign_folds
 from probe_kit.statistics.intervals import Accuracy
 from probe_kit.statistics.significance import chance_margin
 from probe_kit.suite.categories import CATEGORIES, OWN_DOMAIN, category_of
-from probe_kit.suite.items import Episode, Item, Side, counterparts_of
+from probe_kit.suite.items import Episode, Item, counterparts_of
 from probe_kit.suite.manifest import read_suite
 from probe_kit.suite.pictures import NEAR_DUPLICATE_BITS, Look, load_picture, look_of
 from probe_kit.suite.rules import DECODING_RULES, SIDES, Finding, listing, warning
@@ -211,7 +211,6 @@ _THUMBNAIL = 32
 _TREES = 60
 _WORD_BUCKETS = 256
 _INK_SUM_STEP = 60
-_SIDES: tuple[Side, Side] = ("left", "right")
 
 Array = npt.NDArray[np.float64]
 Labels = npt.NDArray[np.bool_]  # True where the correct picture lies left
@@ -324,11 +323,9 @@ def _groups(episodes: Sequence[Episode]) -> tuple[npt.NDArray[np.str_], str]:
 
 def _both_sides(episodes: Sequence[Episode], describe: Callable[[Image.Image], Array]) -> Array:
     """Return the values of `describe` for the left and then the right picture of every episode."""
-    paths = {episode.picture(side) for episode in episodes for side in _SIDES}
+    paths = {episode.picture(side) for episode in episodes for side in SIDES}
     described = {path: describe(load_picture(path)) for path in paths}
-    return np.array(
-        [np.concatenate([described[episode.picture(side)] for side in _SIDES]) for episode in episodes]
-    )
+    return np.array([np.concatenate([described[episode.picture(side)] for side in SIDES]) for episode in episodes])
 
 
 def _pixels(episodes: Sequence[Episode]) -> Array:

@@ -72,8 +72,6 @@ def factory_of(name: str) -> Callable[..., Any]:
     """
     module, colon, attribute = name.partition(":")
     if module == LEROBOT and colon:
-        from functools import partial
-
         from probe_kit.extract.sources.lerobot_env import LeRobotEnvironment
 
         return partial(LeRobotEnvironment, attribute)
@@ -396,8 +394,6 @@ class EnvironmentSource(Source[EnvSource]):
 
     def example(self, instruction: str) -> Observation:
         """The first observation with a blank picture."""
-        from dataclasses import replace
-
         assert self.seen is not None
         return replace(self.seen, image=np.zeros_like(self.seen.image), instruction=instruction)
 

@@ -39,10 +39,10 @@ class SourceSettings(Part):
     kind: the name of the source in files. opens: MODULE:CLASS of the `Source`, which is imported when it is
     opened. command: the option that a command names it with; empty for the scene. shows: the reason why options of
     other sources do not apply. subject, loads: what its options are about, and what is loaded of it, in words.
-    decides: fields of other parts that are the source's
-    own. refuses: fields of other parts that do not apply, some with the only value that does not. moves: fields
-    that a later command may give anew, with what it says of them, because a file or module lies elsewhere. played:
-    the word before the name in a run's label; empty for a label without it.
+    decides: fields of other parts that are the source's own. refuses: fields of other parts that do not apply,
+    some with the only value that does not. moves: fields that a later command may give anew, with what it says of
+    them, because a file or module lies elsewhere. played: the word before the name in a run's label; empty for a
+    label without it.
     """
 
     kind: str
