@@ -242,6 +242,9 @@ def _cells(finding: Finding) -> tuple[Cell | str, ...]:
     )  # fmt: skip
 
 
+# -- the demo ----------------------------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True)
 class Size:
     """The extent of a demo. items: per category; permutations: of the labels, for the probes."""

@@ -204,25 +204,25 @@ def _units(settings: "Settings") -> str:
     return "" if family is None else family.whose_units(model.checkpoint, model.options, fetch=False)
 
 
-def check_size(extraction: "Extraction", location: "Location", agreed: bool) -> None:
-    """Raise DiskSpaceError for more than 64 GB, unless that was agreed to."""
-    from probe_kit.extract.plan import space_needed
-    from probe_kit.runs.run_folders import in_units
-
-    needed = sum(space_needed(extraction.further_plan(location), extraction.settings).values())
-    if needed > LARGE and not agreed:
-        raise DiskSpaceError(
-            f"{location} would take up to {in_units(needed)}; more than {in_units(LARGE)} is written with --yes "
-            "only. Choose fewer episodes, inferences (--captured-calls) or frames (--select every:N), leave "
-            "--tokens all out, or add --yes"
-        )
-
-
 def _acts(identity: Mapping[str, Any], subject: str) -> str:
     """Return why a model does not act. subject: of the source."""
     reasons = {"recordings": "recorded frames are shown", "pictures": "pictures are shown"}
     reason = reasons.get(subject, "only captured, once per episode")
     return f"no: {reason}; no success rate" if identity.get("capture_only") else ""
+
+
+def _protocol(identity: Mapping[str, Any]) -> str:
+    if "protocol" not in identity:
+        return ""
+    protocol = identity["protocol"]
+    changed = ", ".join(f"{name}={run} instead of {was}" for name, (was, run) in protocol["deviations"].items())
+    name = " ".join(filter(None, (protocol["name"], protocol.get("variant"))))
+    return name + (f", but {changed}" if changed else ", as released")
+
+
+def _describe(stored: Any) -> str:
+    steps = f" x {stored.iterations} iterations" if stored.iterations else ""
+    return f"{stored.name} {stored.layers} layers{steps} x {stored.tokens} tokens x {stored.width}"
 
 
 def print_sufficiency(extraction: "Extraction") -> None:
@@ -248,18 +248,18 @@ def print_sufficiency(extraction: "Extraction") -> None:
     err.print(table)
 
 
-def _protocol(identity: Mapping[str, Any]) -> str:
-    if "protocol" not in identity:
-        return ""
-    protocol = identity["protocol"]
-    changed = ", ".join(f"{name}={run} instead of {was}" for name, (was, run) in protocol["deviations"].items())
-    name = " ".join(filter(None, (protocol["name"], protocol.get("variant"))))
-    return name + (f", but {changed}" if changed else ", as released")
+def check_size(extraction: "Extraction", location: "Location", agreed: bool) -> None:
+    """Raise DiskSpaceError for more than 64 GB, unless that was agreed to."""
+    from probe_kit.extract.plan import space_needed
+    from probe_kit.runs.run_folders import in_units
 
-
-def _describe(stored: Any) -> str:
-    steps = f" x {stored.iterations} iterations" if stored.iterations else ""
-    return f"{stored.name} {stored.layers} layers{steps} x {stored.tokens} tokens x {stored.width}"
+    needed = sum(space_needed(extraction.further_plan(location), extraction.settings).values())
+    if needed > LARGE and not agreed:
+        raise DiskSpaceError(
+            f"{location} would take up to {in_units(needed)}; more than {in_units(LARGE)} is written with --yes "
+            "only. Choose fewer episodes, inferences (--captured-calls) or frames (--select every:N), leave "
+            "--tokens all out, or add --yes"
+        )
 
 
 def _next_command(run: "Run") -> str:
@@ -292,6 +292,9 @@ def _print_outcomes(run: "Run") -> None:
     print_input_notes(run)
     say(marked("next: [bold]{}[/]", _next_command(run)))
     out.print(str(run.location), soft_wrap=True)
+
+
+# -- ask ---------------------------------------------------------------------------------------------------------
 
 
 OWN_SCENE = frozenset(SceneOptions.model_fields) - {"scene"} | {"wordings"}

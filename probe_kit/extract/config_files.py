@@ -130,6 +130,9 @@ def _check_there(run: "Run", field: str, path: Path, flag: str | None) -> None:
         raise UsageError(f"{run.location} was made of {path}, its {field}, which is not here any more. {again}")
 
 
+# -- moved parts of a source -------------------------------------------------------------------------------------
+
+
 _PANEL = "Source that was moved"
 
 

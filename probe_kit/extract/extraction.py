@@ -367,6 +367,9 @@ def _plan(
     )
 
 
+# -- workers -----------------------------------------------------------------------------------------------------
+
+
 def play(prepared: Extraction, writer: RunWriter[Plan], numbers: list[int]) -> Generator[Event]:
     """Play episodes where the settings say; yields `Done` of each, or `Failed` once it is given up.
 
@@ -443,6 +446,9 @@ def _failure(writer: RunWriter[Plan], given_up: list[Failed], committed: int) ->
         where = f" (traceback in {writer.location}/{failure_key(failed.number)})" if failed.traceback else ""
         error.add_note(f"{writer.plan.episode(failed.number).episode_id}: {failed.reason}{where}")
     return error
+
+
+# -- from settings to a run --------------------------------------------------------------------------------------
 
 
 def prepare(

@@ -168,6 +168,9 @@ def _model_rows(name: str | None) -> list[dict[str, Any]]:
     return rows
 
 
+# -- runs --------------------------------------------------------------------------------------------------------
+
+
 run_app = typer.Typer(help="Inspect, verify, copy and export runs.", no_args_is_help=True)
 DAMAGED = 1
 
@@ -269,6 +272,9 @@ def export(
     with err.status("exporting"):
         written = export_run(location, style, target, partial, sites=sites, view=view, dtype=dtype, seed=seed)
     out.print(str(written), soft_wrap=True)
+
+
+# -- data sets and environments ----------------------------------------------------------------------------------
 
 
 FAILED = 1

@@ -65,6 +65,9 @@ class Plan:
         return sum(len(stream.stream.sites()) for stream in self.streams)
 
 
+# -- disk space and memory ---------------------------------------------------------------------------------------
+
+
 EPISODE = 40_000
 """Bytes of an episode's commit, trajectory and files of the file system (measured: 12 to 30 kB)."""
 THUMBNAILS = 15_000
@@ -196,9 +199,9 @@ def weights_needed(
     """Memory for the weights and the size of a download, in words; empty for a model that declares no size.
 
     Of the checkpoint's configuration where it is here, else of the released size. dtype: None for both.
-    parameters: of a model that is loaded; None for one that is not. No network
-    is asked: a download is counted from the index of the weights in the cache, else estimated from the number of
-    parameters, whose stored precision is not known.
+    parameters: of a model that is loaded; None for one that is not. No network is asked: a download is counted
+    from the index of the weights in the cache, else estimated from the number of parameters, whose stored
+    precision is not known.
     """
     from probe_kit.hooks.registry import get_family
     from probe_kit.runs.run_folders import in_units

@@ -117,6 +117,9 @@ def _absent(item: Item, items: Sequence[Item], seed: int) -> Phrase | None:
     return Phrase(*listed[derive_seed(seed, "absent", item.item_id) % len(listed)])
 
 
+# -- templates ---------------------------------------------------------------------------------------------------
+
+
 Order = Literal["original", "swapped"]
 """Which side is named first: left, or right."""
 ORDERS: tuple[Order, Order] = ("original", "swapped")
@@ -230,6 +233,9 @@ def find_template(name: str) -> Template:
     except UnicodeDecodeError:
         raise UsageError(f"{path} is not UTF-8 text; write the prompt as plain text with {{object}}") from None
     return Template(re.sub(r"[^\w-]+", "-", path.stem), text.rstrip("\n"))
+
+
+# -- pictures side by side ---------------------------------------------------------------------------------------
 
 
 GREY = (128, 128, 128)

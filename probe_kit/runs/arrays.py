@@ -217,6 +217,9 @@ def inner_chunks(shard: bytes, count: int) -> list[slice]:
     return [*chunk_slices(shard[index]), index]
 
 
+# -- rows --------------------------------------------------------------------------------------------------------
+
+
 Spans = Sequence[tuple[str, int, int]]
 _BLOCK_BYTES = 1 << 24
 """Rows that are read in order come this many bytes at a time: beginning a request takes longer than reading."""
@@ -316,6 +319,9 @@ def token_blocks(rows: Rows, at: tuple[int, ...], mask: NDArray[np.bool_], block
             # Not a product: padding may hold NaN or infinity, and NaN times 0 is NaN.
             values[position] = np.where(block_mask[position, :, None], decode_bfloat16(bits), 0)
         yield TokenBlock(start, values, block_mask)
+
+
+# -- inputs of recorded frames -----------------------------------------------------------------------------------
 
 
 _TYPES = {"columns": "float64", "pixels": "uint8"}

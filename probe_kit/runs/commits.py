@@ -201,6 +201,9 @@ def stamp_of(commits: Mapping[int, Commit]) -> str:
     return sha256_json([[number, commits[number].hash] for number in sorted(commits)])
 
 
+# -- failures ----------------------------------------------------------------------------------------------------
+
+
 def write_failure(root: Root, number: int, reason: str, traceback: str = "") -> None:
     """Record why an episode was given up. traceback: of its error, empty if its process died."""
     failure = Failure(
@@ -233,6 +236,9 @@ def read_failures(root: Root) -> dict[str, str]:
         failure = Failure.parse(raw, f"{root.location}/{key}", advice, **expected)
         reasons[failure.episode_id] = failure.reason
     return reasons
+
+
+# -- seconds -----------------------------------------------------------------------------------------------------
 
 
 _ADVICE = f"Restore it from a copy, or delete the folder {TIMES}: no other number comes from it"

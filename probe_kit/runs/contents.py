@@ -138,6 +138,9 @@ def _expected(key: str) -> bool:
     )
 
 
+# -- copies without activations ----------------------------------------------------------------------------------
+
+
 def copy_run(
     path: Path | str | Location,
     out: Path | str | Location,

@@ -128,6 +128,9 @@ def _digest(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
+# -- all that was stored -----------------------------------------------------------------------------------------
+
+
 def _arrays(run: Run) -> Iterator[tuple[str, str, Rows]]:
     """Stream, kind and rows of every array of the run."""
     tokens: tuple[ArrayKind, ...] = ("tokens",) if run.settings["tokens"] == "all" else ()
@@ -251,6 +254,9 @@ def _write_header(file: BinaryIO, header: dict[str, Any]) -> None:
     file.write(len(text).to_bytes(8, "little") + text)
 
 
+# -- a LeRobotDataset --------------------------------------------------------------------------------------------
+
+
 CAMERA = "observation.images.scene"
 EPISODES = "probe_kit_episodes.csv"
 """In `meta`: a row per episode of the data set with all that the run says of it; lerobot does not read it."""
@@ -329,6 +335,9 @@ def _control_rate(run: Run) -> float:
     return float(scene["physics"]["rate"] / scene["physics"]["substeps"])
 
 
+# -- directions --------------------------------------------------------------------------------------------------
+
+
 def write_class_means(run: Run, choices: Sequence[StreamChoice], file: Path) -> None:
     """Write half the difference of the means of left and right, per category, view and site, of all episodes.
 
@@ -358,6 +367,9 @@ def write_class_means(run: Run, choices: Sequence[StreamChoice], file: Path) -> 
     if not vectors:
         raise UsageError(f"{run.location}: the means of left and right are equal at all of these sites")
     write_directions(file, vectors, about)
+
+
+# -- the formats -------------------------------------------------------------------------------------------------
 
 
 LEROBOT: ExportFormat = "lerobot"

@@ -207,6 +207,9 @@ def _token_blocks(rows: Rows, choice: StreamChoice, position: int, spans: Sequen
         yield Block(choice, position, inference, view, tokens, roles, values)
 
 
+# -- Parquet -----------------------------------------------------------------------------------------------------
+
+
 KEYS = ("episode_id", "item_id", "group_id", "category", "layout", "side_correct", "outcome", "source_episode")
 """Columns of the episodes that say where a vector is from; a run has some of them."""
 NUMBERS = ("source_episode",)
@@ -282,6 +285,9 @@ def _table(block: Block, origins: Origins, schema: Any) -> Any:
     ends = np.arange(0, (sites * count + 1) * width, width, dtype=np.int32)
     columns["vector"] = pa.ListArray.from_arrays(pa.array(ends), pa.array(block.values.ravel()))
     return pa.table([columns[name] for name in schema.names], schema=schema)
+
+
+# -- memory maps -------------------------------------------------------------------------------------------------
 
 
 INDEX = "index.parquet"

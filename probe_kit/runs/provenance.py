@@ -143,6 +143,9 @@ def check_other_provenance(stored: Iterable[Provenance], current: Provenance, wh
             )
 
 
+# -- certificates ------------------------------------------------------------------------------------------------
+
+
 INPUT_CHECK = "input_check"
 """Entry of a certificate: by input, the last thing that changed with it at the first inference of a process."""
 

@@ -353,6 +353,9 @@ class RunReader(Protocol):
         """The reading of answers by which outcomes are given, see `scored`."""
 
 
+# -- checks ------------------------------------------------------------------------------------------------------
+
+
 def full_name(label: str, random_weights: bool, captured_only: bool = False) -> str:
     """Return the label of a run, marked if the weights are random or the model only captured."""
     return label + (" (random weights)" if random_weights else "") + (" (capture only)" if captured_only else "")
@@ -435,6 +438,9 @@ def _check_twins(items: "pd.DataFrame", count: int, category: str) -> None:
             f"items is {count}, which would keep one of the role-exchanged twins {min(separated)!r} of "
             f"{category!r} and drop the other. Give an even number."
         )
+
+
+# -- a run in words ----------------------------------------------------------------------------------------------
 
 
 def run_text(run: RunReader) -> str:

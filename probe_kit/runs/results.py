@@ -272,6 +272,9 @@ def advice_for(folder: str) -> str:
     return f"Remove {folder} and run the same `probe-kit {_MAKERS[folder.partition('/')[0]]}` again"
 
 
+# -- pieces of unfinished results --------------------------------------------------------------------------------
+
+
 _HEX = 2 * DIGEST_BYTES
 
 

@@ -162,6 +162,9 @@ def while_growing[Result](location: Location, read: Callable[[], Result]) -> Res
                 raise
 
 
+# -- the card ----------------------------------------------------------------------------------------------------
+
+
 _SETTINGS = {"model": str, "captured_calls": int, "tokens": str, "codec": str}
 """The settings of every run, and their types."""
 _FURTHER = {"random_weights": bool, "suite": dict, "later_views": str}
@@ -451,6 +454,9 @@ def _check_settings(settings: Mapping[str, Any], name: str) -> None:
         if source in settings:
             expect(settings, {source: dict}, f"{name}: the settings", RESTORE)
             expect(settings[source], parts, f"{name}: the {source}", RESTORE)
+
+
+# -- the label ---------------------------------------------------------------------------------------------------
 
 
 LONGEST_LABEL = 200

@@ -26,7 +26,7 @@ from urllib.parse import urlsplit
 
 from zarr.abc.store import ByteRequest, Store
 from zarr.core.buffer import Buffer, BufferPrototype
-from zarr.storage import ObjectStore, WrapperStore
+from zarr.storage import WrapperStore
 
 from probe_kit._system.imports import require
 from probe_kit.errors import SettingsMismatchError, StoreError, UsageError
@@ -282,6 +282,8 @@ class Bucket:
 
     def store(self, folder: str, read_only: bool = False) -> Store:
         """Zarr's own, over obstore; its errors in our words."""
+        from zarr.storage import ObjectStore
+
         return _PatientStore(ObjectStore(self._below(folder), read_only=read_only), self)
 
     # -- runs ------------------------------------------------------------------------------------------
@@ -397,6 +399,9 @@ class _Ranges(RawIOBase):
             content = self._file.read(len(buffer))
         buffer[: len(content)] = bytes(content)
         return len(content)
+
+
+# -- the location of an address ----------------------------------------------------------------------------------
 
 
 SCHEMES = ("s3", "gs", "az")

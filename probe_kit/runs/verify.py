@@ -139,6 +139,9 @@ def _write_roles(run: "Run", name: str, group: zarr.Group) -> None:
     array[:] = codes
 
 
+# -- verification ------------------------------------------------------------------------------------------------
+
+
 _READERS = min(8, max(4, os.cpu_count() or 1))
 """Objects that are read and hashed at once: both let other threads work."""
 _BATCH = 256

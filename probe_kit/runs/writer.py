@@ -152,6 +152,9 @@ def growth_at(location: Location, requested: Sequence[Row]) -> Growth | None:
     return Growth(len(stored), len(requested), added, tuple(results))
 
 
+# -- the writer --------------------------------------------------------------------------------------------------
+
+
 def check_other_settings(stored: dict[str, Any], requested: dict[str, Any], where: str) -> None:
     """Raise SettingsMismatchError naming the settings that differ between a stored run and this request."""
     was, now = flat_settings(stored), flat_settings(requested)

@@ -76,6 +76,9 @@ def planned_suite(table: SuiteTable) -> tuple[PlannedSuite, list[Mistake]]:
     return PlannedSuite(f"{suite.name}@{suite.version}", items, folder, str(folder), contents), wrong
 
 
+# -- cells -------------------------------------------------------------------------------------------------------
+
+
 def slug(name: str) -> str:
     """The slug of a category that was named by slug or title, in any case."""
     return "-".join(name.lower().split())
@@ -87,7 +90,7 @@ def slugs(names: Sequence[str]) -> tuple[str, ...]:
 
 
 KEY_DIGITS = 8
-"""Of a key in a folder's name; `matching` finds out if two settings ever share them."""
+"""Of a key in a folder's name; `stored` finds out if two settings ever share them."""
 
 
 @dataclass(frozen=True)
@@ -229,6 +232,9 @@ def checkpoint_stamp(checkpoint: str | None) -> Any:
     files = sorted(folder.rglob("*")) if folder.is_dir() else [folder]
     stats = [(file, file.stat()) for file in files if file.is_file()]
     return [[file.relative_to(folder).as_posix(), stat.st_size, stat.st_mtime_ns] for file, stat in stats]
+
+
+# -- failures ----------------------------------------------------------------------------------------------------
 
 
 FOLDER = "failures"

@@ -119,6 +119,9 @@ def _cosines(first: Direction, second: Direction, features: Features) -> tuple[f
     return float(before @ after), float(of_first @ of_second) / length if length else float("nan"), float(ceiling)
 
 
+# -- categories --------------------------------------------------------------------------------------------------
+
+
 Verdict = Literal["kept", "transfer not shown", "forgotten", "learned", "not shown in either", "not clear"]
 VERDICTS: Mapping[Verdict, str] = {
     "kept": "signal in both, and probes transfer after recentring",
@@ -352,6 +355,9 @@ def _has_signal(results: ProbeResults, category: str, view: str, site: Site) -> 
     scores = results.scores
     of_site = scores[(scores["category"] == category) & (scores["view"] == view) & (scores["site"] == str(site))]
     return bool(of_site["signal"].iloc[0])
+
+
+# -- the table ---------------------------------------------------------------------------------------------------
 
 
 _COLUMNS = (

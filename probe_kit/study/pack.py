@@ -120,6 +120,9 @@ def _pack(study: LoadedStudy, folder: Path, partial: bool, extras: Collection[Ex
     return pack
 
 
+# -- a data set --------------------------------------------------------------------------------------------------
+
+
 ARCHIVE, EPISODES, CARD = "study.zip", "episodes.parquet", "README.md"
 _COLUMNS = {
     "episode_id": "string", "item_id": "string", "group_id": "string", "category": "string", "layout": "string",

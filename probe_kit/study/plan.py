@@ -118,6 +118,9 @@ def untrained_cell(study: LoadedStudy, table: ProbesTable, cell: Cell) -> Cell |
     return control_of(study.study, study.cells, cell) if "untrained" in table.controls else None
 
 
+# -- the plan ----------------------------------------------------------------------------------------------------
+
+
 State = Literal["new", "partial", "whole", "damaged", "failed", "waiting", "skipped"]
 _MOST_CHANGES = 3
 

@@ -122,6 +122,9 @@ def draw_overview(table: RetentionTable) -> "Figure":
     return figure
 
 
+# -- the report --------------------------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True)
 class StudyReport:
     """html: the page. missing: by table or figure, why it is not there. is_partial: whether a run is missing."""

@@ -82,6 +82,9 @@ def unknown(what: str, name: str, names: Collection[str]) -> str:
     return f"unknown {what} {shortened(name)!r}; known: {', '.join(names) or 'there are none'}.{hint}"
 
 
+# -- the tables of a file ----------------------------------------------------------------------------------------
+
+
 SCHEMA_VERSION = 1
 
 

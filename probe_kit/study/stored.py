@@ -36,57 +36,6 @@ Change = tuple[str, Any, Any]
 """Path of a setting, its stored value, and the value that the cell has."""
 
 
-def _weights(run: "Run", cell: Cell) -> Iterator[Change]:
-    """Yield the seed of random weights, or the checkpoint, as the process that loaded them recorded it.
-
-    A card has the commit of a hub id. A file may name a branch or nothing: then repository and folder count. The
-    folder of a local checkpoint may have been moved since. If it is still at its old path, and is another one than
-    the file's by name, size and time of its files, the run is another checkpoint's.
-    """
-    if not run.commits():
-        return
-    card: Mapping[str, Any] = run.certificate.get("policy") or {}
-    if cell.settings.model.random_weights and "weights_seed" in card:
-        yield "weights_seed", card["weights_seed"], cell.settings.model.weights_seed
-    stored, expected = str(card.get("checkpoint")), str(cell.settings.model.checkpoint)
-    if is_on_hub(stored) and is_on_hub(expected):
-        has_commit = len(expected.partition("@")[2]) == COMMIT_DIGITS
-        names = [name if has_commit else without_revision(name) for name in (stored, expected)]
-        yield "checkpoint", names[0], names[1]
-    stamps = [checkpoint_stamp(stored), checkpoint_stamp(expected)]
-    if all(isinstance(stamp, list) for stamp in stamps) and stamps[0] != stamps[1]:
-        yield "checkpoint", stored, expected
-
-
-def check_same_items(runs: Sequence["Run"]) -> None:
-    """Raise SettingsMismatchError for two runs that hold different items under one id, naming both runs."""
-    contents = [dict(zip(run.items["item_id"], run.items["content_sha256"], strict=True)) for run in runs]
-    for (run, items), (other, other_items) in combinations(zip(runs, contents, strict=True), 2):
-        changed = [name for name in items if name in other_items and items[name] != other_items[name]]
-        if changed and run.suite.partition("#")[0] == other.suite.partition("#")[0]:
-            raise SettingsMismatchError(
-                f"{run.location} and {other.location} hold different items as {changed[0]!r} "
-                f"({len(changed)} in all): their suites have one name and version and other content. Play both "
-                "with one suite, or give the changed suite another version"
-            )
-
-
-def check_same_weights(runs: Sequence[tuple[Cell, "Run"]]) -> None:
-    """Raise SettingsMismatchError for two runs of one model that were played with different weights.
-
-    A model that acts and answers may load other parts of its checkpoint for either.
-    """
-    first: dict[tuple[str, bool], Run] = {}
-    for cell, run in runs:
-        other = first.setdefault((cell.model, cell.asks), run)
-        if other.weights_sha256 != run.weights_sha256:
-            raise SettingsMismatchError(
-                f"{other.location} and {run.location} are runs of {cell.model!r} with different weights "
-                f"({str(other.weights_sha256)[:12]} and {str(run.weights_sha256)[:12]}). The checkpoint was "
-                "changed in between, or a folder was moved: remove one of them, and run the study again"
-            )
-
-
 def differences(run: "Run", cell: Cell) -> Iterator[str]:
     """Yield the settings in which a run is not one of `cell`, in words, stored value first."""
     changes = chain(
@@ -132,9 +81,60 @@ def _expected(cell: Cell) -> dict[str, Any]:
     return plain
 
 
+def _weights(run: "Run", cell: Cell) -> Iterator[Change]:
+    """Yield the seed of random weights, or the checkpoint, as the process that loaded them recorded it.
+
+    A card has the commit of a hub id. A file may name a branch or nothing: then repository and folder count. The
+    folder of a local checkpoint may have been moved since. If it is still at its old path, and is another one than
+    the file's by name, size and time of its files, the run is another checkpoint's.
+    """
+    if not run.commits():
+        return
+    card: Mapping[str, Any] = run.certificate.get("policy") or {}
+    if cell.settings.model.random_weights and "weights_seed" in card:
+        yield "weights_seed", card["weights_seed"], cell.settings.model.weights_seed
+    stored, expected = str(card.get("checkpoint")), str(cell.settings.model.checkpoint)
+    if is_on_hub(stored) and is_on_hub(expected):
+        has_commit = len(expected.partition("@")[2]) == COMMIT_DIGITS
+        names = [name if has_commit else without_revision(name) for name in (stored, expected)]
+        yield "checkpoint", names[0], names[1]
+    stamps = [checkpoint_stamp(stored), checkpoint_stamp(expected)]
+    if all(isinstance(stamp, list) for stamp in stamps) and stamps[0] != stamps[1]:
+        yield "checkpoint", stored, expected
+
+
 def _short(value: Any) -> str:
     text = repr(value)
     return text if len(text) <= 60 else f"{text[:57]}…"
+
+
+def check_same_items(runs: Sequence["Run"]) -> None:
+    """Raise SettingsMismatchError for two runs that hold different items under one id, naming both runs."""
+    contents = [dict(zip(run.items["item_id"], run.items["content_sha256"], strict=True)) for run in runs]
+    for (run, items), (other, other_items) in combinations(zip(runs, contents, strict=True), 2):
+        changed = [name for name in items if name in other_items and items[name] != other_items[name]]
+        if changed and run.suite.partition("#")[0] == other.suite.partition("#")[0]:
+            raise SettingsMismatchError(
+                f"{run.location} and {other.location} hold different items as {changed[0]!r} "
+                f"({len(changed)} in all): their suites have one name and version and other content. Play both "
+                "with one suite, or give the changed suite another version"
+            )
+
+
+def check_same_weights(runs: Sequence[tuple[Cell, "Run"]]) -> None:
+    """Raise SettingsMismatchError for two runs of one model that were played with different weights.
+
+    A model that acts and answers may load other parts of its checkpoint for either.
+    """
+    first: dict[tuple[str, bool], Run] = {}
+    for cell, run in runs:
+        other = first.setdefault((cell.model, cell.asks), run)
+        if other.weights_sha256 != run.weights_sha256:
+            raise SettingsMismatchError(
+                f"{other.location} and {run.location} are runs of {cell.model!r} with different weights "
+                f"({str(other.weights_sha256)[:12]} and {str(run.weights_sha256)[:12]}). The checkpoint was "
+                "changed in between, or a folder was moved: remove one of them, and run the study again"
+            )
 
 
 @dataclass(frozen=True)

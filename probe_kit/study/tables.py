@@ -1,4 +1,4 @@
-"""Making of a study's named tables, those of differences among them."""
+"""The tables of a study: those of differences, and every one that a file names, made of stored runs."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -217,17 +217,6 @@ def _encoded(join: KnownUsedTable, row: CategoryCounts) -> int | None:
     return sum(part.encoded or 0 for part in inside if part.has_signal and part.category != OVERALL)
 
 
-_OF_RUNS: Mapping[str, Callable[[RetentionTable], Table]] = {
-    "success": success_table,
-    "vlms": vlm_table,
-    "sides": sides_table,
-}
-_OF_PROBED_RUNS: Mapping[str, Callable[[RetentionTable], Table]] = {
-    "probing": probing_table,
-    "as-paper": attrgetter("as_paper"),
-}
-
-
 def _title(category: str) -> str:
     return category if category == MEAN else category_of(category).title
 
@@ -249,6 +238,20 @@ def _difference_numbers(row: Difference) -> Number:
         "least_p_over_models": None if models is None else models.smallest_p,
         "models_ci": None if models is None else models.ci,
     }
+
+
+# -- tables by name ----------------------------------------------------------------------------------------------
+
+
+_OF_RUNS: Mapping[str, Callable[[RetentionTable], Table]] = {
+    "success": success_table,
+    "vlms": vlm_table,
+    "sides": sides_table,
+}
+_OF_PROBED_RUNS: Mapping[str, Callable[[RetentionTable], Table]] = {
+    "probing": probing_table,
+    "as-paper": attrgetter("as_paper"),
+}
 
 
 def make_table(study: LoadedStudy, name: str, partial: bool = False) -> Table:

@@ -103,6 +103,11 @@ def _item(
 
 
 Progress = Callable[[int, int], None]
+
+
+# -- the suite ---------------------------------------------------------------------------------------------------
+
+
 ITEMS = 150
 """Items per category, unless another number is asked for."""
 

@@ -176,6 +176,9 @@ class Episode:
         return side if self.layout == "original" else other_side(side)
 
 
+# -- words -------------------------------------------------------------------------------------------------------
+
+
 VERBATIM = "verbatim"
 """Rule of items whose instruction is their source's own question, not a sentence of ours."""
 MOST_WORDS = 12
@@ -234,6 +237,9 @@ def in_words(episode: Episode, wording: Wording) -> Episode | None:
     else:
         text = NEUTRAL if wording_text is None and wording == "neutral" else wording_text
     return None if not text else replace(episode, item=replace(item, instruction=text), wording=wording)
+
+
+# -- groups ------------------------------------------------------------------------------------------------------
 
 
 def ties(item: Item) -> tuple[str, ...]:

@@ -60,6 +60,9 @@ def listing(findings: Iterable[Finding]) -> str:
     return "\n".join(lines)
 
 
+# -- records -----------------------------------------------------------------------------------------------------
+
+
 SCHEMA_MAJOR = "1"
 LONGEST_FIELD = 4096
 """Characters of any text in a record; only an attribution comes anywhere near."""
@@ -170,6 +173,9 @@ def unique_ids(lines_of: Mapping[str, Sequence[int]]) -> Iterator[Finding]:
         if len(lines) > 1:
             listed = ", ".join(map(str, lines[:-1]))
             yield error("E04", f"item {item_id}", f"the id appears in lines {listed} and {lines[-1]}")
+
+
+# -- items and the suite -----------------------------------------------------------------------------------------
 
 
 SMALLEST_PICTURE = 64

@@ -204,6 +204,9 @@ def drawing_libraries() -> dict[str, str]:
     return {"pillow": PIL.__version__, "freetype": freetype, "numpy": np.__version__}
 
 
+# -- pictures and items ------------------------------------------------------------------------------------------
+
+
 _TRANSFER_TYPES = {
     **dict.fromkeys(("shape", "symmetry", "counting", "time", "celebrity"), "moderate"),
     "living-world": "heavy",

@@ -204,6 +204,9 @@ WARNING_RULES: Sequence[Callable[[Suite], Iterator[Finding]]] = (
 )
 
 
+# -- leakage -----------------------------------------------------------------------------------------------------
+
+
 FILE_NAME = "baselines.json"
 FOLDS = 5
 
@@ -378,6 +381,9 @@ def _forest(features: Array, correct: Labels, train: Rows, test: Rows, seed: int
 
     model = RandomForestClassifier(_TREES, random_state=seed)
     return np.asarray(model.fit(features[train], correct[train]).predict(features[test]), bool)
+
+
+# -- the report --------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -199,6 +199,9 @@ def _outcomes(viewed: ViewedRun, trajectory: Trajectory, row: dict[str, Any]) ->
     }
 
 
+# -- all episodes ------------------------------------------------------------------------------------------------
+
+
 _WORDS = {
     "item": "item_id",
     "category": "category",

@@ -116,6 +116,9 @@ def _encode(value: Any, places: tuple[str, ...]) -> Any:
     return value
 
 
+# -- runs --------------------------------------------------------------------------------------------------------
+
+
 SCENE_VIEWS = ("overview", "map", "episodes", "compare", "questions", "results")
 OTHER_VIEWS = ("overview", "map", "episodes")
 """Views of a run of the scene, and of one without sides: its overview holds the results."""
@@ -247,6 +250,9 @@ def _cell(column: Column, row: RetentionRow) -> dict[str, Any]:
     return cell
 
 
+# -- site maps ---------------------------------------------------------------------------------------------------
+
+
 NULL_SHARE = 0.95
 """Share of accuracies under label permutation that lie below the quantile that is shown."""
 HEADINGS = (
@@ -369,6 +375,9 @@ def _cells(row: Mapping[Hashable, Any], quantile: float | None) -> list[str]:
 
 def _or_none(value: float) -> float | None:
     return None if value != value else float(value)
+
+
+# -- results -----------------------------------------------------------------------------------------------------
 
 
 def results_payload(viewed: ViewedRun) -> dict[str, Any]:

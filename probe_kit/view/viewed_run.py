@@ -163,6 +163,9 @@ def decisions_toward_correct(curve: ProbeCurve, places: Sequence[int], sides: Se
     return np.asarray(curve.decisions[:, places] * np.array([toward(side) for side in sides]))
 
 
+# -- the run -----------------------------------------------------------------------------------------------------
+
+
 UNREAD = "unread"
 _UNSAFE = re.compile(r"[^A-Za-z0-9._-]+")
 

@@ -149,6 +149,9 @@ def _blanked(pattern: re.Pattern[str], text: str) -> str:
     return pattern.sub(lambda match: " " * len(match[0]), text)
 
 
+# -- the meaning of a text ---------------------------------------------------------------------------------------
+
+
 Said = Literal["left", "right", "center", "yes", "no", "none"]
 Tier = Literal["strict", "clause"]
 """strict: the whole text is an option or a side. clause: one was found among other words."""
@@ -277,6 +280,9 @@ def _by_letter(mentions: Mentions, options: Mapping[str, Side]) -> Answer | None
     if not mentions.sides:
         return Answer("none", "denied")
     return Answer("none", "contradicts itself") if denied & mentions.sides else None
+
+
+# -- scores ------------------------------------------------------------------------------------------------------
 
 
 Outcome = Literal["correct", "wrong", "oob"]

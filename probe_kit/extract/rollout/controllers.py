@@ -158,6 +158,9 @@ def check_not_ignored(reaches: Mapping[str, Reach], model: str) -> None:
         )
 
 
+# -- actions -----------------------------------------------------------------------------------------------------
+
+
 _TURN = slice(3, 6)
 """Roll, pitch and yaw among the seven numbers of an action."""
 _GRIPPER_OPEN = 0.5
@@ -224,6 +227,9 @@ def count_lost_words(pack: Callable[[str], Sequence[int] | None], instruction: s
             stacklevel=2,
         )
     return lost
+
+
+# -- controllers -------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

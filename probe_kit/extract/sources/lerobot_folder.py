@@ -207,6 +207,9 @@ def _download(repo: str, commit: str, patterns: list[str]) -> Path:
         ) from error
 
 
+# -- frames ------------------------------------------------------------------------------------------------------
+
+
 OFF_GRID_S = 1e-4
 """Seconds by which a timestamp may differ from frame / fps, and a picture of a video from its timestamp."""
 MOST_AT_ONCE = 32_000_000

@@ -116,6 +116,9 @@ def _stamp(opened: BinaryIO) -> _Stamp:
     return status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
 
 
+# -- the meta ----------------------------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True)
 class VideoRange:
     """The part of a video file that shows an episode. begin, end: seconds in the file. file: in the data set."""

@@ -166,6 +166,9 @@ def _cut(texture: Image.Image, uv: NDArray[np.float64], path: Path) -> Image.Ima
     return texture.crop((int(left), int(upper), int(right), int(lower)))
 
 
+# -- pairs and objects -------------------------------------------------------------------------------------------
+
+
 SOURCE = "act2answer"
 PAIRS = "pairs.json"
 REMEDY = "Name the folder of one set, such as carrot/test_colors, with its shapes."
@@ -235,6 +238,9 @@ def object_of(question: str) -> tuple[str, str]:
     phrase = (behind if preposition else question).strip().rstrip(".").strip()
     article, space, noun = phrase.partition(" ")
     return (noun.strip(), "the") if space and article.lower() == "the" else (phrase, "none")
+
+
+# -- conversion --------------------------------------------------------------------------------------------------
 
 
 VERSION = "1.0.0"

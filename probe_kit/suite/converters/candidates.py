@@ -95,6 +95,9 @@ class Reading:
     notes: list[str] = field(default_factory=list)
 
 
+# -- options -----------------------------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True)
 class ConvertOptions:
     """Settings every source shares.
@@ -198,6 +201,9 @@ def options_from[Options: (ConvertOptions, Act2AnswerOptions)](
     if isinstance(values.get("extra_boards"), list):
         values = values | {"extra_boards": tuple(values["extra_boards"])}
     return kind(**values)
+
+
+# -- files and pictures ------------------------------------------------------------------------------------------
 
 
 MARGIN = 0.08  # of the longer side, around trimmed art

@@ -203,6 +203,9 @@ _TABLE: tuple[_Rule, ...] = (
 )
 
 
+# -- filters -----------------------------------------------------------------------------------------------------
+
+
 _LEAST_EDGE_ENERGY = 0.25  # of the original, after a picture was as small as on the screen
 
 
@@ -247,6 +250,9 @@ def text_problem(instruction: str, phrase: str, options: ConvertOptions) -> str 
         "instruction names a side": lambda: bool(side_words(text)),
     }
     return next((reason for reason, failed in checks.items() if failed()), None)
+
+
+# -- a language model --------------------------------------------------------------------------------------------
 
 
 _TIMEOUT_SECONDS = 60

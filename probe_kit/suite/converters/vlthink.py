@@ -141,6 +141,9 @@ def upright_board(path: Path) -> Image.Image:
     return art
 
 
+# -- boards in GLB files -----------------------------------------------------------------------------------------
+
+
 _UNREADABLE = (
     AttributeError, KeyError, IndexError, TypeError, ValueError, struct.error, OSError,
 )  # fmt: skip

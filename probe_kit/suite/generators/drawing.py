@@ -109,6 +109,9 @@ def on_hues[T: Any](first: T, second: T, rng: np.random.Generator) -> tuple[T, T
     )
 
 
+# -- the canvas --------------------------------------------------------------------------------------------------
+
+
 TILE_PIXELS = 256
 _SUPERSAMPLING = 3
 _DRAWN_PIXELS = TILE_PIXELS * _SUPERSAMPLING
@@ -276,6 +279,9 @@ class Pen:
     def _pixels(self, points: Points) -> list[tuple[float, float]]:
         pixels = (self._placement.apply(points) + 1) * _DRAWN_PIXELS / 2
         return [(x, y) for x, y in pixels.tolist()]
+
+
+# -- icons -------------------------------------------------------------------------------------------------------
 
 
 FOLDER = Path(__file__).parents[1] / "art"

@@ -95,6 +95,9 @@ _DRAWN: dict[str, Points] = {
 OUTLINES: dict[str, Points] = {name: _matched(points) for name, points in _DRAWN.items()}
 
 
+# -- figures -----------------------------------------------------------------------------------------------------
+
+
 # edged: filled, with a thin dark edge; plain: filled; hollow: a thick line only
 Style = Literal["edged", "plain", "hollow"]
 
@@ -134,6 +137,9 @@ def random_figure(color: str, outline: str, style: Style, rng: np.random.Generat
     ink = jittered(COLORS[color], rng)
     background = background_for(ink, rng)
     return Figure(color, outline, style, random_placement(rng), ink=ink, background=background)
+
+
+# -- Color -------------------------------------------------------------------------------------------------------
 
 
 _SHRUNK = (0.5, 0.75)
@@ -186,6 +192,9 @@ COLOR = Generator(
 )
 
 
+# -- Shape -------------------------------------------------------------------------------------------------------
+
+
 _HOLLOW_SHARE = 0.3
 _CONFUSABLE = (
     {"square", "rectangle", "diamond", "parallelogram"},
@@ -213,6 +222,9 @@ SHAPE = Generator(
     tiles=each_on_hues(_figure),
     name_of=colored_outline,
 )
+
+
+# -- Symmetry ----------------------------------------------------------------------------------------------------
 
 
 _MOST_OVERLAP = 0.78  # of an asymmetric shape with its best mirror image, or with itself upside down
