@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,35 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+@dataclass
+class BestSiteDisplay(Panelled):
+    """A panel of a label's probes at the best site of a stream: that of the largest score above its own chance."""
+
+    target: str
+    view: str
+    stream: str
+    site: str
+    certificate: ProvenanceLine
+
+    @property
+    def title(self) -> str:
+        """The site."""
+        return self.site
+
+
+def _site_fields(results: ProbeResults, category: str, view: str, stream: str, row: int) -> dict[str, Any]:
+    """Return the fields of `BestSiteDisplay` of the site at `row` of a curve."""
+    return {
+        "target": results.settings.target,
+        "view": view,
+        "stream": stream,
+        "site": str(results.curves[category, view].sites[row]),
+        "certificate": ProvenanceLine.of_results(results, view, category),
+    }
+
+
+# -- confusion of classes ------------------------------------------------------------------------------------
+
 _WITH_NUMBERS = 12
 """Classes, more than which leave no room for numbers in the cells."""
 _LONGEST = 14
@@ -29,20 +58,14 @@ _LONGEST = 14
 
 
 @dataclass
-class ClassConfusionDisplay(Panelled):
-    """Held-out predictions of the best site of a stream.
+class ClassConfusionDisplay(BestSiteDisplay):
+    """Held-out predictions of the best site of a stream, the one farthest above its own chance.
 
-    counts: (K, K) samples by true class, down, and predicted class, across. site: of the largest score above its
-    own chance.
+    counts: (K, K) samples by true class, down, and predicted class, across.
     """
 
-    target: str
-    view: str
-    stream: str
-    site: str
     classes: tuple[str, ...]
     counts: NDArray[np.int64]
-    certificate: ProvenanceLine
 
     @classmethod
     def from_results(
@@ -64,13 +87,9 @@ class ClassConfusionDisplay(Panelled):
         row = best_row(curve, stream)
         classes = np.arange(len(curve.classes))
         return cls(
-            target=results.settings.target,
-            view=view,
-            stream=stream,
-            site=str(curve.sites[row]),
+            **_site_fields(results, category, view, stream, row),
             classes=curve.classes,
             counts=confusion_matrix(curve.labels, curve.decisions[row], labels=classes),
-            certificate=ProvenanceLine.of_results(results, view, category),
         )
 
     @property
@@ -78,11 +97,6 @@ class ClassConfusionDisplay(Panelled):
         """(K, K) of each true class; the mean of the diagonal is the balanced accuracy."""
         shares: NDArray[np.float64] = self.counts / self.counts.sum(axis=1, keepdims=True).clip(1)
         return shares
-
-    @property
-    def title(self) -> str:
-        """The site."""
-        return self.site
 
     @property
     def measure(self) -> str:
@@ -127,27 +141,24 @@ def confusion_figures(source: FigureSource) -> Iterator[ReportFigure]:
             )  # fmt: skip
 
 
+# -- predicted against true values ---------------------------------------------------------------------------
+
 _PIXELS_FROM = 2000
 """Points, from which on a figure holds them as pixels."""
 
 
 @dataclass
-class PredictedValuesDisplay(Panelled):
-    """Held-out predictions of the best site of a stream; arrays (n,).
+class PredictedValuesDisplay(BestSiteDisplay):
+    """Held-out predictions of the best site of a stream, the one farthest above its own chance; arrays (n,).
 
     true, predicted: values in the label's own unit. groups: (n,) number of each sample's group, which is its
-    colour. site: of the largest score above its own chance. score: its R².
+    colour. score: R² of the site.
     """
 
-    target: str
-    view: str
-    stream: str
-    site: str
     score: float
     true: NDArray[np.float64]
     predicted: NDArray[np.float64]
     groups: NDArray[np.int64]
-    certificate: ProvenanceLine
 
     @classmethod
     def from_results(
@@ -166,15 +177,11 @@ class PredictedValuesDisplay(Panelled):
             raise UsageError(f"the label {results.settings.target!r} is of classes; expected a continuous one")
         row = best_row(curve, stream)
         return cls(
-            target=results.settings.target,
-            view=view,
-            stream=stream,
-            site=str(curve.sites[row]),
+            **_site_fields(results, category, view, stream, row),
             score=float(curve.metric[row]),
             true=curve.labels,
             predicted=curve.decisions[row],
             groups=np.unique(curve.groups, return_inverse=True)[1].astype(np.int64),
-            certificate=ProvenanceLine.of_results(results, view, category),
         )
 
     @property
@@ -217,25 +224,23 @@ def predicted_figures(source: FigureSource) -> Iterator[ReportFigure]:
             )  # fmt: skip
 
 
+# -- scores by step ------------------------------------------------------------------------------------------
+
 _CONTROLS = (Line("black", "", ":"), Line(GREEN, "", (0, (5, 1))))  # type: ignore[arg-type]  # as `SERIES`
 
 
 @dataclass
-class StepScoresDisplay(Panelled):
-    """The metric at each step, of the best site of a stream; arrays (W,).
+class StepScoresDisplay(BestSiteDisplay):
+    """The metric at each step, of the site of a stream that is farthest above its own chance; arrays (W,).
 
     R² is that of the label's spread over all steps. Balanced accuracy is that of the classes at the
     step. steps: inferences, or places behind the event where windows begin. low, high: 95 % interval over groups.
-    controls: by name, the metric of the best control and of `step`. site: of the largest score above its
-    own chance. signal: whether the site exceeds chance, family-wise, and every control that was run.
+    controls: by name, the metric of the best control and of `step`. signal: whether the site exceeds chance,
+    family-wise, and every control that was run.
     """
 
-    target: str
     metric: str
-    view: str
-    stream: str
     part: str
-    site: str
     signal: bool
     steps: NDArray[np.int64]
     from_event: bool
@@ -243,7 +248,6 @@ class StepScoresDisplay(Panelled):
     low: NDArray[np.float64]
     high: NDArray[np.float64]
     controls: dict[str, NDArray[np.float64]]
-    certificate: ProvenanceLine
 
     @classmethod
     def from_results(
@@ -269,12 +273,9 @@ class StepScoresDisplay(Panelled):
             for at in (curve.places == step for step in curve.steps)
         ]
         return cls(
-            target=settings.target,
+            **_site_fields(results, category, view, stream, row),
             metric=METRICS[settings.task],
-            view=view,
-            stream=stream,
             part=curve.parts[row],
-            site=str(curve.sites[row]),
             signal=bool(table.loc[str(curve.sites[row]), "signal"]),
             steps=curve.steps,
             from_event=curve.aligned is not None,
@@ -284,13 +285,7 @@ class StepScoresDisplay(Panelled):
             controls={
                 control.name: np.array(control.by_step) for control in _with_steps(results, category, view, stream)
             },
-            certificate=ProvenanceLine.of_results(results, view, category),
         )
-
-    @property
-    def title(self) -> str:
-        """The site."""
-        return self.site
 
     @property
     def measure(self) -> str:
