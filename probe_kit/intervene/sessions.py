@@ -182,10 +182,9 @@ def load_policy_of(run: Run, source: ReplaySource) -> "Policy":
     from probe_kit.hooks import load_policy
 
     origin = origin_of(run)
-    checkpoint = source.checkpoint
-    if (
-        checkpoint is None
-    ):  # where the run had it, if its folder, or its commit of the hub, is here; none is fetched
+    checkpoint = source.checkpoint or None
+    if checkpoint is None:
+        # Where the run had it, if its folder, or its commit of the hub, is here: none is fetched.
         before = origin.checkpoint
         is_folder = before not in ("", EMBEDDED) and Path(before).expanduser().is_dir()
         checkpoint = before if is_folder or cached_folder(before) is not None else None
@@ -218,6 +217,8 @@ def check_policy(run: Run, policy: "Policy") -> None:
         lines = "; ".join(f"{name}: stored {was.get(name)!r}, here {now.get(name)!r}" for name in different)
         raise SettingsMismatchError(f"{run.location} was made with other options ({lines}). Give the same with -M")
 
+
+# -- the scene -----------------------------------------------------------------------------------------------
 
 _OTHER: Mapping[Layout, Layout] = {"original": "swapped", "swapped": "original"}
 
@@ -364,6 +365,8 @@ class SceneSession(ReplaySession):
 def _layout_of(record: Any) -> Layout:
     return "original" if record["layout"] == "original" else "swapped"
 
+
+# -- runs without sides --------------------------------------------------------------------------------------
 
 Array = NDArray[np.float64]
 _FLAT = 1e-6
