@@ -11,7 +11,7 @@ from probe_kit._terminal import options as common
 from probe_kit._terminal.console import counter, err, marked, print_json, progress, say
 from probe_kit._terminal.field_options import command_with
 from probe_kit._terminal.options import further_option
-from probe_kit.diagnose.results import FRAMES
+from probe_kit.diagnose.results import FRAMES, check_names, diagnosis_table
 from probe_kit.errors import UsageError
 from probe_kit.extract import commands as start
 from probe_kit.extract.config_files import MovedOptions, moved_of
@@ -100,7 +100,6 @@ def diagnose(
     """
     from probe_kit.diagnose.diagnosis import diagnose_run
     from probe_kit.diagnose.inputs import names_of, read_paraphrases
-    from probe_kit.diagnose.results import check_names, diagnosis_table
     from probe_kit.intervene.places import read_pairs
     from probe_kit.train.command_options import TargetOptions
 
@@ -156,7 +155,6 @@ class _Request(NamedTuple):
     def check_cameras(self, cameras: Sequence[str]) -> None:
         """Raise UsageError for a required input that a model with these cameras does not have."""
         from probe_kit.diagnose.inputs import names_of
-        from probe_kit.diagnose.results import check_names
 
         check_names(self.require, names_of(cameras))
 

@@ -1,4 +1,7 @@
-"""A diagnosis of a run: every input's importance and passage, stored in the run and read from there."""
+"""A diagnosis of a run: every input's importance and passage, stored in the run and read from there.
+
+The knowledge of a target is that of `probe-kit train`'s probes, which the run stores too.
+"""
 
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -38,6 +41,7 @@ from probe_kit.runs.layout import DIAGNOSES
 from probe_kit.runs.reader import origin_of
 from probe_kit.runs.records import as_json
 from probe_kit.runs.results import HEAD, read_bundle, write_bundle
+from probe_kit.train.choices import EVERYWHERE
 
 if TYPE_CHECKING:
     from probe_kit.hooks import ActivationCache, Model, Policy
@@ -47,8 +51,7 @@ if TYPE_CHECKING:
     from probe_kit.train import ProbeResults, Target
 
 
-POOLED = "all"
-"""The category that pools all episodes."""
+# -- the knowledge of a target -------------------------------------------------------------------------------
 
 
 def measure_knowledge(run: "Run", target: "Target | str", seed: int = 0) -> Knowledge:
@@ -58,7 +61,7 @@ def measure_knowledge(run: "Run", target: "Target | str", seed: int = 0) -> Know
     """
     from probe_kit.train import train_probes
 
-    results = train_probes(run, [POOLED], target=target, seed=seed)
+    results = train_probes(run, [EVERYWHERE], target=target, seed=seed)
     # A layer of a stream with iterations is one site of a diagnosis: the farthest above chance stands for it.
     frame = results.scores.assign(excess=lambda scores: scores["score"] - scores["chance"])
     best = frame.sort_values("excess", ascending=False).drop_duplicates(["stream", "layer"]).sort_index()
@@ -76,13 +79,16 @@ def measure_knowledge(run: "Run", target: "Target | str", seed: int = 0) -> Know
 def _retention(run: "Run", results: "ProbeResults") -> tuple[float, Limits, str]:
     from probe_kit.retention.rows.probe_parts import target_row
 
-    retained = target_row(run, results, POOLED, results.settings.views[0]).retention
+    retained = target_row(run, results, EVERYWHERE, results.settings.views[0]).retention
     low, high = retained.ci or (None, None)
     return _or_nan(retained.value), (_or_nan(low), _or_nan(high)), retained.note
 
 
 def _or_nan(value: float | None) -> float:
     return nan if value is None else value
+
+
+# -- the passage of an input ---------------------------------------------------------------------------------
 
 
 def places_of(model: "Model") -> list[SiteGroup]:
@@ -96,9 +102,10 @@ def places_of(model: "Model") -> list[SiteGroup]:
 def measure_passage(
     session: "ReplaySession", pairs: Sequence[Pair], scale: ActionScale
 ) -> tuple[SitePassage, ...]:
-    """Both numbers at every site, over pairs of equally many tokens; two inferences per pair, and one per site.
+    """Return difference and carried share at every site, over pairs of equally many tokens.
 
-    scale: of the session's actions. Raises what `capture` and `patched` raise.
+    Two inferences per pair, and one per site. scale: of the session's actions. Raises what `capture` and `patched`
+    raise.
     """
     model, places = session.policy, places_of(session.policy)
     differences = np.zeros((len(pairs), len(places)))
@@ -144,6 +151,8 @@ def _relative_difference(group: SiteGroup, before: "ActivationCache", after: "Ac
         norm += float(clean.square().sum())
     return float(np.sqrt(difference / norm)) if norm else 0.0
 
+
+# -- the diagnosis of a run ----------------------------------------------------------------------------------
 
 FORMAT, FILE = "probe_kit diagnosis 4", "diagnosis.json"
 Progress = Callable[[str], None]

@@ -89,6 +89,8 @@ def _retyped(words: str) -> list[str]:
     return [text[:1].swapcase() + text[1:] for text in (stopped, words)] + [stopped]
 
 
+# -- words of the same meaning -------------------------------------------------------------------------------
+
 COLUMNS = ("instruction", "other")
 
 
@@ -113,6 +115,8 @@ def read_paraphrases(file: Path) -> dict[str, str]:
             )
     return words
 
+
+# -- the frames of a run -------------------------------------------------------------------------------------
 
 GOLDEN = (5**0.5 - 1) / 2
 """The golden ratio: its multiples, without their whole part, cover 0 to 1 evenly for any number of them.

@@ -280,6 +280,8 @@ def exit_code(inputs: Sequence[InputDiagnosis], required: Sequence[str] = ()) ->
     return 0 if judged and all(diagnosed.matters for diagnosed in judged) else 1
 
 
+# -- table and sentences -------------------------------------------------------------------------------------
+
 _HEADINGS = (
     Heading("input"),
     Heading("arrives", "whether any number of any action changed under another value"),

@@ -19,9 +19,10 @@ from probe_kit._terminal import options as common
 from probe_kit._terminal.console import counter, marked, out, print_json, progress, say, say_note, split
 from probe_kit._terminal.field_options import PanelledHelp, command_with
 from probe_kit._terminal.options import LISTED, AsJson, Names, Partial, RunFolder, choices, further_option, one_of
-from probe_kit.errors import UsageError
+from probe_kit.errors import ProbeKitError, UsageError
 from probe_kit.extract.config_files import MovedOptions, moved_of
 from probe_kit.hooks.contract.declared import Readout
+from probe_kit.hooks.contract.declared import read_pairs as read_options
 from probe_kit.intervene.kinds import every_kind, kind_names, kind_of
 from probe_kit.suite.categories import category_of
 
@@ -200,7 +201,6 @@ def intervene(
     probe-kit intervene runs/mine
     probe-kit intervene runs/mine --kind interchange --sites "backbone.*"
     """
-    from probe_kit.hooks.contract.declared import read_pairs as read_options
     from probe_kit.intervene import ReplaySource
     from probe_kit.intervene.places import read_pairs
     from probe_kit.runs import open_run
@@ -278,6 +278,8 @@ def print_result(result: "InterventionResult", style: str = "table", details: bo
             out.print(sentence)
 
 
+# -- runs, and what they store -------------------------------------------------------------------------------
+
 _COLUMNS = ("run", "model", "suite", "episodes", "correct", "probes", "interventions")
 """Facts that are shown, by their names."""
 
@@ -290,7 +292,6 @@ def list_runs(
 
     `probe-kit view FOLDER` opens them all. A run that cannot be read is named with the reason.
     """
-    from probe_kit.errors import ProbeKitError
     from probe_kit.runs import open_run
     from probe_kit.runs.run_folders import find_runs
 

@@ -425,7 +425,7 @@ def stored_results(run: RunReader, kind: str) -> list[StoredResult]:
     results = []
     for stored in stored_interventions(run, kind):
         family = stored.certificate().get("supported", {}).get("readout", FIRST_CHUNK)
-        is_wrong = family == PER_STEP != stored.settings.get("readout", FIRST_CHUNK)
+        is_wrong = family == PER_STEP != stored.readout
         for category, outcomes in stored.outcomes().by_category():
             rank = not is_wrong, outcomes.episodes.size, stored.readout == family
             results.append(StoredResult(stored, category, outcomes, rank))

@@ -118,6 +118,8 @@ def check_pairs(table: Sequence[PairRow], frames: Collection[tuple[str, int]]) -
             )
 
 
+# -- places --------------------------------------------------------------------------------------------------
+
 TILE_ROLES = ("image.left", "image.right")
 """Roles of the patches that see one of the two pictures; see `tiles`."""
 ALL = "all"
@@ -372,6 +374,8 @@ def unread_note(places: Iterable[str]) -> str:
         "changes no action whatever probes read in it: a control, no place to steer at"
     )
 
+
+# -- tokens --------------------------------------------------------------------------------------------------
 
 TILES: Mapping[str, Side] = dict(zip(TILE_ROLES, ("left", "right"), strict=True))
 """Roles by tile, and the tile."""

@@ -277,6 +277,8 @@ def effects_csv(measurement: Measurement) -> str:
     return csv_of_frame(frame_of(rows).drop(columns="key", errors="ignore"))
 
 
+# -- what a run stores ---------------------------------------------------------------------------------------
+
 COMMON = frozenset(
     {"format", "kind", "run_settings", "stamp", "weights", "wording", "categories", "items", "readout", "donors"}
 )

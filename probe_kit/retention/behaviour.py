@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 
+# -- answers of a VLM ----------------------------------------------------------------------------------------
+
 SCORES: Mapping[str, tuple[str, str]] = {
     "text": ("outcome", "side_placed"),
     "logits": ("outcome_logits", "side_logits"),
@@ -97,6 +99,9 @@ def left_out(runs: Sequence[RunReader]) -> list[str]:
         for run in runs
         if isinstance(run, ScoredAnswers) and (missing := len(run._run.episodes) - len(run.episodes))
     ]
+
+
+# -- success -------------------------------------------------------------------------------------------------
 
 
 class Regime(StrEnum):
@@ -334,6 +339,8 @@ def paired_items(episodes: "pd.DataFrame") -> PairedItems:
 def _rate(values: "pd.Series[bool] | pd.Series[float]") -> float | None:
     return float(values.mean()) if len(values) else None
 
+
+# -- names and settings of the runs of a table ---------------------------------------------------------------
 
 _MARKS: Sequence[Callable[[RunReader, int], str]] = (
     lambda run, _: run.settings_sha256[:6],

@@ -241,6 +241,8 @@ Figures = Annotated[
 ]
 
 
+# -- the command ---------------------------------------------------------------------------------------------
+
 WITH_STAGES = ("runs", "probes", "views", "wording", "score", "with_side_words", "style", "figures")
 WITH_TARGET = (
     "runs", "family", "probes", "views", "iterations", "wording", "partial", "details", "style", "html", "figures",

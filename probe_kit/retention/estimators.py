@@ -223,6 +223,8 @@ def _only(run: StreamScores, names: Sequence[str]) -> CrossFit:
     return replace(fit, above=fit.above[rows], peaks=fit.peaks[rows], influence=fit.influence[rows])
 
 
+# -- retention -----------------------------------------------------------------------------------------------
+
 NO_SCORES = "n/a (too few groups of items, or a fold with one side only)"
 """In place of retention where no score is defined."""
 

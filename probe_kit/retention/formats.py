@@ -127,6 +127,9 @@ def _dtype(hint: Any) -> str:
     return _DTYPES[kinds[0]] if kinds else "string"
 
 
+# -- JSON ----------------------------------------------------------------------------------------------------
+
+
 def table_json(
     rows: Sequence[RetentionRow],
     differences: Sequence[Difference],
@@ -186,6 +189,8 @@ def _of_vlm_and_policy(row: Difference) -> dict[str, Any]:
 def _test(row: Difference) -> dict[str, Any]:
     return {name: getattr(row, name) for name in ("p", "p_holm", "n_items", "of_items", "n_groups")}
 
+
+# -- the paper's own numbers ---------------------------------------------------------------------------------
 
 EPSILON = 1e-6
 """The ε of the paper's denominator. The paper prints no value: this one only keeps the ratio finite."""

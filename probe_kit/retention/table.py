@@ -32,7 +32,7 @@ from probe_kit.retention.compare.pairing import (
     compare_with_vlms,
     compare_wordings,
 )
-from probe_kit.retention.formats import frame_of, part_frame, peak_frame, table_json
+from probe_kit.retention.formats import frame_of, paper_table, part_frame, peak_frame, table_json
 from probe_kit.retention.rows.build import RowSettings, RowWithEstimates, mean_row, run_rows
 from probe_kit.retention.rows.outcome_rules import can_be_judged, check_epsilons, under_rule
 from probe_kit.retention.rows.probe_parts import label_notes, label_rows, read_labels
@@ -255,8 +255,6 @@ class RetentionTable:
     @property
     def as_paper(self) -> Table:
         """The paper's own numbers by its own formulas, see `probe_kit.retention.formats`."""
-        from probe_kit.retention.formats import paper_table
-
         steps = f" over the last {self.last_steps} control steps" if self.last_steps > 1 else ""
         return paper_table(self.rows, self.means, f"outcome rule {self.rule}{steps}")
 

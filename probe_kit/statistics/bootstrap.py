@@ -157,6 +157,9 @@ def draw_groups(count: int, seed: int, draws: int = DRAWS) -> NDArray[np.int64]:
     return times
 
 
+# -- by Student's t ------------------------------------------------------------------------------------------
+
+
 def student_interval(
     values: NDArray[np.floating], groups: ArrayLike, seed: int, bounds: Bounds = GAINS
 ) -> tuple[float, float]:

@@ -119,6 +119,8 @@ def _combined(first: float, second: float, correlation: float) -> float:
     return sqrt(max(0.0, first**2 + second**2 - 2 * correlation * first * second))
 
 
+# -- shares --------------------------------------------------------------------------------------------------
+
 Matrix = NDArray[np.float64]
 
 TAIL = SIGNIFICANCE / 2

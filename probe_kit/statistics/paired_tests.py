@@ -15,6 +15,8 @@ from probe_kit.statistics.significance import SIGNIFICANCE
 
 Matrix = NDArray[np.float64]
 
+# -- controls and other models -------------------------------------------------------------------------------
+
 EXCHANGES = 999
 """With the observed one 1,000, so that no p is below 0.001."""
 SHARED_PROBE = 1.25
@@ -82,6 +84,9 @@ def _group_sums(values: NDArray[np.bool_] | Matrix, groups: ArrayLike) -> Matrix
     sums = np.zeros((len(values), names.size))
     np.add.at(sums.T, group_of, values.T.astype(np.float64))
     return sums
+
+
+# -- exact tests ---------------------------------------------------------------------------------------------
 
 
 def heads_p(heads: int, tosses: int) -> float:
@@ -200,6 +205,9 @@ def overlap_p(first: Right, second: Right, strata: ArrayLike, seed: int, draws: 
     return float((as_far.sum() + 1) / (draws + 1))
 
 
+# -- corrections ---------------------------------------------------------------------------------------------
+
+
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
     """Holm's family-wise p of each; None stays None and takes no part."""
     order = sorted((p, position) for position, p in enumerate(p_values) if p is not None)
@@ -229,6 +237,8 @@ def corrected[Row](
         corrected_of |= zip(family, holm(list(family.values())), strict=True)
     return [corrected_of[name] for name in tests]
 
+
+# -- many effects together -----------------------------------------------------------------------------------
 
 FLOOR = 1e-6
 """Metres added to every standard error: a site that nothing reads has effects of exactly 0, and a finite T."""

@@ -29,6 +29,9 @@ if TYPE_CHECKING:
     from probe_kit.runs.arrays import StoredInputs, TokenBlock
 
 
+# -- a run made of arrays ------------------------------------------------------------------------------------
+
+
 class NotPlayed:
     """The parts of a `RunReader` that arrays in memory do not have; a class of your own may have some."""
 
@@ -186,6 +189,8 @@ class ArrayRun(NotPlayed):
 def _sha256(array: NDArray[np.generic]) -> str:
     return sha256(np.ascontiguousarray(array).tobytes()).hexdigest()
 
+
+# -- probes of arrays ----------------------------------------------------------------------------------------
 
 Sites = ArrayLike | Mapping[str, ArrayLike]
 """Features of one site (N, D), of several (S, N, D), or by name."""

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
     from probe_kit.runs import Run
     from probe_kit.train import ProbeResults, RunReader, Target
-    from probe_kit.train.command_options import TargetOptions
     from probe_kit.train.results.inventory import Inventory, StoredProbes
 
 
@@ -61,10 +60,9 @@ def train(
     """
     from probe_kit.runs import open_run
     from probe_kit.runs.direction_files import check_direction_file
-    from probe_kit.train.command_options import TargetOptions
     from probe_kit.train.results.probe_results import write_direction_file
 
-    target_options = TargetOptions(target, labels, task, group_by, exchange_within, align_to)
+    target_options = own.TargetOptions(target, labels, task, group_by, exchange_within, align_to)
     target_options.check(window)
     if test_on is None and (test_labels is not None or across_weights):
         option = "--test-labels" if test_labels is not None else "--across-weights"
@@ -120,7 +118,7 @@ def train(
 
 def _train(
     run: "Run",
-    target_options: "TargetOptions",
+    target_options: own.TargetOptions,
     categories: Any,
     call: str,
     options: Mapping[str, Any],
@@ -188,6 +186,9 @@ def _transfer(
     say(marked("nothing was stored; [bold]transfer_probes[/] in Python gives every site as a frame"))
 
 
+# -- what a run stores ---------------------------------------------------------------------------------------
+
+
 def facts_table(inventory: "Inventory", more_lines: Mapping[str, str]) -> "Table":
     """A run and what is stored with it. more_lines: those below, by name."""
     from rich.table import Table
@@ -248,7 +249,6 @@ def _probes_in_words(probes: "StoredProbes", inventory: "Inventory") -> str:
 
 def _calls(text: str, run: "RunReader") -> list[int]:
     """The captured inferences that were asked for, each once."""
-
     if text == "all":
         return list(range(run.captured_calls))
     parts = split(text) or ()

@@ -34,6 +34,8 @@ from probe_kit.train.run_suite import suite_of
 from probe_kit.train.samples import Samples
 from probe_kit.train.target_samples import TargetSamples
 
+# -- features that never saw the model -----------------------------------------------------------------------
+
 SIDE_DEFAULT = (RANDOM_FEATURES, "pixels")
 """Controls of a side that are run where the suite's pictures are, unless others, or none, are requested."""
 NOT_BY_DEFAULT = frozenset({"action", "position"})
@@ -198,6 +200,8 @@ def _compared(
     for row, of_site in zip(rows, p, strict=True):
         yield ControlComparison(name, *key, str(curve.sites[row]), level, float(of_site))
 
+
+# -- an untrained network ------------------------------------------------------------------------------------
 
 _SHOWN = (DATASET, "suite", "scene", "seed")
 """Settings that decide which frames a network is shown."""

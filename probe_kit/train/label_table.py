@@ -141,6 +141,8 @@ def _plain(cell: Any, table: LabelTable, row: int, column: str) -> Cell:
     )
 
 
+# -- values of a column under a task -------------------------------------------------------------------------
+
 MOST_DOUBTFUL = 20
 """Integers of 3 to so many values can be classes or quantities; only the user knows."""
 LARGEST = 1e100

@@ -96,6 +96,8 @@ def _probe(samples: Samples, problems: Problems, device: str | None = None) -> P
     return {category: problem.probe(on_device) for category, problem in problems.items()}
 
 
+# -- the sweep -----------------------------------------------------------------------------------------------
+
 TOKEN_PERMUTATIONS = 59
 """Label permutations of token views by default: every token is a sample, and each permutation costs a full fit.
 

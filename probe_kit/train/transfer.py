@@ -140,6 +140,8 @@ class TransferResults:
             }
 
 
+# -- the transfer --------------------------------------------------------------------------------------------
+
 _DIGITS = 12
 """Of a suite's hash, in its identity."""
 
@@ -389,6 +391,8 @@ def _curve(
     )
     return TransferCurve(plain, moved, np.stack([refitted for _, refitted, _ in of_view.values()]))
 
+
+# -- table and sentences -------------------------------------------------------------------------------------
 
 _LEGEND = (
     "Fitted on one run, scored on the other. The score of a chosen site is too high. Chance: mean score with "

@@ -259,6 +259,9 @@ def _change(source: "ActivationCache", tokens: int, along: Basis | None, complem
     return ReplaceInSubspace(source, tokens, basis, complement)
 
 
+# -- attention -----------------------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True)
 class AttentionPattern:
     """The attention of the heads of a block, in one inference.

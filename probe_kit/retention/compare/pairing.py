@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations, product
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from probe_kit.env.scoring import DEFAULT_RULE
 from probe_kit.errors import UsageError
@@ -22,10 +22,6 @@ from probe_kit.retention.compare.models import grew_from, origins_of
 from probe_kit.retention.rows.build import RowSettings, RowWithEstimates, run_rows
 from probe_kit.runs.layout import FIRST_FRAME
 from probe_kit.runs.reader import RunReader
-
-if TYPE_CHECKING:
-    pass
-
 
 PairedRuns = tuple[list[Difference], tuple[str, ...]]
 """Differences of runs or groups on the items that they have in common; and why others have none, and which items

@@ -220,6 +220,8 @@ def event_calls(run: Any) -> EventCalls:
     return by_event
 
 
+# -- figures -------------------------------------------------------------------------------------------------
+
 _PERMUTED = "best permuted probe, 95 %"
 
 

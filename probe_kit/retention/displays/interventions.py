@@ -36,6 +36,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+# -- readable and used ---------------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True)
 class Points:
     """One line: percent by layer, and which points are significant, family-wise."""
@@ -169,6 +172,8 @@ def site_effect_figures(source: FigureSource) -> Iterator[ReportFigure]:
             drawn.position, partial(site_effect_curve, drawn.run, drawn.results, drawn.results.settings.views[0]),
         )  # fmt: skip
 
+
+# -- attention -----------------------------------------------------------------------------------------------
 
 Percent = NDArray[np.float64]
 Picture = NDArray[np.uint8]

@@ -150,6 +150,9 @@ def role_figures(source: FigureSource) -> Iterator[ReportFigure]:
                 )  # fmt: skip
 
 
+# -- models by depth -----------------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True)
 class ModelCurve:
     """Accuracy above chance by layer, and by depth as its fraction; (L,) each, averaged over categories."""
@@ -307,6 +310,8 @@ def depth_figures(source: FigureSource) -> Iterator[ReportFigure]:
             None, partial(model_depths, results, iterations=source.table.iterations, names=names), is_detail=True,
         )  # fmt: skip
 
+
+# -- runs ----------------------------------------------------------------------------------------------------
 
 PARTS = {"backbone": "backbone", "action": "where the action is made"}
 _IN_A_ROW = 4

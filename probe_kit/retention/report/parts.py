@@ -144,6 +144,8 @@ def _rounded(numbers: str) -> str:
     return re.sub(r"\s*([A-Za-z])\s*", r"\1", re.sub(r"\s+", " ", short)).strip()
 
 
+# -- origin of numbers ---------------------------------------------------------------------------------------
+
 PAPER = "arXiv:2606.19297"
 
 
@@ -240,6 +242,9 @@ def _stream(run: RunReader, name: str) -> str:
 
 def _of_target(probes: ProbeResults) -> str:
     return "" if probes.settings.is_side else f" of {probes.settings.target}"
+
+
+# -- glossary ------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -221,6 +221,8 @@ def _no_success(episodes: "pd.DataFrame", heard: bool) -> SuccessRate:
     return SuccessRate(n_episodes=len(episodes), n_items=items, n_groups=groups, reason=reason)
 
 
+# -- the mean over categories --------------------------------------------------------------------------------
+
 _PARTS = ("success", "rules", "answers", "backbone", "action", "controls", "image_swap")
 
 

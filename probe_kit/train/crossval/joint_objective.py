@@ -21,6 +21,8 @@ from probe_kit.train.samples import Samples
 from probe_kit.train.solver.arrays import Array, Moments, RowSubset, array_namespace, to_numpy
 from probe_kit.train.solver.design_matrix import narrow_axes
 
+# -- the site ------------------------------------------------------------------------------------------------
+
 ROWS_PER_BLOCK = 512
 """8 MB of float64 at a width of 2,048: a block is used twice, so it should stay in the processor's cache."""
 
@@ -150,6 +152,8 @@ def _sorted(samples: Samples, folds: Sequence[NestedFold]) -> tuple[RowSubset, t
     ]
     return sorted_.features, tuple(Block(rows, episode[rows], fold) for fold, rows in spans)
 
+
+# -- the objective -------------------------------------------------------------------------------------------
 
 TOLERANCE = 1e-9
 """A solution is accepted when ‖gradient‖ ≤ TOLERANCE · ‖w‖, in float64."""

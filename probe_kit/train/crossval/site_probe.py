@@ -24,6 +24,8 @@ from probe_kit.train.crossval.task_scores import balanced_scores, correctness, e
 from probe_kit.train.samples import Samples
 from probe_kit.train.solver.arrays import Standardiser, to_numpy
 
+# -- ridge ---------------------------------------------------------------------------------------------------
+
 PENALTIES: Matrix = np.array([*10.0 ** np.arange(-2, 6), np.inf])
 """λ of the grid; at infinity the prediction is the mean of the training labels."""
 
@@ -122,6 +124,9 @@ def _along_penalties(samples: Samples, labels: Matrix, classes: int, fold: Fold)
     shape = (fold.test.size, classes, labels.shape[1])
     for predicted in ridge.predictions(training_samples.repeat(scaled)):
         yield (predicted.reshape(shape) + absent).argmax(axis=1).astype(np.float64)
+
+
+# -- the probe -----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

@@ -84,6 +84,8 @@ class ProbeSettings:
         return self.target in SIDES
 
 
+# -- directions ----------------------------------------------------------------------------------------------
+
 Place = tuple[str, str, Site]
 """A category, a view and a site."""
 
@@ -188,6 +190,9 @@ def write_direction_file(directions: Mapping[Place, Direction], file: Path, weig
             about[name] = about_name
     write_directions(file, vectors, about)
     return len(vectors)
+
+
+# -- the table of scores -------------------------------------------------------------------------------------
 
 
 def score_rows(
@@ -333,6 +338,9 @@ def results_html(settings: ProbeSettings, label: str, scores: "pd.DataFrame") ->
         "results.scores has every site"
     )
     return rows_html(title, columns, rows, note)
+
+
+# -- all results ---------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, repr=False)

@@ -91,6 +91,8 @@ class SweepCheckpoint:
         self.pieces.discard()
 
 
+# -- complete results ----------------------------------------------------------------------------------------
+
 SCORES, DECISIONS = "scores.csv", "decisions.npz"
 DIRECTIONS, CONTROLS = PROBE_DIRECTIONS, "controls.json"
 _TEXTS, _FACTS = ("parts", "classes"), ("task", "is_side", "smallest_p")

@@ -71,6 +71,8 @@ def keep_freed_memory() -> None:
     np.empty(2**25 - 2**16, np.uint8)  # below 32 MB, with what glibc adds to a block
 
 
+# -- rows of large arrays ------------------------------------------------------------------------------------
+
 ROWS_PER_BLOCK = 2048
 """32 MB of float64 at a width of 2,048."""
 
@@ -127,6 +129,9 @@ def blocks_of(features: Features) -> Iterator[Array]:
 def module_of(features: Features) -> Any:
     """numpy or torch, whichever holds `features`."""
     return array_namespace(features.matrix if isinstance(features, RowSubset) else features)
+
+
+# -- standardisation -----------------------------------------------------------------------------------------
 
 
 class Moments(NamedTuple):

@@ -19,6 +19,9 @@ from probe_kit.train.solver.arrays import (
     to_numpy,
 )
 
+# -- principal axes ------------------------------------------------------------------------------------------
+
+
 WORTH_NARROWING = 1024
 """Features from which on eigenvectors in float32, made orthogonal again, take less time than in float64."""
 
@@ -103,6 +106,9 @@ def _orthogonal(axes: Array) -> Array:
     missing *= 0.5
     exact -= missing
     return exact
+
+
+# -- samples along them --------------------------------------------------------------------------------------
 
 
 WORTH_CONVERTING = 2**17
@@ -281,6 +287,8 @@ class StreamedDesign(_OfAllColumns):
 Design = DenseDesign | StackedDesign | StreamedDesign
 """N samples Z in R orthogonal coordinates, the last one all ones for the intercept."""
 
+
+# -- a training fold -----------------------------------------------------------------------------------------
 
 IN_MEMORY = 2**29
 """Bytes up to which training samples are turned to their axes once, in float64, rather than in every product."""

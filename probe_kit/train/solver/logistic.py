@@ -1,7 +1,7 @@
 """Exact solver of many L2-regularised logistic regressions on the same samples.
 
 The objective is scikit-learn's: C · Σ log(1 + exp(−y f)) + ½‖w‖², f = Zw, the intercept not penalised.
-Samples come in principal coordinates (`features.Coordinates`), whose columns are nearly orthogonal: there the
+Samples come in principal coordinates (`design_matrix.Projection`), whose columns are nearly orthogonal: there the
 Hessian I + C·ZᵀSZ is nearly diagonal, so Newton steps by conjugate gradients with a diagonal preconditioner
 need a few products each, and all label columns share them as matrix–matrix products.
 
@@ -21,6 +21,8 @@ from numpy.typing import NDArray
 from probe_kit.errors import ProbeNotConvergedError, TooFewGroupsError
 from probe_kit.train.solver.arrays import Array, array_namespace, keep_freed_memory
 from probe_kit.train.solver.design_matrix import Design
+
+# -- one Newton step, by conjugate gradients -----------------------------------------------------------------
 
 MAX_CG_STEPS = 100
 """Columns that need more are solved by factorising; another number changes times, not optima."""
@@ -85,6 +87,8 @@ def _dots(first: Array, second: Array) -> Array:
     """(K,) products of columns."""
     return array_namespace(first).einsum("rk,rk->k", first, second)
 
+
+# -- the solver ----------------------------------------------------------------------------------------------
 
 MAX_NEWTON_STEPS = 100
 """After these `ProbeNotConvergedError` is raised: no probe is used that is not at its optimum."""
