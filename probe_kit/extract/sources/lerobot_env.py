@@ -17,8 +17,9 @@ from probe_kit._system.imports import require
 from probe_kit.errors import MissingExtraError, OwnEnvironmentError, UsageError
 from probe_kit.extract.sources.environment import SUCCESS, EnvEpisode, Step
 from probe_kit.hooks.contract.observation import Observation
+from probe_kit.hooks.families.shared.kinds import IMAGES, STATE
 
-IMAGE, IMAGES, STATE = "observation.image", "observation.images.", "observation.state"
+IMAGE = "observation.image"
 PER_TASK = 20
 """Episodes per task where none are named."""
 
