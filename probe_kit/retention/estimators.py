@@ -44,7 +44,7 @@ class StreamScores:
     """Cross-fitted scores of K streams of one category and view.
 
     names: `action` and `backbone` in this order, as far as they were probed. fit: their scores, on the same
-    groups. at_most: of a side, by name, an upper limit of the best site's accuracy, see `verdict.at_most`.
+    groups. at_most: of a side, by name, an upper limit of the best site's accuracy, see `sufficiency.at_most`.
     """
 
     names: tuple[str, ...]

@@ -190,7 +190,7 @@ def unbounded_student_interval(
         return -inf, inf
     mean, sizes = float(values.mean()), np.bincount(group_of)
     residuals = np.bincount(group_of, values) - mean * sizes
-    spread = _reach(residuals, values.size, tail)
+    spread = _student_reach(residuals, values.size, tail)
     return mean - spread, mean + spread
 
 
@@ -215,13 +215,13 @@ def explained_interval(
         return 1.0, 1.0
     relative = deviations / varying if varying > 0 else np.ones(scores.size)
     residuals = np.asarray(np.bincount(group_of, (1 - scores) - missing * relative), dtype=np.float64)
-    reach = _reach(residuals, scores.size) * widening / missing
+    reach = _student_reach(residuals, scores.size) * widening / missing
     low, high = 1 - missing * exp(min(reach, 100.0)), 1 - missing * exp(-reach)  # exp overflows from 710 on
     # The subtractions round: around a score of -5e-17, the limits of groups that all agree would both be 0.
     return min(low, explained), max(high, explained)
 
 
-def _reach(residuals: NDArray[np.floating], count: int, tail: float = SIGNIFICANCE / 2) -> float:
+def _student_reach(residuals: NDArray[np.floating], count: int, tail: float = SIGNIFICANCE / 2) -> float:
     """Student's quantile times the standard error of a mean over `count` episodes of G groups.
 
     residuals: (G,) sums over the episodes of a group of the values without their mean. tail: beyond the quantile.

@@ -22,6 +22,9 @@ CHANCE = 0.5
 """Balanced accuracy of any answer that does not depend on the question."""
 
 
+# -- balanced scores -----------------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True)
 class GroupSums:
     """Weighted correct decisions per group of items, the unit of every resampling.
@@ -107,6 +110,8 @@ def remove_fold_priors(decisions: Matrix, labels: NDArray[np.bool_], fold_of: Ar
             balanced[:, tested] -= np.log(yes / no)
     return balanced
 
+
+# -- cross-fitted scores -------------------------------------------------------------------------------------
 
 RESAMPLES = 1000
 """Resamples of the groups in which the sites are chosen anew."""

@@ -17,6 +17,8 @@ from probe_kit.statistics.intervals import (
     wilson_interval,
 )
 
+# -- scores above chance -------------------------------------------------------------------------------------
+
 
 @dataclass(frozen=True)
 class Scores:
@@ -63,6 +65,8 @@ def t_quantile(df: float, tail: float = TAIL) -> float:
 
     return float(stdtrit(df, 1 - tail))
 
+
+# -- their ratio ---------------------------------------------------------------------------------------------
 
 LEAST_KNOWN = 0.25
 """Share of the backbone's score that the lower end of its 95 % interval must reach.

@@ -19,6 +19,8 @@ from probe_kit.statistics.label_permutations import possible_flips, smallest_p
 from probe_kit.statistics.paired_tests import smallest_flip_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 
+# -- verdicts on a stream ------------------------------------------------------------------------------------
+
 Verdict = Literal["shown", "not shown", "absent"]
 
 ABSENT_BELOW = 0.65
@@ -87,6 +89,8 @@ def verdict(signal: bool, most: float, least: float, absent_below: float = ABSEN
         return "shown"
     return "absent" if is_absent(most, least, absent_below) else "not shown"
 
+
+# -- numbers of groups ---------------------------------------------------------------------------------------
 
 GROUPS_FOR_PROBES = OUTER_FOLDS
 """With fewer, `train` refuses the category."""

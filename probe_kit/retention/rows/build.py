@@ -231,7 +231,7 @@ def mean_row(drawn: Sequence[RowWithEstimates], averaged: Sequence[str]) -> Rete
 
     averaged: fields that are averaged over the categories that have them, as `part.field`; the columns declare
     them, see `probe_kit.retention.columns.columns`. Intervals: of independent
-    categories, see `probe_kit.statistics.crossfit`.
+    categories, see `mean_interval` and `Scores.mean`.
     """
     rows = [part.row for part in drawn]
     of_streams = [part.streams for part in drawn if part.streams is not None]
