@@ -61,6 +61,8 @@ def serve(connection: Connection) -> None:
         connection.send(error)
 
 
+# -- the executor ---------------------------------------------------------------------------------------------
+
 MOST_STILLBORN = 3
 """So many workers in a row that die before their first task are no accident of one of them."""
 _NAMED_TASKS = 3

@@ -1,4 +1,4 @@
-"""A pool of workers in child processes, each of which answers requests over one connection.
+"""A child process that answers requests over one connection, and a pool of workers in such processes.
 
 `multiprocessing` starts a child by importing the caller's script again, which breaks every script and notebook
 without a main guard; forking breaks torch and zarr. So a child is a fresh interpreter that runs this module and
@@ -63,6 +63,8 @@ def main() -> None:
         except (EOFError, BrokenPipeError, ConnectionResetError):
             return  # the parent hung up or is gone
 
+
+# -- the pool -------------------------------------------------------------------------------------------------
 
 VISIBLE_GPUS = "CUDA_VISIBLE_DEVICES"
 LONGEST_WAIT_S = 1.0

@@ -10,7 +10,6 @@ import stat
 import zlib
 from codecs import BOM_UTF8
 from io import BufferedReader, BytesIO
-from math import isfinite
 from pathlib import Path
 from tokenize import TokenError
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -82,6 +81,8 @@ def _too_large(path: Path, size: int, most: int) -> OSError:
     return OSError(errno.EFBIG, reason, str(path))
 
 
+# -- YAML -----------------------------------------------------------------------------------------------------
+
 MOST_NODES = 1_000_000
 """Values of a YAML file, where an alias counts as all that it stands for."""
 _MOST_YAML_BYTES = 16 << 20
@@ -117,6 +118,8 @@ def _nodes(value: Any, counted: dict[int, int]) -> int:
         counted[id(value)] = 1 + sum(_nodes(child, counted) for child in children)
     return counted[id(value)]
 
+
+# -- JSON -----------------------------------------------------------------------------------------------------
 
 MOST_VALUES = 1 << 25
 """Values of one text; in Python each takes 8 to 80 bytes, however short it is written."""
@@ -165,7 +168,7 @@ def _distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def _finite(number: str) -> float:
     value = float(number)
-    if not isfinite(value):
+    if not math.isfinite(value):
         raise ValueError(f"it holds {number[:20]}, which is not a finite number")
     return value
 
@@ -215,6 +218,8 @@ def read_json_object(file: Path, raises: type[ProbeKitError], advice: str) -> di
     value: dict[str, Any] = read_json(file, raises, advice, kind=dict)
     return value
 
+
+# -- arrays ---------------------------------------------------------------------------------------------------
 
 MOST_ARRAY_BYTES = 4 << 30
 """Of all arrays of a file, unpacked."""

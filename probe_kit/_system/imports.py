@@ -34,6 +34,9 @@ def lazy_names(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], 
     return load, names
 
 
+# -- entry points ---------------------------------------------------------------------------------------------
+
+
 def entry_points(group: str) -> tuple[metadata.EntryPoint, ...]:
     """Return the entry points of a group, read again where a folder of the import path has changed."""
     return tuple(_read(tuple((folder, _modified(folder)) for folder in sys.path)).select(group=group))
@@ -52,6 +55,9 @@ def _modified(folder: str) -> int:
         return 0
 
 
+# -- optional libraries ---------------------------------------------------------------------------------------
+
+
 def require(module: str, extra: str) -> Any:
     """The module, or MissingExtraError naming the extra of probe-kit that brings it."""
     try:
@@ -61,6 +67,8 @@ def require(module: str, extra: str) -> Any:
             f"this needs {module.partition('.')[0]}, which is not installed; `{install_command(extra)}`"
         ) from error
 
+
+# -- commands that install ------------------------------------------------------------------------------------
 
 _ROOT = Path(__file__).parents[2]
 

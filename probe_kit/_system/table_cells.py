@@ -133,6 +133,8 @@ def group_names(cells: Sequence[Any], where: Callable[[int], str], error: Callab
     return names
 
 
+# -- columns --------------------------------------------------------------------------------------------------
+
 Cell = str | int | float | bool | None
 Where = Callable[[int], str]
 

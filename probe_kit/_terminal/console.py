@@ -164,6 +164,8 @@ def counter(bar: Progress, description: str) -> Callable[..., None]:
     return advance
 
 
+# -- lines in place of bars -----------------------------------------------------------------------------------
+
 FIRST = 10.0
 """Seconds until the first line."""
 EVERY = 60.0

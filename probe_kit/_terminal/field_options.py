@@ -1,7 +1,8 @@
 """Commands whose options are fields of models: a field is declared once, as setting, option and key of a file.
 
 A field that a command offers has a `typer.Option` in its annotation. The type, the choices, the default and the
-bounds are the field's own; pydantic ignores the option, and typer sees nothing of the model.
+bounds are the field's own; pydantic ignores the option, and typer sees nothing of the model. A command with many
+options prints those of further panels with `--help-all` only.
 """
 
 import inspect
@@ -163,6 +164,8 @@ def plain(value: Mapping[str, Any]) -> dict[str, Any]:
     """The entries that are neither None nor False: those that were chosen."""
     return {name: entry for name, entry in value.items() if entry is not None and entry is not False}
 
+
+# -- help in panels -------------------------------------------------------------------------------------------
 
 MOST_OPTIONS = 12
 """A command with more options than this prints its further panels with `--help-all` only."""

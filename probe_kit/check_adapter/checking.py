@@ -37,6 +37,10 @@ _RUNS = {
     ),
 }
 """Name and sentence of the run by whether it acts."""
+STEPS = 8
+"""Control steps of an episode at most."""
+_SIDE = 224
+_COLOURS = ("red", "blue")
 _RUN_ADVICE = "Correct what the error names; the contract checks above do not see a scene."
 
 
@@ -135,12 +139,6 @@ def _require_light(module: str) -> None:
         last = (process.stderr.strip().splitlines() or [f"exit code {process.returncode}"])[-1]
         raise UsageError(f"`import {module}` fails in a new process: {last}")
     require(process.returncode == 0, f"`import {module}` imports torch", "a module that imports none")
-
-
-STEPS = 8
-"""Control steps of an episode at most."""
-_SIDE = 224
-_COLOURS = ("red", "blue")
 
 
 def _one_item(instruction: str, folder: Path) -> Path:

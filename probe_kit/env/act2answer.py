@@ -20,8 +20,6 @@ from probe_kit.env.spec import XY, SceneSpec
 from probe_kit.errors import EpisodeOverError, SceneError
 from probe_kit.suite.items import LAYOUTS, Episode, Item, Layout, Side, other_side
 
-_SIDES: tuple[Side, Side] = ("left", "right")
-
 
 @dataclass(frozen=True)
 class Question:
@@ -45,7 +43,7 @@ class Question:
         from probe_kit.suite.pictures import load_picture
 
         episode = Episode(item, _checked(layout))
-        left, right = (load_picture(episode.picture(side), episode.pixels_sha256(side) or None) for side in _SIDES)
+        left, right = (load_picture(episode.picture(side), episode.pixels_sha256(side) or None) for side in SIDES)
         return cls(
             episode.episode_id, item.instruction, {"left": left, "right": right}, episode.side_correct, layout
         )
@@ -64,6 +62,8 @@ def _checked(layout: Layout) -> Layout:
         raise SceneError(f"layout {layout!r} does not exist; expected one of {', '.join(LAYOUTS)}.")
     return layout
 
+
+# -- the trial ------------------------------------------------------------------------------------------------
 
 FALLEN_BELOW = -0.05
 """Height of the cube, metres, at which it has left the table."""
@@ -151,6 +151,8 @@ class Trial:
         x, y, _ = self.scene.cube_state().position
         return (float(x), float(y))
 
+
+# -- the environment ------------------------------------------------------------------------------------------
 
 Observation = dict[str, Any]
 Info = dict[str, Any]
@@ -394,6 +396,9 @@ def _question(options: dict[str, Any]) -> Question:
     if not isinstance(item, Item):
         raise SceneError(f"reset option 'item' is a {type(item).__name__}; expected an Item of a suite.")
     return Question.from_item(item, layout)
+
+
+# -- the recorder ---------------------------------------------------------------------------------------------
 
 
 class Recorder:

@@ -144,6 +144,9 @@ def _numbers(vector: XYZ) -> str:
     return " ".join(f"{value:.9g}" for value in vector)
 
 
+# -- kinds of arms --------------------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True)
 class ArmModel:
     """The constants of one arm: joints, links, fingers and limits.
@@ -210,6 +213,8 @@ WIDOWX = ArmModel(
 
 ARMS: Mapping[ArmName, ArmModel] = MappingProxyType({"panda": PANDA, "widowx": WIDOWX})
 
+
+# -- the arm in the simulation --------------------------------------------------------------------------------
 
 POSITION_GAIN = 0.3
 VELOCITY_GAIN = 1.0
@@ -336,6 +341,8 @@ class Arm:
     def _matrix(self, quaternion: tuple[float, float, float, float]) -> Array:
         return np.array(self._client.getMatrixFromQuaternion(quaternion)).reshape(3, 3)
 
+
+# -- actions --------------------------------------------------------------------------------------------------
 
 ACTION_SIZE = 7
 OPEN_ABOVE = 0.5

@@ -58,6 +58,8 @@ def yaw_quaternion(yaw: float) -> tuple[float, float, float, float]:
     return (0.0, 0.0, float(np.sin(yaw / 2)), float(np.cos(yaw / 2)))
 
 
+# -- kinematics -----------------------------------------------------------------------------------------------
+
 DAMPING = 0.02
 """Largest damping factor; it shrinks with the residual, so that the last steps are Newton steps."""
 MAX_JOINT_STEP = 0.3

@@ -136,6 +136,8 @@ class Trajectory:
         return xr.Dataset(arrays, coords=times)
 
 
+# -- outcome --------------------------------------------------------------------------------------------------
+
 Zone = Literal["correct", "wrong", "oob"]
 Ending = Literal["max_steps", "cube_fell", "non_finite"]
 SENSITIVITY_RADII = (0.055, 0.065, 0.081)
@@ -246,6 +248,8 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
+# -- events ---------------------------------------------------------------------------------------------------
+
 MOVED = 0.005
 """Metres the tool has to leave its first place by to have set off; less is the arm settling."""
 LATERAL = 0.02
@@ -303,6 +307,8 @@ def _first(happened: NDArray[np.bool_]) -> int | None:
     frames = np.flatnonzero(happened)
     return int(frames[0]) if frames.size else None
 
+
+# -- outcome rules --------------------------------------------------------------------------------------------
 
 RELEASED_STEPS = 11
 """Control steps at the end that the released evaluation averages over."""
@@ -490,6 +496,8 @@ _MAKERS: dict[str, Callable[[Mapping[str, Any]], OutcomeRule]] = {
     ReleasedOnTile.name: lambda scene: ReleasedOnTile(scene["tile_side"] / 2),
 }
 
+
+# -- behaviour ------------------------------------------------------------------------------------------------
 
 Choice = Literal["correct", "wrong", "none"]
 

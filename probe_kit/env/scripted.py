@@ -157,6 +157,9 @@ class Idle:
         return np.array([0, 0, 0, 0, 0, 0, not self._env.scene_spec.start_grasped], np.float32)
 
 
+# -- pictures for models elsewhere ----------------------------------------------------------------------------
+
+
 def to_lerobot(observation: Mapping[str, Any]) -> dict[str, Any]:
     """The observation as lerobot's policies name it, in numpy.
 

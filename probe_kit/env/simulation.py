@@ -101,6 +101,8 @@ class BulletClient:
             self._server = -1
 
 
+# -- camera ---------------------------------------------------------------------------------------------------
+
 Picture = NDArray[np.uint8]
 
 
@@ -222,6 +224,8 @@ class Backdrop:
         return picture
 
 
+# -- pictures on tiles ----------------------------------------------------------------------------------------
+
 TEXTURE_PIXELS = 256
 """Side of a texture; a tile covers about 170 pixels of the rendered picture."""
 TEXTURE_BUDGET = 128
@@ -265,6 +269,8 @@ class TextureCache:
             path.unlink()
         return self._ids[key]
 
+
+# -- backgrounds ----------------------------------------------------------------------------------------------
 
 # All colours and numbers of grain are chosen by eye. Pictures, and all that models make of them, depend on each.
 PLANK_WIDTH = 0.14
@@ -338,6 +344,8 @@ def _noise(u: Array, v: Array, seed: int) -> Array:
 def _ease(share: Array) -> Array:
     return np.asarray(share * share * (3 - 2 * share))
 
+
+# -- films ----------------------------------------------------------------------------------------------------
 
 INVISIBLE = (0.0, 0.0, 0.0, 0.0)
 """Colour of what the renderer leaves out."""

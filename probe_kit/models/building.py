@@ -36,6 +36,9 @@ def building_device(device: str = "cpu") -> str:
     return "meta" if builds_sizes_only() else device
 
 
+# -- initial weights ------------------------------------------------------------------------------------------
+
+
 @torch.no_grad()
 def initialise(network: nn.Module, seed: int) -> None:
     """Fill every parameter with random numbers of a scale that keeps activations of order one.
@@ -60,6 +63,9 @@ def initialise(network: nn.Module, seed: int) -> None:
             scale /= 2
         values = rng.standard_normal(tuple(parameter.shape), dtype=np.float32) * np.float32(scale)
         parameter.copy_(torch.from_numpy(values))
+
+
+# -- parts of networks ----------------------------------------------------------------------------------------
 
 
 def frequencies(count: int, longest: float) -> Tensor:
@@ -101,8 +107,7 @@ def build_empty[Network: nn.Module](
 
     device: `meta` for parameters that have names and shapes but no memory, to be filled with
     `load_weights(…, assign=True)`; `cpu` for uninitialised weights. The rotary frequencies, which no
-    checkpoint holds, are then to be computed, with `fill_decoder_rotary`,
-    for Qwen's with `fill_rotary`.
+    checkpoint holds, are then to be computed, with `fill_decoder_rotary`, for Qwen's with `fill_rotary`.
     """
     before = torch.get_default_dtype()
     torch.set_default_dtype(dtype)

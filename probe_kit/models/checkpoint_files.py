@@ -27,6 +27,8 @@ def renamed(name: str, renames: Sequence[tuple[str, str]]) -> str:
     return name
 
 
+# -- processors -----------------------------------------------------------------------------------------------
+
 PROCESSOR_FILE = "preprocessor_config.json"
 
 
@@ -59,6 +61,8 @@ def square_side(values: dict[str, Any], folder: Path) -> int:
     return height
 
 
+# -- files that transformers reads ----------------------------------------------------------------------------
+
 _REMOTE_CODE = "trust_remote_code"
 
 
@@ -80,6 +84,8 @@ def load_pretrained(loader: Any, source: Path | str, **options: Any) -> Any:
             "tokenizer_class in tokenizer_config.json"
         ) from error
 
+
+# -- statistics -----------------------------------------------------------------------------------------------
 
 STATISTICS_FILE = "dataset_statistics.json"
 _SHOWN = 40

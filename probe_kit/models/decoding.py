@@ -35,6 +35,8 @@ class PromptKV(nn.Module):
             layer.keys, layer.values = cast(Tensor, keys(layer.keys)), cast(Tensor, values(layer.values))
 
 
+# -- decoding -------------------------------------------------------------------------------------------------
+
 Choose = Callable[[Tensor], Tensor]
 """(B,) ids of the next tokens from their logits (B, V)."""
 
@@ -125,6 +127,9 @@ class TokenNetwork(nn.Module):
             following = ids[-1] if fed is None else fed[:, len(ids) - 1]
             embeddings = self.language_model.get_input_embeddings()(following[:, None])
             mask = torch.cat([mask, torch.ones_like(mask[:, :1])], dim=1)
+
+
+# -- batches --------------------------------------------------------------------------------------------------
 
 
 def packed(rows: Sequence[Tensor], padding: int = 0) -> tuple[Tensor, Tensor]:

@@ -51,6 +51,8 @@ def full_size_internvl(size: str) -> Any:
     return build_internvl(config, torch.float32)
 
 
+# -- pictures -------------------------------------------------------------------------------------------------
+
 _NEEDED = ("image_mean", "image_std", "size")
 _OPTIONAL = ("do_resize", "do_rescale", "rescale_factor", "do_normalize", "resample", "min_patches", "max_patches")
 

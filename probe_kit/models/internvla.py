@@ -194,6 +194,9 @@ def _sizes_of(name: str, table: Mapping[str, tuple[int, int, int]], field: str, 
     return {"embed_dim": width, "token_size": width, "depth": blocks, "num_heads": heads}
 
 
+# -- layers ---------------------------------------------------------------------------------------------------
+
+
 class Attention(nn.Module):
     """Self-attention of (B, T, D) without a mask."""
 
@@ -223,6 +226,8 @@ class MLP(nn.Module):
         """(B, T, D)."""
         return cast(Tensor, self.fc2(functional.gelu(self.fc1(stream), approximate=self.approximate)))
 
+
+# -- DINOv2 ---------------------------------------------------------------------------------------------------
 
 _DINO_EPSILON = 1e-6
 _OFFSET = 0.1
@@ -300,6 +305,9 @@ class DinoV2(nn.Module):
         return torch.cat([embeddings[:, :1], stretched.flatten(2).transpose(1, 2)], dim=1)
 
 
+# -- the querying transformer ---------------------------------------------------------------------------------
+
+
 class Layer(nn.Module):
     """Queries read one hidden state, then pass an MLP."""
 
@@ -333,6 +341,8 @@ class QueryTransformer(nn.Module):
             queries = layer(queries, self.proj(state))
         return queries
 
+
+# -- the diffusion head ---------------------------------------------------------------------------------------
 
 _SINUSOID = 256
 _LONGEST_PERIOD = 10000
@@ -474,6 +484,9 @@ def _added_noise(steps: int) -> NDArray[np.float64]:
     return np.array([min(1 - left((step + 1) / steps) / left(step / steps), 0.999) for step in range(steps)])
 
 
+# -- the network ----------------------------------------------------------------------------------------------
+
+
 class _Qwen(nn.Module):
     def __init__(self, config: Qwen2_5_VLConfig) -> None:
         super().__init__()
@@ -583,6 +596,8 @@ def full_size_internvla() -> InternVLANetwork:
     vlm = {"vision_config": vision, "text_config": text, "tie_word_embeddings": True}
     return build_internvla(InternVLAConfig.from_values(run, vlm, "released"), torch.float32)
 
+
+# -- inputs ---------------------------------------------------------------------------------------------------
 
 SIDE = 224
 """Of the picture that the released evaluation sends."""

@@ -123,6 +123,8 @@ def shipped_statistics() -> dict[str, Any]:
     return dict(load_json(Path(__file__).parent / "magma_statistics.json")["norm_stats"])
 
 
+# -- pictures -------------------------------------------------------------------------------------------------
+
 Colour = tuple[float, float, float]
 # CLIP's (Radford et al. 2021), the defaults of Magma's image processor.
 _MEAN: Colour = (0.48145466, 0.4578275, 0.40821073)
@@ -226,6 +228,9 @@ def prepare_picture(picture: NDArray[np.uint8], settings: PictureSettings) -> Pi
     return Picture(crops.reshape(-1, 3, side, side).contiguous(), grid)
 
 
+# -- the vision tower -----------------------------------------------------------------------------------------
+
+
 class ClipVisionModel(nn.Module):
     """Holds the trunk under the name it has in the released files."""
 
@@ -312,6 +317,9 @@ def map_size(grid: Grid, side: int, reduction: int, strategy: str) -> tuple[int,
     return grid.rows * (side // reduction), grid.columns * (side // reduction)
 
 
+# -- packing --------------------------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True)
 class PictureSpan:
     """The positions of a picture's tokens in its row: `start`, then `rows` times `columns` and a separator."""
@@ -336,6 +344,8 @@ def placeholder(ids: Sequence[int], image_token: int) -> int:
         )
     return places[0]
 
+
+# -- the network ----------------------------------------------------------------------------------------------
 
 # In the released files and never read: the contrastive head that the trunk was trained with.
 UNUSED_WEIGHTS = (
@@ -472,6 +482,8 @@ def full_size_magma() -> MagmaNetwork:
     )
     return build_magma(config, torch.bfloat16)
 
+
+# -- prompts --------------------------------------------------------------------------------------------------
 
 SYSTEM = "You are agent that can see, talk and act."
 ACTION_QUESTION = "What action should the robot take to {instruction}?"

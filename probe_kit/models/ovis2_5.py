@@ -83,6 +83,8 @@ class OvisConfig(ConfigFile):
         return cls.read(values, "config.json")
 
 
+# -- the vision tower -----------------------------------------------------------------------------------------
+
 _THETA = 10000.0
 
 
@@ -215,6 +217,8 @@ def word_order(maps: Tensor, stride: int) -> Tensor:
     return cut.transpose(1, 2).reshape(rows * columns, *maps.shape[2:])
 
 
+# -- the network ----------------------------------------------------------------------------------------------
+
 PICTURE, PICTURE_BEGINS, PICTURE_ENDS = -300, -301, -302
 """What stands in the ids of a prompt where no text does."""
 _MARKS = 4
@@ -326,6 +330,8 @@ def full_size_ovis2_5() -> OvisNetwork:
     values = {"llm_config": text, "vit_config": vision, "visual_vocab_size": 65536}
     return build_ovis2_5(OvisConfig.from_values(values), torch.float32)
 
+
+# -- pictures -------------------------------------------------------------------------------------------------
 
 SMALLEST, LARGEST = 448 * 448, 1792 * 1792
 """Pixels between which pictures are brought; the authors' code has them, no file does."""

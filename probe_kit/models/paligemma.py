@@ -59,6 +59,8 @@ def full_size_paligemma() -> Any:
     return build_paligemma(config, torch.float32)
 
 
+# -- pictures -------------------------------------------------------------------------------------------------
+
 CROP = "probe_kit_crop"
 _NEEDED = ("image_mean", "image_std", "size")
 _OPTIONAL = ("do_resize", "do_rescale", "rescale_factor", "do_normalize", "resample")

@@ -70,6 +70,9 @@ def _current(name: str, names: Sequence[tuple[str, str]]) -> str:
     return f"model.{bare}"
 
 
+# -- pi0 ------------------------------------------------------------------------------------------------------
+
+
 class GemmaSize(ConfigFile, extra="forbid"):
     """One Gemma stack. Backbone and expert must agree in depth, KV heads and head size."""
 
@@ -185,6 +188,9 @@ def _sized_expert(module: Any, size: Pi0Size) -> Callable[..., Any]:
         return real(config=config)
 
     return build
+
+
+# -- pi0.5 ----------------------------------------------------------------------------------------------------
 
 
 class Gate(nn.Module):

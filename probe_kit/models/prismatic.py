@@ -230,6 +230,9 @@ def _text_config(values: Mapping[str, Any], model_type: str, source: str) -> Any
     return CONFIG_MAPPING[model_type].from_dict(stored)
 
 
+# -- vision towers --------------------------------------------------------------------------------------------
+
+
 class LayerScale(nn.Module):
     """timm's layer scale under the name the released files have: `scale_factor` instead of `gamma`."""
 
@@ -287,6 +290,9 @@ def _tower(config: TowerConfig) -> Any:
             if not isinstance(getattr(block, name), nn.Identity):
                 setattr(block, name, LayerScale(int(tower.embed_dim)))
     return tower
+
+
+# -- the network ----------------------------------------------------------------------------------------------
 
 
 class Projector(nn.Module):
@@ -380,6 +386,8 @@ def _full_size(model_type: str, vision: str, language: str) -> PrismaticNetwork:
     )
     return build_prismatic(config, torch.bfloat16)
 
+
+# -- pictures -------------------------------------------------------------------------------------------------
 
 Colour = tuple[float, float, float]
 _RESAMPLING = {"bicubic": Image.Resampling.BICUBIC, "bilinear": Image.Resampling.BILINEAR}
@@ -518,6 +526,8 @@ def _between(pixels: NDArray[np.float32], places: NDArray[np.float32], axis: int
     below, above = pixels.take(low, axis), pixels.take(high, axis)
     return np.asarray(below + (above - below) * share, np.float32)
 
+
+# -- pictures as tensors --------------------------------------------------------------------------------------
 
 _MODES = {"bicubic": InterpolationMode.BICUBIC, "bilinear": InterpolationMode.BILINEAR}
 

@@ -124,6 +124,8 @@ def full_size_qwen3_vl(size: str) -> Any:
     return build_qwen3_vl(config, torch.float32)
 
 
+# -- batches of prompts ---------------------------------------------------------------------------------------
+
 IMAGE = "<|vision_start|><|image_pad|><|vision_end|>"
 """Where a picture goes in a prompt; `image_slots` repeats the middle token."""
 
@@ -216,6 +218,8 @@ def pack_inputs(
         mask[index, : len(row)] = 1
     return QwenInputs(ids, mask, pixel_values, grid, image_token)
 
+
+# -- pictures -------------------------------------------------------------------------------------------------
 
 SETTINGS_FILE = "preprocessor_config.json"
 _NEEDED = ("patch_size", "temporal_patch_size", "merge_size", "image_mean", "image_std")

@@ -107,6 +107,8 @@ class SpatialVLAConfig(ConfigFile):
         return self
 
 
+# -- depth ----------------------------------------------------------------------------------------------------
+
 # The original fixes both in its code; no file of a checkpoint names them.
 MARGIN = 31
 """Pixels of mirrored picture on every side, so that the map has no border effects."""
@@ -168,6 +170,8 @@ def fill_depth_buffers(network: Any) -> None:
             module.k_minus_1 = torch.tensor([module.k - 1]).view(1, -1, 1, 1)
 
 
+# -- space ----------------------------------------------------------------------------------------------------
+
 # The box the code is made for: two metres to each side, four metres ahead of the camera.
 _CENTRE, _HALF = (0.0, 0.0, 2.0), 2.0
 
@@ -220,6 +224,8 @@ class PositionEmbedding3D(nn.Module):
         embedded: Tensor = self.position_embedding_head(self.code(points).to(dtype))
         return embedded
 
+
+# -- the network ----------------------------------------------------------------------------------------------
 
 EAGER = "eager"
 """The only attention of transformers that keeps Gemma-2's soft cap of attention logits."""
@@ -408,6 +414,8 @@ def _fill_buffers(network: SpatialVLANetwork) -> None:
         )
 
 
+# -- the size of the release ----------------------------------------------------------------------------------
+
 _VISION = {
     "hidden_size": 1152,
     "image_size": 224,
@@ -461,6 +469,8 @@ def full_size_spatialvla() -> SpatialVLANetwork:
     """SpatialVLA-4B on the meta device."""
     return build_spatialvla(SpatialVLAConfig.from_json(_VALUES), torch.bfloat16)
 
+
+# -- pictures -------------------------------------------------------------------------------------------------
 
 PREPROCESSOR_FILE = "preprocessor_config.json"
 Colour = tuple[float, float, float]

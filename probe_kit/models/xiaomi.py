@@ -86,6 +86,8 @@ class XiaomiConfig(ConfigFile):
         return self
 
 
+# -- the flow transformer -------------------------------------------------------------------------------------
+
 Cache = tuple[Tensor, Tensor]
 """Keys and values of one layer of the vision-language model, (B, K, P, E) each, keys after rotation."""
 Angles = tuple[Tensor, Tensor]
@@ -231,6 +233,8 @@ class FlowTransformer(nn.Module):
         return stream
 
 
+# -- the network ----------------------------------------------------------------------------------------------
+
 STEPS = 5
 """Euler steps of the released software."""
 _THOUSANDTHS = 1000
@@ -351,6 +355,8 @@ def full_size_xiaomi() -> XiaomiNetwork:
     )
 
 
+# -- robots ---------------------------------------------------------------------------------------------------
+
 DEFAULT_ROBOT = "bridge_delta"
 STATISTICS_FILE = "preprocessor_config.json"
 _UNUSED = 1e-5
@@ -459,6 +465,8 @@ def robot_of(name: str) -> Robot:
         f"choose a robot of {' or '.join(robot.name for robot in _ROBOTS)}"
     )
 
+
+# -- inputs ---------------------------------------------------------------------------------------------------
 
 CROP = 0.95
 """Share of each side that stays; the rest is cut off equally around it."""

@@ -94,6 +94,9 @@ def same_bits(array: NDArray[np.float32], other: NDArray[np.float32]) -> bool:
     return array.shape == other.shape and array.dtype == other.dtype and array.tobytes() == other.tobytes()
 
 
+# -- the cache ------------------------------------------------------------------------------------------------
+
+
 class ActivationCache(Mapping[Site, Tensor]):
     """The captured activations of one inference, a mapping from sites in the order in which they fired.
 
@@ -193,6 +196,8 @@ class ActivationCache(Mapping[Site, Tensor]):
         note = "tape[site] or tape['backbone.03.residual'] for one of them, tape.stack(stream) for all layers"
         return rows_html(f"ActivationCache of {len(self)} sites", columns, rows, note)
 
+
+# -- capture --------------------------------------------------------------------------------------------------
 
 Reduce = Callable[[Site, Tensor], Tensor]
 EditFunction = Callable[[Tensor], Tensor]
@@ -339,6 +344,8 @@ def _check_non_finite(tape: ActivationCache) -> None:
                 f"{site} holds NaN or infinity; look for overflow (try --dtype float32) or damaged weights"
             )
 
+
+# -- gradients ------------------------------------------------------------------------------------------------
 
 Metric = Callable[[Tensor], Tensor]
 """From (B, chunk, 7) actions, metres and radians, to a number."""

@@ -74,6 +74,8 @@ def vector_hash(vector: NDArray[np.floating]) -> str:
     return hashlib.sha256(str(values.shape).encode() + values.tobytes()).hexdigest()
 
 
+# -- changes of tokens ----------------------------------------------------------------------------------------
+
 TokenIndex = Union["Tensor", slice]
 """Positions of tokens: a slice of neighbours, which copies nothing, or (T',) indices."""
 EVERY = slice(None)
@@ -239,6 +241,8 @@ class DeclaredEdit:
             where = torch.arange(first, first + activation.shape[1], device=other.device)
         return other.index_select(0, where % self.tokens)[None]
 
+
+# -- the engine -----------------------------------------------------------------------------------------------
 
 LOG_FIELDS = ("fires", "no_op_fires", "norm", "change", "largest_change")
 """The columns of a stored log."""

@@ -45,6 +45,9 @@ def project_heads(model: Model, cache: ActivationCache, site: Site | str) -> Ten
         return added if bias is None else added - bias
 
 
+# -- the logit lens -------------------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True)
 class LogitLens:
     """The tokens that the layers of one stream would put out.

@@ -164,6 +164,8 @@ def record_commit(repository: str, commit: str) -> None:
         commits[repository] = commit
 
 
+# -- files ----------------------------------------------------------------------------------------------------
+
 CONFIG_FILE, ADAPTER_FILE = "config.json", "adapter_config.json"
 GENERATION_FILE = "generation_config.json"
 WEIGHTS_FILE, INDEX_FILE = "model.safetensors", "model.safetensors.index.json"

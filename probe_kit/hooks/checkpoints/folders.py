@@ -178,6 +178,8 @@ def _check_own_base(adapter: AdapterFiles) -> None:
     )
 
 
+# -- folders --------------------------------------------------------------------------------------------------
+
 CONFIGURATIONS = (CONFIG_FILE, "config.yaml")
 """Either holds the configuration of a network."""
 _READ_TOGETHER = (
@@ -272,6 +274,9 @@ def _is_replaced(name: str, adapter_names: Sequence[str]) -> bool:
     """Whether the adapter has this file of the base, or one that is read together with such files."""
     parts = (begin for heads, begin in _READ_TOGETHER if any(head in adapter_names for head in heads))
     return name in adapter_names or any(name.startswith(begin) for begin in parts)
+
+
+# -- checks before loading ------------------------------------------------------------------------------------
 
 
 def check_files(

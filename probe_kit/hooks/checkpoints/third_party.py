@@ -181,6 +181,8 @@ def _noted_interruptions() -> Iterator[Interruptions]:
             signal.signal(ending, handler)
 
 
+# -- names of errors ------------------------------------------------------------------------------------------
+
 _LONGEST = 300
 
 

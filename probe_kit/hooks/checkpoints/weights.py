@@ -155,6 +155,8 @@ def _few(names: list[str], most: int = 8) -> str:
     return ", ".join(names[:most]) + more
 
 
+# -- reading and loading --------------------------------------------------------------------------------------
+
 RANDOM_MARK = "probe_kit.weights"
 _WRAPPERS = (
     "_orig_mod", "_fsdp_wrapped_module", "_checkpoint_wrapped_module", "_forward_module", "_ddp_module", "module",

@@ -198,6 +198,9 @@ def an_unknown_site_is_refused(subject: Subject) -> None:
             subject.model.tap(site)
 
 
+# -- edits ----------------------------------------------------------------------------------------------------
+
+
 @check(
     "Rewriting a site with itself changes no output, and zeros in its place do.",
     "Tap the tensor that the block itself reads, not a copy: an edit is written into that tensor.",
@@ -238,6 +241,8 @@ def an_edit_is_what_a_capture_inside_it_reads(subject: Subject) -> None:
     most = float(tape[site].abs().max())
     require(most == 0, f"{site} holds values up to {most:.3g} behind an edit to zeros", "zeros")
 
+
+# -- attention heads ------------------------------------------------------------------------------------------
 
 _SUM_TOLERANCE = 1e-5
 
@@ -357,6 +362,9 @@ def _streams_with_heads(subject: Subject) -> list[Stream]:
     return streams
 
 
+# -- batches --------------------------------------------------------------------------------------------------
+
+
 @check(
     "A batch gives what its rows give one by one.",
     "Mask padding, and take each row's randomness from its seed; or declare batch=1 in the card.",
@@ -384,6 +392,9 @@ def an_observation_without_what_is_needed_is_refused(subject: Subject) -> None:
         return
     with refused("an observation without cameras and intrinsics", ObservationError, says="reads"):
         subject.run([bare])
+
+
+# -- token roles ----------------------------------------------------------------------------------------------
 
 
 @check(

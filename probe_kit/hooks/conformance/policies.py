@@ -106,6 +106,9 @@ def _acting(subject: PolicySubject) -> Policy:
     return subject.policy
 
 
+# -- interventions --------------------------------------------------------------------------------------------
+
+
 @check(
     "Policy and family declare the same interventions.",
     "Name one `Interventions` in the adapter and in its Family, with every stream and its quantities.",
@@ -379,6 +382,8 @@ def _edits_from(
     vectors = {vector_hash(row): row for row in rows.values()}
     return [Edit("replace", (site,), vector=vector_hash(row)) for site, row in rows.items()], vectors
 
+
+# -- gradients ------------------------------------------------------------------------------------------------
 
 CLOSE = 0.01
 """Relative difference of a gradient from a central difference."""

@@ -29,6 +29,8 @@ EMBEDDED = DefaultScene("act2answer", MappingProxyType({"early_stop": True, "max
 """Of the embedded models, whose demonstrations took at most 40 actions."""
 
 
+# -- options --------------------------------------------------------------------------------------------------
+
 # For text options of kind bool; Python's own `bool("false")` is True.
 _WORDS = {"true": True, "yes": True, "on": True, "1": True, "false": False, "no": False, "off": False, "0": False}
 _EXPECTED = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
@@ -105,6 +107,8 @@ def check_options(family: str, declared: Sequence[Option], options: Mapping[str,
     return {name: by_name[name].value(value) for name, value in options.items()}
 
 
+# -- protocols ------------------------------------------------------------------------------------------------
+
 Rotation = Literal["roll-pitch-yaw", "axis-angle"]
 """What reaches the controller as the rotation of an action; see `ProtocolRow.rotation`."""
 ROTATIONS: tuple[Rotation, ...] = get_args(Rotation)
@@ -177,6 +181,8 @@ ACT2ANSWER: ProtocolName = "act2answer"
 OWN_SEEDS = "draws come from the episode's seed; the release seeds once per process"
 
 
+# -- streams --------------------------------------------------------------------------------------------------
+
 TEXT = ("language", "special")
 
 
@@ -221,6 +227,8 @@ def answering(layers: int, width: int, tokens: int, sums: bool = True) -> tuple[
     """The two streams of a VLM that answers."""
     return backbone(layers, width, tokens, sums=sums), chosen_tokens("answer", layers, width, 1, sums)
 
+
+# -- interventions --------------------------------------------------------------------------------------------
 
 InterventionKind = Literal["swap", "edit", "kv", "attention", "tiles", "gradients"]
 Readout = Literal["first-chunk", "per-step"]

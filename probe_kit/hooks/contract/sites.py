@@ -171,6 +171,8 @@ def first_of(part: Part, streams: Iterable[Stream]) -> str | None:
     return next((stream.name for stream in streams if stream.part == part and stream.probed), None)
 
 
+# -- roles and views ------------------------------------------------------------------------------------------
+
 PADDING = "padding"
 CAMERA = "primary"
 """The camera of families whose models know one."""

@@ -134,6 +134,8 @@ def _window() -> dict[str, Any]:
     return {"registry_name": "image_crop_resize_processor", "config": config}
 
 
+# -- vlm-tiny -------------------------------------------------------------------------------------------------
+
 MOST_TOKENS = 128
 """Of a whole prompt, the picture's 36 included."""
 CAMERA_PICTURE = (480, 640)

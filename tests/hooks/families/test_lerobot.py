@@ -146,6 +146,16 @@ def test_a_policy_that_reads_several_observations_is_refused(family: str, tmp_pa
         load_policy(family, str(folder))
 
 
+@pytest.mark.parametrize("family", list(CONFIG_WRITERS))
+def test_a_picture_under_a_name_that_is_no_cameras_is_refused(family: str, tmp_path: Path) -> None:
+    folder = CONFIG_WRITERS[family](tmp_path / "checkpoint")
+    features = json.loads((folder / "config.json").read_text(encoding="utf-8"))["input_features"]
+    picture = next(feature for name, feature in features.items() if name.startswith("observation.images."))
+    change(folder, input_features={**features, "observation.image": picture})
+    with pytest.raises(ProbeKitError, match=r"observation\.image\b"):
+        load_policy(family, str(folder))
+
+
 def test_delta_indices_of_the_configuration_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from lerobot.policies.pi05.configuration_pi05 import PI05Config
 

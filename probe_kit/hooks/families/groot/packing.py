@@ -170,6 +170,8 @@ def _check_number(path: Path, name: str, value: Any, kind: Any, most: int) -> No
         raise CheckpointError(f"{path} says {name}: {value!r}; expected a number above 0 and at most {most}")
 
 
+# -- pictures -------------------------------------------------------------------------------------------------
+
 NVIDIAS_VERSION = "gr00t_n1d7 of Isaac-GR00T, commit 1852a8c of 2026"
 """The newest code of NVIDIA that was read."""
 _EDGE, _FRACTION = 256, 0.95
@@ -272,6 +274,8 @@ def _letterboxed(picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
     rows, columns = side - height, side - width
     return np.pad(picture, ((rows // 2, rows - rows // 2), (columns // 2, columns - columns // 2), (0, 0)))
 
+
+# -- prompts --------------------------------------------------------------------------------------------------
 
 _READ = (
     "input_ids", "attention_mask", "pixel_values", "image_grid_thw", "mm_token_type_ids", "embodiment_id"

@@ -276,6 +276,8 @@ def load_internvla(
     return InternVLA(loaded, parts, unnorm_key, steps, guidance, tokenizer)
 
 
+# -- verification ---------------------------------------------------------------------------------------------
+
 _INPUTS = ("cfg_scale", "unnorm_q01", "unnorm_q99", "unnorm_mask")
 
 

@@ -161,6 +161,8 @@ def _is_vlm(folder: Path) -> bool:
     return file.is_file() and load_json(file).get("model_type") == _VLM_TYPE
 
 
+# -- conversion -----------------------------------------------------------------------------------------------
+
 PROVENANCE = "converted.json"
 _RUN_FILES = (RUN_FILE, DIMS_FILE, STATISTICS_FILE)
 

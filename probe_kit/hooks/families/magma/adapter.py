@@ -392,6 +392,8 @@ def load_magma(
     )
 
 
+# -- verification ---------------------------------------------------------------------------------------------
+
 TOLERANCE = 2e-5
 _CLIENT = "action_config.json"
 _INPUTS = (

@@ -130,6 +130,8 @@ class ChatText(TokenizerFile):
         return self.words(ids, self.ends)
 
 
+# -- loading --------------------------------------------------------------------------------------------------
+
 _BLOCK = re.compile(r"(?P<block>vision_tower\..*\.blocks\.\d+)\.(?P<name>gamma|weight)")
 
 

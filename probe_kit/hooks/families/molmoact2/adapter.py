@@ -42,6 +42,7 @@ from probe_kit.hooks.families.shared.lerobot.flow import PackedPolicy
 from probe_kit.hooks.families.shared.lerobot.normaliser import Normaliser
 from probe_kit.hooks.families.shared.lerobot.pipelines import Inert
 from probe_kit.hooks.families.shared.lerobot.policy import checked_steps
+from probe_kit.hooks.families.shared.loading import DTYPES
 from probe_kit.hooks.families.shared.taps import TOWER, Note, Stack, recording_weights, shares
 from probe_kit.hooks.outputs import Produce, RecordedRun, stacked
 from probe_kit.models.building import build_empty, building_device, replaced
@@ -49,7 +50,6 @@ from probe_kit.models.checkpoint_files import load_pretrained
 from probe_kit.models.decoding import PromptKV
 from probe_kit.models.pi0 import Gate
 
-DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 RELEASED: dict[str, Any] = {
     "text_config": {
         "hidden_size": 2560, "intermediate_size": 9728, "num_hidden_layers": 36, "num_attention_heads": 32,
@@ -225,6 +225,8 @@ def uses_cuda_graphs(policy: Any) -> bool:
     managers = (policy._backbone().action_cuda_graph_manager, network.depth_decode_cuda_graph_manager)
     return any(getattr(manager, "enabled", False) for manager in managers)
 
+
+# -- the adapter ----------------------------------------------------------------------------------------------
 
 _PRECISION = "dtype"
 

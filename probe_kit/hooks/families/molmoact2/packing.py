@@ -105,6 +105,8 @@ class SteppedUnits:
         return np.asarray(self.units.unusual(self.frame.entered(values)) & ~self.unscaled)
 
 
+# -- settings of processor steps ------------------------------------------------------------------------------
+
 _PACK, _CLAMP_STATE, _CLAMP_ACTION = (
     "molmoact2_pack_inputs",
     "molmoact2_clamp_normalized",
@@ -186,6 +188,8 @@ def in_packed_order(config: Any, folder: Path) -> dict[str, Any]:
     }
     return {**pictures, **other_features}
 
+
+# -- prompts --------------------------------------------------------------------------------------------------
 
 _PROMPT = re.compile(
     r"The task is to (?P<language>.*)\. The setup is .*<state_start>(?P<state>(?:<state_\d+>)*)<state_end>",

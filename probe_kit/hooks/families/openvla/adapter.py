@@ -20,7 +20,7 @@ from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES
 from probe_kit.hooks.contract.card import ARM
 from probe_kit.hooks.contract.model import Policy
 from probe_kit.hooks.contract.observation import Observation, checked_picture
-from probe_kit.hooks.families.prismatic.adapter import BYTES, SLOT, PrismaticModel, find_tokenizer, template_of
+from probe_kit.hooks.families.prismatic.adapter import BYTES, PrismaticModel, find_tokenizer
 from probe_kit.hooks.families.prismatic.checkpoint import (
     checkpoint_folders,
     load_checkpoint,
@@ -31,6 +31,7 @@ from probe_kit.hooks.families.shared.action_statistics import DIMENSIONS, Action
 from probe_kit.hooks.families.shared.kinds import TOKENS
 from probe_kit.hooks.families.shared.loading import Loaded
 from probe_kit.hooks.families.shared.taps import kept_prompt
+from probe_kit.hooks.families.shared.text import SLOT, template_of
 from probe_kit.hooks.families.shared.token_decoder import ALL, chooser, top_of, warn_of_unknown
 from probe_kit.hooks.outputs import Arrays, Outputs, Produce
 from probe_kit.models.prismatic import CROP_AREA, PrismaticConfig, PrismaticNetwork, centre_crop, prepare_tensor
@@ -262,6 +263,8 @@ def _template(prompt: str | None, config: PrismaticConfig) -> str:
     first = config.language_id.startswith("vicuna")
     return template_of(prompt or ("openvla-v01" if first else "openvla"), PROMPTS)
 
+
+# -- verification ---------------------------------------------------------------------------------------------
 
 _ACTION = "action_"
 _WITHOUT_EMPTY = "prompt_ids_without_empty"

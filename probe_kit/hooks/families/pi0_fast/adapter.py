@@ -198,6 +198,9 @@ class ActionText:
 _NO_TOKENIZER = SimpleNamespace(from_pretrained=lambda *_, **__: None)
 
 
+# -- the network ----------------------------------------------------------------------------------------------
+
+
 class Pi0FastSize(SizeFile):
     """Every dimension of a pi0-FAST that its `config.json` cannot express."""
 
@@ -292,6 +295,9 @@ def _dtype(joint: Any, entering: Tensor) -> torch.dtype:
     """lerobot computes in bfloat16 where the attention's weights are."""
     stored: torch.dtype = joint.paligemma.model.language_model.layers[0].self_attn.q_proj.weight.dtype
     return torch.bfloat16 if stored == torch.bfloat16 else entering.dtype
+
+
+# -- the adapter ----------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

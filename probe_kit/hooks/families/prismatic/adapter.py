@@ -5,7 +5,7 @@ one the positions whose logits choose the output: the prompt's last token, then 
 """
 
 from abc import abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import takewhile
@@ -83,6 +83,8 @@ def frame_of(language_id: str) -> TextFrame:
         return _CHAT
     return _INSTRUCT if language_id.endswith("-instruct") else _PURE
 
+
+# -- tokenizers -----------------------------------------------------------------------------------------------
 
 BYTES = "bytes"
 """Asks for `ByteTokenizer`."""
@@ -195,16 +197,7 @@ def find_tokenizer(
     )
 
 
-SLOT = "{instruction}"
-
-
-def template_of(name: str, prompts: Mapping[str, str]) -> str:
-    """A prompt by its name, or a template as it is. Raises UsageError for one without a place for words."""
-    template = prompts.get(name, name)
-    if SLOT not in template:
-        raise UsageError(f"prompt {name!r} is neither one of {', '.join(prompts)} nor a template with {SLOT}")
-    return template
-
+# -- the adapter ----------------------------------------------------------------------------------------------
 
 DEFAULT_CHECKPOINT = "TRI-ML/prismatic-vlms/prism-dinosiglip-224px+7b"
 

@@ -67,6 +67,8 @@ def _packed(layers: Any, linear: nn.Linear, bits: int) -> nn.Module:
     return packed
 
 
+# -- TRI-ML's release -----------------------------------------------------------------------------------------
+
 _PARTS = {"projector", "llm_backbone"}
 _TOWERS = "vision_backbone"
 _LAYERS = {"projector.0.": "projector.fc1.", "projector.2.": "projector.fc2.", "projector.4.": "projector.fc3."}
@@ -160,6 +162,8 @@ def _scale_name(name: str) -> str:
     """timm calls a layer scale `gamma`, the network `scale_factor`."""
     return name.removesuffix(".gamma") + ".scale_factor" if name.endswith(".gamma") else name
 
+
+# -- loading --------------------------------------------------------------------------------------------------
 
 FILES = (*PATTERNS, RUN_WEIGHTS)
 """What is needed of a hub repository, or of the folder of one model of it."""

@@ -69,6 +69,8 @@ def answering_family(name: str, description: str, checkpoint: str | None, loader
     return Family(name, description, checkpoint, f"{_FAMILIES}.{loader}", **{**shared, **fields})
 
 
+# -- names and evaluations of lerobot's policies --------------------------------------------------------------
+
 IMAGES, STATE, ACTION = "observation.images.", "observation.state", "action"
 _EMPTY_CAMERA = "empty_camera"
 """Beginning of the names that lerobot gives to cameras that never get a picture."""

@@ -189,6 +189,8 @@ def _stored_dtype(weights: Weights) -> str:
     return "bfloat16" if kinds == {torch.bfloat16} else "float32"
 
 
+# -- vision-language models -----------------------------------------------------------------------------------
+
 Build = Callable[[Any, torch.dtype, str], Any]
 # What Python, torch and transformers raise for numbers and names in a configuration that cannot be. Many kinds,
 # because nothing checks a configuration before its numbers reach the layers.

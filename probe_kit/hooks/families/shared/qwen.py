@@ -69,6 +69,8 @@ class QwenVision(ByPicture):
         return QwenPictures.from_folder(self.folder, *sizes, fast=self.fast_pictures)
 
 
+# -- models that answer ---------------------------------------------------------------------------------------
+
 SYSTEM = "<|im_start|>system\nYou are a helpful assistant.<|im_end|>\n"
 USER, ASSISTANT = "<|im_start|>user\n", "<|im_end|>\n<|im_start|>assistant\n"
 
@@ -113,6 +115,8 @@ class QwenVLM(QwenVision, VisionLanguageModel):
         """mm_token_type_ids: 1 at positions of pictures. Left out, Qwen2.5-VL silently counts them as text."""
         return {"mm_token_type_ids": (packed.ids == int(self.network.config.image_token_id)).long()}
 
+
+# -- policies -------------------------------------------------------------------------------------------------
 
 BACKBONE_ROLES = (IMAGE_ROLE, "language", "special", PADDING)
 

@@ -59,6 +59,9 @@ def output_projection(attention: Any) -> Any:
     return next(getattr(attention, name) for name in _PROJECTIONS if hasattr(attention, name))
 
 
+# -- stacks ---------------------------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True)
 class Stack:
     """One transformer stack inside a policy.
@@ -113,6 +116,8 @@ def flow_stacks(backbone: Any, expert: Any, vision: Any, iterations: int) -> dic
     }
 
 
+# -- keys and values of the prompt ----------------------------------------------------------------------------
+
 ALL_TOKENS = slice(None)
 ALL_BUT_LAST = slice(None, -1)
 """Models whose last prompt token belongs to the acting stream: its keys and values are not the backbone's."""
@@ -154,6 +159,8 @@ def attach_prompt_kv(joint: Any, blocks: int) -> PromptKV:
     joint.forward = reading
     return kv
 
+
+# -- attention ------------------------------------------------------------------------------------------------
 
 Note = Callable[[int, int, Tensor], None]
 """Takes a block, an iteration, and weights (B, H, S, K)."""

@@ -1,10 +1,10 @@
-"""The text side of a model: a checkpoint's `tokenizer.json`, and the frame of a question.
+"""The text side of a model: a checkpoint's `tokenizer.json`, and the text around a question or an instruction.
 
 The file is read by the `tokenizers` library itself: transformers 5 rebuilds Llama's tokenizer by rules of its own,
 while the released models were trained with what the file says.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import takewhile
@@ -135,6 +135,9 @@ def values_of(file: Path) -> dict[str, Any]:
         raise CheckpointError(f"{file} is not JSON ({error}); download the checkpoint again") from error
 
 
+# -- frames of questions --------------------------------------------------------------------------------------
+
+
 @dataclass(frozen=True)
 class Frame:
     """The fixed strings around a question.
@@ -240,3 +243,16 @@ def _ends(folder: Path, config: Any) -> frozenset[int]:
             "Copy the file from the model's page"
         )
     return frozenset(map(int, numbers))
+
+
+# -- prompts of instructions ----------------------------------------------------------------------------------
+
+SLOT = "{instruction}"
+
+
+def template_of(name: str, prompts: Mapping[str, str]) -> str:
+    """A prompt by its name, or a template as it is. Raises UsageError for one without a place for words."""
+    template = prompts.get(name, name)
+    if SLOT not in template:
+        raise UsageError(f"prompt {name!r} is neither one of {', '.join(prompts)} nor a template with {SLOT}")
+    return template

@@ -102,6 +102,9 @@ def _stored_top(file: Path) -> int | None:
     return top or None
 
 
+# -- the decoder ----------------------------------------------------------------------------------------------
+
+
 class TokenDecoder(Model):
     """A model with two streams in one stack, by position.
 

@@ -145,6 +145,8 @@ class SpeakingModel(AnswerModel):
         return [self.words(row) for row in ids.tolist()]
 
 
+# -- the adapter ----------------------------------------------------------------------------------------------
+
 ANSWER = "answer"
 Pictures = list[NDArray[np.uint8]]
 
@@ -362,6 +364,8 @@ def _labels(prompt: TokenPrompt) -> list[str]:
     labels[start:stop] = [IMAGE_ROLE] * (stop - start)
     return labels
 
+
+# -- verification ---------------------------------------------------------------------------------------------
 
 PIXELS, LOGITS = 1e-6, 2e-5
 """Tolerances, absolute."""

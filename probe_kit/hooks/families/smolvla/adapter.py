@@ -21,7 +21,7 @@ from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
 from lerobot.policies.smolvla.modeling_smolvla import SmolVLAPolicy
 from numpy.typing import NDArray
 from torch import Tensor
-from transformers import SmolVLMConfig
+from transformers import AutoTokenizer, SmolVLMConfig
 
 from probe_kit.errors import CheckpointError
 from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES, is_on_hub
@@ -160,8 +160,6 @@ class SmolVLA(LerobotFlow):
     @cached_property
     def tokenizer(self) -> Any:
         """The tokenizer of the saved step, or else the VLM's, by its name where there is no network yet."""
-        from transformers import AutoTokenizer
-
         if (saved := tokenizer_folder(self.folder)) is not None:
             return load_pretrained(AutoTokenizer, saved)
         name = tokenizer_name(self.folder)

@@ -29,11 +29,12 @@ from probe_kit.hooks.contract.model import Policy, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import IMAGE_ROLE, Site, Stream
-from probe_kit.hooks.families.prismatic.adapter import BYTES, SLOT, TextTokenizer, find_tokenizer, template_of
+from probe_kit.hooks.families.prismatic.adapter import BYTES, TextTokenizer, find_tokenizer
 from probe_kit.hooks.families.shared.action_statistics import ActionStatistics, open_or_closed
 from probe_kit.hooks.families.shared.kinds import TOKENS
 from probe_kit.hooks.families.shared.loading import DTYPES, Loaded, load_network
 from probe_kit.hooks.families.shared.taps import Note, decoder_tap, kept_prompt, of_decoder
+from probe_kit.hooks.families.shared.text import SLOT, template_of
 from probe_kit.hooks.families.shared.token_decoder import TokenDecoder, warn_of_unknown
 from probe_kit.models.checkpoint_files import stored_statistics
 from probe_kit.models.decoding import Decoded, Packed
@@ -112,6 +113,8 @@ def read_processor(folder: Path) -> dict[str, Any]:
     return dict(load_json(file))
 
 
+# -- prompts --------------------------------------------------------------------------------------------------
+
 PROMPTS = {"bare": SLOT, "question": f"What action should the robot take to {SLOT}?"}
 """What training and the released evaluation say, and what the model's page shows."""
 _END = "\n"
@@ -170,6 +173,8 @@ class Speech:
             )
         return [self.config.image_token] * self.config.patches + ids
 
+
+# -- the adapter ----------------------------------------------------------------------------------------------
 
 DEFAULT_CHECKPOINT = "IPEC-COMMUNITY/spatialvla-4b-224-pt"
 """The data set of the WidowX arm that Act2Answer imitates."""

@@ -276,6 +276,8 @@ def load_xiaomi(
     return Xiaomi(loaded, config, robot, steps, tokenizer, openness)
 
 
+# -- verification ---------------------------------------------------------------------------------------------
+
 _NORMS = ("norm_mean", "norm_std")
 
 

@@ -130,6 +130,8 @@ def denoised_actions(policy: Any, inputs: Mapping[str, Tensor], noise: Tensor) -
     return cast(Tensor, model.action_space.postprocess(actions))
 
 
+# -- settings of processor steps ------------------------------------------------------------------------------
+
 _MEAN, _DOMAIN = "xvla_imagenet_normalize", "xvla_add_domain_id"
 STEPS = ("xvla_image_to_float", _MEAN, _DOMAIN)
 
@@ -172,6 +174,8 @@ def read_steps(folder: Path, domain: int | None, pictures: Sequence[str] = ()) -
     robot = configs.get(_DOMAIN, {}).get("domain_id", 0) if domain is None else domain
     return XvlaSteps(int(robot), _MEAN in configs, tokenizer, length)
 
+
+# -- the adapter ----------------------------------------------------------------------------------------------
 
 SOFT_PROMPT = "soft_prompt"
 """The role of the robot's learned tokens."""

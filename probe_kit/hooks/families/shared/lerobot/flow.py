@@ -166,6 +166,8 @@ def _with_graph(model: Any) -> Iterator[None]:
         del model.sample_actions
 
 
+# -- packed prompts -------------------------------------------------------------------------------------------
+
 Tokens = list[tuple[int, str]]
 """The id and the role of every position of one prompt."""
 
@@ -274,6 +276,8 @@ class PackedPolicy(DenoisingPolicy):
         return np.zeros((rows, self.state_numbers), np.float32)
 
 
+# -- PaliGemma's prompts --------------------------------------------------------------------------------------
+
 _TOKENIZER = "google/paligemma-3b-pt-224"
 _TOKENIZER_FILES = ("tokenizer*", "special_tokens_map.json", "added_tokens.json", "config.json")
 LEAST_BYTES = 1_000_000_000
@@ -358,6 +362,8 @@ class PaliGemmaPolicy(LerobotPolicy):
         vision = self.network.model.paligemma_with_expert.paligemma.model.vision_tower.vision_model
         return int(vision.embeddings.num_patches)
 
+
+# -- prompts that hold the state ------------------------------------------------------------------------------
 
 BINS = np.linspace(-1, 1, 256 + 1)[:-1]
 """Lower edges of the 256 bins of a normalised state, as lerobot's processor step of pi0.5 makes them."""

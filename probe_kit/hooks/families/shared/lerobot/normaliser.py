@@ -211,6 +211,8 @@ def from_buffers(
     return Normaliser(mode, buffers[names[0]], buffers[names[1]], _EPS, "the weights")
 
 
+# -- statistics of an evaluation's file -----------------------------------------------------------------------
+
 SHIPPED = ("bridge",)
 """Statistics that come with the package, by name."""
 NO_STATISTICS = "none"

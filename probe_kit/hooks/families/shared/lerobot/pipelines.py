@@ -77,6 +77,8 @@ def check_one_frame(config: Any, folder: Path) -> None:
             )
 
 
+# -- pipelines ------------------------------------------------------------------------------------------------
+
 PREPROCESSOR, POSTPROCESSOR = "policy_preprocessor", "policy_postprocessor"
 _HARMLESS = (
     "rename_observations_processor", "to_batch_processor", "to_batch_processor_action",

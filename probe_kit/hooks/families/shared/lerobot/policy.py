@@ -245,6 +245,11 @@ class LerobotPolicy(Policy):
             raise CheckpointError(f"{folder / 'config.json'} is missing; {folder} is not a lerobot checkpoint")
         config: Any = cls.parse_config(folder, evaluation)
         check_one_frame(config, folder)
+        if strange := [name for name in config.image_features if not name.startswith(IMAGES)]:
+            raise CheckpointError(
+                f"{folder} reads a picture as {strange[0]!r}; expected names such as {IMAGES}top. Give it one in "
+                "config.json and in the processor files"
+            )
         cls._check_steps(folder, PREPROCESSOR)
         if hasattr(config, "tokenizer_max_length"):
             # lerobot tokenises as the saved step says, whatever the configuration has.
