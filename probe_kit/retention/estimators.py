@@ -190,8 +190,8 @@ class PooledScores:
     def covariance_with(self, other: "PooledScores") -> NDArray[np.float64]:
         """(K, L) covariance of the scores; 0 on other groups.
 
-        Of a stream with itself it leaves room for unseen groups, in which one run may hold
-        all and the other nothing.
+        Of a stream with itself it leaves room for unseen groups, in which one run may hold all and the other
+        nothing.
         """
         if self.fit is None or other.fit is None or not self.shares_groups_with(other):
             return np.zeros((len(self.names), len(other.names)))

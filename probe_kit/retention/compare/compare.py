@@ -1,8 +1,7 @@
 """One comparison: the first side minus the second, on the same items, with one exact test.
 
 Two runs, two groups of models, a VLM and a policy, two wordings of a run are calls of `compare`; `pairing` says
-which sides are compared. Rows pair by item, layout and content; groups of items
-are the unit of intervals and of p.
+which sides are compared. Rows pair by item, layout and content. Groups of items are the unit of intervals and p.
 """
 
 from collections.abc import Mapping, Sequence
@@ -33,6 +32,8 @@ from probe_kit.statistics.retention import Ratio, Scores, retention_difference
 if TYPE_CHECKING:
     import pandas as pd
 
+
+# -- items in common -----------------------------------------------------------------------------------------
 
 MANY = 0.8
 """Share of items in common below which groups of runs are not paired."""
@@ -117,6 +118,8 @@ def _episodes(episodes: "pd.DataFrame", by_content: bool) -> Mapping[str, frozen
     }
 
 
+# -- the test of success rates -------------------------------------------------------------------------------
+
 _FINEST = 1000
 """Parts that an outcome is counted in, where several last steps or several runs make shares of it."""
 
@@ -159,6 +162,9 @@ def _of_side(tables: "Sequence[pd.DataFrame]") -> tuple[dict[str, Fraction], dic
     if len(runs) > 1:
         return None
     return {name: sum(shares, Fraction(0)) / len(shares) for name, shares in by_episode.items()}, units
+
+
+# -- the comparison ------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

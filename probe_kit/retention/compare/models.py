@@ -15,6 +15,8 @@ from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.model_groups import exchange_p, is_exchangeable, welch_interval
 from probe_kit.statistics.retention import Scores, retention
 
+# -- what a network grew from --------------------------------------------------------------------------------
+
 _STEP = re.compile(r"(?:^|.*(?:step|checkpoint|ckpt|iter|iteration)s?[-_=]?)0*(\d+)$", re.IGNORECASE)
 """A folder of a training: `020000`, `checkpoint-500`, `step_20000`, `ckpt-3`."""
 _INNER = ("pretrained_model", "model", "params", "weights")
@@ -84,6 +86,8 @@ def _origin(run: RunReader) -> str:
         return training[0]
     return run.weights_sha256 or str(run.location)
 
+
+# -- two groups of models ------------------------------------------------------------------------------------
 
 Sides = tuple[Sequence[Sequence[RowWithEstimates]], Sequence[Sequence[RowWithEstimates]]]
 """Of either side and per category, the row of each run."""

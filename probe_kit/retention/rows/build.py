@@ -230,8 +230,8 @@ def mean_row(drawn: Sequence[RowWithEstimates], averaged: Sequence[str]) -> Rete
     """The category average of rows of one run and view; retention is the ratio of the mean scores.
 
     averaged: fields that are averaged over the categories that have them, as `part.field`; the columns declare
-    them, see `probe_kit.retention.columns.columns`. Intervals: of independent
-    categories, see `mean_interval` and `Scores.mean`.
+    them, see `probe_kit.retention.columns.columns`. Intervals: of independent categories, see
+    `mean_interval` and `Scores.mean`.
     """
     rows = [part.row for part in drawn]
     of_streams = [part.streams for part in drawn if part.streams is not None]

@@ -138,10 +138,10 @@ class StreamPart:
     verdict: `shown` (family-wise above chance, and above every control that was run), `absent` (not shown,
     `at_most` below a bound, and the bound findable by so many items), or `not shown`. site, layer, depth: the
     first of the best sites, a place without an interval of its own; ties: how many others are as accurate.
-    p_fwe: of that site, family-wise. exceeds: whether
-    it is better than `chance` and each control; None for one that was not run. selectivity: its accuracy above
-    that of the same probe on random labels of items. minus_untrained: how much more accurate it is than the
-    untrained network's best. remedy: what to do where no p can be below 0.05; empty where one can.
+    p_fwe: of that site, family-wise. exceeds: whether it is better than `chance` and each control; None for one
+    that was not run. selectivity: its accuracy above that of the same probe on random labels of items.
+    minus_untrained: how much more accurate it is than the untrained network's best. remedy: what to do where no p
+    can be below 0.05; empty where one can.
 
     Of a target that is no side, peak is the metric of the site with the largest score above its own chance, and
     chance the mean score of the label permutations there. above: score above chance of the sites that the inner
