@@ -3,10 +3,12 @@
     python benchmarks/capture.py [--families pi0,openvla] [--repeats 7] [--host] [--keep DIR]
     python benchmarks/capture.py --families pi0 --checkpoint DIR --device cuda [--dtype bfloat16] [--batch 8]
         [--trace FILE]
+    python benchmarks/capture.py --full --device cuda
 
-Each family at 110 to 160 million random parameters, or at the size of a checkpoint, whose weights need not be
-there: the same model, observation and process for all ways, in turns. A ratio is that of one turn to the plain
-inference of the same turn; medians are printed, of processor time on a CPU (whatever else the machine does) and of
+Each family at 110 to 160 million random parameters, with `--full` three at the released size, or one at the size
+of a checkpoint, whose weights need not be there: the same model, observation and process for all ways, in turns. A
+ratio is that of one turn to the plain inference of the same turn; medians are printed, of processor time on a CPU
+(whatever else the machine does) and of
 wall time on a GPU. No way may change the numbers that come out, which is checked bit for bit first.
 
 * pooled: every residual site, all views, reduced on the device as it fires.
@@ -30,7 +32,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from capture_subjects import LARGER, Subject, hidden_states, subject
+from capture_subjects import FULL, LARGER, Subject, hidden_states, subject
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -138,7 +140,10 @@ def measure(run: Callable[[], Output], device: str) -> float:
 
 def line(family: str, options: argparse.Namespace, folder: Path) -> str:
     """The cost of capturing one family, as a row."""
-    made = subject(family, folder, options.device, options.dtype, options.batch, options.checkpoint)
+    made = subject(
+        family, folder, options.device, options.dtype, options.batch, options.checkpoint,
+        FULL if options.full else LARGER,
+    )  # fmt: skip
     benchmark = Benchmark(made, options.device)
     ways, reference = benchmark.ways(options.host), benchmark.plain()
     for name, way in ways.items():
@@ -152,7 +157,8 @@ def line(family: str, options: argparse.Namespace, folder: Path) -> str:
         for name, seconds in times.items():
             ratios[name].append(seconds / times["plain"])
     if options.trace:
-        trace(benchmark.tokens_to_host, options.trace)
+        path = Path(options.trace)
+        trace(benchmark.tokens_to_host, str(path.with_stem(f"{path.stem}-{family}")))
     card, sites = made.model.card, len(made.model.sites())
     tokens = ", ".join(f"{len(rows[0])} {name}" for name, rows in made.roles.items())
     found = "  ".join(
@@ -178,7 +184,8 @@ def trace(run: Callable[[], Output], path: str) -> None:
 def main() -> None:
     """One family after another."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--families", default=",".join(LARGER))
+    parser.add_argument("--families", help="default: all")
+    parser.add_argument("--full", action="store_true", help="at the released size")
     parser.add_argument("--checkpoint", help="its config gives the size; for one family")
     parser.add_argument("--dtype", help="default float32 on a CPU, bfloat16 elsewhere")
     parser.add_argument("--batch", type=int, default=1)
@@ -191,7 +198,7 @@ def main() -> None:
     options = parser.parse_args()
     options.dtype = options.dtype or ("float32" if options.device == "cpu" else "bfloat16")
     torch.set_num_threads(options.threads)
-    for family in options.families.split(","):
+    for family in options.families.split(",") if options.families else FULL if options.full else LARGER:
         kept = options.keep / f"{family}.txt" if options.keep else None
         if kept is None or not kept.exists():
             with tempfile.TemporaryDirectory() as folder:

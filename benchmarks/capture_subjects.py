@@ -1,4 +1,4 @@
-"""Models to capture: every family at about a tenth of a billion random parameters, or at a checkpoint's size.
+"""Models to capture: families of a tenth of a billion random parameters, of the released or a checkpoint's size.
 
 The files around the weights are those that the tests write, in the layout of the released ones; their sizes are
 raised here, and the weights drawn. So no family, and no trained weights, are needed for it.
@@ -52,6 +52,7 @@ _TOWER: Values = {
 _ROPE: Values = {"rope_scaling": {"mrope_section": [16, 8, 8]}}
 _TIMM: Values = {"depth": TOWER_DEPTH, "embed_dim": TOWER, "num_heads": TOWER_HEADS}
 _GEMMA: Values = {"depth": DEPTH, "num_heads": HEADS, "num_kv_heads": 1, "head_dim": HEAD}
+_GEMMA_2B: Values = {"depth": 18, "num_heads": 8, "num_kv_heads": 1, "head_dim": 256}
 _PRISMATIC: Values = {
     "config.json": {
         "text_config": {**_TEXT, "num_key_value_heads": HEADS, "max_position_embeddings": 1024},
@@ -160,6 +161,44 @@ LARGER: dict[str, Values] = {
 }  # fmt: skip
 """What is made larger, by family and file."""
 
+FULL: dict[str, Values] = {
+    "pi0": {
+        "config.json": LARGER["pi0"]["config.json"],
+        "dims.json": {
+            "vlm": {**_GEMMA_2B, "width": 2048, "mlp_dim": 16384},
+            "expert": {**_GEMMA_2B, "width": 1024, "mlp_dim": 4096},
+            "vision": {"hidden": 1152, "layers": 27, "heads": 16, "inter": 4304, "patch": 14},
+        },
+    },
+    "openvla": {
+        "config.json": {
+            "text_config": {
+                "hidden_size": 4096, "intermediate_size": 11008, "num_hidden_layers": 32,
+                "num_attention_heads": 32, "num_key_value_heads": 32, "max_position_embeddings": 2048,
+            },
+            "image_sizes": [224, 224],
+            "timm_model_overrides": [
+                {"depth": 24, "embed_dim": 1024, "num_heads": 16},
+                {"depth": 27, "embed_dim": 1152, "num_heads": 16},
+            ],
+        }
+    },
+    "qwen3-vl": {
+        "config.json": {
+            "text_config": {
+                "hidden_size": 2560, "intermediate_size": 9728, "num_hidden_layers": 36,
+                "num_attention_heads": 32, "num_key_value_heads": 8, "head_dim": 128,
+                "rope_scaling": {"mrope_section": [24, 20, 20]},
+            },
+            "vision_config": {
+                "depth": 24, "hidden_size": 1024, "intermediate_size": 4096, "num_heads": 16,
+                "out_hidden_size": 2560, "num_position_embeddings": 2304, "deepstack_visual_indexes": [5, 11, 17],
+            },
+        }
+    },
+}  # fmt: skip
+"""The released sizes of three families, without their vocabularies: pi0 3.0 B, OpenVLA 7.5 B, Qwen3-VL-4B."""
+
 
 @dataclass(frozen=True)
 class Subject:
@@ -198,12 +237,18 @@ class Subject:
 
 
 def subject(
-    family: str, folder: Path, device: str, dtype: str | None, batch: int, checkpoint: str | None = None
+    family: str,
+    folder: Path,
+    device: str,
+    dtype: str | None,
+    batch: int,
+    checkpoint: str | None = None,
+    sizes: Mapping[str, Values] = LARGER,
 ) -> Subject:
-    """A family as `LARGER` has it, written to `folder`, or at the size of a checkpoint; weights are random."""
+    """A family as `sizes` has it, written to `folder`, or at the size of a checkpoint; weights are random."""
     options: Mapping[str, Any] = {}
     if checkpoint is None:
-        checkpoint, options = str(written(family, folder / "tiny")), WRITERS[family][1]
+        checkpoint, options = str(written(family, folder / "files", sizes)), WRITERS[family][1]
     model = load_model(family, checkpoint, device, dtype, random_weights=True, **options)
     scene = SceneSpec()
     picture, state = np.zeros((*scene.picture_shape, 3), np.uint8), np.zeros(8, np.float32)
@@ -219,13 +264,13 @@ def subject(
     return Subject(model, lambda: model.read(questions).option_logits, model.asked_roles(questions))
 
 
-def written(family: str, folder: Path) -> Path:
-    """The files of a checkpoint as `LARGER` has it, without weights; where it lies."""
+def written(family: str, folder: Path, sizes: Mapping[str, Values] = LARGER) -> Path:
+    """The files of a checkpoint as `sizes` has it, without weights; where it lies."""
     write, _ = WRITERS[family]
     if family == "magma":  # weights that steer its answers fit the tiny network only
         write = partial(magma_checkpoints.write_checkpoint, steered=False, shards=1)
     place = write(folder)
-    _enlarge(place, LARGER[family])
+    _enlarge(place, sizes[family])
     return place
 
 

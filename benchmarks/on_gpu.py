@@ -1,6 +1,6 @@
 """All measurements that need a GPU: parity, capture, probes, and how long the model waits.
 
-    python benchmarks/on_gpu.py [--device cuda] [--only parity,capture] [--checkpoint pi0=DIR]
+    python benchmarks/on_gpu.py [--device cuda] [--only parity,capture]
 
 Each part is a file of tests or a benchmark of this folder in a process of its own, so that none leaves memory
 behind. One that fails is named at the end, the others run, and the exit code is then 1. Without a GPU the same
@@ -9,8 +9,8 @@ and no more.
 
 * parity: every family, an extraction, probes and copies to the host, on the device against the CPU.
 * golden: every recorded reference that lies here, through the ordinary adapter, on the CPU, where it was recorded.
-* capture: clean inference against capture in every family; with `--checkpoint FAMILY=DIR` in that family at full
-  size in bfloat16, with a trace of what waited for the device.
+* capture: clean inference against capture in every family at a tenth of a billion parameters, in bfloat16.
+* full: the same for three families at the released size, with a trace of what waits for the device (a GPU only).
 * probes: a site at N = 300 and 3,440, numpy against torch on the device.
 * waiting: the real loop with `--batch auto`.
 """
@@ -30,26 +30,25 @@ ON_DEVICE = "device_changes and cuda or gpu"
 GOLDEN = "reproduces or reproduced or every_recorded or everything_recorded"
 
 
-def parts(device: str, checkpoint: str | None) -> dict[str, list[str]]:
+def parts(device: str) -> dict[str, list[str]]:
     """The command of each part by name."""
     small = device == "cpu"
     pytest = [sys.executable, "-m", "pytest", "-q", "-m", "slow or not slow"]
     capture = ["--device", device]
-    if checkpoint is not None:
-        family, _, folder = checkpoint.partition("=")
-        capture += ["--families", family, "--checkpoint", folder, "--trace", "trace.json"]
-    elif small:
+    if small:
         capture += ["--families", "qwen3-vl", "--repeats", "1"]
+    full = {"full": _benchmark("capture.py", "--host", "--full", "--trace", "trace.json", "--device", device)}
     return {
         "parity": [*pytest, *PARITY, "-k", "device_changes and cpu and not vl or gpu" if small else ON_DEVICE],
         "golden": [*pytest, "tests/hooks/test_verify.py" if small else "tests/hooks", "-k", GOLDEN],
         "capture": _benchmark("capture.py", "--host", *capture),
+        **({} if small else full),
         "probes": _benchmark(
             "probes.py", "--device", device, "--sizes", "60" if small else "300,3440",
             *(["--permutations", "2", "--tokens", "8"] if small else []),
         ),
         "waiting": _benchmark(
-            "waiting.py", "--device", device, "--subjects", "tiny" if small else "tiny,large",
+            "waiting.py", "--device", device, "--subjects", "tiny" if small else "tiny,large,full",
             "--items", "4" if small else "40",
         ),
     }  # fmt: skip
@@ -79,10 +78,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", help="default: cuda if there is one, else cpu")
     parser.add_argument("--only")
-    parser.add_argument("--checkpoint", metavar="FAMILY=DIR", help="its config; the weights need not be there")
     options = parser.parse_args()
     device = options.device or found_device()
-    commands = parts(device, options.checkpoint)
+    commands = parts(device)
     chosen = options.only.split(",") if options.only else list(commands)
     if unknown := [name for name in chosen if name not in commands]:
         parser.error(f"--only {unknown[0]}; expected one of {', '.join(commands)}")

@@ -1,9 +1,11 @@
 """How much of its time a model waits for simulators, in the real loop with `--batch auto`.
 
-    python benchmarks/waiting.py [--subjects tiny,large] [--items 12] [--max-steps 20] [--device cuda] [--spread]
+    python benchmarks/waiting.py [--subjects tiny,large,full] [--items 12] [--max-steps 20] [--device cuda]
+        [--spread]
 
 `tiny` is the embedded pi0-tiny, whose inference is over in milliseconds: the worst case. `large` is a pi0 of 142
-million random parameters (see `capture_subjects.py`). Batch and simulating processes are what calibration chooses.
+million random parameters, `full` one of the released size in bfloat16 (see `capture_subjects.py`). Batch and
+simulating processes are what calibration chooses.
 Time is the clock's, from the end of the first inference to the end of the last, without those seconds at the start
 in which the first pictures are drawn; the model works while it is asked for actions (its capture included), and
 waits the rest, for observations, buffers and this process's own affairs. Also printed: the
@@ -23,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import psutil
-from capture_subjects import written
+from capture_subjects import FULL, LARGER, written
 
 from probe_kit.env import SceneSpec
 from probe_kit.extract import Extraction, ExtractSettings, prepare
@@ -38,15 +40,15 @@ class Clock:
     calls: list[tuple[float, float, float]] = field(default_factory=list)
     """Begin and end of every call of the model, and the processor time of this process at its end."""
 
-    def around(self, act: Callable[[Any], Any]) -> Callable[[Any], Any]:
-        """`act`, timed."""
+    def around(self, infer: Callable[[Any], Any]) -> Callable[[Any], Any]:
+        """`infer`, timed."""
 
         def timed(turns: Sequence[Any]) -> Any:
             if self.spread and not self.calls:
                 _spread()
             began = time.perf_counter()
             try:
-                return act(turns)
+                return infer(turns)
             finally:
                 self.calls.append((began, time.perf_counter(), time.process_time()))
 
@@ -81,12 +83,12 @@ def measure(extraction: Extraction, out: Path, spread: bool) -> str:
     """One run of its own."""
     clock, cores = Clock(spread), os.sched_getaffinity(0)
     controller: Any = extraction.controller
-    act = controller.act
-    controller.act = clock.around(act)
+    infer = controller.infer
+    controller.infer = clock.around(infer)
     try:
         extraction.run(out)
     finally:
-        controller.act = act
+        controller.infer = infer
         os.sched_setaffinity(0, cores)
     return clock.words
 
@@ -111,10 +113,14 @@ def main() -> None:
         )  # fmt: skip
         for subject in options.subjects.split(","):
             settings = base
-            if subject == "large":
-                checkpoint = str(written("pi0", folder / "large"))
+            if subject != "tiny":
+                checkpoint = str(written("pi0", folder / subject, FULL if subject == "full" else LARGER))
                 settings = base.changed(
-                    model="pi0", checkpoint=checkpoint, random_weights=True, options={"statistics": "bridge"}
+                    model="pi0",
+                    checkpoint=checkpoint,
+                    random_weights=True,
+                    options={"statistics": "bridge"},
+                    **({"dtype": "bfloat16"} if subject == "full" else {}),
                 )
             chosen = prepare(settings.changed(batch="auto"))
             print(f"{subject}: {chosen.calibration.words}", flush=True)

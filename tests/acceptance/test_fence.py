@@ -109,6 +109,8 @@ def test_ends_of_intervals_may_move_by_rounding() -> None:
 def test_another_platform_allows_a_tolerance_and_no_hash_but_still_compares() -> None:
     assert not _changed("bytes_sha256", lambda value: value[::-1], platform="another")
     assert not _changed("accuracy", lambda value: value + 1e-6, platform="another")
+    assert not _changed("p_fwe", lambda value: value + 1 / 32, platform="another")
+    assert _changed("p_fwe", lambda value: value + 0.25, platform="another")
     assert _changed("accuracy", lambda value: value + 0.05, platform="another")
     assert _changed("outcome", lambda value: f"not {value}", platform="another")
 
