@@ -127,6 +127,11 @@ def _first(output: Tensor | tuple[Tensor, ...]) -> Tensor:
     return output[0] if isinstance(output, tuple) else output
 
 
+def _default_dtype(family: str, device: str) -> str:
+    """`bfloat16` on a GPU, save in families that refuse it."""
+    return "float32" if device == "cpu" or family == "smolvla" else "bfloat16"
+
+
 def measure(run: Callable[[], Output], device: str) -> float:
     """Seconds of one call: of the processor, or by the clock where a GPU works."""
     on_cpu = device == "cpu"
@@ -140,10 +145,9 @@ def measure(run: Callable[[], Output], device: str) -> float:
 
 def line(family: str, options: argparse.Namespace, folder: Path) -> str:
     """The cost of capturing one family, as a row."""
-    made = subject(
-        family, folder, options.device, options.dtype, options.batch, options.checkpoint,
-        FULL if options.full else LARGER,
-    )  # fmt: skip
+    dtype, sizes = options.dtype or _default_dtype(family, options.device), FULL if options.full else LARGER
+    made = subject(family, folder, options.device, dtype, options.batch, options.checkpoint, sizes)
+    torch.set_num_threads(options.threads)
     benchmark = Benchmark(made, options.device)
     ways, reference = benchmark.ways(options.host), benchmark.plain()
     for name, way in ways.items():
@@ -187,7 +191,7 @@ def main() -> None:
     parser.add_argument("--families", help="default: all")
     parser.add_argument("--full", action="store_true", help="at the released size")
     parser.add_argument("--checkpoint", help="its config gives the size; for one family")
-    parser.add_argument("--dtype", help="default float32 on a CPU, bfloat16 elsewhere")
+    parser.add_argument("--dtype", help="default float32 on a CPU, else bfloat16 in families that have it")
     parser.add_argument("--batch", type=int, default=1)
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--repeats", type=int, default=7)
@@ -196,8 +200,6 @@ def main() -> None:
     parser.add_argument("--trace")
     parser.add_argument("--keep", type=Path, help="a folder for the lines of finished families")
     options = parser.parse_args()
-    options.dtype = options.dtype or ("float32" if options.device == "cpu" else "bfloat16")
-    torch.set_num_threads(options.threads)
     for family in options.families.split(",") if options.families else FULL if options.full else LARGER:
         kept = options.keep / f"{family}.txt" if options.keep else None
         if kept is None or not kept.exists():

@@ -128,7 +128,7 @@ def main() -> None:
                 f"  simulators beside it: {measure(chosen, folder / f'{subject}-beside', options.spread)}",
                 flush=True,
             )
-            alone = prepare(settings.changed(env_workers=0))
+            alone = prepare(settings.changed(env_workers=0, batch=chosen.calibration.batch))
             print(f"  none beside it:       {measure(alone, folder / f'{subject}-alone', False)}", flush=True)
 
 

@@ -42,13 +42,21 @@ def captured(family: str, place: str, device: str, options: dict[str, Any]) -> d
     scene = SceneSpec()
     picture, state = np.zeros((*scene.picture_shape, 3), np.uint8), np.zeros(8, np.float32)
     seen = Observation(picture, state, "Put the cube on the red shape", scene.intrinsics)
+    roles = model.roles([seen]) if isinstance(model, Policy) else {}
     with capture(model, model.sites()) as tape:
         if isinstance(model, Policy):
             out = model.infer_without_acting([seen], [0])
         else:
             assert isinstance(model, AnswerModel)
             out = model.read([Prompt(seen, "Which of them is red?", ("a", "b"))]).option_logits
-    found = {str(site): tape[site].float().cpu().numpy() for site in model.sites()}
+    found = {}
+    for site in model.sites():
+        values = tape[site].float().cpu().numpy()
+        if (
+            site.stream in roles
+        ):  # what padding attends to, where a mask forbids everything, is the kernel's choice
+            values = values[:, ~roles[site.stream][0].mask("padding")]
+        found[str(site)] = values
     del model
     gc.collect()
     return {**found, "out": np.asarray(out)}

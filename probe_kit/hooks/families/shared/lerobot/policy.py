@@ -55,7 +55,7 @@ from probe_kit.hooks.families.shared.lerobot.window import PictureWindow, read_w
 from probe_kit.hooks.families.shared.loading import Loaded
 from probe_kit.hooks.families.shared.taps import ALL_TOKENS, Stack, kv_tap
 from probe_kit.hooks.outputs import Arrays, Produce, RecordedRun
-from probe_kit.models.building import initialise
+from probe_kit.models.building import WithoutFilling, initialise
 from probe_kit.models.decoding import PromptKV
 
 MOST_TOKENS = 1 << 16
@@ -215,7 +215,8 @@ class LerobotPolicy(Policy):
         config = cls._read_config(folder, evaluation)
         if dtype is not None:
             config.dtype = dtype
-        network = cls.build(config, folder)
+        with WithoutFilling():
+            network = cls.build(config, folder)
         if random_weights:
             initialise(network, weights_seed)
             weights = Weights(network.state_dict(), f"random twin of {checkpoint}", random=True)
