@@ -5,8 +5,6 @@ raised here, and the weights drawn. So no family, and no trained weights, are ne
 """
 
 import json
-import sys
-import types
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -15,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tests_of_checkout  # noqa: F401
 from numpy.typing import NDArray
 from torch import nn
 
@@ -23,13 +22,8 @@ from probe_kit.hooks import AnswerModel, Model, Policy, load_model
 from probe_kit.hooks.contract.model import Prompt
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.roles import Roles
-
-# The tests' folder is no installed package, and an installed one may have its name.
-sys.modules["tests"] = types.ModuleType("tests")
-sys.modules["tests"].__path__ = [str(Path(__file__).parents[1] / "tests")]
-
-from tests.support import magma_checkpoints  # noqa: E402
-from tests.support.every_checkpoint import WRITERS  # noqa: E402
+from tests.support import magma_checkpoints
+from tests.support.every_checkpoint import WRITERS
 
 WIDTH, DEPTH, INNER, HEADS, KEYS, HEAD = 768, 12, 3072, 12, 4, 64
 TOWER, TOWER_DEPTH, TOWER_INNER, TOWER_HEADS = 384, 6, 1536, 6

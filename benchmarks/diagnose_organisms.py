@@ -1,6 +1,6 @@
 """How often is a diagnosis right about organisms whose answer is known by construction?
 
-    PYTHONPATH=. python benchmarks/diagnose_organisms.py FOLDER [--draws 20] [--first 0]
+    python benchmarks/diagnose_organisms.py FOLDER [--draws 20] [--first 0]
         [--frames 24] [--organisms deaf,blind]
 
 A draw is a run of its own seed, whose frames and donors are fresh. Organisms are edits of the embedded policy; for
@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 
+import tests_of_checkout  # noqa: F401
 import torch
 
 from probe_kit.diagnose.diagnosis import diagnose_run

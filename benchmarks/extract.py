@@ -15,6 +15,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import tests_of_checkout  # noqa: F401
 import zarr
 
 from probe_kit.env import SceneSpec

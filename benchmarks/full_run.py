@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import tests_of_checkout  # noqa: F401
 from numpy.typing import NDArray
 
 from probe_kit.env import SceneSpec

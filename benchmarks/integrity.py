@@ -23,6 +23,7 @@ from unittest.mock import patch
 
 import google_crc32c
 import numpy as np
+import tests_of_checkout  # noqa: F401
 
 from probe_kit.env import SceneSpec
 from probe_kit.extract.plan import Plan

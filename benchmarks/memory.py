@@ -12,6 +12,8 @@ import time
 from itertools import cycle, islice
 from pathlib import Path
 
+import tests_of_checkout  # noqa: F401
+
 from probe_kit.env import SceneSpec
 from probe_kit.extract.sources.scene_source import ScenePlayer
 from probe_kit.extract.sources.source import Played

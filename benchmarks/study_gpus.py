@@ -16,7 +16,7 @@ from tempfile import TemporaryDirectory
 from probe_kit.study import load_study, plan_study
 from probe_kit.study.cells import Failure
 from probe_kit.study.plan import StudyPlan
-from probe_kit.study.playing import Made, ModelTask, RunTask, play_models
+from probe_kit.study.playing import ModelTask, RunFinished, RunTask, play_models
 
 STUDY = """
 schema = 1
@@ -113,7 +113,7 @@ def main() -> None:
             failures: list[Failure] = []
 
             def note(event: object) -> None:
-                waiting.ended += isinstance(event, Made | Failure)
+                waiting.ended += isinstance(event, RunFinished | Failure)
                 failures.extend([event] if isinstance(event, Failure) else [])
 
             play_models(tasks, note, ray="auto")

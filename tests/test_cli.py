@@ -77,9 +77,7 @@ def test_extract_train_retention_end_in_rows_with_the_contracts_keys(small_suite
     rows = json.loads(printed.stdout)
     assert {row["category"] for row in rows} == {"color", "mean"}
     assert "data:image/svg+xml" in (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert {"run-layer-curves.png", "run-final-positions.pdf"} <= {
-        p.name for p in (tmp_path / "figures").iterdir()
-    }
+    assert {"run-layer-curves.png", "run-layer-curves.pdf"} <= {p.name for p in (tmp_path / "figures").iterdir()}
     assert all(row[part].keys() >= keys for row in rows for part, keys in KEYS.items())
     for style in ("table", "csv", "markdown", "latex"):
         assert "random" in in_process("retention", run, "--format", style).stdout.lower()

@@ -152,7 +152,7 @@ def _verdict(exchanges: Exchanges, p: float) -> tuple[Verdict, str]:
     groups = exchanges.groups
     above = exchanges.exchanged - (0.0 if exchanges.control is None else exchanges.control)
     if not exchanges.largest.any():
-        # A blank and another stop are texts of other lengths: a length arrives where no word does.
+        # A blank and another full stop are texts of other lengths: a length arrives where no word does.
         meaningless = {"a blank": exchanges.blanked, "its control": exchanges.control}
         changed = [
             f"{name} changes some in {np.count_nonzero(changes)} of {changes.size}"
@@ -163,7 +163,8 @@ def _verdict(exchanges: Exchanges, p: float) -> tuple[Verdict, str]:
             [f"no number of any action changed in {exchanges.largest.size} exchanges", *changed]
         )
     if unbounded_student_interval(above, groups)[1] < TRACE:
-        # No interval holds an effect in rare frames of which none was drawn.
+        # No interval holds an effect in rare frames of which none was drawn: Clopper and Pearson's upper limit of
+        # a share that none of the groups shows.
         unseen = 1 - SIGNIFICANCE ** (1 / np.unique(groups).size)
         return "no effect", f"in these frames; up to {whole_percent(unseen)} % of all frames may have one"
     if p >= SIGNIFICANCE:

@@ -209,7 +209,10 @@ def _repeated(rows: NDArray[np.intp], values: NDArray[np.intp]) -> NDArray[np.bo
 
 
 def _declared(measured: InputDiagnosis) -> InputDiagnosis:
-    """An input that the model is said never to read is none, where the measurement agrees."""
+    """The diagnosis of an input that the adapter says is never read: it is no input, where nothing arrived.
+
+    A measured effect counts more than the declaration.
+    """
     if measured.verdict not in ("does not arrive", "not varied"):
         return measured
     return replace(measured, verdict="not an input", reason=f"the model reads no {measured.name}")

@@ -424,7 +424,7 @@ class Recorder:
 
 
 def _state(scene: Scene) -> Array:
-    """The state part of a frame; see `trajectory.STATE`."""
+    """The state part of a frame; see `scoring.STATE`."""
     cube, tiles = scene.cube_state(), [scene.tile_state(side) for side in SIDES]
     return np.array(
         [

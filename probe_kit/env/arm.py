@@ -28,7 +28,9 @@ from probe_kit.scene_names import ArmName
 MESH_FOLDER = Path("xacro/trossen_descriptions/meshes/meshes_wx250s")
 GREY = "0.13 0.13 0.13 1"
 EFFORT = 100.0
+"""Largest torque of a joint, N m: more than gravity and a cube take, so that no motion is cut short."""
 FINGER_EFFORT = 10.0
+"""Largest force of a finger, N."""
 ORIGIN: XYZ = (0.0, 0.0, 0.0)
 QUARTER: XYZ = (0.0, 0.0, pi / 2)
 
@@ -218,8 +220,10 @@ ARMS: Mapping[ArmName, ArmModel] = MappingProxyType({"panda": PANDA, "widowx": W
 
 POSITION_GAIN = 0.3
 VELOCITY_GAIN = 1.0
+"""Gains of PyBullet's position control, without unit: shares of an error that one simulation step corrects."""
 GEAR_FORCE = 50.0
 GEAR_ERP = 0.1
+"""Force, N, and share of an error corrected in a step, of the gear by which one finger mirrors the other."""
 
 
 class Arm:

@@ -38,13 +38,14 @@ FLOOR_SIZE = (8.0, 8.0, 0.02)
 FLOOR_CENTRE = (0.0, 0.0, -0.75)
 FLOOR_COLOR = (0.62, 0.64, 0.66, 1.0)
 TILE_COLOR = (0.85, 0.85, 0.83, 1.0)
+"""Sizes and centres (x, y, z) are metres in the frame of the robot's base; colours are RGBA."""
 LIMBO = (0.0, 0.0, 5.0)
 """Where the cube waits in the saved state, so far up that it touches nothing."""
 TILE_LIMBO: Mapping[Side, XYZ] = MappingProxyType({"left": (0.0, 1.0, 5.0), "right": (0.0, -1.0, 5.0)})
 """Likewise tiles that can be pushed."""
 GRAVITY = (0.0, 0.0, -9.81)
-HOME_ERROR = 0.001
-"""How far, in metres and radians / 10, `home_joints` may bring the tool from `home`."""
+HOME_POSITION_ERROR, HOME_ROTATION_ERROR = 0.001, 0.01
+"""How far `home_joints` may bring the tool from `home`, metres and radians."""
 GRASP_GAP = 0.003
 """Space between each finger and a cube that starts in the hand, before the fingers close, metres."""
 QUAD_LIFT = 0.0005
@@ -53,8 +54,8 @@ _EMPTY_TABLES: dict[tuple[CameraSpec, LightSpec, float], Frame] = {}
 """What scenes of this process saw before anything was on their table; the next like them need not draw it."""
 _TILE_PIXELS: dict[tuple[CameraSpec, float, float, float, tuple[XY, ...]], dict[Side, int]] = {}
 """Likewise the pixels of their pictures."""
-_KEPT = 8
-"""So many of either."""
+_MOST_CACHED = 8
+"""Entries of each of the two caches."""
 
 
 @dataclass(frozen=True)
@@ -299,7 +300,7 @@ class Scene:
         pose = self.arm.chain.pose(q)
         apart = float(np.linalg.norm(pose.position - home.position))
         turned = float(np.linalg.norm(to_vector(pose.rotation @ home.rotation.T)))
-        if apart > HOME_ERROR or turned > 10 * HOME_ERROR:
+        if apart > HOME_POSITION_ERROR or turned > HOME_ROTATION_ERROR:
             raise SceneError(
                 f"home_joints bring the tool of the {spec.arm} to {pose.position.round(4).tolist()}, "
                 f"{1000 * apart:.1f} mm and {turned:.3f} rad from home {spec.home} with home_rpy {spec.home_rpy}. "
@@ -390,7 +391,7 @@ class Scene:
 def _drawn_once[Key, Seen](drawings: dict[Key, Seen], key: Key, draw: Callable[[], Seen]) -> Seen:
     """Return the rendering for `key`, drawn on first use; renderings are the same bit for bit."""
     if key not in drawings:
-        if len(drawings) == _KEPT:
+        if len(drawings) == _MOST_CACHED:
             drawings.clear()
         drawings[key] = draw()
     return drawings[key]

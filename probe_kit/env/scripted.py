@@ -20,7 +20,9 @@ MAX_SHIFT = 0.05
 MAX_TURN = 0.35
 """Largest rotation of one action, radians."""
 TRAVEL_HEIGHT = 0.12
+"""Height of the tool above the table on the way, metres."""
 RELEASE_GAP = 0.003
+"""Space between the cube and what it is put on when the fingers open, metres."""
 OPEN, CLOSED = 1.0, 0.0
 STAY_SHUT = np.array([0, 0, 0, 0, 0, 0, CLOSED])
 

@@ -119,7 +119,7 @@ class Extraction:
         location = locate(out)
         if self.declared:
             raise UsageError("this extraction was planned without its model; prepare it again with fetch=True")
-        with location.in_words():
+        with location.explained_errors():
             self._check_settings(location)
             if not force and (addition := self.further_plan(location)).episodes:
                 check_if_full(space_needed(addition, self.settings), location)
@@ -306,7 +306,7 @@ def _check_other_run(settings: Settings, source: Source[Any], location: Location
     lies there was changed.
     """
     early = source.known_early()
-    with location.in_words():
+    with location.explained_errors():
         if early is None or not location.exists(RUN_FILE):
             return
         root = read_root(location)
@@ -331,7 +331,7 @@ def _selects_only(settings: Settings, location: Location | None) -> bool:
     if location is None:
         family = get_family(settings.model.family)
         return family is not None and bool(family.declared)
-    with location.in_words():
+    with location.explained_errors():
         return not location.exists(RUN_FILE)
 
 

@@ -18,10 +18,10 @@ from probe_kit.statistics.intervals import (
     NO_LIMITS,
     Interval,
     Share,
+    allowing_for_unseen_groups,
     correlation_of,
     difference_interval,
     mean_interval,
-    not_surer,
 )
 from probe_kit.statistics.retention import Ratio, Scores, accuracy_interval, retention, t_quantile
 from probe_kit.statistics.sufficiency import ABSENT_BELOW, at_most, findable, is_absent, permuted_threshold
@@ -199,7 +199,9 @@ class PooledScores:
         for name in set(self.names) & set(other.names):
             row, column = self.names.index(name), other.names.index(name)
             variances = float(self.scores.covariance[row, row]), float(other.scores.covariance[column, column])
-            between[row, column] = not_surer(between[row, column], variances, self.fit.n_groups, CHANCE)
+            between[row, column] = allowing_for_unseen_groups(
+                between[row, column], variances, self.fit.n_groups, CHANCE
+            )
         return between
 
     def accuracy_difference(self, other: "PooledScores", name: str) -> Rate:

@@ -174,7 +174,7 @@ def copy_run(
             _write_copy(run, Folder(draft), keys, left_out)
             move_draft(draft, folder)
     else:  # a killed copy leaves objects and no root, and the next one writes them again
-        with target.in_words():
+        with target.explained_errors():
             _write_copy(run, target, keys, left_out)
     return open_run(target, allow_partial)
 

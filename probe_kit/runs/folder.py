@@ -90,7 +90,7 @@ class Folder:
         return shutil.disk_usage(existing).free
 
     @contextmanager
-    def in_words(self) -> Iterator[None]:
+    def explained_errors(self) -> Iterator[None]:
         """Errors in the body that come from what is below (a full disk, a network) say what to do.
 
         Raises DiskSpaceError or StoreError in place of the system's error.

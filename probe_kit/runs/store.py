@@ -110,7 +110,7 @@ class Bucket:
     def _below(self, folder: str, quick: bool = False) -> "ObjectStore":
         from obstore.store import from_url
 
-        with self.in_words():
+        with self.explained_errors():
             store: ObjectStore = from_url(
                 f"{self._url}/{folder}".rstrip("/"),
                 retry_config={
@@ -130,7 +130,7 @@ class Bucket:
         from obstore.exceptions import GenericError
 
         pauses = pauses_for(PATIENCE)
-        with self.in_words():
+        with self.explained_errors():
             while True:
                 try:
                     answer = request(self._patient if self._answered else self._quick)
@@ -147,7 +147,7 @@ class Bucket:
                 time.sleep(pause)
 
     @contextmanager
-    def in_words(self) -> Iterator[None]:
+    def explained_errors(self) -> Iterator[None]:
         """Whatever obstore says."""
         from obstore.exceptions import BaseError
 
@@ -180,7 +180,7 @@ class Bucket:
     # -- objects ---------------------------------------------------------------------------------------
 
     def exists(self, key: str) -> bool:
-        """One request for the head of the object."""
+        """See `Folder.exists`: a request for the head of the object."""
         import obstore
 
         try:
@@ -190,7 +190,7 @@ class Bucket:
         return True
 
     def read(self, key: str) -> bytes:
-        """One request."""
+        """See `Folder.read`: one request."""
         import obstore
 
         def content(objects: Any) -> bytes:
@@ -201,17 +201,17 @@ class Bucket:
         return self._answer(content)
 
     def pieces(self, key: str) -> Iterator[bytes]:
-        """All of it at once."""
+        """See `Folder.pieces`: the whole object is the only one."""
         yield self.read(key)
 
     def open(self, key: str) -> BinaryIO:
-        """Reads ranges when they are asked for."""
+        """See `Folder.open`: ranges are requested when they are read."""
         import obstore
 
         return BufferedReader(_Ranges(self._answer(lambda objects: obstore.open_reader(objects, key)), self))
 
     def read_all(self, folder: str, suffix: str) -> dict[str, bytes]:
-        """A listing, then many requests side by side. An object that is gone by then is left out."""
+        """See `Folder.read_all`: a listing, then requests side by side. An object that is gone by then is left out."""
         names = [key.removeprefix(f"{folder}/") for key in self.keys(folder)]
         names = [name for name in names if name.endswith(suffix) and "/" not in name]
         with ThreadPoolExecutor(READERS) as readers:
@@ -226,11 +226,11 @@ class Bucket:
             return None
 
     def keys(self, folder: str) -> list[str]:
-        """Read a listing."""
+        """See `Folder.keys`; read from a listing."""
         return sorted(self._listing(folder))
 
     def sizes(self, folder: str, keys: Iterable[str]) -> dict[str, int]:
-        """Read a listing."""
+        """See `Folder.sizes`; read from a listing."""
         listing = self._listing(folder)
         return {key: listing[f"{folder}/{key}"] for key in keys if f"{folder}/{key}" in listing}
 
@@ -245,11 +245,11 @@ class Bucket:
         """A put that was answered is durable."""
 
     def create(self, key: str, content: bytes) -> bool:
-        """A conditional put."""
+        """See `Folder.create`: a put that fails where the key exists."""
         return self._put(key, content, "create")
 
     def write(self, key: str, content: bytes, durable: bool = True) -> None:  # noqa: ARG002 - always
-        """A put."""
+        """See `Folder.write`: a put, which is durable in any case."""
         self._put(key, content, "overwrite")
 
     def _put(self, key: str, content: bytes, mode: Literal["create", "overwrite"]) -> bool:
@@ -267,11 +267,11 @@ class Bucket:
         return self._answer(put)
 
     def delete(self, key: str) -> None:
-        """One request."""
+        """See `Folder.delete`: one request."""
         self._delete([key])
 
     def remove(self, folder: str) -> None:
-        """A listing, then bulk deletions."""
+        """See `Folder.remove`: a listing, then bulk deletions."""
         self._delete(self.keys(folder))
 
     def _delete(self, keys: list[str]) -> None:
@@ -281,7 +281,7 @@ class Bucket:
             self._answer(lambda objects: obstore.delete(objects, keys))
 
     def store(self, folder: str, read_only: bool = False) -> Store:
-        """Zarr's own, over obstore; its errors in our words."""
+        """Zarr's own, over obstore; its errors are those of `explained_errors`."""
         from zarr.storage import ObjectStore
 
         return _PatientStore(ObjectStore(self._below(folder), read_only=read_only), self)
@@ -341,7 +341,7 @@ class _PatientStore(WrapperStore[Store]):
         from obstore.exceptions import GenericError
 
         pauses = pauses_for(PATIENCE)
-        with self._bucket.in_words():
+        with self._bucket.explained_errors():
             while True:
                 try:
                     return await request()
@@ -362,7 +362,7 @@ class _PatientStore(WrapperStore[Store]):
     ) -> AsyncIterator[Sequence[tuple[int, Buffer | None]]]:
         """Parts of one."""
         # Not repeated: parts that were handed on already would come twice.
-        with self._bucket.in_words():
+        with self._bucket.explained_errors():
             async for group in super().get_ranges(key, byte_ranges, prototype=prototype, **how):
                 yield group
 
@@ -395,7 +395,7 @@ class _Ranges(RawIOBase):
         return self._file.seek(offset, whence)
 
     def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
-        with self._bucket.in_words():
+        with self._bucket.explained_errors():
             content = self._file.read(len(buffer))
         buffer[: len(content)] = bytes(content)
         return len(content)

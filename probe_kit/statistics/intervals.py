@@ -98,7 +98,9 @@ def mean_interval(values: Sequence[float], limits: Sequence[Interval]) -> Interv
     return Interval(middle - below, middle + above)
 
 
-def not_surer(covariance: float, variances: tuple[float, float], n_groups: int, most: float) -> float:
+def allowing_for_unseen_groups(
+    covariance: float, variances: tuple[float, float], n_groups: int, most: float
+) -> float:
     """The covariance of two estimates on the same groups, less where their difference would be known too well.
 
     Two runs that agree in all G groups may differ in unseen ones: in a share t of them, by `most`
@@ -202,12 +204,12 @@ class Share:
     def difference(self, other: "Share") -> Interval:
         """95 % interval of this share minus another (MOVER), paired where both are of the same groups.
 
-        Where the two agree in all groups it leaves room for unseen ones, see `not_surer`.
+        Where the two agree in all groups it leaves room for unseen ones, see `allowing_for_unseen_groups`.
         """
         related = 0.0
         if np.array_equal(self.groups, other.groups):
             variances = self.variance, other.variance
-            shared = not_surer(self.covariance(other), variances, self.groups.size, 1.0)
+            shared = allowing_for_unseen_groups(self.covariance(other), variances, self.groups.size, 1.0)
             related = correlation_of(shared, variances)
         return difference_interval(self.value, self.interval(), other.value, other.interval(), related)
 

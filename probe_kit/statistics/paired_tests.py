@@ -24,7 +24,7 @@ SHARED_PROBE = 1.25
 
 Groups share a probe, so two networks that know a quantity equally well differ by more than exchanges of groups
 allow. Without the factor one exceeds the other in 6 to 14 % of experiments, with it in 2 to 6 %
-(`label_coverage.py`).
+(`benchmarks/label_coverage.py`).
 """
 
 
@@ -139,10 +139,7 @@ def mcnemar_p(first: Right, second: Right) -> float:
 
     Only items on which they differ count, each as a toss of a fair coin; 1 where there is none.
     """
-    from scipy.stats import binomtest  # type: ignore[import-untyped]
-
-    more, fewer = int((first & ~second).sum()), int((~first & second).sum())
-    return 1.0 if more + fewer == 0 else float(binomtest(more, more + fewer, 0.5).pvalue)
+    return sign_p(int((first & ~second).sum()), int((~first & second).sum()))
 
 
 def flip_p(first: Right, second: Right, groups: ArrayLike) -> float:

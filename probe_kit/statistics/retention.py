@@ -77,8 +77,8 @@ OTHER_TRAINING = 1.1
 """Factor of the standard errors of both scores, for what other training questions would change.
 
 A group influences a score also through the probes of the other folds, which no variance over tested groups knows.
-Without the factor intervals cover 90.8 % at least in seven worlds of 480 draws, with it 94.2 %. In a weak world
-88.7 % of those with limits cover (`retention_coverage.py`).
+Without the factor intervals cover 90.8 % at least in seven simulated settings of 480 draws, with it 94.2 %. In a
+weak one 88.7 % of those with limits cover (`benchmarks/retention_coverage.py`).
 """
 
 

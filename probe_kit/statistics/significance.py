@@ -10,7 +10,7 @@ SIGNIFICANCE = 0.05
 
 
 def detectable(items: int, power: float = 0.8) -> float:
-    """Accuracy that a single baseline must have to be red in a share `power` of suites with so many items.
+    """Accuracy at which a baseline is flagged as above chance in a share `power` of suites with so many items.
 
     One-sided at 0.05, an item as one trial: its two layouts are one question. Raises UsageError without items.
     """

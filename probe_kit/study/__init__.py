@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from probe_kit.study.drift import CategoryDrift, measure_drift
     from probe_kit.study.pack import pack_study, publish_data_set, write_data_set
     from probe_kit.study.plan import StudyPlan, plan_study
-    from probe_kit.study.playing import Made, Moved, conduct_study, fit_probes
+    from probe_kit.study.playing import EpisodeStored, RunFinished, conduct_study, fit_probes
     from probe_kit.study.reading import LoadedStudy, load_study
     from probe_kit.study.report import make_figures, write_study_report
     from probe_kit.study.schema import Mistake, StudyFileError
@@ -17,11 +17,11 @@ if TYPE_CHECKING:
 
 __all__ = [
     "CategoryDrift",
+    "EpisodeStored",
     "Failure",
     "LoadedStudy",
-    "Made",
     "Mistake",
-    "Moved",
+    "RunFinished",
     "StudyFileError",
     "StudyPlan",
     "conduct_study",
@@ -54,8 +54,8 @@ __getattr__, __dir__ = lazy_names(
         "StudyPlan": "plan",
         "plan_study": "plan",
         "Failure": "cells",
-        "Made": "playing",
-        "Moved": "playing",
+        "RunFinished": "playing",
+        "EpisodeStored": "playing",
         "conduct_study": "playing",
         "fit_probes": "playing",
         "make_table": "tables",

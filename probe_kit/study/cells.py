@@ -289,7 +289,7 @@ class Failures:
 
     def check_place(self) -> None:
         """Raise DiskSpaceError or StoreError for a place that cannot be written; remove drafts of killed ones."""
-        with self._location.in_words(), self._location.tended(FOLDER):
+        with self._location.explained_errors(), self._location.tended(FOLDER):
             pass
 
     def of(self, cell: Cell, probes: str = "") -> Failure | None:
@@ -302,7 +302,7 @@ class Failures:
     def note(self, cell: Cell, failure: Failure, probes: str = "") -> None:
         """Write a failure, unless the same one is there."""
         if not failure.same(self.of(cell, probes)):
-            with self._location.in_words():
+            with self._location.explained_errors():
                 self._location.write(_key(cell, probes), failure.to_bytes())
 
     def clear(self, cell: Cell, probes: str = "") -> None:

@@ -179,7 +179,7 @@ def _look(plan: "StudyPlan", verify: bool, orphans: bool, as_json: bool) -> bool
 
 def _played(plan: "StudyPlan", **options: Any) -> "list[Failure]":
     """Play what is missing, with a bar for the study and one per run in play."""
-    from probe_kit.study import Failure, Moved, conduct_study
+    from probe_kit.study import EpisodeStored, Failure, conduct_study
 
     with progress() as bar:
         totals, count = plan.totals(), _counters(bar, "")
@@ -189,7 +189,7 @@ def _played(plan: "StudyPlan", **options: Any) -> "list[Failure]":
             nonlocal stored
             if isinstance(event, Failure):
                 say(marked("[red]{}[/]", event))
-            elif isinstance(event, Moved):
+            elif isinstance(event, EpisodeStored):
                 count(event.run, event.stored, event.planned)
                 stored += 1
                 of_study(stored, totals["episodes"])

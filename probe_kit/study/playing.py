@@ -69,7 +69,7 @@ class ModelTask:
 
 
 @dataclass(frozen=True)
-class Moved:
+class EpisodeStored:
     """The event that an episode of a run is stored. stored, planned: episodes."""
 
     model: str
@@ -80,14 +80,14 @@ class Moved:
 
 
 @dataclass(frozen=True)
-class Made:
+class RunFinished:
     """The event that a run is whole."""
 
     model: str
     run: str
 
 
-Event = Moved | Made | Failure
+Event = EpisodeStored | RunFinished | Failure
 Report = Callable[[Event], None]
 ProbeProgress = Callable[[str, int, int, str], None]
 
@@ -123,7 +123,7 @@ def conduct_study(
     stored.check_place()  # a place that cannot be written is no model's failure
 
     def note(event: Event) -> None:
-        if isinstance(event, Made):
+        if isinstance(event, RunFinished):
             stored.clear(cells[event.run])
         elif isinstance(event, Failure):
             failures.append(event)
@@ -203,7 +203,7 @@ def play_model(task: ModelTask, report: Report) -> None:
         # Defaults bind what the loop assigns anew.
         def count(stored: int, planned: int, outcome: str, run: RunTask = run, moved: list[int] = moved) -> None:
             moved.append(stored)
-            report(Moved(task.model, run.run, stored, planned, outcome))
+            report(EpisodeStored(task.model, run.run, stored, planned, outcome))
 
         settings = run.settings
         try:
@@ -211,7 +211,7 @@ def play_model(task: ModelTask, report: Report) -> None:
                 loaded[settings.asks] = task_of(settings).load(settings)
             extraction = prepare(settings, run.location, loaded[settings.asks])
             extraction.run(run.location, progress=count)
-            report(Made(task.model, run.run))
+            report(RunFinished(task.model, run.run))
         except STOPS_ALL:
             raise
         except EpisodesFailedError as error:
@@ -278,9 +278,9 @@ def _note(queue: TaskQueue[ModelTask], slot: int, event: Any, report: Report) ->
         reason = f"{event.reason}, {MOST_LOSSES} times without an episode in between. Its last words are above"
         report(Failure.of("playing", model, run, WorkerDiedError(reason)))
         return
-    if isinstance(event, Moved):
+    if isinstance(event, EpisodeStored):
         queue.advanced(event.model)  # its losses are counted anew: it does not die of one episode
-    elif isinstance(event, Made) or event.stage == "episodes":
+    elif isinstance(event, RunFinished) or event.stage == "episodes":
         task = queue.holds(slot)[event.model]
         runs = tuple(run for run in task.runs if run.run != event.run)
         queue.replace(slot, event.model, replace(task, runs=runs))

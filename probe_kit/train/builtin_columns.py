@@ -13,7 +13,7 @@ from probe_kit.errors import UsageError
 from probe_kit.runs.action_errors import compare_actions, why_not_compared
 from probe_kit.runs.reader import RunReader, reached_calls
 from probe_kit.train.choices import Task
-from probe_kit.train.label_table import EPISODE, INFERENCE
+from probe_kit.train.label_columns import EPISODE, INFERENCE
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -23,7 +23,7 @@ from probe_kit.runs.reader import RunReader, check_sides
 from probe_kit.statistics.label_permutations import flip_items
 from probe_kit.train.builtin_columns import BuiltinColumn, BuiltinColumns
 from probe_kit.train.choices import SIDES, Task
-from probe_kit.train.label_table import EPISODE, FRAME, INFERENCE, SOURCE, LabelValues, code_labels, read_table
+from probe_kit.train.label_columns import EPISODE, FRAME, INFERENCE, SOURCE, LabelValues, code_labels, read_table
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from probe_kit.errors import UsageError
 from probe_kit.runs.reader import RunReader, check_call, reached_calls
 from probe_kit.train.choices import EVERYWHERE, Incomplete
-from probe_kit.train.label_table import EPISODE, INFERENCE
+from probe_kit.train.label_columns import EPISODE, INFERENCE
 from probe_kit.train.target import Target
 
 REACHED = 0.9

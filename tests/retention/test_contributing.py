@@ -115,7 +115,7 @@ print(CliRunner().invoke(app, ["retention", "--help-all"]).output)
     printed = use("To add an outcome rule", code)
     assert "False [False, False] [True, True] [False, False]" in printed
     assert "True [True, True] [False, False] [False, False]" in printed
-    assert "True within 6.5 cm" in printed
+    assert "True let go within 6.5 cm" in printed
     assert "released-disc" in printed.partition("seen from above")[2]
 
 

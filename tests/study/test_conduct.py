@@ -19,7 +19,7 @@ from probe_kit.hooks import load_policy
 from probe_kit.runs import open_run
 from probe_kit.study import Failure, conduct_study, fit_probes, load_study, make_table, plan_study, playing
 from probe_kit.study.cells import Cell, Failures
-from probe_kit.study.playing import Made, ModelTask, Moved, RunTask
+from probe_kit.study.playing import EpisodeStored, ModelTask, RunFinished, RunTask
 from probe_kit.study.stored import open_cell
 from probe_kit.suite import Suite
 from tests.study.broken_files import BASE
@@ -155,7 +155,7 @@ def test_every_scene_is_built_before_the_first_run_is_played(file: Path, tmp_pat
     told: list[object] = []
     failures = conduct_study(plan_study(load_study(changed)), told.append, env_workers=0)
     assert [(one.stage, one.run) for one in failures] == [("checking", "broken/short"), ("checking", "idle/dark")]
-    assert [type(one).__name__ for one in told][:3] == ["Failure", "Failure", "Moved"]
+    assert [type(one).__name__ for one in told][:3] == ["Failure", "Failure", "EpisodeStored"]
     assert states(changed)["idle/short"] == ("waiting", 0)
     assert states(changed)["expert/short"] == ("whole", 4)
     changed.write_text(text, encoding="utf-8")  # what failed before it played is tried again unasked
@@ -333,7 +333,7 @@ def test_the_longest_model_goes_first_and_one_with_a_gpu_only_where_there_is_one
 def test_a_lost_model_comes_back_without_the_runs_that_are_made_or_given_up(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    made = Made("base", "base/plain")
+    made = RunFinished("base", "base/plain")
     failed = Failure(stage="episodes", model="base", run="base/dark", reason="two of them")
 
     def story(queue: TaskQueue[ModelTask]) -> Iterator[tuple[int, Any]]:
@@ -351,7 +351,7 @@ def test_a_lost_model_comes_back_without_the_runs_that_are_made_or_given_up(
 def test_a_model_is_given_up_after_three_losses_without_an_episode_in_between(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    moved = Moved("base", "base/plain", 1, 4, "correct")
+    moved = EpisodeStored("base", "base/plain", 1, 4, "correct")
 
     def story(queue: TaskQueue[ModelTask]) -> Iterator[tuple[int, Any]]:
         def lose() -> tuple[ModelTask, bool]:

@@ -9,7 +9,7 @@ import pytest
 
 from probe_kit._execution.executor import WorkerLostWarning
 from probe_kit.errors import WorkerDiedError
-from probe_kit.study import Moved, conduct_study, load_study, plan_study, playing
+from probe_kit.study import EpisodeStored, conduct_study, load_study, plan_study, playing
 from probe_kit.suite import Suite
 from tests.study.small_study import EPISODES, check_same_bytes, small_study
 
@@ -24,10 +24,10 @@ def played_here(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) ->
 
 
 def test_processes_give_the_bytes_of_this_process(played_here: Path, small_suite: Suite, tmp_path: Path) -> None:
-    file, moved = small_study(tmp_path, small_suite), list[Moved]()
+    file, moved = small_study(tmp_path, small_suite), list[EpisodeStored]()
     failures = conduct_study(
         plan_study(load_study(file)),
-        lambda event: moved.append(event) if isinstance(event, Moved) else None,
+        lambda event: moved.append(event) if isinstance(event, EpisodeStored) else None,
         slots=2,
     )
     assert failures == []
@@ -42,7 +42,7 @@ def test_a_killed_process_is_replaced_and_nothing_changes(
     killed: list[int] = []
 
     def kill_one(event: object) -> None:
-        if isinstance(event, Moved) and event.stored in (5, 15) and len(killed) < 4:
+        if isinstance(event, EpisodeStored) and event.stored in (5, 15) and len(killed) < 4:
             victims = [one.pid for one in _players() if one.pid not in killed]
             killed.append(victims[0])
             psutil.Process(victims[0]).kill()

@@ -169,9 +169,6 @@ class BufferPool:
         self._free.put(buffers)
 
 
-SMALL = 10_000_000
-"""Parameters below which a second thread costs more than it brings: ten times the time on a busy machine."""
-
 RolesByStream = Mapping[str, "Sequence[Roles]"]
 
 

@@ -324,7 +324,7 @@ class Worker:
         """On the writing thread."""
         try:
             rollout.buffers.wait()  # copies from a GPU may still be under way
-            with self._writer.location.in_words():
+            with self._writer.location.explained_errors():
                 # Not before: the certificate holds fire counts and proofs, which the first inference gives.
                 self._writer.write_certificate(self._certificate())
                 self._writer.write(

@@ -202,7 +202,7 @@ class ActivationCache(Mapping[Site, Tensor]):
 Reduce = Callable[[Site, Tensor], Tensor]
 EditFunction = Callable[[Tensor], Tensor]
 Handle = Callable[[Site, Tap, Tensor], Tensor | None]
-"""Receives what passes at a site; of an output, what it returns passes on in its place."""
+"""Receives what passes at a site; what it returns passes on in its place, unless it is None or a keyword's value."""
 _captured_now: WeakSet[Model] = WeakSet()
 
 
@@ -218,21 +218,21 @@ def capture(model: Model, sites: Iterable[Site], reduce: Reduce | None = None) -
     """
     if model in _captured_now:
         raise CaptureError("this model is being captured already; leave the first capture before the next")
-    tape = ActivationCache()
+    cache = ActivationCache()
 
     def keep(site: Site, tap: Tap, passing: Tensor) -> None:
         activation = tap.select(passing).detach()
-        tape._kept[site] = activation.clone() if reduce is None else reduce(site, activation)
+        cache._kept[site] = activation.clone() if reduce is None else reduce(site, activation)
 
     with ExitStack() as stack:
         _captured_now.add(model)
         stack.callback(_captured_now.discard, model)
         hooks = _attach(model, sites, keep, stack)
-        yield tape
+        yield cache
     for hook in hooks:
         hook.check_count()
-        tape.fires[hook.name] = hook.promised
-    _check_non_finite(tape)
+        cache.fires[hook.name] = hook.promised
+    _check_non_finite(cache)
 
 
 @contextmanager

@@ -1,6 +1,6 @@
 """Kinds of intervention, one file each: options, conditions, effects with columns, and the sentence.
 
-A file here, or a module that `register` is called with, is all that a kind needs; see `base.Intervention`.
+A file here, or a module that `register` is called with, is a kind; see `base.Intervention`.
 """
 
 from importlib import import_module

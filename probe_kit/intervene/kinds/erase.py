@@ -96,7 +96,7 @@ class ConceptErasure(Intervention):
 
     sites: tuple[str, ...]
     roles: tuple[str, ...] = ("image",)
-    method: str = LEACE
+    method: str = LEACE  # the command's --direction: what is removed is a direction too
     controls: int = 5
     seed: int = 0
 

@@ -37,7 +37,7 @@ def steered(cell: Cell, name: str, coefficient: float, target_side: TargetSide, 
 
     def play(context: ConditionContext) -> ConditionResult:
         pair, session, site_group = context.pair, context.session, cell.site_group
-        is_left = pair.side != "right"
+        is_left = pair.side != "right"  # without sides it is not read
         side = {"left": 1.0, "right": -1.0, "correct": 1.0 if is_left else -1.0, "wrong": -1.0 if is_left else 1.0}
         strength = coefficient * (1.0 if pair.side is None else side[target_side])
         shift = bases.shift(name, pair.episode, strength)

@@ -639,6 +639,10 @@ BASELINES = tuple(map(_baseline, _BASELINES))
 _SELECTIVITY = "Accuracy above that of the same probe on random labels, at the best site"
 _UNTRAINED = "The same probes on another run of the same episodes, usually with untrained weights, subtracted"
 
+BY_LAYOUT = ColumnGroup(
+    "By layout and item", (ORIGINAL, SWAPPED, GOES_LEFT, RIGHT_TWICE, RIGHT_TWICE_P, SIZES), True
+)
+
 TABLES: Mapping[str, tuple[ColumnGroup, ...]] = {
     "Success rate": (
         ColumnGroup(
@@ -648,12 +652,12 @@ TABLES: Mapping[str, tuple[ColumnGroup, ...]] = {
         ColumnGroup("Where the cube ended", (WRONG, OUTSIDE, NEVER_MOVED, INVALID_ACTION)),
         ColumnGroup("With the two pictures swapped", (FOLLOWS, USED), section="interventions"),
         ColumnGroup("What the outcome rule makes of it", RULES, section="rules"),
-        ColumnGroup("By layout and item", (ORIGINAL, SWAPPED, GOES_LEFT, RIGHT_TWICE, RIGHT_TWICE_P, SIZES), True),
+        BY_LAYOUT,
     ),
     "Accuracy of answers": (
         ColumnGroup("Does it know the answer?", (ACCURACY, SR_MODELS, DIFFERENCE_P, MARGIN, REGIME, LEFT, RIGHT)),
         ColumnGroup("How it answered", ANSWERS, section="answers"),
-        ColumnGroup("By layout and item", (ORIGINAL, SWAPPED, GOES_LEFT, RIGHT_TWICE, RIGHT_TWICE_P, SIZES), True),
+        BY_LAYOUT,
     ),
     "Retention": (
         ColumnGroup(
@@ -718,7 +722,8 @@ def all_columns(modes: Modes = "both") -> tuple[Column, ...]:
     """Every column of the tables of such rows once, in order and with their words."""
     tables = [groups for title, groups in TABLES.items() if modes in ("both", _OF_ONE_MODE.get(title, modes))]
     every = [column.worded(modes) for groups in tables for group in groups for column in group.columns]
-    return tuple({column.heading: column for column in every}.values())  # both tables of behaviour share some
+    # Both tables of behaviour share some.
+    return tuple({(column.key, column.heading): column for column in every}.values())
 
 
 def averaged_fields() -> tuple[str, ...]:

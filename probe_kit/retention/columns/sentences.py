@@ -128,10 +128,10 @@ def verdict(row: RetentionRow) -> str:
     used nor read in the backbone, and without an image swap, it is `readable`.
     """
     use = row.image_swap.use
-    return readable(row) if use is None or _is_nowhere(row, use) else use.verdict
+    return readable(row) if use is None or _is_neither_used_nor_found(row, use) else use.verdict
 
 
-def _is_nowhere(row: RetentionRow, use: UseVerdict) -> bool:
+def _is_neither_used_nor_found(row: RetentionRow, use: UseVerdict) -> bool:
     """Whether the image swap bounds the use, and probes did not find the answer."""
     return use.is_bounded and is_probed(row) and not row.backbone.has_signal
 
@@ -147,7 +147,7 @@ def readable(row: RetentionRow) -> Readable:
     if is_vlm(row):
         return "known" if knows(row) else "not shown"
     nothing: Readable = "absent" if row.backbone.verdict == "absent" else "not shown"
-    if row.image_swap.use is not None and _is_nowhere(row, row.image_swap.use):
+    if row.image_swap.use is not None and _is_neither_used_nor_found(row, row.image_swap.use):
         return nothing
     evidence: Readable = "shown" if row.backbone.has_signal else nothing
     if row.success.sr is None:
@@ -210,7 +210,7 @@ def conclusion(row: RetentionRow) -> str:
 
 def _used(row: RetentionRow, use: UseVerdict) -> str:
     """Return the sentence of a row with a stored image swap: behaviour; place; tie."""
-    if _is_nowhere(row, use):
+    if _is_neither_used_nor_found(row, use):
         return f"{_nothing_shown(row)} {use.sentence}"
     return use.sentence
 

@@ -344,7 +344,7 @@ def test_timestamps_off_the_grid_are_refused_with_their_frame(recording: Path, t
 def test_a_state_of_another_robot_is_refused(tmp_path: Path) -> None:
     other = [[replace(one, state=one.state[:6]) for one in episode] for episode in observations(1)]
     folder = write_recording(tmp_path / "rec", other)
-    with pytest.raises(RecordingError, match=r"6 numbers as observation\.state; embedded reads 8"):
+    with pytest.raises(RecordingError, match=r"6 numbers as observation\.state; pi0-tiny reads 8"):
         prepare(settings(folder))
 
 
@@ -355,7 +355,7 @@ def test_states_far_outside_the_checkpoints_statistics_are_refused_unless_accept
     scale = np.array([1000, 1000, 1000, 1, 1, 1, 1, 1], np.float32)
     other = [[replace(one, state=one.state * scale) for one in episode] for episode in observations(1)]
     folder = write_recording(tmp_path / "rec", other)
-    with pytest.raises(UnitsError, match=r"outside the statistics of embedded \(s0 100%.*--accept-units"):
+    with pytest.raises(UnitsError, match=r"outside the statistics of embedded \(s0 in 100%.*--accept-units"):
         prepare(settings(folder), model=pi0_tiny)
     assert prepare(settings(folder, accept_units=True), model=pi0_tiny).plan.episodes
 
