@@ -24,7 +24,7 @@ from probe_kit.errors import (
     SettingsMismatchError,
     UsageError,
 )
-from probe_kit.extract.rollout.capturing import SMALL
+from probe_kit.extract.rollout.capturing import FEWEST_FOR_THREADS
 from probe_kit.extract.rollout.worker import torch_threads
 from probe_kit.extract.sources.inputs import (
     INSTRUCTION,
@@ -146,7 +146,7 @@ class ReplaySession(ABC):
     @contextmanager
     def ready(self) -> Iterator[None]:
         """Use as many threads as the run had, so that sums are rounded alike."""
-        threads = 1 if self.policy.card.parameters < SMALL else None
+        threads = 1 if self.policy.card.parameters < FEWEST_FOR_THREADS else None
         with torch_threads(threads):
             yield
 

@@ -211,7 +211,7 @@ class Bucket:
         return BufferedReader(_Ranges(self._answer(lambda objects: obstore.open_reader(objects, key)), self))
 
     def read_all(self, folder: str, suffix: str) -> dict[str, bytes]:
-        """See `Folder.read_all`: a listing, then requests side by side. An object that is gone by then is left out."""
+        """See `Folder.read_all`: a listing, then requests side by side. What is gone by then is left out."""
         names = [key.removeprefix(f"{folder}/") for key in self.keys(folder)]
         names = [name for name in names if name.endswith(suffix) and "/" not in name]
         with ThreadPoolExecutor(READERS) as readers:

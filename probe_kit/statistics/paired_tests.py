@@ -172,7 +172,7 @@ def flip_gains_p(gains: NDArray[np.int64], groups: ArrayLike) -> float:
 
 def clopper_pearson(hits: int, trials: int) -> tuple[float, float]:
     """Exact 95 % interval of a share; (0, 1) without trials."""
-    from scipy.stats import beta
+    from scipy.stats import beta  # type: ignore[import-untyped]
 
     low = 0.0 if hits == 0 else float(beta.ppf(SIGNIFICANCE / 2, hits, trials - hits + 1))
     high = 1.0 if hits == trials else float(beta.ppf(1 - SIGNIFICANCE / 2, hits + 1, trials - hits))

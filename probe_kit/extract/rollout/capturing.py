@@ -169,6 +169,9 @@ class BufferPool:
         self._free.put(buffers)
 
 
+FEWEST_FOR_THREADS = 10_000_000
+"""Parameters below which a second thread costs more than it brings: ten times the time on a busy machine."""
+
 RolesByStream = Mapping[str, "Sequence[Roles]"]
 
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from probe_kit.env.arm import ACTION_SIZE
 from probe_kit.env.rotations import from_rpy, to_vector
 from probe_kit.errors import IgnoredInputsError, InstructionError, PolicyFailedError, ProbeKitError
-from probe_kit.extract.rollout.capturing import Capturer, stored_streams
+from probe_kit.extract.rollout.capturing import FEWEST_FOR_THREADS, Capturer, stored_streams
 from probe_kit.extract.settings import ExtractSettings
 from probe_kit.extract.sources.inputs import INSTRUCTION, PICTURE, blank_of, same_input, with_input
 from probe_kit.extract.sources.player import Row
@@ -41,8 +41,6 @@ if TYPE_CHECKING:
 
 Reach = Literal["output", "last layer", "nothing", "not the output", "not tested"]
 """The last thing on the way to the output that changed with an input; "not the output" where no layer was read."""
-FEWEST_FOR_THREADS = 10_000_000
-"""Parameters below which a second thread costs more than it brings: ten times the time on a busy machine."""
 MOST_TEXTS = 32
 """Other instructions that are searched for one with as many tokens; each of them is tokenised."""
 Ids = Callable[[str], tuple[int, ...] | None]
