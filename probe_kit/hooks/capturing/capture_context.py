@@ -202,7 +202,7 @@ class ActivationCache(Mapping[Site, Tensor]):
 Reduce = Callable[[Site, Tensor], Tensor]
 EditFunction = Callable[[Tensor], Tensor]
 Handle = Callable[[Site, Tap, Tensor], Tensor | None]
-"""Receives what passes at a site; what it returns passes on in its place, unless it is None or a keyword's value."""
+"""Receives what passes at a site; what it returns, unless None or of a keyword, passes on in its place."""
 _captured_now: WeakSet[Model] = WeakSet()
 
 
