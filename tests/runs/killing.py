@@ -50,7 +50,7 @@ def rollout(plan: Plan, number: int) -> Rollout:
 def extract(run: str, plan: Plan) -> None:
     """What an extraction does with its episodes."""
     writing = writer.RunWriter(locate(run), plan, SETTINGS)
-    with writing.owned(), writing.location.in_words():
+    with writing.owned(), writing.location.explained_errors():
         for number in writing.remaining():
             writing.write(rollout(plan, number).record)
         verify.seal(run)

@@ -206,7 +206,7 @@ def test_a_process_that_may_write_no_larger_file_has_a_full_disk(tmp_path: Path)
     location, before = locate(tmp_path), resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1000, before[1]))
     try:
-        with pytest.raises(DiskSpaceError, match=r"takes no file so large"), location.in_words():
+        with pytest.raises(DiskSpaceError, match=r"takes no file so large"), location.explained_errors():
             location.write("frames/a.webp", bytes(5000))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
@@ -387,7 +387,7 @@ def test_missing_credentials_are_named_and_not_the_address_that_was_asked_for_th
     asked = "Error performing PUT http://169.254.169.254/latest/api/token in 23ms - Server returned 403"
     with (
         pytest.raises(StoreError, match=r"no credentials.*AWS_ACCESS_KEY_ID") as caught,
-        locate("s3://b/r").in_words(),
+        locate("s3://b/r").explained_errors(),
     ):
         raise GenericError(asked)
     assert "169.254" not in str(caught.value)

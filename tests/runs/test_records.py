@@ -165,7 +165,7 @@ def test_a_name_that_stands_twice_in_a_card_is_refused_though_its_hash_is_right(
 
 @pytest.mark.parametrize("error", [errno.ENOSPC, errno.EDQUOT, errno.EFBIG])
 def test_a_disk_that_takes_no_more_is_full_whatever_the_system_calls_it(tmp_path: Path, error: int) -> None:
-    with pytest.raises(DiskSpaceError, match=f"the disk of {tmp_path}"), locate(tmp_path).in_words():
+    with pytest.raises(DiskSpaceError, match=f"the disk of {tmp_path}"), locate(tmp_path).explained_errors():
         raise OSError(error, os.strerror(error))
 
 

@@ -301,9 +301,9 @@ def test_a_full_disk_is_named_and_leaves_a_store_that_resumes(suite: Suite, whol
 
 
 def test_other_errors_of_the_disk_keep_their_name(tmp_path: Path) -> None:
-    with pytest.raises(PermissionError), locate(tmp_path).in_words():
+    with pytest.raises(PermissionError), locate(tmp_path).explained_errors():
         raise PermissionError
-    with pytest.raises(DiskSpaceError), locate(tmp_path).in_words():
+    with pytest.raises(DiskSpaceError), locate(tmp_path).explained_errors():
         raise OSError(28, "No space left on device")
 
 
