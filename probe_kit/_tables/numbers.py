@@ -22,12 +22,12 @@ def whole_percent(value: float | None) -> str:
 
 def number(value: float | None, digits: int = 2) -> str:
     """Return a number with two decimals by default, and zero without a sign; a dash for None and NaN."""
-    return NONE if value is None or value != value else f"{round(value, digits) + 0.0:.{digits}f}"
+    return NONE if value is None or value != value else f"{value:z.{digits}f}"
 
 
 def signed(value: float | None, digits: int = 2) -> str:
     """Return the same with its sign."""
-    return NONE if value is None or value != value else f"{value:+.{digits}f}"
+    return NONE if value is None or value != value else f"{value:+z.{digits}f}"
 
 
 def points(value: float | None) -> str:

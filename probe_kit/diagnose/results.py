@@ -217,12 +217,12 @@ class Knowledge:
         return f"{self.target} is known up to the action by {where}{self._retained()}{used}."
 
     def _words(self, site: SiteKnowledge) -> str:
-        return f"{site.name} ({self.metric} {site.score:.2f}, chance {site.chance:.2f})"
+        return f"{site.name} ({self.metric} {site.score:z.2f}, chance {site.chance:z.2f})"
 
     def _retained(self) -> str:
         low, high = self.retention_ci
-        limits = f" [{low:.2f}, {high:.2f}]" if isfinite(low) and isfinite(high) else ""
-        return f"; retention {self.retention:.2f}{limits}" if isfinite(self.retention) and not self.note else ""
+        limits = f" [{low:z.2f}, {high:z.2f}]" if isfinite(low) and isfinite(high) else ""
+        return f"; retention {self.retention:z.2f}{limits}" if isfinite(self.retention) and not self.note else ""
 
 
 @dataclass(frozen=True)

@@ -280,8 +280,8 @@ def is_bounded(effect: ImageSwapEffect) -> bool:
 def _measured(effect: ImageSwapEffect) -> str:
     """Displacement and net follow rate with their intervals."""
     return (
-        f"moved by {effect.reach_share:.2f} {_ends(effect.reach_share_ci)} of its reach, net follow rate "
-        f"{effect.net_follow_rate:.2f} {_ends(effect.net_follow_rate_ci)}"
+        f"moved by {effect.reach_share:z.2f} {_ends(effect.reach_share_ci)} of its reach, net follow rate "
+        f"{effect.net_follow_rate:z.2f} {_ends(effect.net_follow_rate_ci)}"
     )
 
 
@@ -291,7 +291,7 @@ def _open(effect: ImageSwapEffect) -> str:
     is_other = effect.moved_share >= SMALLEST_EFFECT_OF_INTEREST and not is_graded
     if is_other and abs(effect.reach_share) < effect.moved_share / 2:
         return (
-            f"the images move it by {effect.moved_share:.2f} of its reach, the answer by {effect.reach_share:.2f} "
+            f"the images move it by {effect.moved_share:z.2f} of its reach, the answer by {effect.reach_share:z.2f} "
             f"{_ends(effect.reach_share_ci)}: it depends on something else in the images, or on the answer in "
             "opposite directions, or the items are too few"
         )
@@ -330,7 +330,7 @@ def _width(limits: tuple[float | None, float | None] | None) -> float:
 
 
 def _ends(limits: tuple[float, float]) -> str:
-    return "[no interval]" if inf in limits else f"[{limits[0]:.2f}, {limits[1]:.2f}]"
+    return "[no interval]" if inf in limits else f"[{limits[0]:z.2f}, {limits[1]:z.2f}]"
 
 
 # -- with what else is stored ----------------------------------------------------------------------------------
@@ -459,7 +459,7 @@ def describe_swap(swap: Any, use: UseVerdict) -> str:
     use = replace(use, other=None)
     low, high = (whole_percent(limit) for limit in swap.net_follow_rate_ci or (None, None))
     followed, net = f"in {whole_percent(swap.follow_rate)} % of episodes", f"net of reversals {low} to {high} %"
-    moved = "" if swap.reach_share is None else f", moved by {swap.reach_share:.2f} of its reach"
+    moved = "" if swap.reach_share is None else f", moved by {swap.reach_share:z.2f} of its reach"
     if use.behaviour == "used" and not use.reversed:
         return f"the action follows a swap of the pictures {followed} ({net})"
     if use.behaviour == "used":

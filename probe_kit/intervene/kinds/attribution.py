@@ -213,7 +213,7 @@ class AttributionPatching(Intervention):
         if worst.finding == "void":
             return f"void: gradients miss the effect at {worst.name} by more than a factor of 3; patch instead"
         first = max((row for row in rows if row.rank == 1), key=lambda row: abs(row.estimate or 0.0))
-        share = f"{first.estimate or 0.0:.2f} of the effect"
+        share = f"{first.estimate or 0.0:z.2f} of the effect"
         return f"ordered: gradients agree with patches; {first.name} comes first with {share}"
 
 

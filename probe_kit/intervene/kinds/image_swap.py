@@ -180,7 +180,7 @@ def _find_input(row: InputEffect) -> str:
     """Return a verdict and what the action does, without brackets."""
     if not row.changed:
         return f"does not arrive: another {row.vary} changes no number of any action"
-    share = "" if row.share is None else f", by {row.share:.2f} of what all inputs do"
+    share = "" if row.share is None else f", by {row.share:z.2f} of what all inputs do"
     return {
         "decides": f"decides: the action follows the {row.vary}{share}",
         "moves": f"moves: the {row.vary} shifts the action without deciding it{share}",
@@ -193,7 +193,7 @@ def _describe_input(row: InputEffect) -> str:
     """Return the same as the end of a sentence."""
     if not row.changed:
         return f"the {row.vary} does not arrive: it changes no number of any action"
-    share = "n/a" if row.share is None else f"{row.share:.2f}"
+    share = "n/a" if row.share is None else f"{row.share:z.2f}"
     return f"the {row.vary} {_VERBS[row.finding]} ({share} of the full exchange)"
 
 

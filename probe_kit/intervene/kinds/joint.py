@@ -360,7 +360,7 @@ def describe_joint_places(rows: Sequence[JointEffect]) -> str:
     text = f"{joint.verb} at {joint.list_cells()}" if joint.cells else ""
     if not joint.is_jointly:
         return text
-    alone = ", ".join(f"{name} {share:.2f}" for name, share in joint.alone.items())
+    alone = ", ".join(f"{name} {share:z.2f}" for name, share in joint.alone.items())
     return f"{text} (alone: {alone})" if alone else f"no single place: {text}"
 
 
@@ -370,7 +370,7 @@ def describe_remainder(rows: Sequence[JointEffect]) -> str:
     opposing = [row.cells for row in rows if row.part == "cell" and row.finding == "opposes it"]
     parts = [f"opposed at {list_places(opposing)}"] * bool(opposing)
     if not joint_places(rows).is_past and every.alone_ci is not None and every.alone_ci[1] < KEEP:
-        parts.append(f"all cells of {every.cells} carry {every.alone:.2f} of it")
+        parts.append(f"all cells of {every.cells} carry {every.alone:z.2f} of it")
     return "; ".join(parts)
 
 
