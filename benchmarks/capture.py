@@ -8,8 +8,8 @@
 Each family at 110 to 160 million random parameters, with `--full` three at the released size, or one at the size
 of a checkpoint, whose weights need not be there: the same model, observation and process for all ways, in turns. A
 ratio is that of one turn to the plain inference of the same turn; medians are printed, of processor time on a CPU
-(whatever else the machine does) and of
-wall time on a GPU. No way may change the numbers that come out, which is checked bit for bit first.
+(whatever else the machine does) and of wall time on a GPU. No way may change the numbers that come out, which is
+checked bit for bit first.
 
 * pooled: every residual site, all views, reduced on the device as it fires.
 * tokens: a copy of every token of every residual site.

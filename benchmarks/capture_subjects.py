@@ -191,7 +191,7 @@ FULL: dict[str, Values] = {
         }
     },
 }  # fmt: skip
-"""The released sizes of three families, without their vocabularies: pi0 3.0 B, OpenVLA 7.5 B, Qwen3-VL-4B."""
+"""The released sizes of pi0, OpenVLA and Qwen3-VL-4B, without their vocabularies, by family and file."""
 
 
 @dataclass(frozen=True)

@@ -23,15 +23,16 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any
+
+import tests_of_checkout  # noqa: F401
 
 from probe_kit import open_run
 from probe_kit.view import write_viewer
 from probe_kit.view.export import page_files
+from tests.support.browser import CHROMIUM, WHY_SKIPPED, Browser
 
-ROOT = Path(__file__).parents[1]
 VIEWS = {
     "overview": ("#/overview", "document.querySelector('.overview tbody tr')"),
     "layer × iteration": ("#/map", "document.querySelector('.readout')"),
@@ -51,16 +52,6 @@ TIMED = """new Promise(done => {
 """Milliseconds from an input until the frame behind the one in which a text has changed."""
 FRAME_EPISODES, FRAME_REPEATS = (4, 48), 3
 """Episodes of the two runs that are subtracted from each other; how often each is made. The shortest counts."""
-
-
-def chromium_of_tests() -> Any:
-    """The module that drives Chromium for the tests, which are no package."""
-    spec = spec_from_file_location("browser", ROOT / "tests" / "support" / "browser.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def report(name: str, text: str) -> None:
@@ -187,11 +178,10 @@ def main() -> None:
         parser.error("give a run, or --frames")
     code = [len(content) for name, content in page_files().items() if "LICENSE" not in name]
     report("page code, without licences", f"{sum(code) / 1000:.0f} kB")
-    tests = chromium_of_tests()
-    if tests.CHROMIUM is None:
-        sys.exit(tests.WHY_SKIPPED)
+    if CHROMIUM is None:
+        sys.exit(WHY_SKIPPED)
     scratch = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
-    with scratch as folder, tests.Browser(Path(folder) / "profile") as browser:
+    with scratch as folder, Browser(Path(folder) / "profile") as browser:
         measure_server(browser, options.run)
         if options.export:
             measure_export(browser, options.run, Path(folder))

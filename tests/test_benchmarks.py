@@ -23,7 +23,7 @@ SMALLEST: dict[str, list[str]] = {
     "intervention_null": ["OUT", "--networks", "1", "--inside", "1", "--items", "6", "--categories", "color"],
     "joint_probes": ["--episodes", "20", "--tokens", "4", "--width", "16"],
     "label_cost": ["--permutations", "2"],
-    "label_coverage": ["--draws", "2", "--only", "ridge"],
+    "label_coverage": ["--draws", "2", "--only", "12 white"],
     "label_null": ["--labels", "1", "--tasks", "binary", "--jobs", "1"],
     "memory": ["--episodes", "4", "--items", "2", "--lines", "2"],
     "on_gpu": ["--device", "cpu", "--only", "probes"],
@@ -43,7 +43,7 @@ SMALLEST: dict[str, list[str]] = {
 MODULES = {"capture_subjects", "coverage_worlds", "kept_draws", "tests_of_checkout"}
 """Parts of others."""
 ELSEWHERE = {
-    "intervention_acceptance": "its own slow test plays every organism: tests/demo",
+    "intervention_acceptance": "plays six policies for an hour",
     "null_worlds": "draws for minutes in its smallest form",
     "study_gpus": "needs Ray",
     "viewer": "needs a browser",

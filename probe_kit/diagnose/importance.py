@@ -163,8 +163,8 @@ def _verdict(exchanges: Exchanges, p: float) -> tuple[Verdict, str]:
             [f"no number of any action changed in {exchanges.largest.size} exchanges", *changed]
         )
     if unbounded_student_interval(above, groups)[1] < TRACE:
-        # No interval holds an effect in rare frames of which none was drawn: Clopper and Pearson's upper limit of
-        # a share that none of the groups shows.
+        # No interval holds an effect in rare frames of which none was drawn: Clopper and Pearson's one-sided
+        # upper limit of a share that none of the groups shows.
         unseen = 1 - SIGNIFICANCE ** (1 / np.unique(groups).size)
         return "no effect", f"in these frames; up to {whole_percent(unseen)} % of all frames may have one"
     if p >= SIGNIFICANCE:

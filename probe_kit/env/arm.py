@@ -28,9 +28,9 @@ from probe_kit.scene_names import ArmName
 MESH_FOLDER = Path("xacro/trossen_descriptions/meshes/meshes_wx250s")
 GREY = "0.13 0.13 0.13 1"
 EFFORT = 100.0
-"""Largest torque of a joint, N m: more than gravity and a cube take, so that no motion is cut short."""
+"""Largest torque of a joint in the description, N m."""
 FINGER_EFFORT = 10.0
-"""Largest force of a finger, N."""
+"""Largest force of a finger in the description, N."""
 ORIGIN: XYZ = (0.0, 0.0, 0.0)
 QUARTER: XYZ = (0.0, 0.0, pi / 2)
 

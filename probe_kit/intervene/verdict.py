@@ -291,9 +291,9 @@ def _open(effect: ImageSwapEffect) -> str:
     is_other = effect.moved_share >= SMALLEST_EFFECT_OF_INTEREST and not is_graded
     if is_other and abs(effect.reach_share) < effect.moved_share / 2:
         return (
-            f"the images move it by {effect.moved_share:z.2f} of its reach, the answer by {effect.reach_share:z.2f} "
-            f"{_ends(effect.reach_share_ci)}: it depends on something else in the images, or on the answer in "
-            "opposite directions, or the items are too few"
+            f"the images move it by {effect.moved_share:z.2f} of its reach, the answer by "
+            f"{effect.reach_share:z.2f} {_ends(effect.reach_share_ci)}: it depends on something else in the "
+            "images, or on the answer in opposite directions, or the items are too few"
         )
     return f"{_measured(effect)}; {more_groups(effect, effect.n_groups)}, there are {effect.n_groups}"
 

@@ -139,7 +139,11 @@ def mcnemar_p(first: Right, second: Right) -> float:
 
     Only items on which they differ count, each as a toss of a fair coin; 1 where there is none.
     """
-    return sign_p(int((first & ~second).sum()), int((~first & second).sum()))
+    # scipy's rather than `sign_p`, which differs in the last digits: stored numbers are compared bit for bit.
+    from scipy.stats import binomtest  # type: ignore[import-untyped]
+
+    more, fewer = int((first & ~second).sum()), int((~first & second).sum())
+    return 1.0 if more + fewer == 0 else float(binomtest(more, more + fewer, 0.5).pvalue)
 
 
 def flip_p(first: Right, second: Right, groups: ArrayLike) -> float:
@@ -172,7 +176,7 @@ def flip_gains_p(gains: NDArray[np.int64], groups: ArrayLike) -> float:
 
 def clopper_pearson(hits: int, trials: int) -> tuple[float, float]:
     """Exact 95 % interval of a share; (0, 1) without trials."""
-    from scipy.stats import beta  # type: ignore[import-untyped]
+    from scipy.stats import beta
 
     low = 0.0 if hits == 0 else float(beta.ppf(SIGNIFICANCE / 2, hits, trials - hits + 1))
     high = 1.0 if hits == trials else float(beta.ppf(1 - SIGNIFICANCE / 2, hits + 1, trials - hits))

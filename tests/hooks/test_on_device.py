@@ -49,14 +49,11 @@ def captured(family: str, place: str, device: str, options: dict[str, Any]) -> d
         else:
             assert isinstance(model, AnswerModel)
             out = model.read([Prompt(seen, "Which of them is red?", ("a", "b"))]).option_logits
-    found = {}
+    found = {str(site): tape[site].float().cpu().numpy() for site in model.sites()}
     for site in model.sites():
-        values = tape[site].float().cpu().numpy()
-        if (
-            site.stream in roles
-        ):  # what padding attends to, where a mask forbids everything, is the kernel's choice
-            values = values[:, ~roles[site.stream][0].mask("padding")]
-        found[str(site)] = values
+        if site.stream in roles:
+            # What padding attends to, where a mask forbids it everything, is the kernel's choice.
+            found[str(site)] = found[str(site)][:, ~roles[site.stream][0].mask("padding")]
     del model
     gc.collect()
     return {**found, "out": np.asarray(out)}
