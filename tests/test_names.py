@@ -58,9 +58,8 @@ STORED = {
     ("probe_kit/intervene/verdict.py", "place"),
     ("probe_kit/retention/behaviour.py", "one"),
     ("probe_kit/retention/compare/known_used.py", "asked"),
-    ("probe_kit/suite/generators/attribute.py", "thing"),
 }
-"""Keys of tables and of stored results, which the fence holds, and a field that is hashed into items."""
+"""Keys of tables and of stored results, which the fence holds."""
 PRONOUNS = re.compile(
     r"(what|whose|which|as|of|by|with|who|where|how|that|those|these|it|this|so|if|when|from|to|in|for|whether)\b",
     re.IGNORECASE,

@@ -7,7 +7,7 @@ the same places, each the target once. Neither the pictures alone nor the text a
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -38,7 +38,7 @@ def draw_twins(category: str, count: int, seed: int) -> Iterator[Twins]:
     generator = GENERATORS[category]
     for number, couple in enumerate(islice(draw_couples(generator, seed), count)):
         left_picture, right_picture = (
-            picture_of(f"{SUITE_NAME}/{category}/{sha256_json(asdict(tile))[:16]}", tile.draw())
+            picture_of(f"{SUITE_NAME}/{category}/{sha256_json(tile.record())[:16]}", tile.draw())
             for tile in (couple.left_tile, couple.right_tile)
         )
         pictures = left_picture, right_picture
@@ -47,8 +47,8 @@ def draw_twins(category: str, count: int, seed: int) -> Iterator[Twins]:
             "version": SUITE_VERSION,
             "seed": seed,
             "couple": number,
-            "left": asdict(couple.left_tile),
-            "right": asdict(couple.right_tile),
+            "left": couple.left_tile.record(),
+            "right": couple.right_tile.record(),
         }
         sides: tuple[Side, Side] = ("left", "right") if couple.left_asked_first else ("right", "left")
         first, second = (_item(couple, pictures, side, gen, generator) for side in sides)

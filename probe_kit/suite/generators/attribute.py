@@ -3,6 +3,7 @@
 import colorsys
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -242,19 +243,23 @@ _GAP = (0.45, 0.6)  # between the two levels; a smaller one vanishes on the far 
 _SCALES = (0.84, 0.89)  # so little that a smaller scale never looks like a smaller thing
 _INKS = ("red", "green", "blue", "orange", "brown", "purple", "gray")
 _LIGHTEST, _DARKEST = 0.95, 0.2  # value of a shaded thing
-_THINGS = {name: gradable for gradable in GRADABLES for name in (gradable.more, gradable.less)}
+_BY_NAME = {name: gradable for gradable in GRADABLES for name in (gradable.more, gradable.less)}
 
 
 @dataclass(frozen=True)
 class Sample(Tile):
-    """Everything the picture is drawn from: a thing, named by its more, with this much of its property."""
+    """Everything the picture is drawn from: a gradable, by its word for more, with this much of its property."""
 
-    thing: str
+    more: str
     level: float
     placement: Placement
 
+    def record(self) -> dict[str, Any]:
+        """Return the values under the keys of hashed items, in which the word for more is called `thing`."""
+        return {"thing" if name == "more" else name: value for name, value in super().record().items()}
+
     def _paint(self, canvas: Canvas) -> None:
-        _THINGS[self.thing].draw(canvas.pen(self.placement), self.level, self.ink)
+        _BY_NAME[self.more].draw(canvas.pen(self.placement), self.level, self.ink)
 
 
 def _sample(gradable: Gradable, level: float, rng: np.random.Generator) -> Sample:
@@ -276,7 +281,7 @@ def _tiles(left: Concept, right: Concept, rng: np.random.Generator) -> tuple[Sam
     gap = rng.uniform(*_GAP)
     low = rng.uniform(0, 1 - gap)
     levels = {"neg": low, "pos": low + gap}
-    left_tile, right_tile = (_sample(_THINGS[c.name], float(levels[c.polarity]), rng) for c in (left, right))
+    left_tile, right_tile = (_sample(_BY_NAME[c.name], float(levels[c.polarity]), rng) for c in (left, right))
     return on_hues(left_tile, right_tile, rng)
 
 

@@ -15,7 +15,7 @@ names in the order of the cells. `suite/art/NOTICE.md` says where they come from
 
 import colorsys
 import json
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -231,6 +231,10 @@ class Tile:
         canvas = Canvas(self.background)
         self._paint(canvas)
         return canvas.picture()
+
+    def record(self) -> dict[str, Any]:
+        """Return the values that are hashed into the picture's name and stored with its item."""
+        return asdict(self)
 
     def _paint(self, canvas: Canvas) -> None:
         raise NotImplementedError
