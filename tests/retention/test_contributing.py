@@ -1,5 +1,6 @@
 """The diffs and calls of CONTRIBUTING do what they say: each is applied to a copy of the package and used."""
 
+import ast
 import re
 import shutil
 import subprocess
@@ -12,9 +13,11 @@ import pandas as pd
 import pytest
 
 from probe_kit.train import ArrayRun
+from tests.test_names import fillers, first_words
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+EXAMPLES = re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)
 USE = """
 from pathlib import Path
 import pandas as pd
@@ -141,6 +144,19 @@ def test_a_comparison_is_one_call(tmp_path: Path, outcome_table: Callable[..., p
     code = block("To add a comparison", "python")
     assert code.count("compare(") == 1
     exec(code, runs)
-    color, mean = runs["found"]
+    color, mean = runs["differences"]
     assert (color.group, color.minus, color.sr, mean.category) == ("after", "before", 0.25, "mean")
     assert 0 < color.p == color.p_holm <= 1
+
+
+@pytest.mark.parametrize("example", EXAMPLES, ids=lambda code: code.split("\n")[0])
+def test_an_example_follows_the_rules_of_the_house(example: str) -> None:
+    # The text around an example leaves docstrings of methods and names from outside to the reader.
+    for command in (["check", "--extend-ignore", "D1,F821"], ["format", "--diff"]):
+        ruff = subprocess.run(
+            [sys.executable, "-m", "ruff", *command, "--no-cache", "--stdin-filename", "probe_kit/new.py", "-"],
+            cwd=ROOT, input=example, capture_output=True, encoding="utf-8", check=False,
+        )  # fmt: skip
+        assert ruff.returncode == 0, ruff.stdout + ruff.stderr
+    tree = ast.parse(example)
+    assert not [*fillers(tree), *first_words(tree)]
