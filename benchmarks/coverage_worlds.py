@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from probe_kit.hashing import derive_seed
-from probe_kit.statistics.crossfit import CrossFit, Stream, balanced_sums, crossfit
+from probe_kit.statistics.crossfit import CrossFit, StreamScores, balanced_sums, crossfit
 from probe_kit.statistics.folds import fold_numbers, fold_of_groups, sums_by_group
 from probe_kit.train.crossval.nested_folds import nested_folds
 from probe_kit.train.crossval.site_probe import SiteProbe, probe_site
@@ -94,7 +94,7 @@ def neighbours(values: Matrix) -> Matrix:
     return values
 
 
-def probe_streams(data: DataSet, seed: int) -> list[Stream]:
+def probe_streams(data: DataSet, seed: int) -> list[StreamScores]:
     """The streams of (expert, backbone) as `train_probes` and `retention` make them."""
     folds = nested_folds(data.labels, data.groups, derive_seed("folds", seed))
     fold_of = fold_numbers([fold.outer for fold in folds])
@@ -106,7 +106,9 @@ def probe_streams(data: DataSet, seed: int) -> list[Stream]:
         ]
         sums = balanced_sums(np.array([probe.decisions for probe in probes]), data.labels, fold_of, data.groups)
         inner = sums_by_group(np.array([probe.inner for probe in probes]), data.groups)
-        streams.append(Stream.of(sums, inner, fold_of_groups(fold_of, data.groups), np.arange(len(features))))
+        streams.append(
+            StreamScores.of(sums, inner, fold_of_groups(fold_of, data.groups), np.arange(len(features)))
+        )
     return streams
 
 

@@ -17,15 +17,15 @@ Bounds = tuple[float, float]
 SHARES: Bounds = (0.0, 1.0)
 GAINS: Bounds = (-1.0, 1.0)
 """What the difference of two shares can be."""
-DRAWS = 2000
-"""Of whole groups; with another number every interval by resampling moves a little."""
+BOOTSTRAP_DRAWS = 2000
+"""Resamples of whole groups; with another number every interval by resampling moves a little."""
 
 
 def group_bootstrap(
     values: NDArray[np.floating] | NDArray[np.bool_],
     groups: ArrayLike,
     seed: int,
-    draws: int = DRAWS,
+    draws: int = BOOTSTRAP_DRAWS,
     bounds: Bounds = SHARES,
 ) -> tuple[Matrix, Matrix]:
     """95 % interval of the mean over episodes, with whole groups resampled.
@@ -45,7 +45,7 @@ def interval(draws: Matrix, value: Matrix) -> tuple[Matrix, Matrix]:
 
 
 def bootstrap_means(
-    values: NDArray[np.floating] | NDArray[np.bool_], groups: ArrayLike, seed: int, draws: int = DRAWS
+    values: NDArray[np.floating] | NDArray[np.bool_], groups: ArrayLike, seed: int, draws: int = BOOTSTRAP_DRAWS
 ) -> Matrix:
     """Means over episodes in every draw of whole groups, (draws, S) from (E, S) values and (E,) groups.
 
@@ -93,7 +93,9 @@ def widened(draws: Matrix, value: Matrix, each: Matrix, seed: int, bounds: Bound
     return wide
 
 
-def unseen(value: NDArray[np.floating], each: Matrix, draws: int = DRAWS, bounds: Bounds = SHARES) -> Matrix:
+def unseen(
+    value: NDArray[np.floating], each: Matrix, draws: int = BOOTSTRAP_DRAWS, bounds: Bounds = SHARES
+) -> Matrix:
     """(draws, S) quantiles, from least to largest, of a mean that unobserved groups could have.
 
     value: (S,) the mean. each: (G, S) those of the groups. Groups that were not seen may lie at either bound, with
@@ -150,7 +152,7 @@ def units_seed(names: ArrayLike, seed_text: str) -> int:
 
 
 @lru_cache(maxsize=4)  # of one table: its groups and items, drawn for every number alike
-def draw_groups(count: int, seed: int, draws: int = DRAWS) -> NDArray[np.int64]:
+def draw_groups(count: int, seed: int, draws: int = BOOTSTRAP_DRAWS) -> NDArray[np.int64]:
     """Return how often each of `count` groups is drawn, (draws, count), read-only."""
     times = np.random.default_rng(seed).multinomial(count, np.full(count, 1 / count), size=draws)
     times.setflags(write=False)

@@ -122,7 +122,7 @@ _EQUAL = 1e-9
 
 
 @dataclass(frozen=True)
-class Stream:
+class StreamScores:
     """The sites of one stream, on G groups in F outer folds.
 
     scores: what a site scores in every group, held out by the outer folds. guide: (S, F, G) what sites are chosen
@@ -142,7 +142,7 @@ class Stream:
         fold_of: ArrayLike,
         layers: ArrayLike,
         iterations: ArrayLike | None = None,
-    ) -> "Stream":
+    ) -> "StreamScores":
         """Sites at (S,) layers and (S,) iterations, in any order. inner: (S, F, G) qualities, see `guide`.
 
         A stream that runs once is chosen by its qualities. With several iterations the guide is half a site's
@@ -226,7 +226,7 @@ class CrossFit:
 
 
 def crossfit(
-    streams: Sequence[Stream], groups: Sequence[str], suite: str = "", chance: float = CHANCE
+    streams: Sequence[StreamScores], groups: Sequence[str], suite: str = "", chance: float = CHANCE
 ) -> CrossFit:
     """Score each stream by the sites that its inner folds choose, on the outer folds.
 
@@ -247,7 +247,7 @@ def crossfit(
     )
 
 
-def _scored(stream: Stream) -> tuple[float, Matrix]:
+def _scored(stream: StreamScores) -> tuple[float, Matrix]:
     """The score of a stream, and (G,) the influence of every group on it."""
     sums, sizes = stream.scores.sums, stream.scores.sizes
     # One seed for all streams and runs: on equal groups their choices are made in the same resamples.
@@ -304,7 +304,7 @@ def smoothing(layers: ArrayLike, iterations: ArrayLike) -> Matrix:
     return weights
 
 
-def _check(streams: Sequence[Stream], groups: Sequence[str]) -> None:
+def _check(streams: Sequence[StreamScores], groups: Sequence[str]) -> None:
     counts = sorted({stream.scores.n_groups for stream in streams})
     if counts != [len(groups)]:
         raise UsageError(

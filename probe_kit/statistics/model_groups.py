@@ -13,9 +13,9 @@ from probe_kit.statistics.intervals import NO_LIMITS, Interval
 from probe_kit.statistics.significance import SIGNIFICANCE
 
 MOST_EXACT = 200_000
-"""Ways of exchanging labels that are all tried; beyond, `DRAWS` of them are drawn."""
-DRAWS = 20_000
-"""Of ways, with which no p is below 1 / 20,001."""
+"""Ways of exchanging labels that are all tried; beyond, `EXCHANGES` of them are drawn."""
+EXCHANGES = 20_000
+"""Drawn exchanges of labels, with which no p is below 1 / 20,001."""
 
 
 class ModelsP(NamedTuple):
@@ -42,10 +42,10 @@ def exchange_p(first: Sequence[float], second: Sequence[float], seed: int = 0) -
         gaps = _gaps(values, values[members].sum(axis=1), size)
         return ModelsP(float((gaps >= gaps[0] - _slack(values)).mean()), turned / ways, True)
     generator = np.random.default_rng(seed)
-    sums = generator.permuted(np.tile(values, (DRAWS, 1)), axis=1)[:, :size].sum(axis=1)
+    sums = generator.permuted(np.tile(values, (EXCHANGES, 1)), axis=1)[:, :size].sum(axis=1)
     gaps, observed = _gaps(values, sums, size), _gaps(values, values[:size].sum(keepdims=True), size)[0]
     hits = int((gaps >= observed - _slack(values)).sum())
-    return ModelsP((hits + 1) / (DRAWS + 1), 1 / (DRAWS + 1), False)
+    return ModelsP((hits + 1) / (EXCHANGES + 1), 1 / (EXCHANGES + 1), False)
 
 
 def is_exchangeable(first: Sequence[float], second: Sequence[float]) -> bool:

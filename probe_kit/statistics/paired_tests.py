@@ -244,9 +244,9 @@ def corrected[Row](
 FLOOR = 1e-6
 """Metres added to every standard error: a site that nothing reads has effects of exactly 0, and a finite T."""
 EXACT = 12
-"""Up to so many groups every pattern of signs is tried; beyond, `DRAWS` of them."""
-DRAWS = 2000
-"""Of signs, or of places; the observed ones are among them, so that no p is below 1 / 2,000."""
+"""Up to so many groups every pattern of signs is tried; beyond, `SIGN_PATTERNS` of them."""
+SIGN_PATTERNS = 2000
+"""Drawn patterns of signs, or of places; the observed ones are among them, so that no p is below 1 / 2,000."""
 
 
 def max_t(
@@ -286,7 +286,7 @@ def least_column_p(values: NDArray[np.float64], groups: ArrayLike, seed: int) ->
     treated = (values.sum(axis=1, keepdims=True) - values) / (columns - 1)
     gains = np.zeros((names.size, columns))
     np.add.at(gains, group_of, treated - values)
-    places = np.random.default_rng(seed).integers(columns, size=(DRAWS, names.size))
+    places = np.random.default_rng(seed).integers(columns, size=(SIGN_PATTERNS, names.size))
     places[0] = 0
     drawn = gains[np.arange(names.size), places].sum(axis=1)
     return float((drawn >= drawn[0] - 1e-9 * (1 + abs(drawn[0]))).mean())
@@ -294,12 +294,12 @@ def least_column_p(values: NDArray[np.float64], groups: ArrayLike, seed: int) ->
 
 def smallest_flip_p(groups: int) -> float:
     """The smallest p-value of `max_t` with so many groups: one pattern of all that are tried."""
-    return 0.5**groups if groups <= EXACT else 1 / DRAWS
+    return 0.5**groups if groups <= EXACT else 1 / SIGN_PATTERNS
 
 
 def _signs(groups: int, seed: int) -> NDArray[np.float64]:
     """(draws, groups) of ±1, the first row all +1."""
     if groups <= EXACT:
         return np.array(list(product((1.0, -1.0), repeat=groups)))
-    drawn = np.random.default_rng(seed).choice((1.0, -1.0), (DRAWS - 1, groups))
+    drawn = np.random.default_rng(seed).choice((1.0, -1.0), (SIGN_PATTERNS - 1, groups))
     return np.vstack([np.ones(groups), drawn])

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.hooks.contract.sites import Site, part_of
-from probe_kit.statistics.crossfit import CHANCE, GroupSums, Stream, balanced_sums
+from probe_kit.statistics.crossfit import CHANCE, GroupSums, StreamScores, balanced_sums
 from probe_kit.statistics.folds import Fold, fold_of_groups, split_by_fold, sums_by_group
 from probe_kit.statistics.intervals import Accuracy
 from probe_kit.statistics.label_permutations import max_statistic_p, smallest_p
@@ -248,14 +248,14 @@ class ProbeCurve:
         last = max(other.layer for other in self.sites if other.stream == site.stream)
         return site.layer / max(1, last)  # a stream of one layer has depth 0
 
-    def fit_stream(self, rows: NDArray[np.intp]) -> Stream:
+    def fit_stream(self, rows: NDArray[np.intp]) -> StreamScores:
         """Return the sites at `rows`, which are one stream or a part of it, for cross-fitted scores.
 
         Of a side their balanced accuracies, else their scores above the chance of each site. Raises as `sums`, and
-        as `Stream.of`.
+        as `StreamScores.of`.
         """
         sites = [self.sites[row] for row in rows]
-        return Stream.of(
+        return StreamScores.of(
             self.sums.only(rows) if self.is_side else self._above_chance(rows),
             self.inner[rows],
             fold_of_groups(self.fold_of, self.groups),
