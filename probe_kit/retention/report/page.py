@@ -18,7 +18,7 @@ from probe_kit.retention.columns.text import Modes, model_name, modes_of, title_
 from probe_kit.retention.displays.bars import joins_of
 from probe_kit.retention.displays.layer_curves import LayerCurveDisplay
 from probe_kit.retention.displays.report_figure import ONLY_FILLED, ReportFigure, collect_figures
-from probe_kit.retention.displays.style import axes_for, legend_above
+from probe_kit.retention.displays.style import caption, legend_above, panels
 from probe_kit.retention.report.episodes import PICTURES, EpisodeGrid, episode_grid
 from probe_kit.retention.report.parts import Picture, arranged, citation, data_uri, provenance, render, words_of
 from probe_kit.retention.report.summaries import RunInWords, read_run
@@ -222,13 +222,12 @@ def _opening_curve(row: RetentionRow, table: RetentionTable, position: int) -> R
 
 def _together(display: LayerCurveDisplay) -> "Figure":
     """All streams on the same axes, with a legend and no more."""
-    axes, figure = axes_for(None, 4.7, 3.1)
-    assert figure is not None
+    figure, (axes,) = panels(1, 4.7, 2.0)
     display.plot(axes)
     axes.set_title("", loc="left")
-    axes.set_ylabel("held-out accuracy (%)", fontsize=8.5)
+    axes.set_ylabel(display.measure, fontsize=8.5)
     legend_above(figure, axes.get_legend_handles_labels()[0])
-    figure.caption = display.certificate.line  # type: ignore[attr-defined]
+    caption(figure, *display.certificates)
     return figure
 
 
