@@ -73,7 +73,7 @@ class BarDisplay(Display):
 
     def plot(self, ax: "Axes | None" = None) -> Self:
         """Draw on `ax`, or on a figure of its own that is as high as the bars need."""
-        self.alone = 6.2, 0.34 * self.heights[-1] + 0.85
+        self.figure_size = 6.2, 0.34 * self.heights[-1] + 0.85
         return super().plot(ax)
 
     def draw(self, axes: "Axes") -> None:

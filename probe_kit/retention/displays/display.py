@@ -36,7 +36,7 @@ class Display(ABC):
     """One panel of numbers: on axes of its own, or beside others in one figure.
 
     A display that has been plotted shows its figure. title: above the panel. measure: name of the upright axis.
-    certificates: where its numbers come from. alone: width and height in inches of a panel by itself; beside: of
+    certificates: where its numbers come from. figure_size: inches of a panel by itself; panel_size: of
     one of several. is_level: whether panels side by side have one range of the upright axis. is_framed: whether
     all spines are drawn. ax_: what `plot` drew on.
     """
@@ -44,10 +44,10 @@ class Display(ABC):
     title: str = ""
     measure: str = ""
     certificates: tuple[ProvenanceLine, ...] = ()
-    alone: tuple[float, float] = (6.2, 2.8)
+    figure_size: tuple[float, float] = (6.2, 2.8)
     is_level: bool = False
     ax_: "Axes | None" = field(default=None, init=False, repr=False)
-    beside: ClassVar[tuple[float, float]] = (3.1, 2.5)
+    panel_size: ClassVar[tuple[float, float]] = (3.1, 2.5)
     is_framed: ClassVar[bool] = False
     title_size: ClassVar[float] = 9
 
@@ -67,7 +67,7 @@ class Display(ABC):
     def plot(self, ax: "Axes | None" = None) -> Self:
         """Draw on `ax`, or on a figure of its own with legend and caption."""
         if ax is None:
-            in_panels([self], self.alone, in_pyplot=True)
+            in_panels([self], self.figure_size, in_pyplot=True)
             return self
         self.draw(ax)
         if not self.is_framed:
@@ -105,7 +105,7 @@ def in_panels(
     """
     present = [display for display in displays if display is not None]
     first = present[0]
-    figure, places = panels(len(displays), *(size or first.beside), columns, share=False, in_pyplot=in_pyplot)
+    figure, places = panels(len(displays), *(size or first.panel_size), columns, share=False, in_pyplot=in_pyplot)
     for display, axes in zip(displays, places, strict=True):
         if display is None:
             axes.set_visible(False)

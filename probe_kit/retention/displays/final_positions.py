@@ -50,7 +50,7 @@ class FinalPositionsDisplay(Display):
     never_moved: int
     scene: Mapping[str, Any]
     rule: str = DEFAULT_RULE
-    beside: ClassVar = (3.1, 2.35)
+    panel_size: ClassVar = (3.1, 2.35)
     is_framed: ClassVar = True
     title_size: ClassVar = 10
 
@@ -74,7 +74,7 @@ class FinalPositionsDisplay(Display):
         unmoved = episodes["never_moved"].astype(bool).sum() if "never_moved" in episodes else 0
         return cls(
             title=title_of(category or "all categories"),
-            alone=(4.6, 3.3),
+            figure_size=(4.6, 3.3),
             category=category,
             xy=episodes[["cube_x", "cube_y"]].to_numpy(dtype=float),
             outcome=episodes["outcome"].to_numpy(dtype=str),

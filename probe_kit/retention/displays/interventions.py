@@ -356,7 +356,7 @@ class DoseResponseDisplay(Display):
     """
 
     measure: str = "% of episodes that turn"
-    beside: ClassVar = (3.1, 2.7)
+    panel_size: ClassVar = (3.1, 2.7)
     category: str
     position: str
     coefficients: NDArray[np.float64]

@@ -50,7 +50,7 @@ class IterationMapDisplay(Display):
     iterations: NDArray[np.int64]
     accuracy: NDArray[np.float64]
     significant: NDArray[np.bool_]
-    beside: ClassVar = (2.7, 2.1)
+    panel_size: ClassVar = (2.7, 2.1)
     is_framed: ClassVar = True
     title_size: ClassVar = 10
 

@@ -99,7 +99,7 @@ class ClassConfusionDisplay(BestSiteDisplay):
     """Held-out predictions of classes, by true class."""
 
     measure: str = "true class (samples)"
-    beside: ClassVar = (3.3, 3.1)
+    panel_size: ClassVar = (3.3, 3.1)
 
     @staticmethod
     def why_not(curve: ProbeCurve) -> str:
@@ -171,7 +171,7 @@ class PredictedValuesDisplay(BestSiteDisplay):
 
     measure: str = "predicted value"
     is_level: bool = True
-    beside: ClassVar = (3.3, 3.0)
+    panel_size: ClassVar = (3.3, 3.0)
 
     def __post_init__(self) -> None:
         self.title += f", {METRICS['continuous']} {self.curve.metric[0]:.2f}"
@@ -241,7 +241,7 @@ class StepScoresDisplay(BestSiteDisplay):
     """
 
     is_level: bool = True
-    beside: ClassVar = (3.1, 2.6)
+    panel_size: ClassVar = (3.1, 2.6)
 
     def __post_init__(self) -> None:
         self.measure = f"{METRICS[self.curve.task]} at each step"

@@ -215,7 +215,7 @@ class LayerCurveDisplay(Display):
     view: str
     streams: tuple[StreamCurve, ...]
     grounds: tuple[Ground, ...]
-    beside: ClassVar = (2.75, 2.3)
+    panel_size: ClassVar = (2.75, 2.3)
 
     @classmethod
     def from_results(
@@ -241,7 +241,7 @@ class LayerCurveDisplay(Display):
             title=name_of_target(settings.target, category),
             measure="held-out accuracy (%)" if is_side else f"held-out {metric}",
             is_level=not is_side,  # panels of accuracies have a fixed range
-            alone=(2.75, 2.9),
+            figure_size=(2.75, 2.9),
             target=settings.target,
             metric=metric,
             category=category,
@@ -269,7 +269,7 @@ class LayerCurveDisplay(Display):
         if ax is not None:
             return super().plot(ax)
         panels_of = self.by_stream
-        in_panels(panels_of, self.alone, len(panels_of), in_pyplot=True)
+        in_panels(panels_of, self.figure_size, len(panels_of), in_pyplot=True)
         self.ax_ = panels_of[0].ax_
         return self
 

@@ -65,7 +65,7 @@ class CurvesDisplay(Display):
     curves: Mapping[str, StreamCurve]
     looks: tuple[str, ...]
     has_bars: bool = True
-    beside: ClassVar = (3.6, 2.3)
+    panel_size: ClassVar = (3.6, 2.3)
 
     def further_handles(self) -> "Sequence[Artist]":
         """Return the handles of filled and open markers."""
@@ -103,7 +103,7 @@ class RoleCurvesDisplay(CurvesDisplay):
     curves: by view, such as `mean:language`; of iterative streams, the best of the iterations at each layer.
     """
 
-    beside: ClassVar = (3.1, 2.5)
+    panel_size: ClassVar = (3.1, 2.5)
 
     @classmethod
     def from_results(
@@ -182,7 +182,7 @@ class ModelDepthDisplay(Display):
 
     stream: str
     models: tuple[ModelCurve, ...]
-    beside: ClassVar = (4.1, 2.5)
+    panel_size: ClassVar = (4.1, 2.5)
     title_size: ClassVar = 10
 
     @classmethod

@@ -88,7 +88,7 @@ class HeatTableDisplay(Display):
         width = _CELL_WIDTH * len(columns) + _NAME_WIDTH * max(map(len, names)) + 0.3
         return cls(
             title=cls.heading,
-            alone=(max(6.2, width), _ROW_HEIGHT * (len(names) + 1.5) - 0.2),
+            figure_size=(max(6.2, width), _ROW_HEIGHT * (len(names) + 1.5) - 0.2),
             rows=names,
             columns=columns,
             cells=tuple(
@@ -351,7 +351,7 @@ class KnowledgeActionDisplay(Display):
         modes, models = modes_of(drawn), {point.model for point in points}
         return cls(
             measure=f"{RATE[modes].lower()} (%)",
-            alone=(6.2, 5.6 + 0.17 * len(models)),  # the axes are square
+            figure_size=(6.2, 5.6 + 0.17 * len(models)),  # the axes are square
             stream=stream,
             points=tuple(points),
             certificates=certificates,

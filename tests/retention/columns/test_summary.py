@@ -11,7 +11,7 @@ from probe_kit.intervene import Behaviour, UseVerdict
 from probe_kit.retention import RetentionRow, RetentionTable
 from probe_kit.retention.behaviour import Regime, SuccessRate
 from probe_kit.retention.columns.summary import HEADINGS, MARK, summarise_runs, summary_table
-from probe_kit.retention.report.summaries import read_run
+from probe_kit.retention.report.parts import warnings_of
 from probe_kit.retention.rows.row import (
     MEAN,
     ActionPart,
@@ -133,7 +133,7 @@ def test_nothing_is_marked_where_no_control_was_run_and_a_warning_names_the_run(
         replace(one, backbone=replace(one.backbone, depth=0.5), action=replace(one.action, depth=1.0))
         for one in bare
     ]
-    assert any("No control was run" in warning for warning in read_run(deep).warnings)
+    assert any("No control was run" in warning for warning in warnings_of(deep[-1], deep[:-1]))
 
 
 def test_several_runs_stand_in_one_table_by_category() -> None:
