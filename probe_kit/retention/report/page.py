@@ -13,7 +13,7 @@ from probe_kit._tables.content import heat_key
 from probe_kit._tables.table import Table
 from probe_kit.errors import UsageError
 from probe_kit.retention.columns.comparisons import known_used_tables
-from probe_kit.retention.columns.sentences import describe_category
+from probe_kit.retention.columns.sentences import conclusion
 from probe_kit.retention.columns.tables import SUBJECTS
 from probe_kit.retention.columns.text import Modes, model_name, modes_of, title_of
 from probe_kit.retention.displays.bars import joins_of
@@ -39,7 +39,7 @@ from probe_kit.train.choices import Task
 from probe_kit.train.crossval.task_scores import METRICS
 from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.train.results.store import stored_targets
-from probe_kit.train.results.summary import best_sites_sentences, best_sites_table
+from probe_kit.train.results.summary import best_sites_findings, best_sites_table
 from probe_kit.version import __version__
 
 if TYPE_CHECKING:
@@ -150,7 +150,7 @@ def _sides(
     for mean in table.means:
         rows = [row for row in table.rows if (*row.key, row.view) == (*mean.key, mean.view)]
         if mean.key in warnings:  # the summary is of the first view
-            sentences = [f"{title_of(row.category)} {describe_category(row)}" for row in rows]
+            sentences = [f"{title_of(row.category)}: {conclusion(row)}" for row in rows]
             further_views.append((f"{model_name(mean)}, view {mean.view}", sentences))
         else:
             warnings[mean.key] = [(model_name(mean), sentence) for sentence in warnings_of(mean, rows)]
@@ -281,7 +281,7 @@ def _labels(
             "notes": [
                 f"{name}: {sentence}" if several else sentence
                 for name, of in probes.items()
-                for sentence in best_sites_sentences(of)
+                for sentence in best_sites_findings(of)
             ],
         }
         sections.append(section)

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from probe_kit._system.bounded_files import open_arrays
 from probe_kit._tables.numbers import p_text
-from probe_kit._terminal.notebook import rows_html
 from probe_kit.errors import UnknownSiteError
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.contract.sites import Site
@@ -22,7 +21,6 @@ from probe_kit.runs.results import Bundle
 from probe_kit.statistics.folds import FoldUnit
 from probe_kit.statistics.intervals import effective_groups, group_shares, wilson_interval
 from probe_kit.statistics.label_permutations import p_value, permutations_for, shortage
-from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.choices import SIDES, Incomplete, Task
 from probe_kit.train.crossval.task_scores import METRICS, fold_auc, fold_spearman, log_loss
 from probe_kit.train.results.control_scores import Controls, has_signal
@@ -313,33 +311,6 @@ def score_text(value: float | None, is_side: bool) -> str:
     return f"{100 * value:.1f}" if is_side else f"{value:.3f}"
 
 
-def results_html(settings: ProbeSettings, label: str, scores: "pd.DataFrame") -> str:
-    """Return the best site of every category, view and stream as HTML."""
-    random = " (RANDOM WEIGHTS)" if settings.random_weights else ""
-    title = (
-        f"Probes of {label}{random}, target {settings.target}, call {settings.call}: the best site of "
-        "each stream, + as many others that tie"
-    )
-    score = "accuracy % [95 %]" if settings.is_side else f"{METRICS[settings.task]} [95 %]"
-    columns = ("category", "view", "stream", "best site", score, "chance", "family-wise p", "first iteration", "n")
-    rows = [
-        (
-            row["category"],
-            row["view"],
-            row["stream"],
-            *site_cells(row, settings.is_side),
-            score_text(row["first"], settings.is_side),
-            str(row["n"]),
-        )
-        for row in best_sites(scores, settings.is_side)
-    ]
-    note = (
-        f"{settings.permutations} label permutations, key {settings.key}; only p < {SIGNIFICANCE} is evidence. "
-        "results.scores has every site"
-    )
-    return rows_html(title, columns, rows, note)
-
-
 # -- all results ---------------------------------------------------------------------------------------------
 
 
@@ -393,7 +364,9 @@ class ProbeResults:
         )
 
     def _repr_html_(self) -> str:
-        return results_html(self.settings, self.label, self.scores)
+        from probe_kit.train.results.summary import best_sites_table  # which reads results
+
+        return best_sites_table([self])._repr_html_()
 
     @property
     def key(self) -> str:

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
-from probe_kit._system.counting import counted, enumerated
+from probe_kit._system.counting import enumerated
 from probe_kit._tables.numbers import p_text
 from probe_kit._tables.table import Table
 from probe_kit.hooks.contract.sites import label_of
@@ -19,11 +19,6 @@ _TIES = "+: as many other sites tie with it"
 _LEGEND = "the score of a chosen site is too high"
 _OF_SIDE = "; `retention` corrects it"
 _OF_LABEL = ". Chance: mean score of this site with exchanged labels"
-_SIDES = {
-    "side.correct": "the side of the correct picture",
-    "side.chosen": "the chosen side",
-    "side.shuffled": "the shuffled side",
-}
 
 
 # -- the table of a terminal -----------------------------------------------------------------------------------
@@ -106,32 +101,16 @@ def _exceeded(results: ProbeResults, row: "pd.Series") -> tuple[list[str], list[
 # -- sentences -------------------------------------------------------------------------------------------------
 
 
-def best_sites_sentences(results: ProbeResults) -> list[str]:
-    """Return what was left out, then where the target can be decoded: a sentence per category and view.
-
-    Of a side the first view alone, and whether the pictures alone decode it.
-    """
-    sentences, settings = _left_out(results), results.settings
-    for view, category, rows in _places(results):
-        parts = "; ".join(_in_stream(results, row) for row in rows)
-        if settings.is_side:
-            name, what = category_of(category).title, _SIDES[settings.target]
-            subject = f"{name} ({counted(rows[0]['n'], 'episode')}): {what}"
-        else:
-            facts = [counted(rows[0]["groups"], "group"), counted(rows[0]["n"], "sample")]
-            facts += [f"category {category}"] * (settings.categories != (EVERYWHERE,))
-            facts += [f"view {view}"] * (len(settings.views) > 1)
-            subject = f"{settings.target} ({', '.join(facts)})"
-        sentences.append(f"{subject} is {parts}.{_from_pictures(results, category)}")
-    return sentences
-
-
 def best_sites_findings(results: ProbeResults) -> list[str]:
-    """Return the last lines of the command: the same in short, without intervals."""
+    """Return what was left out, then where the target can be decoded: a line per category and view.
+
+    Of a side the first view alone, and whether the pictures alone decode it: no model has to know it then.
+    """
     settings = results.settings
     lines = []
     for view, category, rows in _places(results):
-        by_pictures = ["the pictures alone decode it too"] * bool(_from_pictures(results, category))
+        pixels = results.controls.of_category(category).get("pixels") if settings.is_side else None
+        by_pictures = ["the pictures alone decode it too"] * (pixels is not None and pixels.above_chance)
         name = category_of(category).title if settings.is_side else settings.target
         if not settings.is_side:
             name = ", ".join(
@@ -175,32 +154,3 @@ def _findings(results: ProbeResults, rows: "Sequence[pd.Series]") -> Iterator[st
         yield f"decodable in {enumerated(decodable)}"
     for words, streams in open_.items():
         yield words.format(enumerated(streams))
-
-
-def _in_stream(results: ProbeResults, row: "pd.Series") -> str:
-    where, numbers = f"in the {label_of(row['stream'])}", _numbers(results, row)
-    _, missed = _exceeded(results, row)
-    if remedy := results.remedy(row["category"], row["view"]):
-        return f"not testable {where} {numbers}: {remedy}"
-    if missed:
-        return f"not shown {where} beyond {enumerated(missed)} {numbers}"
-    return f"decodable {where} at {row['site']} {numbers}"
-
-
-def _numbers(results: ProbeResults, row: "pd.Series") -> str:
-    limits = (row["score"], row["ci_low"], row["ci_high"])
-    if results.settings.is_side:
-        accuracy, low, high = (f"{100 * value:.0f}" for value in limits)
-        return f"({accuracy} %, {low} to {high})"
-    score, low, high = (f"{value:.2f}" for value in limits)
-    chance = "" if row["chance"] != row["chance"] else f"; chance {row['chance']:.2f}"
-    return f"({row['metric']} {score}, {low} to {high}{chance})"
-
-
-def _from_pictures(results: ProbeResults, category: str) -> str:
-    """Return a sentence where the control `pixels` decodes the target, for no model has to know it then."""
-    pixels = results.controls.of_category(category).get("pixels") if results.settings.is_side else None
-    if pixels is None or not pixels.above_chance:
-        return ""
-    accuracy, low, high = (f"{100 * share:.0f}" for share in (pixels.score, *pixels.ci))
-    return f" The pictures alone decode it too ({accuracy} %, {low} to {high})."
