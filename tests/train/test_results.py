@@ -31,8 +31,14 @@ from probe_kit.train.results.control_scores import (
     has_signal,
 )
 from probe_kit.train.results.inventory import inventory
-from probe_kit.train.results.probe_results import StoredDirections, best_sites, save_directions, site_cells
-from probe_kit.train.results.summary import best_sites_findings, best_sites_table
+from probe_kit.train.results.probe_results import (
+    StoredDirections,
+    best_sites,
+    best_sites_table,
+    save_directions,
+    site_cells,
+)
+from probe_kit.train.results.summary import best_sites_findings
 from tests.train.conftest import PlantedRun, plant
 
 SETTINGS = ProbeSettings(

@@ -302,7 +302,7 @@ class CategorySummary:
 
     @property
     def details(self) -> str:
-        """What follows from all numbers of the row, and what to do next; the numbers stand in tables."""
+        """The conclusion from all numbers of the row, and what to do next; the numbers stand in tables."""
         return f"{self.name}{':' * self.row.is_side} {conclusion(self.row)}"
 
 

@@ -37,9 +37,9 @@ from probe_kit.retention.table import RetentionTable, retention_table
 from probe_kit.runs.reader import RunReader
 from probe_kit.train.choices import Task
 from probe_kit.train.crossval.task_scores import METRICS
-from probe_kit.train.results.probe_results import ProbeResults
+from probe_kit.train.results.probe_results import ProbeResults, best_sites_table
 from probe_kit.train.results.store import stored_targets
-from probe_kit.train.results.summary import best_sites_findings, best_sites_table
+from probe_kit.train.results.summary import best_sites_findings
 from probe_kit.version import __version__
 
 if TYPE_CHECKING:
