@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 from probe_kit._tables.numbers import number, percent
 from probe_kit._tables.table import Table
 from probe_kit.retention.behaviour import Regime, normalised_score, regime
-from probe_kit.retention.columns.sentences import conclusion, label_details, verdict
+from probe_kit.retention.columns.sentences import conclusion, verdict
 from probe_kit.retention.columns.summary import finding
 from probe_kit.retention.columns.text import NOT_ACTED, model_name, once_per_category
 from probe_kit.retention.compare.compare import Difference
@@ -155,10 +155,8 @@ def _in_words(row: RetentionRow) -> dict[str, Any]:
     """The verdict and what follows from it, as tables and sentences have them; None of a mean."""
     if row.category == MEAN:
         return {"verdict": None, "finding": None, "conclusion": None}
-    if not row.is_side:
-        words = {"metric": row.metric, "verdict": None}
-        return words | {"finding": finding(row), "conclusion": label_details(row)}
-    return {"verdict": verdict(row), "finding": finding(row), "conclusion": conclusion(row)}
+    words = {"verdict": verdict(row)} if row.is_side else {"metric": row.metric, "verdict": None}
+    return words | {"finding": finding(row), "conclusion": conclusion(row)}
 
 
 def _json_of_row(row: RetentionRow, differences: Sequence[Difference]) -> dict[str, Any]:

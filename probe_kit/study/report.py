@@ -51,7 +51,7 @@ def make_figures(study: LoadedStudy, name: str, partial_runs: bool = False) -> l
     if figure.kind == "sides":
         display = SideTableDisplay.from_table(table)
         draw = partial(figure_of, SideTableDisplay.from_table, table)
-        return [ReportFigure(name, display.title, "behaviour", display.note, None, draw)]
+        return [ReportFigure(name, display.heading, "behaviour", display.note, None, draw)]
     reading = "Normalised score of the mean over the categories of a domain: 0 for guessing, 100 for perfection."
     return [ReportFigure(name, "Score by domain", "behaviour", reading, None, partial(draw_overview, table))]
 

@@ -126,7 +126,8 @@ def _train(
 ) -> "list[ProbeResults]":
     """Probe the target at the inferences that `call` names; print the best sites, and return the probes."""
     from probe_kit.train import train_probes
-    from probe_kit.train.results.summary import best_sites_findings, best_sites_sentences, best_sites_table
+    from probe_kit.train.results.probe_results import best_sites_table
+    from probe_kit.train.results.summary import best_sites_findings
 
     read = target_options.read(run, seed=options["seed"])
     if not target_options.is_side:
@@ -159,7 +160,7 @@ def _train(
             "signal is judged against chance only: add the control random-features, or a --untrained by random "
             "weights"
         )
-    for sentence in (best_sites_sentences if details else best_sites_findings)(fitted[0]):
+    for sentence in best_sites_findings(fitted[0]):
         out.print(sentence, markup=False, highlight=False)
     return fitted
 

@@ -1,7 +1,7 @@
 """Probes fitted on all of one run and scored on another: `transfer_probes`, its results, table and sentences."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +20,7 @@ from probe_kit.statistics.label_permutations import p_value
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.choices import EVERYWHERE, Task
 from probe_kit.train.crossval.nested_folds import NestedFold
-from probe_kit.train.crossval.site_probe import predict_once, probe_labels
+from probe_kit.train.crossval.site_probe import SiteProbe, predict_once, probe_labels
 from probe_kit.train.crossval.task_scores import METRICS, balanced_scores, score_interval
 from probe_kit.train.probe_sweep import (
     TOKEN_PERMUTATIONS,
@@ -31,7 +31,7 @@ from probe_kit.train.probe_sweep import (
 )
 from probe_kit.train.problem import Problem, make_problem, smallest_p_of_labels
 from probe_kit.train.results.probe_curve import ProbeCurve
-from probe_kit.train.results.probe_results import score_text
+from probe_kit.train.results.probe_results import best_sites, score_text
 from probe_kit.train.samples import Samples, read_samples, sites_of
 from probe_kit.train.solver.arrays import RowSubset
 from probe_kit.train.target import Target
@@ -317,8 +317,8 @@ def _codes(classes: Sequence[str], other_classes: Sequence[str]) -> Matrix | Non
     return np.array([other_classes.index(name) if name in other_classes else -1 for name in classes], np.float64)
 
 
-_Transferred = tuple[list[tuple[Matrix, Matrix, Matrix]], Matrix, float]
-"""One site: predictions, scores (m,) and null (P,) as fitted and recentred, scores of the other's own, C or λ."""
+_Transferred = tuple[tuple[SiteProbe, SiteProbe], Matrix]
+"""One site: its probe as fitted and recentred, scored on the other run; and held-out scores of the other's own."""
 
 
 def _transfer(
@@ -335,11 +335,10 @@ def _transfer(
     if code is not None:
         predicted = code[predicted.astype(np.intp)]
     truth = np.column_stack([test.labels, test.permuted_for(other_samples)]).astype(np.float64)
-    scored = [
-        (predictions, *_scores(predictions, truth, test.task))
-        for predictions in np.split(predicted, [other_count])
-    ]
-    return scored, probe_labels(other_samples, truth[:, :1], test.task, test.folds).scores, strength
+    fitted, recentred = (
+        _scored(predictions, truth, test.task, strength) for predictions in np.split(predicted, [other_count])
+    )
+    return (fitted, recentred), probe_labels(other_samples, truth[:, :1], test.task, test.folds).scores
 
 
 def _recentred(samples_to_move: Samples, run_samples: Samples) -> Samples:
@@ -353,8 +352,8 @@ def _recentred(samples_to_move: Samples, run_samples: Samples) -> Samples:
     return Samples(RowSubset.all(moved), samples_to_move.counts, means + shift)
 
 
-def _scores(predicted: Matrix, truth: Matrix, task: Task) -> tuple[Matrix, Matrix]:
-    """(m,) scores of the real labels, and (P,) the metric of every permutation, from (m, 1 + P) labels.
+def _scored(predicted: Matrix, truth: Matrix, task: Task, strength: float) -> SiteProbe:
+    """Return the probe with (m,) predictions for the other run, from (m, 1 + P) real and permuted labels.
 
     R² compares with the mean of the other run's labels, as scikit-learn's `r2_score` does.
     """
@@ -362,34 +361,29 @@ def _scores(predicted: Matrix, truth: Matrix, task: Task) -> tuple[Matrix, Matri
         scores = 1 - (truth - predicted[:, None]) ** 2 / truth.var(axis=0)
     else:
         scores = balanced_scores(np.repeat(predicted[:, None], truth.shape[1], axis=1), truth)
-    return scores[:, 0], scores.mean(axis=0)[1:]
+    return SiteProbe(
+        decisions=predicted,
+        scores=scores[:, 0],
+        strengths=np.array([strength]),
+        weights=np.zeros((1, 0), np.float32),
+        intercepts=np.zeros(1),
+        spreads=np.zeros(1),
+        null=scores.mean(axis=0)[1:],
+        inner=np.zeros((0, predicted.size)),  # no fold of the other run chose anything
+    )
 
 
 def _curve(
     run: RunReader, test: Problem, view: str, transferred: dict[tuple[str, Site], _Transferred]
 ) -> TransferCurve:
     of_view = {site: result for (name, site), result in transferred.items() if name == view}
-    plain, moved = (
-        ProbeCurve(
-            sites=tuple(of_view),
-            labels=test.labels,
-            episodes=test.episodes,
-            items=test.items,
-            groups=test.groups,
-            fold_of=test.fold_of,
-            decisions=np.stack([scored[at][0] for scored, _, _ in of_view.values()]),
-            strengths=np.array([[strength] for _, _, strength in of_view.values()]),
-            null=np.stack([scored[at][2] for scored, _, _ in of_view.values()]),
-            inner=np.zeros((len(of_view), 0, 0), np.float32),
-            parts=tuple(str(run.streams[site.stream].part) for site in of_view),
-            task=test.task,
-            is_side=False,
-            classes=test.classes,
-            sample_scores=np.stack([scored[at][1] for scored, _, _ in of_view.values()]),
-        )
-        for at in (0, 1)
+    parts = tuple(str(run.streams[site.stream].part) for site in of_view)
+    # Balanced between classes, of a side too: no fold of the other run says which share of sides was trained on.
+    balanced = replace(test, is_side=False)
+    fitted, recentred = (
+        balanced.curve({site: probes[at] for site, (probes, _) in of_view.items()}, parts) for at in (0, 1)
     )
-    return TransferCurve(plain, moved, np.stack([refitted for _, refitted, _ in of_view.values()]))
+    return TransferCurve(fitted, recentred, np.stack([refitted for _, refitted in of_view.values()]))
 
 
 # -- table and sentences -------------------------------------------------------------------------------------
@@ -446,10 +440,7 @@ def transfer_sentences(results: TransferResults) -> list[str]:
 
 def _best(results: TransferResults) -> "list[pd.Series]":
     """The row of `scores` of the best site of every view and stream: the largest excess over chance."""
-    scores = results.scores
-    excess = scores["score"] - scores["chance"].fillna(0.0)
-    best = excess.groupby([scores["view"], scores["stream"]], sort=False).idxmax()
-    return [scores.loc[number] for number in best]
+    return best_sites(results.scores.assign(category=EVERYWHERE), is_side=False)
 
 
 def _verdict(row: "pd.Series") -> str:

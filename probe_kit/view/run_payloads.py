@@ -40,9 +40,9 @@ from probe_kit.runs.results import bundle_keys
 from probe_kit.runs.writer import flat_settings
 from probe_kit.statistics.crossfit import CHANCE
 from probe_kit.suite.categories import category_of
-from probe_kit.train.results.probe_results import ProbeResults
+from probe_kit.train.results.probe_results import ProbeResults, best_sites_table
 from probe_kit.train.results.store import load_results, stored_targets
-from probe_kit.train.results.summary import best_sites_findings, best_sites_table
+from probe_kit.train.results.summary import best_sites_findings
 from probe_kit.view.viewed_run import Values, ViewedRun, decisions_toward_correct
 
 LOG_ODDS_SCALE = 256

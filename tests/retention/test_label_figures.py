@@ -115,7 +115,7 @@ def test_scores_by_step_are_means_of_the_samples_and_their_mean_is_the_metric(ru
     for name, scores in display.controls.items():
         (control,) = [one for one in results.controls.scores if one.name == name]
         assert scores.mean() == pytest.approx(control.score)
-    assert (display.low < display.score).all()
+    assert (display.limits[0] < display.score).all()
     with pytest.raises(UsageError, match="has one step"):
         step_scores(load_results(run, target="a/b: <i>"))
 
@@ -132,8 +132,8 @@ def test_scores_of_classes_by_step_are_balanced_accuracies_of_the_step_and_withi
     assert curve.scores[row].max() > 1, "weights of the whole window exceed 1 at a rare phase"
     for score in (display.score, *display.controls.values()):
         assert ((score >= 0) & (score <= 1)).all()
-    assert (display.low <= display.score + 1e-12).all()
-    assert (display.score <= display.high + 1e-12).all()
+    assert (display.limits[0] <= display.score + 1e-12).all()
+    assert (display.score <= display.limits[1] + 1e-12).all()
 
 
 def test_places_behind_an_event_are_stored_and_shown_as_such(run: Run) -> None:

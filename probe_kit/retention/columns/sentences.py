@@ -5,16 +5,15 @@ from math import ceil
 from typing import Literal, cast
 
 from probe_kit._system.counting import counted, enumerated
-from probe_kit._tables.numbers import Limits, number, whole_percent, with_limits
+from probe_kit._tables.numbers import number, whole_percent, with_limits
 from probe_kit.hooks.contract.sites import label_of
-from probe_kit.intervene.verdict import UNTESTED, UseVerdict, describe_swap
+from probe_kit.intervene.verdict import UNTESTED, UseVerdict
 from probe_kit.retention.behaviour import Regime, SuccessRate
 from probe_kit.retention.columns.text import is_vlm, model_name
 from probe_kit.retention.rows.probe_parts import NO_STEP
-from probe_kit.retention.rows.row import RetentionRow, StreamPart
+from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.statistics.sufficiency import GROUPS_FOR_PROBES, items_for_absence
-from probe_kit.train.results.control_scores import RANDOM_FEATURES, UNTRAINED
 
 
 def label_finding(row: RetentionRow) -> str:
@@ -172,22 +171,6 @@ def knows(row: RetentionRow) -> bool:
     return row.success.regime == Regime.KNOWLEDGE
 
 
-def describe_category(row: RetentionRow, vlm: RetentionRow | None = None) -> str:
-    """The finding in plain words, to be set behind the category's name.
-
-    Number of items; what the VLM answers, what the streams hold and what the policy does, each with its
-    uncertainty; what follows, and what to do next. vlm: the VLM's row of the same category.
-    """
-    if not row.is_side:
-        return label_details(row)
-    items = row.success.n_items
-    answered = row if is_vlm(row) else vlm
-    parts = [] if answered is None or answered.success.sr is None else [_answered(answered)]
-    parts += _streams(row)
-    parts += [] if is_vlm(row) else [_acted(row)]
-    return f"({counted(items, 'item')}): {'; '.join(parts)}. {conclusion(row)}"
-
-
 # -- what follows --------------------------------------------------------------------------------------------
 
 _UNTESTED = f"{UNTESTED}: run `probe-kit intervene`"
@@ -196,7 +179,9 @@ _LATER = "Yet the policy succeeds: actions after the first inference may follow.
 
 
 def conclusion(row: RetentionRow) -> str:
-    """Return what follows from a row, and what to do next."""
+    """Return what follows from a row, and what to do next; of a label with its numbers."""
+    if not row.is_side:
+        return label_details(row)
     if is_vlm(row):
         return "The VLM knows the answer." if knows(row) else "Not shown that the VLM knows the answer."
     use = row.image_swap.use
@@ -302,84 +287,6 @@ def unprobed(row: RetentionRow) -> str:
     return "the backbone was not probed" if row.run.probes is None else "the probes are not of this category"
 
 
-# -- answers and success rates ---------------------------------------------------------------------------------
-
-
-def _answered(row: RetentionRow) -> str:
-    return f"the VLM answers right in {_rate(row)}"
-
-
-def _rate(row: RetentionRow) -> str:
-    """A success rate with its interval and, where these alone would mislead, why it is in its regime."""
-    return f"{whole_percent(row.success.sr)} %{_range(row.success.ci)}{_regime_reason(row)}"
-
-
-def _regime_reason(row: RetentionRow) -> str:
-    """Return the margin by which the regime decides, where the interval excludes one half and nothing is shown.
-
-    Also where the rate is above guessing and its interval is not, and why a failure is one.
-    """
-    success = row.success
-    if success.sr is None or success.regime in (None, Regime.KNOWLEDGE) or success.chance_margin is None:
-        return ""
-    points, reach = 100 * abs(success.sr - 0.5), f"the {100 * success.chance_margin:.1f} that guessing can reach"
-    side = "above" if success.sr > 0.5 else "below"
-    if success.regime == Regime.FAILURE:
-        return f", {points:.1f} points {side} one half, more than {reach} ({_failure(row)})"
-    low, high = success.ci or (None, None)
-    if low is not None and high is not None and not low <= 0.5 <= high:
-        return f", {points:.1f} points {side} one half, less than {reach}"
-    return ", which includes one half" if success.sr > 0.5 + success.chance_margin else ""
-
-
-def _failure(row: RetentionRow) -> str:
-    wrong, outside = row.success.share_wrong or 0.0, row.success.share_outside or 0.0
-    if outside >= wrong:
-        return f"{whole_percent(outside)} % {'unread' if is_vlm(row) else 'on neither picture'}"
-    return f"{whole_percent(wrong)} % {'name' if is_vlm(row) else 'on'} the other picture"
-
-
-# -- streams -------------------------------------------------------------------------------------------------
-
-_CONTROLS = {RANDOM_FEATURES: "random features", UNTRAINED: "the untrained network"}
-
-
-def _streams(row: RetentionRow) -> list[str]:
-    """Return what can be read in the backbone, and where the action is made. The first clause names the answer."""
-    action = f"the {row.run.action_name}"
-    if is_probed(row) and row.backbone.score is None:
-        return ["the probes have no score: too few groups of items, or a fold with one side only"]
-    parts = [] if row.backbone.score is None else [_in_stream("the backbone", row.backbone, "the answer")]
-    if row.action.score is not None:
-        both = row.backbone.verdict == row.action.verdict == "shown"
-        what = "it" if parts else "the answer"
-        parts.append(
-            f"so does {action} ({_accuracy(row.action)})" if both else _in_stream(action, row.action, what)
-        )
-    return parts
-
-
-def _in_stream(name: str, part: StreamPart, what: str) -> str:
-    """One stream. what: how the answer is called there."""
-    score, most = f"{whole_percent(part.score)} %", f"{whole_percent(part.at_most)} %"
-    open_to = f"{score}; its best site could have up to {most}"
-    if part.verdict == "shown":
-        return f"{name} holds {what} ({_accuracy(part)})"
-    if part.verdict == "absent":
-        return f"a linear probe of so many items does not find {what} in {name} ({score}; at most {most})"
-    if part.remedy:
-        return f"whether {name} holds {what} cannot be tested against chance: {part.remedy} ({open_to})"
-    missed = [_CONTROLS.get(name, name) for name, better in part.exceeds.items() if better is False]
-    beyond = f" beyond {' and '.join(missed)}" if part.exceeds["chance"] else ""
-    return f"{name} is not shown to hold {what}{beyond} ({open_to})"
-
-
-def _accuracy(part: StreamPart) -> str:
-    """Return the score of a stream with signal; one without a control may be in the pictures themselves."""
-    against = "" if part.is_controlled else "; against chance only"
-    return f"{whole_percent(part.score)} %{_range(part.ci)}{against}"
-
-
 def chance_only(rows: Sequence[RetentionRow]) -> str:
     """A warning that names the runs whose probes were compared with no control; empty where all were."""
     probed = [row for row in rows if is_probed(row)]
@@ -392,30 +299,3 @@ def chance_only(rows: Sequence[RetentionRow]) -> str:
         f"No control was run{of_runs}: a signal is judged against chance only, and pictures and words alone may "
         "give the answer away. Run `probe-kit train RUN`, with --suite FOLDER where it cannot find the suite"
     )
-
-
-# -- behaviour -----------------------------------------------------------------------------------------------
-
-
-def _acted(row: RetentionRow) -> str:
-    """Return what the action does when the pictures are swapped, and where the cube ends."""
-    use = row.image_swap.use
-    swap = "" if use is None else describe_swap(row.image_swap, use)
-    if row.success.sr is None:
-        why = "the model did not act" if row.run.capture_only else "there is no success rate"
-        return f"{swap}; {why}" if swap else why
-    right = f"the cube ends on the correct picture in {_rate(row)}"
-    return f"{swap}, {'and' if _agrees(row) else 'but'} {right}" if swap else right
-
-
-def _agrees(row: RetentionRow) -> bool:
-    """Whether the image swap lets expect the success rate."""
-    use = row.image_swap.use
-    return use is None or (use.behaviour == "undecided" and not use.is_bounded) or use.is_used == knows(row)
-
-
-def _range(limits: Limits | None) -> str:
-    """Limits of a share in words, with a comma before them."""
-    if limits is None or None in limits:
-        return ""
-    return f", {whole_percent(limits[0])} to {whole_percent(limits[1])}"

@@ -11,7 +11,7 @@ from probe_kit.intervene.verdict import UseVerdict, describe_readouts, more_grou
 from probe_kit.retention.behaviour import Regime
 from probe_kit.retention.columns.sentences import (
     chance_only,
-    describe_category,
+    conclusion,
     is_probed,
     knows,
     label_finding,
@@ -302,8 +302,8 @@ class CategorySummary:
 
     @property
     def details(self) -> str:
-        """The finding with all its numbers, their uncertainty and the number of items."""
-        return f"{self.name} {describe_category(self.row, self.vlm)}"
+        """The conclusion from all numbers of the row, and what to do next; the numbers stand in tables."""
+        return f"{self.name}{':' * self.row.is_side} {conclusion(self.row)}"
 
 
 HEADINGS = (

@@ -9,7 +9,7 @@ from probe_kit.retention.compare.compare import Difference
 from probe_kit.retention.compare.models import ModelTest
 from probe_kit.retention.rows.row import RetentionRow, StreamPart
 from probe_kit.suite.categories import category_of
-from probe_kit.train.choices import EVERYWHERE
+from probe_kit.train.choices import EVERYWHERE, SIDES
 
 Modes = Literal["acts", "answers", "both"]
 
@@ -163,9 +163,14 @@ def title_of(category: str) -> str:
 
 def name_of(row: RetentionRow) -> str:
     """Return what a row is about: its category, or its target where that is no side."""
-    if row.is_side:
-        return title_of(row.category)
-    return row.target if row.category == EVERYWHERE else f"{row.target}, {title_of(row.category)}"
+    return name_of_target(row.target, row.category)
+
+
+def name_of_target(target: str, category: str) -> str:
+    """Return the category of a side; of another target its name, with the category where there is one."""
+    if target in SIDES:
+        return title_of(category)
+    return target if category == EVERYWHERE else f"{target}, {title_of(category)}"
 
 
 def once_per_category(rows: Sequence[RetentionRow]) -> list[RetentionRow]:

@@ -1,10 +1,11 @@
 """Bars of shares: items by layout, episodes by outcome rule, and items by answer, probe and success."""
 
+from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 
@@ -18,18 +19,12 @@ from probe_kit.retention.displays.report_figure import FigureSource, ReportFigur
 from probe_kit.retention.displays.style import (
     BLUE,
     GREEN,
-    GREY,
     ORANGE,
     PURPLE,
     SKY,
     VERMILION,
     ProvenanceLine,
-    axes_for,
-    caption,
     footer,
-    legend_above,
-    legend_handles,
-    plain,
 )
 from probe_kit.retention.rows.outcome_rules import RunUnderRule, can_be_judged, under_rule
 from probe_kit.retention.table import RetentionTable
@@ -42,34 +37,73 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 
-def _finish(
-    axes: "Axes", figure: "Figure | None", names: Sequence[str], places: Sequence[float], label: str
-) -> None:
-    """Name the bars and the level axis, up to 100 percent, and draw the legend on a figure of their own."""
-    axes.set_yticks(places, names, fontsize=8)
-    axes.set_ylim(places[-1] + 0.6, -0.6)
-    axes.set_xlim(0, 100)
-    axes.set_xlabel(label, fontsize=9)
-    plain(axes)
-    axes.spines["left"].set_visible(False)
-    axes.tick_params(axis="y", length=0)
-    if figure is not None:
-        legend_above(figure, list(legend_handles(axes).values()))
+Part = tuple[str, str, str, float, int | None]
+"""A part of a bar: its label, colour and hatch, its percent, and the number that is written into it."""
+_LEAST = 6.0  # percent of a bar that has room for a number
+_NEITHER = "#D9D9D9"
+
+
+@dataclass(frozen=True)
+class Bar:
+    """One bar: its name, what it is made of, and the text behind it. group: bars of one stand close together."""
+
+    name: str
+    parts: Sequence[Part]
+    text: str
+    is_bold: bool = False
+    group: str = ""
+
+
+@dataclass(kw_only=True)
+class BarDisplay(Display):
+    """Bars of shares, one below the other. share_of: the name of the level axis."""
+
+    share_of: ClassVar[str] = "items (%)"
+
+    @property
+    @abstractmethod
+    def rows(self) -> Sequence[Bar]:
+        """Return the bars, from above."""
+
+    @property
+    def heights(self) -> list[float]:
+        """Return where the middle of each bar is, from above."""
+        groups = list(dict.fromkeys(bar.group for bar in self.rows))
+        return [at + 0.5 * groups.index(bar.group) for at, bar in enumerate(self.rows)]
+
+    def plot(self, ax: "Axes | None" = None) -> Self:
+        """Draw on `ax`, or on a figure of its own that is as high as the bars need."""
+        self.figure_size = 6.2, 0.34 * self.heights[-1] + 0.85
+        return super().plot(ax)
+
+    def draw(self, axes: "Axes") -> None:
+        """Draw the bars with their names."""
+        for height, bar in zip(self.heights, self.rows, strict=True):
+            start = 0.0
+            for label, colour, hatch, width, number in bar.parts:
+                axes.barh(height, width, 0.72, start, color=colour, hatch=hatch, ec="white", lw=0.6, label=label)
+                if number is not None and width >= _LEAST:
+                    ground = {"boxstyle": "round,pad=0.1", "fc": "white", "ec": "none", "alpha": 0.85}
+                    axes.text(
+                        start + width / 2, height, str(number), ha="center", va="center", fontsize=8, bbox=ground
+                    )
+                start += width
+            weight = "bold" if bar.is_bold else "normal"
+            # Without a bar the text takes its place.
+            axes.text(101 if bar.parts else 1, height, bar.text, va="center", fontsize=7.5, weight=weight)
+        axes.set_yticks(self.heights, [bar.name for bar in self.rows])
+        axes.set_ylim(self.heights[-1] + 0.6, -0.6)
+        axes.set_xlim(0, 100)
+        axes.set_xlabel(self.share_of, fontsize=9)
+        axes.spines["left"].set_visible(False)
+        axes.tick_params(axis="y", length=0)
 
 
 # -- layouts -----------------------------------------------------------------------------------------------------
 
-# Name, colour, hatch: distinct without colour too.
-_LAYOUTS = (
-    ("right in both layouts", GREEN, ""),
-    ("right in one", SKY, "\\\\\\"),
-    ("wrong picture in both", VERMILION, "///"),
-    ("none right, otherwise", "#D9D9D9", ""),
-)
 
-
-@dataclass
-class PairedLayoutsDisplay(Display):
+@dataclass(kw_only=True)
+class PairedLayoutsDisplay(BarDisplay):
     """Items by outcome of their two layouts, per category.
 
     Knowledge puts items into "right in both"; a preference for a side puts them into "right in one", whatever its
@@ -77,42 +111,32 @@ class PairedLayoutsDisplay(Display):
     """
 
     items: dict[str, PairedItems]
-    certificate: ProvenanceLine
 
     @classmethod
     def from_run(cls, run: RunReader) -> Self:
         """Read the episodes of a run; items that ran in one layout are left out."""
         by_category = run.episodes.groupby("category", sort=False)
         items = {str(category): paired_items(episodes) for category, episodes in by_category}
-        return cls(items, ProvenanceLine.of_run(run))
+        return cls(items=items, certificates=(ProvenanceLine.of_run(run),))
 
-    def plot(self, ax: "Axes | None" = None) -> Self:
-        """Draw on `ax`, or on a figure of its own with legend and caption."""
-        axes, figure = axes_for(ax, 6.2, 0.33 * len(self.items) + 1.35)
-        for row, paired in enumerate(self.items.values()):
-            _draw_layouts(axes, row, paired)
-        _finish(axes, figure, list(map(title_of, self.items)), range(len(self.items)), "items (%)")
-        caption(figure, self.certificate)
-        self.ax_ = axes
-        return self
+    @property
+    def rows(self) -> Sequence[Bar]:
+        """Return a bar per category."""
+        return [_paired_bar(title_of(category), paired) for category, paired in self.items.items()]
 
 
-def _draw_layouts(axes: "Axes", row: int, paired: PairedItems) -> None:
-    counts = (paired.both, paired.one, paired.both_wrong, paired.none - paired.both_wrong)
-    total, start = sum(counts), 0.0
-    for (label, colour, hatch), count in zip(_LAYOUTS, counts, strict=True):
-        width = 100 * count / max(1, total)
-        axes.barh(row, width, 0.72, start, color=colour, hatch=hatch, ec="white", lw=0.8, label=label)
-        if width >= 5:
-            box = {"boxstyle": "round,pad=0.15", "fc": "white", "ec": "none", "alpha": 0.85} if hatch else None
-            ink = "white" if colour == GREEN else "black"
-            axes.text(
-                start + width / 2, row, str(count), ha="center", va="center", fontsize=8, color=ink, bbox=box
-            )
-        start += width
-    weight = "bold" if paired.p < SIGNIFICANCE else "normal"
+def _paired_bar(name: str, paired: PairedItems) -> Bar:
+    total = paired.both + paired.one + paired.none
+    # Hatches tell the parts apart without colour.
+    counts = (
+        ("right in both layouts", GREEN, "", paired.both),
+        ("right in one", SKY, "\\\\\\", paired.one),
+        ("wrong picture in both", VERMILION, "///", paired.both_wrong),
+        ("none right, otherwise", _NEITHER, "", paired.none - paired.both_wrong),
+    )
+    parts = [(label, colour, hatch, 100 * count / max(1, total), count) for label, colour, hatch, count in counts]
     p = "< 0.001" if paired.p < 0.001 else f"= {paired.p:.3f}"
-    axes.text(101, row, f"p {p}  n {total}", va="center", fontsize=7.5, weight=weight)
+    return Bar(name, parts, f"p {p}  n {total}", is_bold=paired.p < SIGNIFICANCE)
 
 
 @in_report(7)
@@ -135,7 +159,7 @@ def layout_figures(source: FigureSource) -> Iterator[ReportFigure]:
 _VERDICTS = (
     ("correct", "right", GREEN, ""),
     ("wrong", "wrong", VERMILION, "///"),
-    ("oob", "neither", "#D9D9D9", ""),
+    ("oob", "neither", _NEITHER, ""),
 )
 
 
@@ -152,12 +176,12 @@ class RuleBar:
     idle: float | None
 
 
-@dataclass
-class OutcomeRulesDisplay(Display):
+@dataclass(kw_only=True)
+class OutcomeRulesDisplay(BarDisplay):
     """A bar per run and outcome rule: how often the same episodes are called right, wrong or neither."""
 
+    share_of: ClassVar[str] = "episodes (%), mean over categories"
     bars: tuple[RuleBar, ...]
-    certificates: tuple[ProvenanceLine, ...]
 
     @classmethod
     def from_runs(cls, runs: Sequence[RunReader]) -> Self:
@@ -165,22 +189,30 @@ class OutcomeRulesDisplay(Display):
         if not runs or any(run.episodes.empty for run in runs):
             raise UsageError("there are no episodes to judge; give runs that have some")
         bars = [bar for run, name in zip(runs, full_names(runs), strict=True) for bar in _bars(run, name)]
-        return cls(tuple(bars), tuple(map(ProvenanceLine.of_run, runs)))
+        return cls(bars=tuple(bars), certificates=tuple(map(ProvenanceLine.of_run, runs)))
 
-    def plot(self, ax: "Axes | None" = None) -> Self:
-        """Draw on `ax`, or on a figure of its own with legend and caption."""
-        runs = list(dict.fromkeys(bar.run for bar in self.bars))
-        axes, figure = axes_for(ax, 6.2, 0.3 * len(self.bars) + 0.15 * len(runs) + 1.35)
-        places = [at + 0.5 * runs.index(bar.run) for at, bar in enumerate(self.bars)]
-        for height, bar in zip(places, self.bars, strict=True):
-            _draw_rule(axes, height, bar)
-        names = [f"{bar.run}  {bar.rule}" if len(runs) > 1 else bar.rule for bar in self.bars]
-        _finish(axes, figure, names, places, "episodes (%), mean over categories")
+    @property
+    def rows(self) -> Sequence[Bar]:
+        """Return the bars with their names: the rule, of several runs behind the run."""
+        several = len({bar.run for bar in self.bars}) > 1
+        return [_rule_bar(f"{bar.run}  {bar.rule}" if several else bar.rule, bar) for bar in self.bars]
+
+    def draw(self, axes: "Axes") -> None:
+        """Draw the bars, and a mark where doing nothing scores."""
+        super().draw(axes)
+        for height, bar in zip(self.heights, self.bars, strict=True):
+            if bar.idle:
+                x, y = [100 * bar.idle] * 2, [height - 0.44, height + 0.44]
+                axes.plot(x, y, color="black", lw=2, label="doing nothing scores")
         axes.set_xlim(0, 112)
         axes.set_xticks(range(0, 101, 25))
-        caption(figure, *self.certificates)
-        self.ax_ = axes
-        return self
+
+
+def _rule_bar(name: str, bar: RuleBar) -> Bar:
+    if bar.shares is None:
+        return Bar(name, (), "n/a: the run keeps no trajectories", group=bar.run)
+    parts = [(label, colour, hatch, 100 * bar.shares[part], None) for part, label, colour, hatch in _VERDICTS]
+    return Bar(name, parts, f"{100 * bar.shares['correct']:.1f}", group=bar.run)
 
 
 def _bars(run: RunReader, name: str) -> list[RuleBar]:
@@ -203,22 +235,6 @@ def _over_categories(run: RunReader, shares: "ArrayLike") -> float:
     """Return the mean over categories of a share (E,) per episode, in the order of the run's episodes."""
     values, categories = np.asarray(shares, dtype=float), run.episodes["category"].to_numpy()
     return float(np.mean([values[categories == name].mean() for name in np.unique(categories)]))
-
-
-def _draw_rule(axes: "Axes", height: float, bar: RuleBar) -> None:
-    if bar.shares is None:
-        axes.text(1, height, "n/a: the run keeps no trajectories", va="center", fontsize=7.5, color="0.35")
-        return
-    start = 0.0
-    for name, label, colour, hatch in _VERDICTS:
-        width = 100 * bar.shares[name]
-        axes.barh(height, width, 0.72, start, color=colour, hatch=hatch, ec="white", lw=0.5, label=label)
-        start += width
-    axes.text(101, height, f"{100 * bar.shares['correct']:.1f}", va="center", fontsize=8)
-    if bar.idle:
-        axes.plot(
-            [100 * bar.idle] * 2, [height - 0.44, height + 0.44], color="black", lw=2, label="doing nothing scores"
-        )
 
 
 @in_report(4)
@@ -274,49 +290,55 @@ _LOOKS: Mapping[str, tuple[str, str]] = {
     "110": (VERMILION, ""),
     "100": (ORANGE, "///"),
     "010": (PURPLE, "///"),
-    "000": ("#D9D9D9", ""),
+    "000": (_NEITHER, ""),
     "1-1": (GREEN, ""),
     "0-1": (SKY, "\\\\\\"),
     "1-0": (VERMILION, "///"),
-    "0-0": ("#D9D9D9", ""),
+    "0-0": (_NEITHER, ""),
 }
 """Colour and hatch by answer, probe and success: items with success first."""
-_LEAST = 6.0  # percent of a bar that has room for a number
 
 
-@dataclass
-class KnownUsedDisplay(Display):
+@dataclass(kw_only=True)
+class KnownUsedDisplay(BarDisplay):
     """A bar per category: shares of its items by what is known, encoded and used, in both layouts each.
 
-    counts: items by category and code, such as `101` for answer right, probe not, success (`1-1` without probes).
-    title: who was asked and who acted.
+    joined: what `probe_kit.retention.compare.known_used.match_runs` returns.
     """
 
-    title: str
-    counts: Mapping[str, Mapping[str, int]]
-    note: str
+    joined: KnownUsedTable
 
     @classmethod
     def from_join(cls, joined: KnownUsedTable) -> Self:
         """Read a table of `probe_kit.retention.compare.known_used.match_runs`."""
-        probes = f"probes in view {joined.view}" if joined.view else "no probes"
-        return cls(
-            title=f"{joined.asked} (by {joined.score}) · {joined.acted}",
-            counts={row.category: row.counts for row in joined.rows},
-            note=f"{joined.asked} · {joined.acted} · items right in both layouts, a coin: 25 % · {probes}",
-        )
+        return cls(joined=joined, title=f"{joined.asked} (by {joined.score}) · {joined.acted}")
 
-    def plot(self, ax: "Axes | None" = None) -> Self:
-        """Draw on `ax`, or on a figure of its own with legend and caption."""
-        axes, figure = axes_for(ax, 7.2, 0.36 * len(self.counts) + 2.0)
-        for height, counts in enumerate(self.counts.values()):
-            _draw_items(axes, height, counts)
-        axes.set_title(self.title, fontsize=9, loc="left")
-        _finish(axes, figure, list(map(title_of, self.counts)), range(len(self.counts)), "items (%)")
-        if figure is not None:
-            footer(figure, self.note)
-        self.ax_ = axes
-        return self
+    @property
+    def counts(self) -> Mapping[str, Mapping[str, int]]:
+        """Items by category and code, such as `101`: answer right, probe not, success (`1-1` without probes)."""
+        return {row.category: row.counts for row in self.joined.rows}
+
+    @property
+    def rows(self) -> Sequence[Bar]:
+        """Return a bar per category."""
+        return [_counted_bar(title_of(category), counts) for category, counts in self.counts.items()]
+
+    def finish(self, figure: "Figure", grid: "Sequence[Axes]") -> None:
+        """Add the legend, and who was asked and who acted in place of one run's line."""
+        super().finish(figure, grid)
+        probes = f"probes in view {self.joined.view}" if self.joined.view else "no probes"
+        names = f"{self.joined.asked} · {self.joined.acted}"
+        footer(figure, f"{names} · items right in both layouts, a coin: 25 % · {probes}")
+
+
+def _counted_bar(name: str, counts: Mapping[str, int]) -> Bar:
+    total = sum(counts.values())
+    parts = [
+        (words_of(code), *look, 100 * counts[code] / max(1, total), counts[code])
+        for code, look in _LOOKS.items()
+        if code in counts
+    ]
+    return Bar(name, parts, f"n {total}")
 
 
 def words_of(code: str) -> str:
@@ -324,22 +346,6 @@ def words_of(code: str) -> str:
     names = (("answer right", "answer not"), ("probe right", "probe not"), ("success", "no success"))
     parts = zip(names, code, strict=True)
     return ", ".join(right if mark == "1" else wrong for (right, wrong), mark in parts if mark != "-")
-
-
-def _draw_items(axes: "Axes", height: int, counts: Mapping[str, int]) -> None:
-    total, start = sum(counts.values()), 0.0
-    for code, (colour, hatch) in _LOOKS.items():
-        if code not in counts:
-            continue
-        width = 100 * counts[code] / total if total else 0.0
-        axes.barh(height, width, 0.72, start, color=colour, hatch=hatch, ec="white", lw=0.5, label=words_of(code))
-        if width >= _LEAST:
-            ground = {"boxstyle": "round,pad=0.1", "fc": "white", "ec": "none", "alpha": 0.85}
-            axes.text(
-                start + width / 2, height, str(counts[code]), ha="center", va="center", fontsize=8, bbox=ground
-            )
-        start += width
-    axes.text(101, height, f"n {total}", va="center", fontsize=7.5, color=GREY, clip_on=False)
 
 
 @in_report(6)

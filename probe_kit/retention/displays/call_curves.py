@@ -1,6 +1,6 @@
 """Accuracy over the captured calls of an episode, and the same counted from what happens in it."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, Self
@@ -12,7 +12,7 @@ from probe_kit.env.scoring import EVENTS, Events
 from probe_kit.errors import TooFewGroupsError, UsageError
 from probe_kit.hooks.contract.sites import label_of
 from probe_kit.retention.columns.text import title_of
-from probe_kit.retention.displays.display import Display, known_view
+from probe_kit.retention.displays.display import Display, in_panels, known_view
 from probe_kit.retention.displays.report_figure import (
     ONLY_FILLED,
     DrawnRun,
@@ -26,13 +26,7 @@ from probe_kit.retention.displays.style import (
     PARTS,
     ProvenanceLine,
     accuracy_axis,
-    axes_for,
-    caption,
-    legend_above,
-    legend_handles,
     mark_below,
-    panels,
-    plain,
     significance_handles,
 )
 from probe_kit.retention.estimators import best_site, score_streams
@@ -44,6 +38,7 @@ from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.train.results.store import load_results_by_call
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from numpy.typing import ArrayLike
@@ -225,13 +220,14 @@ def event_calls(run: Any) -> EventCalls:
 _PERMUTED = "best permuted probe, 95 %"
 
 
-@dataclass
+@dataclass(kw_only=True)
 class CallCurveDisplay(Display):
     """Held-out accuracy of each stream's best site by captured inference, for one category in one view.
 
     Filled markers are above chance against all sites of their stream, and above the controls that were run; the
     dotted line is what the best site of permuted labels stays below in 95 %. Upright lines: when the events of the
-    trajectories fell due, in the median, with quartiles. A site is chosen anew at each call.
+    trajectories fell due, in the median, with quartiles. A site is chosen anew at each call. event: from which
+    accuracies are counted instead, see `plot_aligned`.
     """
 
     category: str
@@ -239,7 +235,7 @@ class CallCurveDisplay(Display):
     lines: tuple[CallLine, ...]
     events: tuple[EventTimes, ...]
     aligned: Mapping[str, tuple[AlignedLine, ...]]
-    certificate: ProvenanceLine
+    event: str | None = None
 
     @classmethod
     def from_results(
@@ -265,50 +261,50 @@ class CallCurveDisplay(Display):
             lines=tuple(map(curves.line, curves.streams)),
             events=tuple(curves.event_times()),
             aligned={event: lines for event, lines in aligned.items() if lines},
-            certificate=ProvenanceLine.of_results(first, curves.view),
+            title=title_of(category),
+            measure="best site, accuracy (%)",
+            certificates=(replace(ProvenanceLine.of_results(first, curves.view), call=None),),
         )
-
-    def plot(self, ax: "Axes | None" = None) -> Self:
-        """Draw on `ax`, or on a figure of its own with legend and caption."""
-        return self._plot(ax, None)
 
     def plot_aligned(self, event: str, ax: "Axes | None" = None) -> Self:
         """Draw the accuracies counted from an event. Raises UsageError if too few episodes have it."""
         if event not in self.aligned:
             events = ", ".join(self.aligned) or "none"
             raise UsageError(f"too few episodes have the event {event!r}, or no trajectories; there are: {events}")
-        return self._plot(ax, event)
+        return self.around(event).plot(ax)
 
-    def _plot(self, ax: "Axes | None", event: str | None) -> Self:
+    def around(self, event: str) -> Self:
+        """Return the display that counts from an event."""
+        return replace(self, event=event, title=f"{title_of(self.category)}: {event}")
+
+    def further_handles(self) -> "Sequence[Artist]":
+        """Return the handles of filled and open markers; around an event nothing is tested."""
+        return [] if self.event else significance_handles()
+
+    def draw(self, axes: "Axes") -> None:
+        """Draw the streams by call, with the events, or around an event."""
         from matplotlib.ticker import MaxNLocator
 
-        axes, figure = axes_for(ax, 6.2, 3.9)
         axes.axhline(100 * CHANCE, color="0.45", lw=1, ls="--", label="chance")
-        if event is None:
+        if self.event is None:
             self._draw_calls(axes)
         else:
             axes.axvline(0, color="0.6", lw=0.8)
-            for line in self.aligned[event]:
+            for line in self.aligned[self.event]:
                 _draw(axes, line.offsets, line)
-        plain(axes)
         accuracy_axis(axes)
         axes.xaxis.set_major_locator(MaxNLocator(nbins=8, integer=True, min_n_ticks=2))
-        axes.set_title(f"{title_of(self.category)}{f': {event}' if event else ''}", fontsize=9, loc="left")
-        below = "calls after the last one before it" if event else "call (captured inference, from 0)"
+        below = "calls after the last one before it" if self.event else "call (captured inference, from 0)"
         axes.set_xlabel(below, fontsize=8.5)
-        if figure is not None:
-            _complete(figure, axes, self.certificate, tested=event is None)
-        self.ax_ = axes
-        return self
 
     def _draw_calls(self, axes: "Axes") -> None:
         for line in self.lines:
+            style, clear, accuracy = PARTS[line.part], line.significant, 100 * line.accuracy
+            arms = [(accuracy - 100 * line.low).clip(min=0), (100 * line.high - accuracy).clip(min=0)]
+            axes.errorbar(line.calls, accuracy, arms, fmt="none", ecolor=style.colour, elinewidth=0.8, alpha=0.7)
             _draw(axes, line.calls, line)
-            style, clear = PARTS[line.part], line.significant
             axes.plot(line.calls, 100 * line.null, color=style.colour, lw=0.9, ls=":", label=_PERMUTED)
-            axes.plot(
-                line.calls[clear], 100 * line.accuracy[clear], color=style.colour, ls="none", marker=style.marker
-            )
+            axes.plot(line.calls[clear], accuracy[clear], color=style.colour, ls="none", marker=style.marker)
         for number, event in enumerate(self.events):
             # Names stand one above the other below chance, as several events may fall into one call.
             height = 8 * (len(self.events) - number) - 5
@@ -321,12 +317,21 @@ class CallCurveDisplay(Display):
             )  # fmt: skip
 
 
+def _draw(axes: "Axes", places: "ArrayLike", line: CallLine | AlignedLine) -> None:
+    style, accuracy = PARTS[line.part], 100 * line.accuracy
+    axes.plot(
+        places, accuracy, color=style.colour, lw=1.3, ls=style.dash, marker=style.marker, mfc="white",
+        label=label_of(line.stream),
+    )  # fmt: skip
+    mark_below(axes, places, accuracy, style.colour)
+
+
 def call_curves(
     results: Mapping[int, ProbeResults], view: str | None = None, events: EventCalls | None = None
 ) -> "Figure":
     """Accuracy over captured calls for every category; arguments and errors as of `CallCurveDisplay`."""
     names = next(iter(results.values())).settings.categories
-    return _figure([CallCurveDisplay.from_results(results, name, view, events) for name in names], None)
+    return in_panels([CallCurveDisplay.from_results(results, name, view, events) for name in names])
 
 
 def aligned_curves(
@@ -335,38 +340,10 @@ def aligned_curves(
     """The same counted from an event, for every category in which enough episodes have it."""
     names = next(iter(results.values())).settings.categories
     displays = [CallCurveDisplay.from_results(results, name, view, events) for name in names]
-    with_event = [display for display in displays if event in display.aligned]
+    with_event = [display.around(event) for display in displays if event in display.aligned]
     if not with_event:
         raise UsageError(f"too few episodes of any category have the event {event!r}, or no trajectories")
-    return _figure(with_event, event)
-
-
-def _figure(displays: list[CallCurveDisplay], event: str | None) -> "Figure":
-    figure, grid = panels(len(displays))
-    for display, axes in zip(displays, grid, strict=True):
-        display._plot(axes, event)
-    _complete(figure, grid[0], displays[0].certificate, tested=event is None)
-    return figure
-
-
-def _draw(axes: "Axes", places: "ArrayLike", line: CallLine | AlignedLine) -> None:
-    style = PARTS[line.part]
-    accuracy = 100 * line.accuracy
-    if isinstance(line, CallLine):
-        arms = [(accuracy - 100 * line.low).clip(min=0), (100 * line.high - accuracy).clip(min=0)]
-        axes.errorbar(places, accuracy, yerr=arms, fmt="none", ecolor=style.colour, elinewidth=0.8, alpha=0.7)
-    axes.plot(
-        places, accuracy, color=style.colour, lw=1.3, ls=style.dash, marker=style.marker, mfc="white",
-        label=label_of(line.stream),
-    )  # fmt: skip
-    mark_below(axes, places, accuracy, style.colour)
-
-
-def _complete(figure: "Figure", axes: "Axes", certificate: ProvenanceLine, tested: bool) -> None:
-    """tested: whether markers are filled where something is evidence."""
-    legend_above(figure, [*legend_handles(axes).values(), *(significance_handles() if tested else ())])
-    figure.supylabel("best site, accuracy (%)", fontsize=9)
-    caption(figure, replace(certificate, call=None))
+    return in_panels(with_event)
 
 
 @in_report(12)

@@ -1,8 +1,9 @@
-"""The displays' base: a panel with legend and caption, several in one figure, and the choice of what they show."""
+"""The displays' base: a panel alone or beside others, its legend and caption; and the choice of what it shows."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Self
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,6 @@ from probe_kit.retention.choices import Iterations
 from probe_kit.retention.displays.style import (
     Line,
     ProvenanceLine,
-    axes_for,
     caption,
     legend_above,
     legend_handles,
@@ -31,10 +31,50 @@ if TYPE_CHECKING:
     from probe_kit.retention.displays.shown_figure import Picture
 
 
-class Display:
-    """A display that has been plotted shows its figure; `ax_` is what `plot` drew on."""
+@dataclass(kw_only=True)
+class Display(ABC):
+    """One panel of numbers: on axes of its own, or beside others in one figure.
 
-    ax_: "Axes | None" = None
+    A display that has been plotted shows its figure. title: above the panel. measure: name of the upright axis.
+    certificates: where its numbers come from. figure_size: inches of a panel by itself; panel_size: of
+    one of several. is_level: whether panels side by side have one range of the upright axis. is_framed: whether
+    all spines are drawn. ax_: what `plot` drew on.
+    """
+
+    title: str = ""
+    measure: str = ""
+    certificates: tuple[ProvenanceLine, ...] = ()
+    figure_size: tuple[float, float] = (6.2, 2.8)
+    is_level: bool = False
+    ax_: "Axes | None" = field(default=None, init=False, repr=False)
+    panel_size: ClassVar[tuple[float, float]] = (3.1, 2.5)
+    is_framed: ClassVar[bool] = False
+    title_size: ClassVar[float] = 9
+
+    @abstractmethod
+    def draw(self, axes: "Axes") -> None:
+        """Draw marks with labels for the legend, and the axes' scales."""
+
+    def further_handles(self) -> "Sequence[Artist]":
+        """Return handles of the legend, behind those of what is drawn."""
+        return []
+
+    def finish(self, figure: "Figure", grid: "Sequence[Axes]") -> None:
+        """Add to a figure of one or more panels what all of them share: a legend with every name once."""
+        if every := [*legend_handles(*grid).values(), *self.further_handles()]:
+            legend_above(figure, every)
+
+    def plot(self, ax: "Axes | None" = None) -> Self:
+        """Draw on `ax`, or on a figure of its own with legend and caption."""
+        if ax is None:
+            in_panels([self], self.figure_size, in_pyplot=True)
+            return self
+        self.draw(ax)
+        if not self.is_framed:
+            plain(ax)
+        ax.set_title(self.title, fontsize=self.title_size, loc="left")
+        self.ax_ = ax
+        return self
 
     def _repr_png_(self) -> "Picture | None":
         """Return the figure, whatever pyplot's backend is."""
@@ -51,93 +91,35 @@ class Display:
         return picture_of(figure)
 
 
-class Panelled(Display, ABC):
-    """One panel, such as a stream of the model: on axes of its own, or beside others in one figure."""
-
-    certificate: ProvenanceLine
-    title_size = 9
-
-    @property
-    @abstractmethod
-    def measure(self) -> str:
-        """Return the name of the upright axis."""
-
-    @property
-    @abstractmethod
-    def title(self) -> str:
-        """Above the panel."""
-
-    @abstractmethod
-    def draw(self, axes: "Axes") -> None:
-        """Draw marks with labels for the legend, and the axes' scales."""
-
-    def further_handles(self) -> "Sequence[Artist]":
-        """Return handles of the legend, behind those of what is drawn."""
-        return []
-
-    def plot(self, ax: "Axes | None" = None) -> Self:
-        """Draw on `ax`, or on a figure of its own with legend and caption."""
-        axes, figure = axes_for(ax, 6.2, 3.9)
-        self.draw(axes)
-        plain(axes)
-        axes.set_title(self.title, fontsize=self.title_size, loc="left")
-        if figure is not None:
-            axes.set_ylabel(self.measure, fontsize=9)
-            _draw_legend(figure, [axes], self)
-        caption(figure, self.certificate)
-        self.ax_ = axes
-        return self
-
-
 def in_panels(
-    displays: Sequence[Panelled],
-    width: float = 3.1,
-    height: float = 2.5,
+    displays: Sequence[Display | None],
+    size: tuple[float, float] | None = None,
+    columns: int | None = None,
     *,
-    share: bool = True,
-    level: bool = False,
+    in_pyplot: bool = False,
 ) -> "Figure":
-    """Return all of them in one figure, under one legend.
+    """Return displays of one kind in one figure, under one legend.
 
-    displays: at least one, all of a kind. width, height: of a panel in inches. share: whether panels share both
-    axes; level: whether they share the range of the upright one.
+    displays: one or more; None leaves a place empty. size: of a panel in inches, by default that of its kind.
+    columns, in_pyplot: as in `panels`.
     """
-    figure, grid = panels(len(displays), width, height, share=share)
-    for display, axes in zip(displays, grid, strict=True):
-        display.plot(axes)
-    if level:
+    present = [display for display in displays if display is not None]
+    first = present[0]
+    figure, places = panels(len(displays), *(size or first.panel_size), columns, share=False, in_pyplot=in_pyplot)
+    for display, axes in zip(displays, places, strict=True):
+        if display is None:
+            axes.set_visible(False)
+        else:
+            display.plot(axes)
+    grid = [axes for axes in places if axes.get_visible()]
+    if first.is_level:
         ranges = [axes.get_ylim() for axes in grid]
         for axes in grid:
             axes.set_ylim(min(low for low, _ in ranges), max(high for _, high in ranges))
-    figure.supylabel(displays[0].measure, fontsize=9)
-    caption(figure, displays[0].certificate)
-    _draw_legend(figure, grid, displays[0])
+    figure.supylabel(first.measure, fontsize=9)
+    caption(figure, *(line for display in present for line in display.certificates))
+    first.finish(figure, grid)
     return figure
-
-
-def in_streams(
-    read: Callable[[ProbeResults, str, str, str], Panelled],
-    results: ProbeResults,
-    view: str | None,
-    category: str | None,
-    width: float,
-    height: float,
-    *,
-    level: bool = False,
-) -> "Figure":
-    """Return a panel per stream that was probed in a view and category, by default the first ones.
-
-    read: makes a display of results, stream, view and category. Others: as in `in_panels`.
-    """
-    category, view, curve = probed_curve(results, view, category)
-    displays = [read(results, stream, view, category) for stream in curve.streams]
-    return in_panels(displays, width, height, share=False, level=level)
-
-
-def _draw_legend(figure: "Figure", grid: "Sequence[Axes]", display: Panelled) -> None:
-    """Draw a legend with every name once."""
-    if every := [*legend_handles(*grid).values(), *display.further_handles()]:
-        legend_above(figure, every)
 
 
 def draw_series(
@@ -184,10 +166,11 @@ def probed_curve(results: ProbeResults, view: str | None, category: str | None) 
     return category, view, curve_of(results, category, view)
 
 
-def scores_of(results: ProbeResults, category: str, view: str) -> "pd.DataFrame":
-    """Rows of `results.scores` of one category in one view."""
+def scores_of(results: ProbeResults, category: str, view: str, stream: str | None = None) -> "pd.DataFrame":
+    """Rows of `results.scores` of one category in one view, and of one stream where it is named."""
     scores = results.scores
-    return scores[(scores["category"] == category) & (scores["view"] == view)]
+    selected = (scores["category"] == category) & (scores["view"] == view)
+    return scores[selected if stream is None else selected & (scores["stream"] == stream)]
 
 
 def of_iterations(scores: "pd.DataFrame", iterations: Iterations) -> "pd.DataFrame":
@@ -203,6 +186,11 @@ def of_iterations(scores: "pd.DataFrame", iterations: Iterations) -> "pd.DataFra
         stream = scores["stream"].iloc[0]
         raise UsageError(f"the stream {stream} has iterations {steps.min()} to {steps.max()}, not {step}")
     return scores[scores["iteration"] == step]
+
+
+def best_of(iterations: Iterations) -> Iterations:
+    """Return the choice for what has one line or one number: the best iteration in place of all."""
+    return "best" if iterations == "all" else iterations
 
 
 def best_row(curve: ProbeCurve, stream: str) -> int:

@@ -1,9 +1,9 @@
 """A map of where the cube ended, over the tiles, seen from above."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,21 +12,18 @@ from probe_kit.env.scoring import DEFAULT_RULE, Box, Disc, OutcomeRule, Released
 from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour import capture_only
 from probe_kit.retention.columns.text import title_of
-from probe_kit.retention.displays.display import Display
+from probe_kit.retention.displays.display import Display, in_panels
 from probe_kit.retention.displays.report_figure import FigureSource, ReportFigure, in_report
 from probe_kit.retention.displays.style import (
     GREEN,
     VERMILION,
     ProvenanceLine,
-    axes_for,
-    caption,
-    legend_above,
-    panels,
 )
 from probe_kit.runs.reader import RunReader
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -39,7 +36,7 @@ _MARGIN = 0.09  # metres of table around tiles and start
 _MANY = 300  # points, above which a vector figure holds them as a picture
 
 
-@dataclass
+@dataclass(kw_only=True)
 class FinalPositionsDisplay(Display):
     """Final places of the cube in metres: x away from the robot, y to its left.
 
@@ -52,8 +49,10 @@ class FinalPositionsDisplay(Display):
     outcome: NDArray[np.str_]
     never_moved: int
     scene: Mapping[str, Any]
-    certificate: ProvenanceLine
     rule: str = DEFAULT_RULE
+    panel_size: ClassVar = (3.1, 2.35)
+    is_framed: ClassVar = True
+    title_size: ClassVar = 10
 
     @classmethod
     def from_run(cls, run: RunReader, category: str | None = None, scene: Mapping[str, Any] | None = None) -> Self:
@@ -74,12 +73,14 @@ class FinalPositionsDisplay(Display):
             )
         unmoved = episodes["never_moved"].astype(bool).sum() if "never_moved" in episodes else 0
         return cls(
+            title=title_of(category or "all categories"),
+            figure_size=(4.6, 3.3),
             category=category,
             xy=episodes[["cube_x", "cube_y"]].to_numpy(dtype=float),
             outcome=episodes["outcome"].to_numpy(dtype=str),
             never_moved=int(unmoved),
             scene=scene,
-            certificate=ProvenanceLine.of_run(run),
+            certificates=(ProvenanceLine.of_run(run),),
             rule=run.rule,
         )
 
@@ -88,9 +89,8 @@ class FinalPositionsDisplay(Display):
         """Episodes by outcome."""
         return {name: int((self.outcome == name).sum()) for name in _OUTCOMES}
 
-    def plot(self, ax: "Axes | None" = None) -> Self:
-        """Draw on `ax`, or on a figure of its own with legend and caption."""
-        axes, figure = axes_for(ax, 4.6, 4.4)
+    def draw(self, axes: "Axes") -> None:
+        """Draw tiles, zones, start and the final places."""
         rule = rule_of(self.rule, self.scene)
         low, high = _window(self.scene, _reach(rule))
         _draw_table(axes, self.scene, rule)
@@ -104,14 +104,13 @@ class FinalPositionsDisplay(Display):
                 alpha=0.65, linewidths=0, zorder=3, rasterized=bool(of_outcome.sum() > _MANY),
             )  # fmt: skip
         _set_window(axes, low, high, int(beyond.sum()))
-        title = title_of(self.category or "all categories")
-        axes.set_title(title, fontsize=10, loc="left")
         axes.set_xlabel(self._summary(), fontsize=7.5, color="0.3", labelpad=3)
-        if figure is not None:
-            _draw_legend(figure, axes)
-        caption(figure, self.certificate)
-        self.ax_ = axes
-        return self
+
+    def further_handles(self) -> "Sequence[Artist]":
+        """Return the handle of the zones."""
+        from matplotlib.lines import Line2D
+
+        return [Line2D([], [], color="0.45", lw=0.8, ls="--", label="zone that counts")]
 
     def _summary(self) -> str:
         counts = self.counts
@@ -122,13 +121,7 @@ class FinalPositionsDisplay(Display):
 def final_positions(run: RunReader) -> "Figure":
     """Final places of the cube, a panel per category. Raises UsageError if the run stores none."""
     categories = [str(name) for name in run.episodes["category"].unique()]
-    displays = [FinalPositionsDisplay.from_run(run, name) for name in categories]
-    figure, grid = panels(len(displays), width=3.1, height=2.35)
-    for display, axes in zip(displays, grid, strict=True):
-        display.plot(axes)
-    caption(figure, displays[0].certificate)
-    _draw_legend(figure, grid[0])
-    return figure
+    return in_panels([FinalPositionsDisplay.from_run(run, name) for name in categories])
 
 
 def _reach(rule: OutcomeRule) -> float:
@@ -190,14 +183,6 @@ def _set_window(axes: "Axes", low: NDArray[np.float64], high: NDArray[np.float64
     axes.text(start + 0.05, bottom + 0.005, "10 cm", ha="center", va="bottom", fontsize=6.5, color="0.25")
     if outside:
         axes.text(-low[1] - 0.008, bottom, f"{outside} beyond the frame", ha="right", fontsize=6.5, color="0.25")
-
-
-def _draw_legend(figure: "Figure", panel: "Axes") -> None:
-    from matplotlib.lines import Line2D
-
-    zone = Line2D([], [], color="0.45", lw=0.8, ls="--", label="zone that counts")
-    handles = [*panel.get_legend_handles_labels()[0], zone]
-    legend_above(figure, handles)
 
 
 @in_report(8)

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ from probe_kit.intervene.kinds.attention import (
 from probe_kit.intervene.kinds.interchange import BACKBONE, PatchEffect, stored_site_effects, stored_steering
 from probe_kit.intervene.places import ALL, TILE_ROLES, PlaceName
 from probe_kit.retention.columns.text import title_of
-from probe_kit.retention.displays.display import Panelled, draw_series, in_panels, scores_of
+from probe_kit.retention.displays.display import Display, draw_series, in_panels, scores_of
 from probe_kit.retention.displays.report_figure import FigureSource, ReportFigure, in_report
 from probe_kit.retention.displays.style import GREY, ProvenanceLine, caption, layer_axis, panels, series
 from probe_kit.runs.reader import RunReader
@@ -48,8 +48,8 @@ class Points:
     significant: NDArray[np.bool_]
 
 
-@dataclass
-class SiteEffectDisplay(Panelled):
+@dataclass(kw_only=True)
+class SiteEffectDisplay(Display):
     """Curves by backbone layer: held-out accuracy of probes, and the episodes that turn when tokens are exchanged.
 
     readable: accuracy in percent. passes: by role, share of episodes in percent whose action turns to the side of
@@ -57,12 +57,11 @@ class SiteEffectDisplay(Panelled):
     part reads of each block; None where it was not tested. Filled: significant, family-wise.
     """
 
-    measure = "% of episodes"
+    measure: str = "% of episodes"
     category: str
     readable: Points
     passes: dict[str, Points]
     read: Points | None
-    certificate: ProvenanceLine
 
     @classmethod
     def from_run(
@@ -83,14 +82,14 @@ class SiteEffectDisplay(Panelled):
                 f"{run.location} has no stored interchange of {category!r} in a layer of the backbone or of the "
                 f"keys and values. Run `probe-kit intervene {run.location} --kind interchange`"
             )
-        scores = scores_of(results, category, view)
-        scores = scores[scores["stream"] == BACKBONE].sort_values("layer")
+        scores = scores_of(results, category, view, BACKBONE).sort_values("layer")
         by_role: dict[str, list[PatchEffect]] = {}
         for row in rows:
             if _stream(row) == BACKBONE:
                 by_role.setdefault(row.role, []).append(row)
         read = [row for row in rows if _stream(row) == KV_STREAM]
         return cls(
+            title=title_of(category),
             category=category,
             readable=Points(
                 scores["layer"].to_numpy(int), 100 * scores["accuracy"].to_numpy(float),
@@ -98,13 +97,8 @@ class SiteEffectDisplay(Panelled):
             ),
             passes={role: _points(of_role) for role, of_role in by_role.items()},
             read=_points(read) if read else None,
-            certificate=ProvenanceLine.of_results(results, view),
+            certificates=(ProvenanceLine.of_results(results, view),),
         )  # fmt: skip
-
-    @property
-    def title(self) -> str:
-        """The category."""
-        return title_of(self.category)
 
     def draw(self, axes: "Axes") -> None:
         """A line for probes, one for every role, one for `kv`."""
@@ -181,8 +175,8 @@ Boxes = NDArray[np.float32]
 _LABELS = {CORRECT: "correct picture's tile", OTHER: "other picture's tile", ACTION: "its own tokens"}
 
 
-@dataclass
-class AttentionDisplay(Panelled):
+@dataclass(kw_only=True)
+class AttentionDisplay(Display):
     """A curve by block of the backbone: the share of attention in percent that lies on one role's tokens.
 
     blocks: (B,) those that are read. roles: names of R; of tiles by where the answer lies. mean: (R, B) over
@@ -190,14 +184,14 @@ class AttentionDisplay(Panelled):
     iterations and inferences. Descriptive: attended tokens need not be used, and no verdict reads this.
     """
 
-    measure = "% of attention (describes, no cause)"
+    measure: str = "% of attention (describes, no cause)"
+    is_level: bool = True
     category: str
     blocks: NDArray[np.int64]
     roles: tuple[str, ...]
     mean: Percent
     iterations: Percent
     heads: Percent
-    certificate: ProvenanceLine
 
     @classmethod
     def from_run(cls, run: RunReader, category: str, stored: Mapping[str, AttentionShares] | None = None) -> Self:
@@ -223,19 +217,15 @@ class AttentionDisplay(Panelled):
             return 100 * np.stack([table.loc[role].loc[blocks].to_numpy(float) for role in roles])
 
         return cls(
+            title=title_of(category),
             category=category,
             blocks=blocks,
             roles=roles,
             mean=shares()[..., 0],
             iterations=shares("iteration"),
             heads=shares("head"),
-            certificate=ProvenanceLine.of_run(run),
+            certificates=(ProvenanceLine.of_run(run),),
         )
-
-    @property
-    def title(self) -> str:
-        """The category."""
-        return title_of(self.category)
 
     def draw(self, axes: "Axes") -> None:
         """A line for every role, with what iterations and heads there are around it."""
@@ -354,8 +344,8 @@ def attention_figures(source: FigureSource) -> Iterator[ReportFigure]:
             )  # fmt: skip
 
 
-@dataclass
-class DoseResponseDisplay(Panelled):
+@dataclass(kw_only=True)
+class DoseResponseDisplay(Display):
     """A curve by coefficient: the share of episodes that turn to the target side, minus those that turn from it.
 
     coefficients: (K,) in half class-mean differences, ascending, 0 among them. net, net_left, net_right: (K,)
@@ -365,7 +355,8 @@ class DoseResponseDisplay(Panelled):
     significant: (K,) beyond the controls, family-wise.
     """
 
-    measure = "% of episodes that turn"
+    measure: str = "% of episodes that turn"
+    panel_size: ClassVar = (3.1, 2.7)
     category: str
     position: str
     coefficients: NDArray[np.float64]
@@ -375,7 +366,6 @@ class DoseResponseDisplay(Panelled):
     controls: Percent
     relative_change: NDArray[np.float64]
     significant: NDArray[np.bool_]
-    certificate: ProvenanceLine
 
     @classmethod
     def from_run(
@@ -404,6 +394,7 @@ class DoseResponseDisplay(Panelled):
         names = dict.fromkeys(row.direction for row in rows if row.is_control)
         nets = {(row.direction, float(row.coefficient)): 100 * row.net for row in rows}
         return cls(
+            title="\n".join([title_of(category), *position.split(", ")]),
             category=category,
             position=position,
             coefficients=coefficients,
@@ -415,13 +406,8 @@ class DoseResponseDisplay(Panelled):
             ).reshape(len(names), len(coefficients)),
             relative_change=np.array([row.relative_change for row in steered]),
             significant=np.array([row.p_fwe is not None and row.p_fwe < SIGNIFICANCE for row in steered]),
-            certificate=ProvenanceLine.of_run(run),
+            certificates=(ProvenanceLine.of_run(run),),
         )
-
-    @property
-    def title(self) -> str:
-        """The category, and where."""
-        return "\n".join([title_of(self.category), *self.position.split(", ")])
 
     def draw(self, axes: "Axes") -> None:
         """A line for all episodes and one for either side, over the band of the controls."""
@@ -461,7 +447,7 @@ def dose_response(run: RunReader) -> "Figure":
         (category, position) for category, by_position in stored.items() for position in by_position
     ]
     displays = [DoseResponseDisplay.from_run(run, *pair, stored) for pair in pairs or [("any", None)]]
-    return in_panels(displays, height=2.7, share=False)
+    return in_panels(displays)
 
 
 @in_report(14)

@@ -1,32 +1,27 @@
 """Layer × iteration maps: where and when in the action expert the answer can be read."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UnknownSiteError, UsageError
 from probe_kit.retention.columns.text import title_of
-from probe_kit.retention.displays.display import Display, curve_of, known_view, scores_of
+from probe_kit.retention.displays.display import Display, curve_of, in_panels, known_view, scores_of
 from probe_kit.retention.displays.report_figure import (
     DOTS,
     FigureSource,
     ReportFigure,
     in_report,
-    in_view,
-    view_suffix,
+    probed_views,
 )
 from probe_kit.retention.displays.style import (
     FILLED,
     PARTS,
     ProvenanceLine,
-    axes_for,
-    caption,
     legend_above,
-    panels,
 )
 from probe_kit.statistics.crossfit import CHANCE
 from probe_kit.train.results.probe_results import ProbeResults
@@ -34,12 +29,11 @@ from probe_kit.train.results.probe_results import ProbeResults
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Colormap, Normalize
+    from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
 
 
-@dataclass
+@dataclass(kw_only=True)
 class IterationMapDisplay(Display):
     """Held-out accuracy at every layer and iteration of one stream, for one category in one view.
 
@@ -56,7 +50,9 @@ class IterationMapDisplay(Display):
     iterations: NDArray[np.int64]
     accuracy: NDArray[np.float64]
     significant: NDArray[np.bool_]
-    certificate: ProvenanceLine
+    panel_size: ClassVar = (2.7, 2.1)
+    is_framed: ClassVar = True
+    title_size: ClassVar = 10
 
     @classmethod
     def from_results(
@@ -81,6 +77,8 @@ class IterationMapDisplay(Display):
             raise UnknownSiteError(f"stream {stream!r} in view {view!r} has no iterations; see the layer curve")
         grid = scores.pivot(index="iteration", columns="layer", values=["accuracy", "signal"])
         return cls(
+            title=title_of(category),
+            measure="iteration",
             category=category,
             view=view,
             stream=str(stream),
@@ -89,7 +87,7 @@ class IterationMapDisplay(Display):
             iterations=grid.index.to_numpy(dtype=np.int64),
             accuracy=grid["accuracy"].to_numpy(dtype=float),
             significant=grid["signal"].to_numpy(dtype=bool),
-            certificate=ProvenanceLine.of_results(results, view),
+            certificates=(ProvenanceLine.of_results(results, view),),
         )
 
     @property
@@ -98,16 +96,43 @@ class IterationMapDisplay(Display):
         best = np.argwhere(self.accuracy >= self.accuracy.max() - 1e-12)
         return tuple((int(iteration), int(layer)) for iteration, layer in best)
 
-    def plot(self, ax: "Axes | None" = None) -> Self:
-        """Draw on `ax`, or on a figure of its own with colour bar and caption."""
-        axes, figure = axes_for(ax, 5.2, 3.6)
-        drawn = draw_map(axes, self)
-        if figure is not None:
-            axes.set_ylabel("iteration", fontsize=9)
-            draw_keys(figure, [axes], drawn)
-            caption(figure, self.certificate)
-        self.ax_ = axes
-        return self
+    def draw(self, axes: "Axes") -> None:
+        """Draw the cells, dots where they are evidence, and frames around the best."""
+        from matplotlib.patches import Rectangle
+        from matplotlib.patheffects import withStroke
+
+        percent = 100 * self.accuracy
+        axes.imshow(percent, cmap=_colours(self.part), vmin=_LEAST, vmax=100, aspect="auto", origin="lower")
+        for iteration, layer in np.argwhere(self.significant):
+            # The colours get dark in their middle.
+            ink = "white" if percent[iteration, layer] > _LEAST + 0.45 * (100 - _LEAST) else "black"
+            axes.plot(layer, iteration, marker="o", ms=2.2, color=ink, mew=0)
+        for iteration, layer in self.peaks:
+            frame = Rectangle((layer - 0.5, iteration - 0.5), 1, 1, fill=False, ec="black", lw=1.2, zorder=3)
+            frame.set_path_effects([withStroke(linewidth=2.6, foreground="white")])
+            axes.add_patch(frame)
+        for numbers, axis in ((self.layers, axes.xaxis), (self.iterations, axes.yaxis)):
+            labelled = range(0, numbers.size, max(1, -(-numbers.size // 7)))
+            axis.set_ticks(list(labelled), [str(numbers[at]) for at in labelled])
+        axes.set_xlabel("layer", fontsize=8.5)
+        axes.tick_params(labelsize=8)
+
+    def finish(self, figure: "Figure", grid: "Sequence[Axes]") -> None:
+        """Add the colour bar, and the legend of dots, frames and grey cells."""
+        from matplotlib.lines import Line2D
+        from matplotlib.patches import Patch
+
+        handles: list[Artist] = [
+            Line2D([], [], color="0.3", ls="none", marker="o", ms=3, label=FILLED.removeprefix("filled: ")),
+            Patch(fill=False, ec="black", lw=1.4, label="best of its stream (all, where several tie)"),
+            Patch(fc="0.93", label="below chance"),
+        ]
+        bar = figure.colorbar(grid[0].images[0], ax=list(grid), extend="min", aspect=30, shrink=0.9, pad=0.01)
+        bar.set_ticks(range(50, 101, 10))
+        bar.set_label("held-out accuracy (%)", fontsize=8)
+        bar.ax.tick_params(labelsize=8)
+        bar.outline.set_visible(False)
+        legend_above(figure, handles)
 
 
 def iteration_maps(results: ProbeResults, view: str | None = None, stream: str | None = None) -> "Figure":
@@ -116,92 +141,33 @@ def iteration_maps(results: ProbeResults, view: str | None = None, stream: str |
     Raises UnknownSiteError for a view that was not probed or a stream without iterations.
     """
     categories = results.settings.categories
-    displays = [IterationMapDisplay.from_results(results, name, view, stream) for name in categories]
-    figure, grid = panels(len(displays), width=2.7, height=2.1)
-    for display, axes in zip(displays, grid, strict=True):
-        drawn = draw_map(axes, display)
-    figure.supylabel("iteration", fontsize=9)
-    draw_keys(figure, grid, drawn)
-    caption(figure, displays[0].certificate)
-    return figure
+    return in_panels([IterationMapDisplay.from_results(results, name, view, stream) for name in categories])
 
 
-def draw_map(axes: "Axes", display: IterationMapDisplay) -> "ScalarMappable":
-    """One map on `axes`; what it returns makes the colour bar."""
-    from matplotlib.colors import Normalize
-    from matplotlib.patches import Rectangle
-    from matplotlib.patheffects import withStroke
-
-    norm = Normalize(100 * CHANCE, 100)
-    colours = _colours(display.part)
-    image = axes.imshow(100 * display.accuracy, cmap=colours, norm=norm, aspect="auto", origin="lower")
-    iterations, layers = display.accuracy.shape
-    for iteration, layer in np.argwhere(display.significant):
-        ink = _ink(100 * display.accuracy[iteration, layer], norm)
-        axes.plot(layer, iteration, marker="o", ms=2.2, color=ink, mew=0)
-    for iteration, layer in display.peaks:
-        frame = Rectangle((layer - 0.5, iteration - 0.5), 1, 1, fill=False, ec="black", lw=1.2, zorder=3)
-        frame.set_path_effects([withStroke(linewidth=2.6, foreground="white")])
-        axes.add_patch(frame)
-    for ticks, numbers, axis in (
-        (layers, display.layers, axes.xaxis),
-        (iterations, display.iterations, axes.yaxis),
-    ):
-        labelled = range(0, ticks, max(1, -(-ticks // 7)))
-        axis.set_ticks(list(labelled), [str(numbers[at]) for at in labelled])
-    axes.set_xlabel("layer", fontsize=8.5)
-    axes.tick_params(labelsize=8)
-    axes.set_title(title_of(display.category), fontsize=10, loc="left")
-    return image
+_LEAST = 100 * CHANCE
+"""Percent at which colours begin."""
 
 
 def _colours(part: str) -> "Colormap":
     """White at chance, through the part's colour, to nearly black: lightness alone orders the cells."""
     from matplotlib.colors import LinearSegmentedColormap
 
-    colour = PARTS[part].colour
     dark = "#331400" if part == "action" else "#001B2E"
-    return LinearSegmentedColormap.from_list(part, ["#FFFFFF", colour, dark]).with_extremes(under="0.93")
-
-
-def _ink(value: float, norm: "Normalize") -> str:
-    return "white" if norm(value) > 0.45 else "black"  # the colours get dark in their middle
-
-
-def draw_keys(figure: "Figure", grid: "list[Axes]", drawn: "ScalarMappable") -> None:
-    """The colour bar of maps, and the legend of dots, frames and grey cells."""
-    from matplotlib.lines import Line2D
-    from matplotlib.patches import Patch
-
-    handles: list[Artist] = [
-        Line2D([], [], color="0.3", ls="none", marker="o", ms=3, label=FILLED.removeprefix("filled: ")),
-        Patch(fill=False, ec="black", lw=1.4, label="best of its stream (all, where several tie)"),
-        Patch(fc="0.93", label="below chance"),
-    ]
-    bar = figure.colorbar(drawn, ax=grid, extend="min", aspect=30, shrink=0.9, pad=0.01)
-    bar.set_label("held-out accuracy (%)", fontsize=8)
-    bar.ax.tick_params(labelsize=8)
-    bar.outline.set_visible(False)
-    bar.set_ticks(range(50, 101, 10))
-    legend_above(figure, handles)
+    colours = LinearSegmentedColormap.from_list(part, ["#FFFFFF", PARTS[part].colour, dark])
+    return colours.with_extremes(under="0.93")
 
 
 @in_report(10)
 def map_figures(source: FigureSource) -> Iterator[ReportFigure]:
     """The figures that a report of these runs shows."""
-    for drawn in source.runs:
-        if drawn.results is None:
-            continue
-        views, scores = drawn.results.settings.views, drawn.results.scores
-        for view in views:
-            for stream in scores.loc[scores["part"] == "action", "stream"].unique():
-                of_stream = (scores["view"] == view) & (scores["stream"] == stream)
-                if (of_stream & scores["iteration"].notna()).any():
-                    yield ReportFigure(
-                        f"{drawn.stem}-iteration-maps{view_suffix(view, views)}",
-                        in_view("Layer × iteration", view, views), "probes",
-                        "The action is made in several iterations (flow-matching steps or action tokens). The "
-                        "further a cell's colour is from that of chance, the better the answer can be read "
-                        f"there. {DOTS}.",
-                        drawn.position, partial(iteration_maps, drawn.results, view, stream), is_detail=True,
-                    )  # fmt: skip
+    for view in probed_views(source):
+        scores = view.results.scores
+        in_action = (scores["view"] == view.view) & (scores["part"] == "action")
+        for stream in scores.loc[in_action & scores["iteration"].notna(), "stream"].unique():
+            yield view.figure(
+                "iteration-maps", "Layer × iteration",
+                "The action is made in several iterations (flow-matching steps or action tokens). The "
+                "further a cell's colour is from that of chance, the better the answer can be read "
+                f"there. {DOTS}.",
+                iteration_maps, stream, is_detail=True,
+            )  # fmt: skip

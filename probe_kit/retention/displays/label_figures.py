@@ -1,19 +1,22 @@
 """Figures of labels: classes that are confused, predicted against true values, and scores by step."""
 
+from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Self
+from functools import cached_property
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
-from probe_kit.retention.displays.display import Panelled, best_row, in_streams, probed_curve, scores_of
-from probe_kit.retention.displays.report_figure import FigureSource, ReportFigure, in_report, label_views
+from probe_kit.retention.displays.display import Display, best_row, in_panels, probed_curve, scores_of
+from probe_kit.retention.displays.report_figure import FigureSource, ReportFigure, in_report, probed_views
 from probe_kit.retention.displays.style import BLUE, GREEN, PARTS, Line, ProvenanceLine, significance_handles
 from probe_kit.retention.rows.probe_parts import STEP
 from probe_kit.train.crossval.task_scores import METRICS, score_interval
 from probe_kit.train.results.control_scores import ControlScore
+from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:
@@ -22,31 +25,65 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-@dataclass
-class BestSiteDisplay(Panelled):
-    """A panel of a label's probes at the best site of a stream: that of the largest score above its own chance."""
+@dataclass(kw_only=True)
+class BestSiteDisplay(Display):
+    """A panel of a label's probes at the best site of a stream: that of the largest score above its own chance.
+
+    curve: of this site alone. signal: whether it exceeds chance, family-wise, and every control that was run.
+    scores_of_controls: those that it is compared with, the best first.
+    """
 
     target: str
     view: str
     stream: str
-    site: str
-    certificate: ProvenanceLine
+    curve: ProbeCurve
+    signal: bool
+    scores_of_controls: tuple[ControlScore, ...]
+
+    @classmethod
+    def from_results(
+        cls,
+        results: ProbeResults,
+        stream: str = "backbone",
+        view: str | None = None,
+        category: str | None = None,
+    ) -> Self:
+        """Read stored probes; view, category: the first probed one by default.
+
+        Raises UnknownSiteError for a view or stream that was not probed, UsageError for labels of another kind.
+        """
+        category, view, curve = probed_curve(results, view, category)
+        if why_not := cls.why_not(curve):
+            raise UsageError(f"the label {results.settings.target!r} {why_not}")
+        row = best_row(curve, stream)
+        return cls(
+            target=results.settings.target,
+            view=view,
+            stream=stream,
+            curve=curve.only(row),
+            title=str(curve.sites[row]),
+            signal=bool(scores_of(results, category, view)["signal"].iloc[row]),
+            scores_of_controls=results.controls.of_stream(category, view, stream),
+            certificates=(ProvenanceLine.of_results(results, view, category),),
+        )
+
+    @staticmethod
+    @abstractmethod
+    def why_not(curve: ProbeCurve) -> str:
+        """Return why labels have no such figure, and what was expected; empty where they have."""
 
     @property
-    def title(self) -> str:
-        """The site."""
-        return self.site
+    def site(self) -> str:
+        """The name of the site."""
+        return str(self.curve.sites[0])
 
 
-def _site_fields(results: ProbeResults, category: str, view: str, stream: str, row: int) -> dict[str, Any]:
-    """Return the fields of `BestSiteDisplay` of the site at `row` of a curve."""
-    return {
-        "target": results.settings.target,
-        "view": view,
-        "stream": stream,
-        "site": str(results.curves[category, view].sites[row]),
-        "certificate": ProvenanceLine.of_results(results, view, category),
-    }
+def _in_streams(
+    display: type[BestSiteDisplay], results: ProbeResults, view: str | None, category: str | None
+) -> "Figure":
+    """Return a panel per stream that was probed in a view and category, by default the first ones."""
+    category, view, curve = probed_curve(results, view, category)
+    return in_panels([display.from_results(results, stream, view, category) for stream in curve.streams])
 
 
 # -- confusion of classes ------------------------------------------------------------------------------------
@@ -57,40 +94,26 @@ _LONGEST = 14
 """Letters of a class that are shown."""
 
 
-@dataclass
+@dataclass(kw_only=True)
 class ClassConfusionDisplay(BestSiteDisplay):
-    """Held-out predictions of the best site of a stream, the one farthest above its own chance.
+    """Held-out predictions of classes, by true class."""
 
-    counts: (K, K) samples by true class, down, and predicted class, across.
-    """
+    measure: str = "true class (samples)"
+    panel_size: ClassVar = (3.3, 3.1)
 
-    classes: tuple[str, ...]
-    counts: NDArray[np.int64]
+    @staticmethod
+    def why_not(curve: ProbeCurve) -> str:
+        """Quantities are not confused."""
+        return "" if curve.classes else "is continuous; expected classes to confuse"
 
-    @classmethod
-    def from_results(
-        cls,
-        results: ProbeResults,
-        stream: str = "backbone",
-        view: str | None = None,
-        category: str | None = None,
-    ) -> Self:
-        """Read stored probes of a binary label or of classes; view, category: the first probed one by default.
-
-        Raises UnknownSiteError for a view or stream that was not probed, UsageError for a continuous label.
-        """
+    @property
+    def counts(self) -> NDArray[np.int64]:
+        """(K, K) samples by true class, down, and predicted class, across."""
         from sklearn.metrics import confusion_matrix
 
-        category, view, curve = probed_curve(results, view, category)
-        if not curve.classes:
-            raise UsageError(f"the label {results.settings.target!r} is continuous; expected classes to confuse")
-        row = best_row(curve, stream)
-        classes = np.arange(len(curve.classes))
-        return cls(
-            **_site_fields(results, category, view, stream, row),
-            classes=curve.classes,
-            counts=confusion_matrix(curve.labels, curve.decisions[row], labels=classes),
-        )
+        classes = np.arange(len(self.curve.classes))
+        counts: NDArray[np.int64] = confusion_matrix(self.curve.labels, self.curve.decisions[0], labels=classes)
+        return counts
 
     @property
     def shares(self) -> NDArray[np.float64]:
@@ -98,19 +121,14 @@ class ClassConfusionDisplay(BestSiteDisplay):
         shares: NDArray[np.float64] = self.counts / self.counts.sum(axis=1, keepdims=True).clip(1)
         return shares
 
-    @property
-    def measure(self) -> str:
-        """Rows."""
-        return "true class (samples)"
-
     def draw(self, axes: "Axes") -> None:
         """Shares of the true class as colours, and in percent."""
         from matplotlib.colors import LinearSegmentedColormap
 
-        shares, places = self.shares, range(len(self.classes))
+        shares, places = self.shares, range(len(self.curve.classes))
         colours = LinearSegmentedColormap.from_list("shares", ["white", BLUE])
         axes.imshow(shares, vmin=0, vmax=1, cmap=colours, aspect="auto")
-        names = [name if len(name) <= _LONGEST else f"{name[: _LONGEST - 1]}…" for name in self.classes]
+        names = [name if len(name) <= _LONGEST else f"{name[: _LONGEST - 1]}…" for name in self.curve.classes]
         counts = self.counts.sum(axis=1)
         axes.set_xticks(places, names, rotation=35, ha="right", rotation_mode="anchor")
         axes.set_yticks(places, [f"{name} ({count})" for name, count in zip(names, counts, strict=True)])
@@ -125,19 +143,19 @@ class ClassConfusionDisplay(BestSiteDisplay):
 
 def class_confusions(results: ProbeResults, view: str | None = None, category: str | None = None) -> "Figure":
     """Confusion matrices, a panel per stream; arguments and errors as of `ClassConfusionDisplay`."""
-    return in_streams(ClassConfusionDisplay.from_results, results, view, category, 3.3, 3.1)
+    return _in_streams(ClassConfusionDisplay, results, view, category)
 
 
 @in_report(17, "labels")
 def confusion_figures(source: FigureSource) -> Iterator[ReportFigure]:
     """Yield the figures that a report of these labels shows: of those with classes."""
-    for view in label_views(source):
+    for view in probed_views(source):
         if view.curve.classes:
             yield view.figure(
                 "confusion", "Confusion matrix",
                 "Which class the best site of each part predicts for which, in groups it has not seen. Each row "
                 "sums to 100 %; the mean of the diagonal is the balanced accuracy.",
-                class_confusions,
+                class_confusions, view.category,
             )  # fmt: skip
 
 
@@ -147,52 +165,38 @@ _PIXELS_FROM = 2000
 """Points, from which on a figure holds them as pixels."""
 
 
-@dataclass
+@dataclass(kw_only=True)
 class PredictedValuesDisplay(BestSiteDisplay):
-    """Held-out predictions of the best site of a stream, the one farthest above its own chance; arrays (n,).
+    """Held-out predictions of a quantity against its true values."""
 
-    true, predicted: values in the label's own unit. groups: (n,) number of each sample's group, which is its
-    colour. score: R² of the site.
-    """
+    measure: str = "predicted value"
+    is_level: bool = True
+    panel_size: ClassVar = (3.3, 3.0)
 
-    score: float
-    true: NDArray[np.float64]
-    predicted: NDArray[np.float64]
-    groups: NDArray[np.int64]
+    def __post_init__(self) -> None:
+        self.title += f", {METRICS['continuous']} {self.curve.metric[0]:.2f}"
 
-    @classmethod
-    def from_results(
-        cls,
-        results: ProbeResults,
-        stream: str = "backbone",
-        view: str | None = None,
-        category: str | None = None,
-    ) -> Self:
-        """Read stored probes of a continuous label; view, category: the first probed one by default.
-
-        Raises UnknownSiteError for a view or stream that was not probed, UsageError for a label of classes.
-        """
-        category, view, curve = probed_curve(results, view, category)
-        if results.settings.task != "continuous":
-            raise UsageError(f"the label {results.settings.target!r} is of classes; expected a continuous one")
-        row = best_row(curve, stream)
-        return cls(
-            **_site_fields(results, category, view, stream, row),
-            score=float(curve.metric[row]),
-            true=curve.labels,
-            predicted=curve.decisions[row],
-            groups=np.unique(curve.groups, return_inverse=True)[1].astype(np.int64),
-        )
+    @staticmethod
+    def why_not(curve: ProbeCurve) -> str:
+        """Classes have no values."""
+        return "" if curve.task == "continuous" else "is of classes; expected a continuous one"
 
     @property
-    def title(self) -> str:
-        """Site and score."""
-        return f"{self.site}, {METRICS['continuous']} {self.score:.2f}"
+    def true(self) -> NDArray[np.float64]:
+        """(n,) labels in their own unit."""
+        labels: NDArray[np.float64] = self.curve.labels
+        return labels
 
     @property
-    def measure(self) -> str:
-        """The prediction."""
-        return "predicted value"
+    def predicted(self) -> NDArray[np.float64]:
+        """(n,) held-out predictions in the unit of the label."""
+        predicted: NDArray[np.float64] = self.curve.decisions[0]
+        return predicted
+
+    @property
+    def groups(self) -> NDArray[np.int64]:
+        """(n,) number of each sample's group, which is its colour."""
+        return np.asarray(np.unique(self.curve.groups, return_inverse=True)[1], np.int64)
 
     def draw(self, axes: "Axes") -> None:
         """A point per sample, and where prediction and label are equal."""
@@ -208,19 +212,19 @@ class PredictedValuesDisplay(BestSiteDisplay):
 
 def predicted_values(results: ProbeResults, view: str | None = None, category: str | None = None) -> "Figure":
     """Predicted against true, a panel per stream; arguments and errors as of `PredictedValuesDisplay`."""
-    return in_streams(PredictedValuesDisplay.from_results, results, view, category, 3.3, 3.0, level=True)
+    return _in_streams(PredictedValuesDisplay, results, view, category)
 
 
 @in_report(18, "labels")
 def predicted_figures(source: FigureSource) -> Iterator[ReportFigure]:
     """Yield the figures that a report of these labels shows: of continuous ones."""
-    for view in label_views(source):
+    for view in probed_views(source):
         if not view.curve.classes:
             yield view.figure(
                 "predicted", "Predicted against true",
                 "A point per sample, predicted by the best site of each part in groups it has not seen. Colours "
                 "are groups. Predictions are clipped to the range of the training labels.",
-                predicted_values,
+                predicted_values, view.category,
             )  # fmt: skip
 
 
@@ -229,68 +233,57 @@ def predicted_figures(source: FigureSource) -> Iterator[ReportFigure]:
 _CONTROLS = (Line("black", "", ":"), Line(GREEN, "", (0, (5, 1))))  # type: ignore[arg-type]  # as `SERIES`
 
 
-@dataclass
+@dataclass(kw_only=True)
 class StepScoresDisplay(BestSiteDisplay):
-    """The metric at each step, of the site of a stream that is farthest above its own chance; arrays (W,).
+    """The metric at each step; arrays (W,).
 
-    R² is that of the label's spread over all steps. Balanced accuracy is that of the classes at the
-    step. steps: inferences, or places behind the event where windows begin. low, high: 95 % interval over groups.
-    controls: by name, the metric of the best control and of `step`. signal: whether the site exceeds chance,
-    family-wise, and every control that was run.
+    R² is that of the label's spread over all steps. Balanced accuracy is that of the classes at the step.
     """
 
-    metric: str
-    part: str
-    signal: bool
-    steps: NDArray[np.int64]
-    from_event: bool
-    score: NDArray[np.float64]
-    low: NDArray[np.float64]
-    high: NDArray[np.float64]
-    controls: dict[str, NDArray[np.float64]]
+    is_level: bool = True
+    panel_size: ClassVar = (3.1, 2.6)
 
-    @classmethod
-    def from_results(
-        cls,
-        results: ProbeResults,
-        stream: str = "backbone",
-        view: str | None = None,
-        category: str | None = None,
-    ) -> Self:
-        """Read stored probes; view, category: the first probed one by default.
+    def __post_init__(self) -> None:
+        self.measure = f"{METRICS[self.curve.task]} at each step"
 
-        Raises UnknownSiteError for a view or stream that was not probed, UsageError for labels of a single step.
-        """
-        category, view, curve = probed_curve(results, view, category)
-        if curve.steps.size < 2:
-            raise UsageError(f"the label {results.settings.target!r} has one step; expected several to show")
-        row = best_row(curve, stream)
-        settings, scores = results.settings, curve.scores[row]
-        table = scores_of(results, category, view).set_index("site")
-        balanced = curve.step_scores(scores)
-        limits = [
-            score_interval(balanced[at], curve.labels[at], curve.groups[at], settings.task, curve.deviations[at])
-            for at in (curve.places == step for step in curve.steps)
-        ]
-        return cls(
-            **_site_fields(results, category, view, stream, row),
-            metric=METRICS[settings.task],
-            part=curve.parts[row],
-            signal=bool(table.loc[str(curve.sites[row]), "signal"]),
-            steps=curve.steps,
-            from_event=curve.aligned is not None,
-            score=curve.by_step(scores),
-            low=np.array([low for low, _ in limits]),
-            high=np.array([high for _, high in limits]),
-            controls={
-                control.name: np.array(control.by_step) for control in _with_steps(results, category, view, stream)
-            },
-        )
+    @staticmethod
+    def why_not(curve: ProbeCurve) -> str:
+        """A single step is no curve."""
+        return "has one step; expected several to show" if curve.steps.size < 2 else ""
 
     @property
-    def measure(self) -> str:
-        """The metric, at each step by itself."""
-        return f"{self.metric} at each step"
+    def steps(self) -> NDArray[np.int64]:
+        """Inferences, or places behind the event where windows begin."""
+        return self.curve.steps
+
+    @property
+    def from_event(self) -> bool:
+        """Whether windows begin at an event."""
+        return self.curve.aligned is not None
+
+    @property
+    def score(self) -> NDArray[np.float64]:
+        """The metric at each step."""
+        return self.curve.by_step(self.curve.scores[0])
+
+    @cached_property
+    def limits(self) -> NDArray[np.float64]:
+        """(2, W) the ends of the 95 % intervals over groups."""
+        curve, balanced = self.curve, self.curve.step_scores(self.curve.scores[0])
+        at_steps = [curve.places == step for step in curve.steps]
+        intervals = [
+            score_interval(balanced[at], curve.labels[at], curve.groups[at], curve.task, curve.deviations[at])
+            for at in at_steps
+        ]
+        return np.array(intervals).T
+
+    @property
+    def controls(self) -> dict[str, NDArray[np.float64]]:
+        """The metric of the best control and of `step`, by name; of those that have it at each step."""
+        scores = [score for score in self.scores_of_controls if len(score.by_step) == self.steps.size]
+        return {
+            score.name: np.array(score.by_step) for at, score in enumerate(scores) if at == 0 or score.name == STEP
+        }
 
     def further_handles(self) -> "Sequence[Artist]":
         """Return the handles of filled and open markers."""
@@ -300,13 +293,14 @@ class StepScoresDisplay(BestSiteDisplay):
         """The site's and the controls' scores."""
         from matplotlib.ticker import MaxNLocator
 
-        line = PARTS[self.part]
+        (part,), score, (low, high) = self.curve.parts, self.score, self.limits
+        line = PARTS[part]
         # Rounding makes arms of less than nothing, where groups agree.
-        arms = np.array([self.score - self.low, self.high - self.score]).clip(min=0)
-        axes.errorbar(self.steps, self.score, yerr=arms, fmt="none", ecolor=line.colour, elinewidth=0.8, alpha=0.7)
+        arms = np.array([score - low, high - score]).clip(min=0)
+        axes.errorbar(self.steps, score, yerr=arms, fmt="none", ecolor=line.colour, elinewidth=0.8, alpha=0.7)
         axes.plot(
-            self.steps, self.score, color=line.colour, lw=1.3, marker=line.marker, ms=4.5,
-            mfc=line.colour if self.signal else "white", label=f"best site, {self.part}",
+            self.steps, score, color=line.colour, lw=1.3, marker=line.marker, ms=4.5,
+            mfc=line.colour if self.signal else "white", label=f"best site, {part}",
         )  # fmt: skip
         for (name, scores), dash in zip(self.controls.items(), _CONTROLS, strict=False):
             axes.plot(self.steps, scores, color=dash.colour, ls=dash.dash, lw=1.2, label=f"control {name}")
@@ -316,28 +310,19 @@ class StepScoresDisplay(BestSiteDisplay):
         axes.set_xlabel(beginning, fontsize=8.5)
 
 
-def _with_steps(results: ProbeResults, category: str, view: str, stream: str) -> list[ControlScore]:
-    """The best control and `step`, each once; none of controls that were stored without scores by step."""
-    steps = results.curves[category, view].steps.size
-    controls = [
-        control for control in results.controls.of_stream(category, view, stream) if len(control.by_step) == steps
-    ]
-    return [control for number, control in enumerate(controls) if number == 0 or control.name == STEP]
-
-
 def step_scores(results: ProbeResults, view: str | None = None, category: str | None = None) -> "Figure":
     """Score of a label by step, a panel per stream; arguments and errors as of `StepScoresDisplay`."""
-    return in_streams(StepScoresDisplay.from_results, results, view, category, 3.1, 2.6, level=True)
+    return _in_streams(StepScoresDisplay, results, view, category)
 
 
 @in_report(16, "labels")
 def step_figures(source: FigureSource) -> Iterator[ReportFigure]:
     """Yield the figures that a report of these labels shows: of those with several steps."""
-    for view in label_views(source):
+    for view in probed_views(source):
         if view.curve.steps.size > 1:
             yield view.figure(
                 "steps", "Score by step",
                 "The same by inference, at the best site of each part, beside controls. Classes are balanced "
                 "among those of the step. A step of one class is easy, so compare with the controls at that step.",
-                step_scores,
+                step_scores, view.category,
             )  # fmt: skip

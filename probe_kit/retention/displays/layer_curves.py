@@ -1,48 +1,51 @@
 """Layer curves: score by layer, the backbone beside where the action is made, a line per iteration."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 from math import ceil
-from typing import TYPE_CHECKING, Literal, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.hooks.contract.sites import label_of
 from probe_kit.retention.choices import Iterations
-from probe_kit.retention.columns.text import title_of
-from probe_kit.retention.displays.display import Display, known_view, of_iterations, probed_curve, scores_of
+from probe_kit.retention.columns.text import name_of_target
+from probe_kit.retention.displays.display import (
+    Display,
+    best_of,
+    in_panels,
+    known_view,
+    of_iterations,
+    probed_curve,
+    scores_of,
+)
 from probe_kit.retention.displays.report_figure import (
     ONLY_FILLED,
     FigureSource,
     ReportFigure,
     in_report,
-    in_view,
-    label_views,
-    view_suffix,
+    probed_views,
 )
 from probe_kit.retention.displays.style import (
-    DPI,
     PARTS,
     Line,
     ProvenanceLine,
     accuracy_axis,
-    caption,
     layer_axis,
     legend_above,
     legend_handles,
     mark_below,
-    plain,
     significance_handles,
 )
 from probe_kit.statistics.sufficiency import FEWEST_PERMUTATIONS
-from probe_kit.train.choices import EVERYWHERE, SIDES
+from probe_kit.train.choices import SIDES
 from probe_kit.train.crossval.task_scores import METRICS
 from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.colors import Colormap
     from matplotlib.figure import Figure
@@ -61,7 +64,7 @@ class LayerLine:
     """
 
     iteration: int | None
-    layers: NDArray[np.int64]
+    layers: NDArray[Any]
     score: Shares
     low: Shares
     high: Shares
@@ -140,6 +143,7 @@ class StreamCurve(LayerLine):
 _SIDESTEP = 0.1  # of a layer, so that the bars of two streams on one axes do not hide each other
 
 _PEAK = "best of its stream (all, where several tie)"
+_ITERATION = "iteration "
 PERCENT = 100.0
 
 
@@ -173,7 +177,7 @@ class Ground:
             (controls[0].name, controls[0].score) if controls else None,
         )
 
-    def draw(self, axes: "Axes", layers: NDArray[np.int64], scale: float) -> None:
+    def draw(self, axes: "Axes", layers: NDArray[Any], scale: float) -> None:
         """Draw the band, chance and the best control; scale: 100 for percent."""
         wide = layers if layers.size > 1 else layers + np.array([-0.3, 0.3])
         if self.null_band is not None:
@@ -197,7 +201,7 @@ class Ground:
             )  # fmt: skip
 
 
-@dataclass
+@dataclass(kw_only=True)
 class LayerCurveDisplay(Display):
     """Held-out score by layer, for one category in one view: accuracy of a side, metric of a label.
 
@@ -211,7 +215,7 @@ class LayerCurveDisplay(Display):
     view: str
     streams: tuple[StreamCurve, ...]
     grounds: tuple[Ground, ...]
-    certificate: ProvenanceLine
+    panel_size: ClassVar = (2.75, 2.3)
 
     @classmethod
     def from_results(
@@ -232,14 +236,19 @@ class LayerCurveDisplay(Display):
         streams = tuple(
             StreamCurve.of_stream(rows, iterations) for _, rows in scores.groupby("stream", sort=False)
         )
+        metric, is_side = METRICS[settings.task], settings.is_side
         return cls(
+            title=name_of_target(settings.target, category),
+            measure="held-out accuracy (%)" if is_side else f"held-out {metric}",
+            is_level=not is_side,  # panels of accuracies have a fixed range
+            figure_size=(2.75, 2.9),
             target=settings.target,
-            metric=METRICS[settings.task],
+            metric=metric,
             category=category,
             view=view,
             streams=streams,
             grounds=tuple(Ground.of(results, category, view, stream) for stream in streams),
-            certificate=ProvenanceLine.of_results(results, view, None if settings.is_side else category),
+            certificates=(ProvenanceLine.of_results(results, view, None if is_side else category),),
         )
 
     @property
@@ -248,55 +257,45 @@ class LayerCurveDisplay(Display):
         return self.target in SIDES
 
     @property
-    def name(self) -> str:
-        """The category of a side, or the label."""
-        if self.is_side:
-            return title_of(self.category)
-        return self.target if self.category == EVERYWHERE else f"{self.target}, {title_of(self.category)}"
-
-    @property
-    def measure(self) -> str:
-        """The name of the upright axis."""
-        return "held-out accuracy (%)" if self.is_side else f"held-out {self.metric}"
+    def by_stream(self) -> "list[LayerCurveDisplay]":
+        """The streams as displays of their own."""
+        return [
+            replace(self, streams=(stream,), grounds=(ground,), title=f"{self.title}: {stream.label}")
+            for stream, ground in zip(self.streams, self.grounds, strict=True)
+        ]
 
     def plot(self, ax: "Axes | None" = None) -> Self:
         """Draw all streams on `ax`, or each beside the other on a figure of its own with legend and caption."""
         if ax is not None:
-            for number, curve in enumerate(self.streams):
-                if number == 0:
-                    self.grounds[0].draw(ax, curve.layers, self._scale)
-                _draw_stream(ax, curve, _SIDESTEP * (number - (len(self.streams) - 1) / 2), self._scale)
-            self._finish(ax, max(curve.layers.max() for curve in self.streams) + 1, self.name)
-            self.ax_ = ax
-            return self
-        figure, grid = _pairs([self], in_pyplot=True)
-        self.ax_ = grid[0][0]
-        _complete(figure, grid, [self])
+            return super().plot(ax)
+        panels_of = self.by_stream
+        in_panels(panels_of, self.figure_size, len(panels_of), in_pyplot=True)
+        self.ax_ = panels_of[0].ax_
         return self
 
-    def plot_beside(self, axes: "Sequence[Axes]") -> Self:
-        """Draw each stream on axes of its own."""
-        for curve, ground, ax in zip(self.streams, self.grounds, axes, strict=False):
-            ground.draw(ax, curve.layers, self._scale)
-            _draw_stream(ax, curve, scale=self._scale)
-            self._finish(ax, int(curve.layers.max()) + 1, f"{self.name}: {curve.label}")
-        self.ax_ = axes[0]
-        return self
-
-    @property
-    def _scale(self) -> float:
-        return PERCENT if self.is_side else 1.0
-
-    def _finish(self, axes: "Axes", layers: int, title: str) -> None:
-        plain(axes)
+    def draw(self, axes: "Axes") -> None:
+        """Draw the ground of the first stream, and all streams."""
+        scale = PERCENT if self.is_side else 1.0
+        self.grounds[0].draw(axes, self.streams[0].layers, scale)
+        for number, curve in enumerate(self.streams):
+            _draw_stream(axes, curve, _SIDESTEP * (number - (len(self.streams) - 1) / 2), scale)
         if self.is_side:
             accuracy_axis(axes)
         else:
             low, high = axes.get_ylim()
             axes.set_ylim(min(low, 0.0), max(high, 1.05))
-        layer_axis(axes, layers)
-        axes.tick_params(labelleft=True)
-        axes.set_title(title, fontsize=9, loc="left")
+        layer_axis(axes, int(max(curve.layers.max() for curve in self.streams)) + 1)
+
+    def further_handles(self) -> "Sequence[Artist]":
+        """Return the handles of filled and open markers and of the caret."""
+        return [*significance_handles(), _peak_handle()]
+
+    def finish(self, figure: "Figure", grid: "Sequence[Axes]") -> None:
+        """Add a legend, in which iterations have one name, and the scale of their colours."""
+        names = legend_handles(*grid).items()
+        drawn = [handle for label, handle in names if not label.startswith(_ITERATION)]
+        legend_above(figure, [*drawn, *self.further_handles()])
+        _draw_scale(figure, grid)
 
 
 def layer_curve(
@@ -317,71 +316,31 @@ def layer_curve(
     """
     view, names = known_view(results, view), categories or results.settings.categories
     displays = [LayerCurveDisplay.from_results(results, name, view, iterations) for name in names]
-    figure, grid = _pairs(displays)
-    _complete(figure, grid, displays)
-    return figure
-
-
-def _pairs(displays: Sequence[LayerCurveDisplay], in_pyplot: bool = False) -> "tuple[Figure, list[list[Axes]]]":
-    """Axes for every stream of every display, those of one display side by side.
-
-    in_pyplot: whether pyplot shall know the figure, so that it is shown where displays are.
-    """
-    from matplotlib import pyplot as plt
-
-    from probe_kit.retention.displays.shown_figure import ShownFigure
-
     streams = max(len(display.streams) for display in displays)
-    across = 1 if len(displays) == 1 else max(1, 4 // streams)
-    rows = ceil(len(displays) / across)
-    size = (max(6.2, 2.75 * streams * across + 0.7), (2.9 if rows == 1 else 2.3) * rows + 1.0)
-    figure: Figure
-    if in_pyplot:
-        figure = plt.figure(figsize=size, layout="constrained", dpi=DPI, FigureClass=ShownFigure)
-    else:
-        figure = ShownFigure(figsize=size, layout="constrained", dpi=DPI)
-    flat = list(figure.subplots(rows, across * streams, sharey=True, squeeze=False).flat)
-    grid = [flat[streams * number : streams * (number + 1)] for number in range(len(flat) // streams)]
-    for unused in (ax for pair in grid[len(displays) :] for ax in pair):
-        unused.set_visible(False)
-    return figure, grid[: len(displays)]
+    # A category that was probed in fewer streams leaves places empty, so that columns stay those of one stream.
+    panels_of: list[LayerCurveDisplay | None] = []
+    for display in displays:
+        panels_of += [*display.by_stream, *[None] * (streams - len(display.streams))]
+    pairs_in_a_row = 1 if len(displays) == 1 else max(1, 4 // streams)
+    return in_panels(panels_of, columns=streams * pairs_in_a_row)
 
 
-def _complete(figure: "Figure", grid: "list[list[Axes]]", displays: Sequence[LayerCurveDisplay]) -> None:
-    for display, axes in zip(displays, grid, strict=True):
-        display.plot_beside(axes)
-        for unused in axes[len(display.streams) :]:
-            unused.set_visible(False)
-    if not displays[0].is_side:
-        ranges = [ax.get_ylim() for axes in grid for ax in axes]
-        grid[0][0].set_ylim(min(low for low, _ in ranges), max(high for _, high in ranges))
-    figure.supylabel(displays[0].measure, fontsize=9)
-    caption(figure, displays[0].certificate)
-    drawn = [handle for label, handle in legend_handles(*grid[0]).items() if not label.startswith("iteration")]
-    drawn += [*significance_handles(), _peak_handle()]
-    legend_above(figure, drawn)
-    _draw_scales(figure, grid, displays)
-
-
-def _draw_scales(figure: "Figure", grid: "list[list[Axes]]", displays: Sequence[LayerCurveDisplay]) -> None:
-    """The scale of iterations, once per figure."""
+def _draw_scale(figure: "Figure", grid: "Sequence[Axes]") -> None:
+    """Draw the scale of iterations, where a panel has lines of several."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import BoundaryNorm
 
-    most = max((curve for display in displays for curve in display.streams), key=lambda curve: len(curve.lines))
-    if len(most.lines) == 1:
+    labels = [label for label in legend_handles(*grid) if label.startswith(_ITERATION)]
+    steps = sorted(int(label.removeprefix(_ITERATION)) for label in labels)
+    if len(steps) < 2:
         return
-    steps = [line.iteration or 0 for line in most.lines]
     edges = [step - 0.5 for step in steps] + [steps[-1] + 0.5]
     scale = ScalarMappable(BoundaryNorm(edges, 256), _colours())
-    bar = figure.colorbar(scale, ax=[ax for axes in grid for ax in axes], aspect=40, pad=0.01, ticks=_few(steps))
+    ticks = steps[:: max(1, ceil(len(steps) / 12))]
+    bar = figure.colorbar(scale, ax=list(grid), aspect=40, pad=0.01, ticks=ticks)
     bar.set_label("iteration of the action", fontsize=8)
     bar.ax.tick_params(labelsize=8, length=0)
     bar.outline.set_visible(False)
-
-
-def _few(steps: Sequence[int]) -> list[int]:
-    return list(steps[:: max(1, ceil(len(steps) / 12))])
 
 
 def _colours() -> "Colormap":
@@ -399,7 +358,7 @@ def _draw_stream(axes: "Axes", curve: StreamCurve, sidestep: float = 0.0, scale:
         colours = _colours()
         for number, layers in enumerate(curve.lines):
             shade = Line(colours(number / (len(curve.lines) - 1)), line.marker)  # type: ignore[arg-type]
-            draw_line(axes, layers, shade, f"iteration {layers.iteration}", sidestep, bars=False, scale=scale)
+            draw_line(axes, layers, shade, f"{_ITERATION}{layers.iteration}", sidestep, bars=False, scale=scale)
         axes.plot([], [], color=line.colour, marker=line.marker, ms=4, lw=1.3, label=f"{curve.name}, by iteration")
     mark_peaks(axes, curve, sidestep, scale)
 
@@ -469,34 +428,24 @@ def _peak_handle() -> "Line2D":
     return Line2D([], [], color="black", ls="none", marker=_MARK, ms=5, label=_PEAK)
 
 
-@in_report(9)
+@in_report(9, "sides", "labels")
 def layer_figures(source: FigureSource) -> Iterator[ReportFigure]:
-    """The figures that a report of these runs shows."""
-    for drawn in source.runs:
-        views = () if drawn.results is None else drawn.results.settings.views
-        for view in views:
-            assert drawn.results is not None
-            yield ReportFigure(
-                f"{drawn.stem}-layer-curves{view_suffix(view, views)}", in_view("Layer curves", view, views),
-                "probes",
+    """Yield the figures that a report of these runs or labels shows."""
+    for view in probed_views(source):
+        if view.category is None:
+            yield view.figure(
+                "layer-curves", "Layer curves",
                 "How often a linear probe names the side of the correct picture in episodes it has not seen, "
                 f"layer by layer; the part that makes the action has a line per iteration. {ONLY_FILLED}, against "
                 "the best layer of permuted labels. The grey band is what no knowledge looks like; a caret "
                 "marks the best layer, or all that tie.",
-                drawn.position, partial(layer_curve, drawn.results, view, source.table.iterations),
-                is_detail=view != views[0],
+                layer_curve, source.table.iterations,
             )  # fmt: skip
-
-
-@in_report(9, "labels")
-def label_layer_figures(source: FigureSource) -> Iterator[ReportFigure]:
-    """Yield the figures that a report of these labels shows."""
-    iterations = "best" if source.table.iterations == "all" else source.table.iterations
-    for view in label_views(source):
-        yield view.figure(
-            "layer-curves", "Layer curves",
-            "How well a linear probe decodes the label in groups it has not seen, layer by layer, with 95 % "
-            f"intervals over groups. {ONLY_FILLED}. Grey: what the same probes reach with labels exchanged "
-            "between groups. Dotted: the best control.",
-            layer_curve, iterations, [view.category],
-        )  # fmt: skip
+        else:
+            yield view.figure(
+                "layer-curves", "Layer curves",
+                "How well a linear probe decodes the label in groups it has not seen, layer by layer, with 95 % "
+                f"intervals over groups. {ONLY_FILLED}. Grey: what the same probes reach with labels exchanged "
+                "between groups. Dotted: the best control.",
+                layer_curve, best_of(source.table.iterations), [view.category],
+            )  # fmt: skip

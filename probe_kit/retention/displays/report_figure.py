@@ -122,47 +122,62 @@ def view_suffix(view: str, views: Sequence[str]) -> str:
     return "" if view == views[0] else f"-{view.replace(':', '-')}"
 
 
-# -- labels ------------------------------------------------------------------------------------------------------
+# -- probes of a run in a view -----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
-class LabelView:
-    """One label of one run in one category and view, for a figure. name: of the view."""
+class ProbedView:
+    """The probes of a run in one view: of all categories of a side, or of a label in one category."""
 
     drawn: DrawnRun
     results: ProbeResults
-    category: str
-    name: str
+    view: str
+    category: str | None
 
     @property
     def curve(self) -> ProbeCurve:
-        """Its probes."""
-        return self.results.curves[self.category, self.name]
+        """The probes of its category, or of the first one."""
+        return self.results.curves[self.category or self.results.settings.categories[0], self.view]
 
     def figure(
-        self, name: str, title: str, reading: str, draw: "Callable[..., Figure]", *more: Any
+        self,
+        name: str,
+        title: str,
+        reading: str,
+        draw: "Callable[..., Figure]",
+        *more: Any,
+        is_detail: bool = False,
     ) -> ReportFigure:
         """Return a figure of it for a report; those of other views than the first are details.
 
         name: of the figure in file names. title: without the view. reading: how to read it, in plain language.
-        draw: makes it of results, view and category, or of results, view and `more`.
+        draw: makes it of results, view and `more`.
         """
-        views = self.results.settings.views
-        of_category = "" if self.category == EVERYWHERE else f"-{file_names([self.category])[0]}"
+        settings = self.results.settings
+        views = settings.views
+        category = self.category or EVERYWHERE
+        of_category = "" if category == EVERYWHERE else f"-{file_names([category])[0]}"
         return ReportFigure(
-            f"{self.drawn.stem}{of_category}-{name}{view_suffix(self.name, views)}",
-            in_view(title, self.name, views), self.results.settings.target, reading, self.drawn.position,
-            partial(draw, self.results, self.name, *(more or [self.category])), is_detail=self.name != views[0],
+            f"{self.drawn.stem}{of_category}-{name}{view_suffix(self.view, views)}",
+            in_view(title, self.view, views), "probes" if settings.is_side else settings.target, reading,
+            self.drawn.position, partial(draw, self.results, self.view, *more),
+            is_detail=is_detail or self.view != views[0],
         )  # fmt: skip
 
 
-def label_views(source: FigureSource) -> Iterator[LabelView]:
-    """Yield the categories and views of the rows of a table of labels, label by label and run by run."""
+def probed_views(source: FigureSource) -> Iterator[ProbedView]:
+    """Yield the probed views of each run; of labels the categories and views of the rows, label by label."""
     for drawn in source.runs:
+        results = drawn.results
+        if results is None:
+            continue
+        if results.settings.is_side:
+            for view in results.settings.views:
+                yield ProbedView(drawn, results, view, None)
+            continue
         for row in source.table.rows:
-            results = drawn.results
-            if results and (row.target, row.run.location) == (results.settings.target, str(drawn.run.location)):
-                yield LabelView(drawn, results, row.category, row.view or "")
+            if (row.target, row.run.location) == (results.settings.target, str(drawn.run.location)):
+                yield ProbedView(drawn, results, row.view or "", row.category)
 
 
 def file_names(targets: Sequence[str]) -> list[str]:

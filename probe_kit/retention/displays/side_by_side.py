@@ -1,11 +1,10 @@
 """Layer curves of several views, models or runs on one scale, and maps in a row."""
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
-from math import ceil
 from textwrap import fill
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,15 +15,15 @@ from probe_kit.retention.choices import Iterations
 from probe_kit.retention.columns.text import title_of
 from probe_kit.retention.displays.display import (
     Display,
-    Panelled,
+    best_of,
     curve_of,
     in_panels,
     known_view,
     of_iterations,
     scores_of,
 )
-from probe_kit.retention.displays.iteration_maps import IterationMapDisplay, draw_keys, draw_map
-from probe_kit.retention.displays.layer_curves import LayerLine, StreamCurve, draw_line
+from probe_kit.retention.displays.iteration_maps import IterationMapDisplay
+from probe_kit.retention.displays.layer_curves import StreamCurve, draw_line
 from probe_kit.retention.displays.report_figure import (
     DOTS,
     ONLY_FILLED,
@@ -38,13 +37,7 @@ from probe_kit.retention.displays.style import (
     ABOVE_CHANCE,
     ProvenanceLine,
     accuracy_axis,
-    axes_for,
-    caption,
     layer_axis,
-    legend_above,
-    legend_handles,
-    panels,
-    plain,
     series,
     significance_handles,
 )
@@ -53,23 +46,64 @@ from probe_kit.statistics.crossfit import CHANCE
 from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:
+    import pandas as pd
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
-@dataclass
-class RoleCurvesDisplay(Panelled):
+@dataclass(kw_only=True)
+class CurvesDisplay(Display):
+    """Held-out accuracy by layer, one line per name, for one category; of each layer the best iteration.
+
+    curves: by name, such as a view or a run. looks: what is drawn alike in all panels, in order. Along the lower
+    side are layers, or depth as a fraction where curves differ in their number. has_bars: whether layers have
+    their 95 % intervals.
+    """
+
+    measure: str = "held-out accuracy (%)"
+    curves: Mapping[str, StreamCurve]
+    looks: tuple[str, ...]
+    has_bars: bool = True
+    panel_size: ClassVar = (3.6, 2.3)
+
+    def further_handles(self) -> "Sequence[Artist]":
+        """Return the handles of filled and open markers."""
+        return significance_handles()
+
+    def draw(self, axes: "Axes") -> None:
+        """Draw a line per name, and chance."""
+        axes.axhline(100 * CHANCE, color="0.45", lw=1, ls="--", label="chance")
+        lengths = {int(curve.layers.max()) for curve in self.curves.values()}
+        by_depth = len(lengths) > 1
+        # Lines stand apart, so that bars do not hide each other.
+        apart = 0.1 / (max(lengths) if by_depth else 1)
+        for rank, (name, curve) in enumerate(self.curves.items()):
+            line = replace(curve.lines[0], layers=curve.depth) if by_depth else curve.lines[0]
+            shift = apart * (rank - (len(self.curves) - 1) / 2)
+            draw_line(axes, line, series(self.looks.index(name)), name, shift, bars=self.has_bars)
+        accuracy_axis(axes)
+        if by_depth:
+            axes.set_xlim(-0.04, 1.04)
+            axes.set_xlabel("depth", fontsize=8.5)
+        else:
+            layer_axis(axes, max(lengths) + 1)
+
+
+def _curves(tables: "Mapping[str, pd.DataFrame]", iterations: Iterations) -> dict[str, StreamCurve]:
+    """Return the curve of each table of scores that has rows, of the best iteration."""
+    return {
+        name: StreamCurve.of_stream(rows, best_of(iterations)) for name, rows in tables.items() if not rows.empty
+    }
+
+
+class RoleCurvesDisplay(CurvesDisplay):
     """Held-out accuracy by layer, one line per view of one stream, for one category.
 
     curves: by view, such as `mean:language`; of iterative streams, the best of the iterations at each layer.
     """
 
-    title_size = 10
-    category: str
-    stream: str
-    curves: dict[str, StreamCurve]
-    certificate: ProvenanceLine
+    panel_size: ClassVar = (3.1, 2.5)
 
     @classmethod
     def from_results(
@@ -86,38 +120,12 @@ class RoleCurvesDisplay(Panelled):
         """
         candidates = tuple(views or results.settings.views)
         curve_of(results, category, results.settings.views[0])
-        curves = {}
-        for view in candidates:
-            scores = scores_of(results, category, view)
-            rows = scores[scores["stream"] == stream]
-            if not rows.empty:
-                curves[view] = StreamCurve.of_stream(rows, "best" if iterations == "all" else iterations)
+        curves = _curves({view: scores_of(results, category, view, stream) for view in candidates}, iterations)
         if not curves:
             raise UnknownSiteError(f"none of the views {', '.join(candidates)} was probed in stream {stream!r}")
-        return cls(category, stream, curves, ProvenanceLine.of_results(results, next(iter(curves))))
-
-    @property
-    def title(self) -> str:
-        """The category."""
-        return title_of(self.category)
-
-    @property
-    def measure(self) -> str:
-        """The accuracy, and where."""
-        return f"held-out accuracy (%), {label_of(self.stream)}"
-
-    def further_handles(self) -> "Sequence[Artist]":
-        """Return the handles of filled and open markers."""
-        return significance_handles()
-
-    def draw(self, axes: "Axes") -> None:
-        """A line per view."""
-        axes.axhline(100 * CHANCE, color="0.45", lw=1, ls=(0, (1, 1)), label="chance")
-        for position, (view, curve) in enumerate(self.curves.items()):
-            sidestep = 0.1 * (position - (len(self.curves) - 1) / 2)
-            draw_line(axes, curve.lines[0], series(position), view, sidestep)
-        accuracy_axis(axes)
-        layer_axis(axes, int(max(curve.layers.max() for curve in self.curves.values())) + 1)
+        certificate = ProvenanceLine.of_results(results, next(iter(curves)))
+        title = f"{title_of(category)}: {label_of(stream)}"
+        return cls(title=title, curves=curves, looks=tuple(curves), certificates=(certificate,))
 
 
 def role_curves(
@@ -164,7 +172,7 @@ class ModelCurve:
     categories: int
 
 
-@dataclass
+@dataclass(kw_only=True)
 class ModelDepthDisplay(Display):
     """Held-out accuracy above chance against depth, averaged over categories, one line per model.
 
@@ -174,7 +182,8 @@ class ModelDepthDisplay(Display):
 
     stream: str
     models: tuple[ModelCurve, ...]
-    certificates: tuple[ProvenanceLine, ...]
+    panel_size: ClassVar = (4.1, 2.5)
+    title_size: ClassVar = 10
 
     @classmethod
     def from_results(
@@ -203,6 +212,8 @@ class ModelDepthDisplay(Display):
         if not with_stream:
             raise UsageError(f"none of the {len(results)} runs has probes of stream {stream!r}")
         return cls(
+            title=label_of(stream),
+            measure="above chance\n(points, mean of categories)",
             stream=stream,
             models=tuple(
                 _depth_curve(probes, stream, probed_view, iterations, name)
@@ -213,9 +224,8 @@ class ModelDepthDisplay(Display):
             ),
         )
 
-    def plot(self, ax: "Axes | None" = None) -> Self:
-        """Draw on `ax`, or on a figure of its own with legend and captions."""
-        axes, figure = axes_for(ax, 6.2, 3.9)
+    def draw(self, axes: "Axes") -> None:
+        """Draw a line per model over the layers of the deepest, with depth above."""
         axes.axhline(0, color="0.45", lw=1, ls=(0, (1, 1)))
         last = max(int(model.layers.max()) for model in self.models)
         for position, model in enumerate(self.models):
@@ -224,19 +234,11 @@ class ModelDepthDisplay(Display):
             axes.plot(
                 last * model.depth, 100 * model.above_chance, color=line.colour, ls=line.dash, lw=1.6, label=label
             )
-        plain(axes)
         axes.set_ylim(*ABOVE_CHANCE)
         layer_axis(axes, last + 1)
         if any(model.layers.max() < last for model in self.models):
             axes.set_xlabel("layer (of the deepest model)", fontsize=8.5)
         _draw_fractions(axes, last)
-        axes.set_title(label_of(self.stream), fontsize=10, loc="left")
-        if figure is not None:
-            axes.set_ylabel("accuracy above chance\n(points, mean of categories)", fontsize=9)
-            legend_above(figure, axes.get_legend_handles_labels()[0])
-        caption(figure, *self.certificates)
-        self.ax_ = axes
-        return self
 
 
 def model_depths(
@@ -246,8 +248,6 @@ def model_depths(
     names: Sequence[str] | None = None,
 ) -> "Figure":
     """Backbones, and where actions are made, on one scale. Raises UsageError if no run has either."""
-    from probe_kit.retention.displays.shown_figure import ShownFigure
-
     parts = {
         (str(part), str(name))
         for probes in results
@@ -257,14 +257,7 @@ def model_depths(
     displays = [ModelDepthDisplay.from_results(results, stream, view, iterations, names) for stream in streams]
     if not displays:
         raise UsageError("no run has probes of a backbone or an action expert")
-    figure = ShownFigure(figsize=(4.1 * max(len(displays), 1.5), 3.6), layout="constrained", dpi=150)
-    grid = figure.subplots(1, len(displays), sharey=True, squeeze=False)[0]
-    for display, axes in zip(displays, grid, strict=True):
-        display.plot(axes)
-    legend_above(figure, list(legend_handles(*grid).values()))
-    figure.supylabel("above chance\n(points, mean of categories)", fontsize=8)
-    caption(figure, *(certificate for display in displays for certificate in display.certificates))
-    return figure
+    return in_panels(displays)
 
 
 def _draw_fractions(axes: "Axes", last: int) -> None:
@@ -285,8 +278,7 @@ def _draw_fractions(axes: "Axes", last: int) -> None:
 def _depth_curve(results: ProbeResults, stream: str, view: str, iterations: Iterations, name: str) -> ModelCurve:
     curves = []
     for category in results.settings.categories:
-        scores = scores_of(results, category, view)
-        scores = scores[scores["stream"] == stream]
+        scores = scores_of(results, category, view, stream)
         if not scores.empty:
             scores = of_iterations(scores, iterations)
             curves.append(scores.groupby("layer")["accuracy"].max() - scores["chance"].iloc[0])
@@ -315,10 +307,9 @@ def depth_figures(source: FigureSource) -> Iterator[ReportFigure]:
 
 PARTS = {"backbone": "backbone", "action": "where the action is made"}
 _IN_A_ROW = 4
-"""Maps side by side, of 2.4 inches each."""
+"""Maps side by side, of 2.7 inches each."""
 _TITLE_LETTERS = 36
-"""Letters of a line above a map, which is 2.4 inches wide."""
-_SIDESTEP = 0.08  # of a layer, so that bars do not hide each other
+"""Letters of a line above a map."""
 
 
 def curves_side_by_side(
@@ -335,66 +326,31 @@ def curves_side_by_side(
     number. names: of the runs, in order. view: one that some of them were probed in. categories: that are shown,
     all by default. Raises UsageError if none was.
     """
-    with_view = [(at, probes) for at, probes in enumerate(results) if view in probes.settings.views]
-    panels_of = [
-        (category, part)
-        for category in _categories([probes for _, probes in with_view])
-        if categories is None or category in categories
-        for part in PARTS
-        if any(_curve(probes, category, view, part, iterations) is not None for _, probes in with_view)
-    ]
-    if not panels_of:
+    probed = {name: probes for name, probes in zip(names, results, strict=True) if view in probes.settings.views}
+    lines = tuple(ProvenanceLine.of_results(probes, view) for probes in probed.values())
+    displays = []
+    for category in categories or _categories(probed.values()):
+        for part, where in PARTS.items():
+            tables = {name: _of_part(probes, category, view, part) for name, probes in probed.items()}
+            if curves := _curves(tables, iterations):
+                title, looks = f"{title_of(category)}: {where}", tuple(names)
+                displays.append(
+                    CurvesDisplay(title=title, curves=curves, looks=looks, certificates=lines, has_bars=False)
+                )
+    if not displays:
         raise UsageError(f"no run has probes of a backbone or where the action is made in view {view!r}")
-    figure, grid = panels(len(panels_of), width=3.6, height=2.3, columns=2, share=False)
-    for (category, part), axes in zip(panels_of, grid, strict=True):
-        every = [(at, _curve(probes, category, view, part, iterations)) for at, probes in with_view]
-        curves = [(at, curve) for at, curve in every if curve is not None]
-        _draw_panel(axes, curves, names)
-        axes.set_title(f"{title_of(category)}: {PARTS[part]}", fontsize=9, loc="left")
-    handles = legend_handles(*grid)
-    order = {name: at for at, name in enumerate(["chance", *names])}
-    legend_above(figure, [*(handles[n] for n in sorted(handles, key=order.__getitem__)), *significance_handles()])
-    figure.supylabel("held-out accuracy (%)", fontsize=9)
-    caption(figure, *(ProvenanceLine.of_results(probes, view) for _, probes in with_view))
-    return figure
+    return in_panels(displays, columns=2)
 
 
-def _categories(results: Sequence[ProbeResults]) -> list[str]:
+def _categories(results: Iterable[ProbeResults]) -> list[str]:
     return list(dict.fromkeys(name for probes in results for name in probes.settings.categories))
 
 
-def _curve(
-    results: ProbeResults, category: str, view: str, part: str, iterations: Iterations
-) -> StreamCurve | None:
+def _of_part(results: ProbeResults, category: str, view: str, part: str) -> "pd.DataFrame":
+    """Return the scores of the first stream of a part of the model; none if none was probed."""
     scores = scores_of(results, category, view)
     scores = scores[scores["part"] == part]
-    if scores.empty:
-        return None
-    of_stream = scores[scores["stream"] == scores["stream"].iloc[0]]
-    return StreamCurve.of_stream(of_stream, "best" if iterations == "all" else iterations)
-
-
-def _draw_panel(axes: "Axes", curves: Sequence[tuple[int, StreamCurve]], names: Sequence[str]) -> None:
-    """curves: with the position of their run, which decides the line's looks whatever else is shown."""
-    axes.axhline(100 * CHANCE, color="0.45", lw=1, ls="--", label="chance")
-    depths = {int(curve.layers.max()) for _, curve in curves}
-    for rank, (at, curve) in enumerate(curves):
-        line = _at_depths(curve.lines[0], curve) if len(depths) > 1 else curve.lines[0]
-        step = _SIDESTEP * (rank - (len(curves) - 1) / 2) * (1 if len(depths) == 1 else 1 / max(depths))
-        draw_line(axes, line, series(at), names[at], step, bars=False)
-    plain(axes)
-    accuracy_axis(axes)
-    if len(depths) > 1:
-        axes.set_xlim(-0.04, 1.04)
-        axes.set_xlabel("depth", fontsize=8.5)
-    else:
-        layer_axis(axes, max(depths) + 1)
-
-
-def _at_depths(line: LayerLine, curve: StreamCurve) -> LayerLine:
-    """The line along depth as a fraction."""
-    depths = curve.depth
-    return LayerLine(line.iteration, depths, line.score, line.low, line.high, line.significant)  # type: ignore[arg-type]
+    return scores[scores["stream"].eq(scores["stream"].iloc[0])] if len(scores) else scores
 
 
 def maps_side_by_side(results: Sequence[ProbeResults], names: Sequence[str], view: str) -> "Figure":
@@ -406,22 +362,19 @@ def maps_side_by_side(results: Sequence[ProbeResults], names: Sequence[str], vie
     if len(with_maps) < 2:
         raise UsageError(f"fewer than two runs have iterations in view {view!r}; `iteration_maps` draws one")
     across = min(_IN_A_ROW, len(with_maps))
-    rows = ceil(len(with_maps) / across)
-    categories = _categories([probes for _, probes in with_maps])
-    figure, grid = panels(across * rows * len(categories), width=2.7, height=2.1, columns=across, share=False)
-    for number, category in enumerate(categories):
-        panels_of = grid[number * across * rows :][: across * rows]
-        for axes, at in zip(panels_of, range(across * rows), strict=True):
-            if at >= len(with_maps) or category not in with_maps[at][1].settings.categories:
-                axes.set_visible(False)
-                continue
-            name, probes = with_maps[at]
-            drawn = draw_map(axes, IterationMapDisplay.from_results(probes, category, view))
-            axes.set_title(fill(f"{title_of(category)}: {name}", _TITLE_LETTERS), fontsize=8, loc="left")
-    figure.supylabel("iteration", fontsize=9)
-    draw_keys(figure, grid, drawn)
-    caption(figure, *(ProvenanceLine.of_results(probes, view) for _, probes in with_maps))
-    return figure
+    maps: list[Display | None] = []
+    for category in _categories(probes for _, probes in with_maps):
+        maps += [
+            replace(
+                IterationMapDisplay.from_results(probes, category, view),
+                title=fill(f"{title_of(category)}: {name}", _TITLE_LETTERS),
+            )
+            if category in probes.settings.categories
+            else None
+            for name, probes in with_maps
+        ]
+        maps += [None] * (-len(with_maps) % across)
+    return in_panels(maps, columns=across)
 
 
 def has_maps(results: ProbeResults, view: str) -> bool:

@@ -175,31 +175,32 @@ def darker(colour: str) -> str:
     return "#" + "".join(f"{int(colour[at : at + 2], 16) * 6 // 10:02X}" for at in (1, 3, 5))
 
 
-def axes_for(ax: "Axes | None", width: float, height: float) -> "tuple[Axes, Figure | None]":
-    """The axes to draw on, and the figure if it was made for them.
+def panels(
+    count: int,
+    width: float = 3.1,
+    height: float = 2.5,
+    columns: int | None = None,
+    *,
+    share: bool = True,
+    in_pyplot: bool = False,
+) -> "tuple[Figure, list[Axes]]":
+    """A figure of `count` panels of `width` × `height` inches, at most three or `columns` in a row.
 
-    ax: the caller's, or None for new ones of `width` × `height` inches, which a notebook then shows.
+    share: whether panels share both axes. in_pyplot: whether pyplot knows the figure, so that notebooks show it.
     """
-    if ax is not None:
-        return ax, None
     from matplotlib import pyplot as plt
 
-    from probe_kit.retention.displays.shown_figure import ShownFigure
-
-    figure, axes = plt.subplots(FigureClass=ShownFigure, figsize=(width, height), layout="constrained", dpi=DPI)
-    return axes, figure
-
-
-def panels(
-    count: int, width: float = 3.1, height: float = 2.5, columns: int | None = None, *, share: bool = True
-) -> "tuple[Figure, list[Axes]]":
-    """A figure of `count` panels of `width` × `height` inches, at most three or `columns` in a row."""
     from probe_kit.retention.displays.shown_figure import ShownFigure
 
     across = columns or (2 if count == 4 else min(3, count))
     rows = ceil(count / across)
     # 1.1 inches for legend and caption; 6.2 is the narrowest that a caption reads well in.
-    figure = ShownFigure(figsize=(max(width * across, 6.2), height * rows + 1.1), layout="constrained", dpi=DPI)
+    size = (max(width * across, 6.2), height * rows + 1.1)
+    figure: Figure
+    if in_pyplot:
+        figure = plt.figure(figsize=size, layout="constrained", dpi=DPI, FigureClass=ShownFigure)
+    else:
+        figure = ShownFigure(figsize=size, layout="constrained", dpi=DPI)
     grid = list(figure.subplots(rows, across, sharex=share, sharey=share, squeeze=False).flat)
     for position in range(count, len(grid)):
         grid[position].set_visible(False)
@@ -243,13 +244,11 @@ def plain(axes: "Axes") -> None:
     axes.tick_params(labelsize=8)
 
 
-def caption(figure: "Figure | None", *certificates: ProvenanceLine) -> None:
+def caption(figure: "Figure", *certificates: ProvenanceLine) -> None:
     """Write under the figure what it is about: every model once, then the parts that all have in common.
 
     `figure.caption` has each certificate in full, with its settings.
     """
-    if figure is None:
-        return
     certificates = tuple(dict.fromkeys(certificates))
     groups = zip(*(certificate.parts for certificate in certificates), strict=True)
     parts = dict.fromkeys(", ".join(filter(None, dict.fromkeys(group))) for group in groups)

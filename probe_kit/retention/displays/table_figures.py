@@ -15,11 +15,8 @@ from probe_kit.retention.displays.display import Display
 from probe_kit.retention.displays.report_figure import FigureSource, ReportFigure, figure_of, in_report
 from probe_kit.retention.displays.style import (
     ProvenanceLine,
-    axes_for,
-    caption,
     darker,
     legend_above,
-    plain,
     series,
     significance_handles,
 )
@@ -27,7 +24,9 @@ from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.retention.table import RetentionTable
 
 if TYPE_CHECKING:
+    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
 
@@ -44,25 +43,24 @@ class Cell:
     bold: bool = False
 
 
-@dataclass
+@dataclass(kw_only=True)
 class HeatTableDisplay(Display):
     """A table drawn as a figure; the numbers are `cells[row][column].values`.
 
     rows, columns: their names. parts: names of the values side by side in a cell. certificates: one per row.
-    rule_words: what the title says of the outcome rule.
     """
 
     rows: tuple[str, ...]
     columns: tuple[str, ...]
     cells: tuple[tuple[Cell, ...], ...]
-    certificates: tuple[ProvenanceLine, ...]
     parts: ClassVar[tuple[str, ...]] = ("",)
-    title = ""
+    heading = ""
     note = ""
+    is_framed: ClassVar = True
+    title_size: ClassVar = 10
     notes: ClassVar[Mapping[Modes, str]] = {}
     scale: ClassVar[float] = 100.0
     digits: ClassVar[int] = 1
-    rule_words: str = ""
 
     @classmethod
     def _of_behaviour(cls, table: RetentionTable, cell: Callable[[RetentionRow], Cell]) -> Self:
@@ -70,25 +68,28 @@ class HeatTableDisplay(Display):
         rows = once_per_category(table.all_rows)
         display = cls._of(rows, cell)
         modes, acted = modes_of(rows), [row for row in rows if row.run.mode == "acts"]
-        display.title = cls.title.replace(RATE["acts"], RATE[modes])
         display.note = cls.notes.get(modes, cls.note)
         rules = ", ".join(dict.fromkeys(row.rules.rule for row in acted))
-        display.rule_words = f", outcome rule {rules}" if acted else ""
+        display.title = cls.heading.replace(RATE["acts"], RATE[modes]) + f", outcome rule {rules}" * bool(acted)
         return display
 
     @classmethod
     def _of(cls, rows: Sequence[RetentionRow], cell: Callable[[RetentionRow], Cell]) -> Self:
         """One line per run and view, one column per category of any of them."""
         if not rows:
-            raise UsageError(f"{cls.title}: the table has no rows to show")
+            raise UsageError(f"{cls.heading}: the table has no rows to show")
         lines: dict[tuple[str | None, str, str | None], dict[str, RetentionRow]] = {}
         for row in rows:
             lines.setdefault((row.group, row.run.location, row.view), {})[row.category] = row
         columns = tuple(dict.fromkeys(row.category for row in rows))
         columns = (*(name for name in columns if name != "mean"), *(["mean"] if "mean" in columns else []))
         blank = Cell((None,) * len(cls.parts))
+        names = tuple(_line_name(line, rows) for line in lines.values())
+        width = _CELL_WIDTH * len(columns) + _NAME_WIDTH * max(map(len, names)) + 0.3
         return cls(
-            rows=tuple(_line_name(line, rows) for line in lines.values()),
+            title=cls.heading,
+            figure_size=(max(6.2, width), _ROW_HEIGHT * (len(names) + 1.5) - 0.2),
+            rows=names,
             columns=columns,
             cells=tuple(
                 tuple(cell(line[name]) if name in line else blank for name in columns) for line in lines.values()
@@ -96,22 +97,17 @@ class HeatTableDisplay(Display):
             certificates=tuple(ProvenanceLine.of_row(list(line.values())[-1]) for line in lines.values()),
         )
 
-    def plot(self, ax: "Axes | None" = None) -> Self:
-        """Draw on `ax`, or on a figure of its own with the key of colours and captions."""
-        width = _CELL_WIDTH * len(self.columns) + _NAME_WIDTH * max(map(len, self.rows)) + 0.3
-        height = _ROW_HEIGHT * (len(self.rows) + 1.5) + 0.9
-        axes, figure = axes_for(ax, max(6.2, width), height)
+    def draw(self, axes: "Axes") -> None:
+        """Draw the cells and the names of rows and columns."""
         for number, line in enumerate(self.cells):
             for column, cell in enumerate(line):
                 self._draw_cell(axes, column, number, cell)
         self._draw_names(axes)
-        if figure is None:
-            axes.set_title(self.title + self.rule_words, fontsize=10, loc="left", pad=34)
-        else:
-            legend_above(figure, self._key(), f"{self.title}{self.rule_words}\n{self.note}")
-        caption(figure, *self.certificates)
-        self.ax_ = axes
-        return self
+
+    def finish(self, figure: "Figure", grid: "Sequence[Axes]") -> None:
+        """Add the key of colours below the title, which may be wider than the table."""
+        grid[0].set_title("", loc="left")
+        legend_above(figure, self._key(), f"{self.title}\n{self.note}")
 
     def _draw_cell(self, axes: "Axes", column: int, number: int, cell: Cell) -> None:
         from matplotlib.patches import Rectangle
@@ -151,7 +147,7 @@ class HeatTableDisplay(Display):
 class SuccessTableDisplay(HeatTableDisplay):
     """Success rate in percent by model and category; bold above 0.5 + Δ."""
 
-    title = "Success rate (%)"
+    heading = "Success rate (%)"
     note = "bold: more than guessing explains, items as the unit"
 
     @classmethod
@@ -165,7 +161,7 @@ class SuccessTableDisplay(HeatTableDisplay):
 class SideTableDisplay(HeatTableDisplay):
     """Success rate in percent where the correct picture lay left | right (the paper's L/R table)."""
 
-    title = "Success rate (%) where the correct picture is left | right"
+    heading = "Success rate (%) where the correct picture is left | right"
     digits = 0
     note = "equal halves: no side is favoured; one blue, one pale: the policy goes to a side, not to an answer"
     notes: ClassVar[Mapping[Modes, str]] = {
@@ -183,7 +179,7 @@ class SideTableDisplay(HeatTableDisplay):
 class RetentionTableDisplay(HeatTableDisplay):
     """Bounded retention and the published ratio by model and category; empty where the backbone knows nothing."""
 
-    title = "Retention | published ratio"
+    heading = "Retention | published ratio"
     note = "dash: the backbone's signal is not shown, so the ratio has no meaning"
     parts = ("retention", "published")
     scale, digits = 1.0, 2
@@ -316,7 +312,7 @@ class GapPoint:
     significant: bool
 
 
-@dataclass
+@dataclass(kw_only=True)
 class KnowledgeActionDisplay(Display):
     """Success rate against the best probe of a stream, a point per category and model.
 
@@ -326,7 +322,6 @@ class KnowledgeActionDisplay(Display):
 
     stream: str
     points: tuple[GapPoint, ...]
-    certificates: tuple[ProvenanceLine, ...]
     modes: Modes = "acts"
 
     @classmethod
@@ -353,34 +348,47 @@ class KnowledgeActionDisplay(Display):
             mean for mean in table.means if view_of.get((mean.group, mean.run.location)) == mean.view is not None
         )
         certificates = tuple(ProvenanceLine.of_row(mean) for mean in means)
-        return cls(stream, tuple(points), certificates, modes_of(drawn))
+        modes, models = modes_of(drawn), {point.model for point in points}
+        return cls(
+            measure=f"{RATE[modes].lower()} (%)",
+            figure_size=(6.2, 5.6 + 0.17 * len(models)),  # the axes are square
+            stream=stream,
+            points=tuple(points),
+            certificates=certificates,
+            modes=modes,
+        )
 
-    def plot(self, ax: "Axes | None" = None) -> Self:
-        """Draw on `ax`, or on a figure of its own with legend and captions."""
-        models = list(dict.fromkeys(point.model for point in self.points))
-        axes, figure = axes_for(ax, 6.2, 6.7 + 0.17 * len(models))
+    @property
+    def _models(self) -> list[str]:
+        return list(dict.fromkeys(point.model for point in self.points))
+
+    def further_handles(self) -> "Sequence[Artist]":
+        """Return the handles of filled and open markers."""
+        return significance_handles()
+
+    def draw(self, axes: "Axes") -> None:
+        """Draw a point with its intervals per category and model."""
         _draw_ground(axes)
-        for position, model in enumerate(models):
+        for position, model in enumerate(self._models):
             _draw_model(axes, [point for point in self.points if point.model == model], position, model)
-        plain(axes)
         output = "answer" if self.modes == "answers" else "action"
         where = "in the backbone" if self.stream == "backbone" else f"where the {output} is made"
         axes.set_xlabel(f"best held-out probe {where} (%)", fontsize=9)
-        axes.set_ylabel(f"{RATE[self.modes].lower()} (%)", fontsize=9)
-        if figure is not None:
-            legend_above(figure, [*axes.get_legend_handles_labels()[0], *significance_handles()])
-        caption(figure, *self.certificates)
-        if figure is not None:
-            figure.draw_without_rendering()  # labels need the final places of points
+
+    def plot(self, ax: "Axes | None" = None) -> Self:
+        """Draw on `ax`, or on a figure of its own with legend and captions; then write names near their points."""
+        super().plot(ax)
+        assert self.ax_ is not None
+        if ax is None:
+            self.ax_.figure.draw_without_rendering()  # type: ignore[union-attr]  # names need the points' final places
         words = [title_of(point.category) for point in self.points]
-        inks = [darker(series(models.index(point.model)).colour) for point in self.points]
+        inks = [darker(series(self._models.index(point.model)).colour) for point in self.points]
         points = [(100 * point.accuracy, 100 * point.sr) for point in self.points]
         bars = [ends for point in self.points for ends in _bars(point)]
         # `place_labels` knows level and upright lines: the diagonal is a stair of short ones.
         diagonal = [((step, step), (step + 1, step + 1)) for step in range(100)]
         guessing = [((0, 50), (100, 50)), ((50, 0), (50, 100))]
-        place_labels(axes, points, words, inks, [*bars, *diagonal, *guessing])
-        self.ax_ = axes
+        place_labels(self.ax_, points, words, inks, [*bars, *diagonal, *guessing])
         return self
 
 

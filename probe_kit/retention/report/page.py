@@ -13,24 +13,33 @@ from probe_kit._tables.content import heat_key
 from probe_kit._tables.table import Table
 from probe_kit.errors import UsageError
 from probe_kit.retention.columns.comparisons import known_used_tables
+from probe_kit.retention.columns.sentences import conclusion
 from probe_kit.retention.columns.tables import SUBJECTS
 from probe_kit.retention.columns.text import Modes, model_name, modes_of, title_of
 from probe_kit.retention.displays.bars import joins_of
 from probe_kit.retention.displays.layer_curves import LayerCurveDisplay
 from probe_kit.retention.displays.report_figure import ONLY_FILLED, ReportFigure, collect_figures
-from probe_kit.retention.displays.style import axes_for, legend_above
+from probe_kit.retention.displays.style import caption, legend_above, panels
 from probe_kit.retention.report.episodes import PICTURES, EpisodeGrid, episode_grid
-from probe_kit.retention.report.parts import Picture, arranged, citation, data_uri, provenance, render, words_of
-from probe_kit.retention.report.summaries import RunInWords, read_run
+from probe_kit.retention.report.parts import (
+    Picture,
+    arranged,
+    citation,
+    data_uri,
+    provenance,
+    render,
+    warnings_of,
+    words_of,
+)
 from probe_kit.retention.rows.outcome_rules import under_rule
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.retention.table import RetentionTable, retention_table
 from probe_kit.runs.reader import RunReader
 from probe_kit.train.choices import Task
 from probe_kit.train.crossval.task_scores import METRICS
-from probe_kit.train.results.probe_results import ProbeResults
+from probe_kit.train.results.probe_results import ProbeResults, best_sites_table
 from probe_kit.train.results.store import stored_targets
-from probe_kit.train.results.summary import best_sites_sentences, best_sites_table
+from probe_kit.train.results.summary import best_sites_findings
 from probe_kit.version import __version__
 
 if TYPE_CHECKING:
@@ -136,10 +145,15 @@ def _sides(
     modes = modes_of(table.all_rows)
     shown_names = [without_places(name, places) for name in names]
     grid = episode_grid([under_rule(run, table.rule, table.last_steps) for run in runs], shown_names, pictures)
-    in_words: dict[tuple[str | None, str], list[RunInWords]] = {}
+    warnings: dict[tuple[str | None, str], list[tuple[str, str]]] = {}
+    further_views = []
     for mean in table.means:
         rows = [row for row in table.rows if (*row.key, row.view) == (*mean.key, mean.view)]
-        in_words.setdefault(mean.key, []).append(read_run([*rows, mean]))
+        if mean.key in warnings:  # the summary is of the first view
+            sentences = [f"{title_of(row.category)}: {conclusion(row)}" for row in rows]
+            further_views.append((f"{model_name(mean)}, view {mean.view}", sentences))
+        else:
+            warnings[mean.key] = [(model_name(mean), sentence) for sentence in warnings_of(mean, rows)]
     opening, question, curve = opening_row(table), None, None
     if opening is not None:
         position = [str(run.location) for run in runs].index(opening.run.location)
@@ -160,8 +174,8 @@ def _sides(
         "reached": "What reaches the answer" if modes == "answers" else "What reaches the action",
         "question": question,
         "curve": curve,
-        "in_words": list(in_words.values()),
-        "warnings": [(views[0].name, warning) for views in in_words.values() for warning in views[0].warnings],
+        "further_views": further_views,
+        "warnings": [warning for of_run in warnings.values() for warning in of_run],
         "tables": tables,
         "wordings": table.wording_tables,
         "further": further_tables,
@@ -222,13 +236,12 @@ def _opening_curve(row: RetentionRow, table: RetentionTable, position: int) -> R
 
 def _together(display: LayerCurveDisplay) -> "Figure":
     """All streams on the same axes, with a legend and no more."""
-    axes, figure = axes_for(None, 4.7, 3.1)
-    assert figure is not None
+    figure, (axes,) = panels(1, 4.7, 2.0)
     display.plot(axes)
     axes.set_title("", loc="left")
-    axes.set_ylabel("held-out accuracy (%)", fontsize=8.5)
+    axes.set_ylabel(display.measure, fontsize=8.5)
     legend_above(figure, axes.get_legend_handles_labels()[0])
-    figure.caption = display.certificate.line  # type: ignore[attr-defined]
+    caption(figure, *display.certificates)
     return figure
 
 
@@ -268,7 +281,7 @@ def _labels(
             "notes": [
                 f"{name}: {sentence}" if several else sentence
                 for name, of in probes.items()
-                for sentence in best_sites_sentences(of)
+                for sentence in best_sites_findings(of)
             ],
         }
         sections.append(section)

@@ -13,12 +13,14 @@ from xml.etree import ElementTree
 
 from probe_kit._system.escaping import without_places
 from probe_kit._tables.html import environment
+from probe_kit._tables.numbers import percent
 from probe_kit._tables.table import Table
 from probe_kit.retention.behaviour import ask_of
-from probe_kit.retention.columns.sentences import VERDICT_HELP
-from probe_kit.retention.columns.text import TERMS
+from probe_kit.retention.columns.sentences import VERDICT_HELP, chance_only
+from probe_kit.retention.columns.text import TERMS, is_vlm, title_of
 from probe_kit.retention.displays.report_figure import ReportFigure, caption_of
 from probe_kit.retention.displays.style import ProvenanceLine
+from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.runs.reader import SIDE, RunReader
 from probe_kit.train.results.probe_results import ProbeResults
 from probe_kit.version import __version__
@@ -242,6 +244,79 @@ def _stream(run: RunReader, name: str) -> str:
 
 def _of_target(probes: ProbeResults) -> str:
     return "" if probes.settings.is_side else f" of {probes.settings.target}"
+
+
+# -- warnings ------------------------------------------------------------------------------------------------
+
+_MOSTLY = 0.5  # share of episodes above which something is said first
+
+
+def warnings_of(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[str]:
+    """Return what would be misread without a word about it, of a run's categories and their mean, in a view."""
+    sentences = []
+    if mean.run.random_weights:
+        sentences.append("The weights are random: the model is untrained. Read every number as “knows nothing”.")
+    sentences += _unread(mean) if is_vlm(mean) else _unmoved(mean)
+    biased = [
+        row
+        for row in rows
+        if row.success.side_preference is not None and abs(row.success.side_preference - 0.5) > 0.25
+    ]
+    if biased:
+        habit = "The answers have a habit of naming" if is_vlm(mean) else "The policy has a habit of going to"
+        sentences.append(f"{habit} one side in {_of(biased, rows)}.")
+    if uncontrolled := chance_only(rows):
+        sentences.append(f"{uncontrolled}.")
+    if mean.controls.leaks:
+        sentences.append(
+            f"The suite gives answers away without a model ({', '.join(mean.controls.leaks)}): see the "
+            "controls before believing a probe."
+        )
+    return sentences
+
+
+def _unread(mean: RetentionRow) -> list[str]:
+    """Return warnings about a model that was asked."""
+    if (mean.success.share_outside or 0) <= _MOSTLY:
+        return []
+    unread = percent(mean.success.share_outside)
+    return [f"No answer could be read in {unread} % of episodes: it may know more than it says."]
+
+
+def _unmoved(mean: RetentionRow) -> list[str]:
+    """Return warnings about a policy."""
+    sentences = []
+    if (mean.success.share_never_moved or 0) > _MOSTLY:
+        sentences.append(
+            f"The cube never moved in {percent(mean.success.share_never_moved)} % of episodes: "
+            "the policy does not grasp, so its success rate is no measure of what it knows."
+        )
+    elif (mean.success.share_outside or 0) > _MOSTLY:
+        sentences.append(
+            f"The cube reached neither picture in {percent(mean.success.share_outside)} % of episodes."
+        )
+    if mean.success.share_invalid_action:
+        sentences.append(
+            f"In {percent(mean.success.share_invalid_action)} % of its steps the policy put out "
+            "something that is no action."
+        )
+    return sentences
+
+
+def _names(part: Sequence[RetentionRow], rows: Sequence[RetentionRow]) -> str:
+    """The shorter of the two lists: those that are in, or those that are not."""
+    absent = [row for row in rows if row not in part]
+    listed, prefix = (absent, "all but ") if len(absent) < len(part) else (part, "")
+    return prefix + ", ".join(title_of(row.category) for row in listed)
+
+
+def _of(part: Sequence[RetentionRow], rows: Sequence[RetentionRow]) -> str:
+    """Return how many of the categories, and which if not all."""
+    noun = "category" if len(rows) == 1 else "categories"
+    if len(part) == len(rows):
+        return f"all {len(rows)} {noun}" if len(rows) > 1 else "the only category"
+    names = f" ({_names(part, rows)})" if part else ""
+    return f"{len(part) or 'none'} of {len(rows)} {noun}{names}"
 
 
 # -- glossary ------------------------------------------------------------------------------------------------

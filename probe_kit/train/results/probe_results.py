@@ -1,6 +1,6 @@
 """Probe results: settings, directions, the table of scores with its best sites, and the decisions behind it."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from functools import cached_property
@@ -12,18 +12,17 @@ from numpy.typing import NDArray
 
 from probe_kit._system.bounded_files import open_arrays
 from probe_kit._tables.numbers import p_text
-from probe_kit._terminal.notebook import rows_html
+from probe_kit._tables.table import Table
 from probe_kit.errors import UnknownSiteError
 from probe_kit.hashing import sha256_json
-from probe_kit.hooks.contract.sites import Site
+from probe_kit.hooks.contract.sites import Site, label_of
 from probe_kit.runs.direction_files import about_direction, write_directions
 from probe_kit.runs.reader import RunReader
 from probe_kit.runs.results import Bundle
 from probe_kit.statistics.folds import FoldUnit
 from probe_kit.statistics.intervals import effective_groups, group_shares, wilson_interval
 from probe_kit.statistics.label_permutations import p_value, permutations_for, shortage
-from probe_kit.statistics.significance import SIGNIFICANCE
-from probe_kit.train.choices import SIDES, Incomplete, Task
+from probe_kit.train.choices import EVERYWHERE, SIDES, Incomplete, Task
 from probe_kit.train.crossval.task_scores import METRICS, fold_auc, fold_spearman, log_loss
 from probe_kit.train.results.control_scores import Controls, has_signal
 from probe_kit.train.results.probe_curve import Matrix, ProbeCurve
@@ -313,33 +312,6 @@ def score_text(value: float | None, is_side: bool) -> str:
     return f"{100 * value:.1f}" if is_side else f"{value:.3f}"
 
 
-def results_html(settings: ProbeSettings, label: str, scores: "pd.DataFrame") -> str:
-    """Return the best site of every category, view and stream as HTML."""
-    random = " (RANDOM WEIGHTS)" if settings.random_weights else ""
-    title = (
-        f"Probes of {label}{random}, target {settings.target}, call {settings.call}: the best site of "
-        "each stream, + as many others that tie"
-    )
-    score = "accuracy % [95 %]" if settings.is_side else f"{METRICS[settings.task]} [95 %]"
-    columns = ("category", "view", "stream", "best site", score, "chance", "family-wise p", "first iteration", "n")
-    rows = [
-        (
-            row["category"],
-            row["view"],
-            row["stream"],
-            *site_cells(row, settings.is_side),
-            score_text(row["first"], settings.is_side),
-            str(row["n"]),
-        )
-        for row in best_sites(scores, settings.is_side)
-    ]
-    note = (
-        f"{settings.permutations} label permutations, key {settings.key}; only p < {SIGNIFICANCE} is evidence. "
-        "results.scores has every site"
-    )
-    return rows_html(title, columns, rows, note)
-
-
 # -- all results ---------------------------------------------------------------------------------------------
 
 
@@ -393,7 +365,7 @@ class ProbeResults:
         )
 
     def _repr_html_(self) -> str:
-        return results_html(self.settings, self.label, self.scores)
+        return best_sites_table([self])._repr_html_()
 
     @property
     def key(self) -> str:
@@ -445,3 +417,81 @@ class ProbeResults:
 def episodes_sha256(run: RunReader) -> str:
     """Return the identity of the episodes a run holds now."""
     return sha256_json(sorted(run.episodes["episode_id"].astype(str)))
+
+
+# -- the table of best sites -------------------------------------------------------------------------------------
+
+_TIES = "+: as many other sites tie with it"
+_LEGEND = "the score of a chosen site is too high"
+_OF_SIDE = "; `retention` corrects it"
+_OF_LABEL = ". Chance: mean score of this site with exchanged labels"
+
+
+def best_sites_table(fitted: Sequence[ProbeResults], splits: bool = True) -> Table:
+    """Return a row per category, stream, view and captured inference, and per control of a target that is no side.
+
+    fitted: probes of one target in a run, one per inference. Controls of a side are in the table with `splits`.
+    """
+    first, several_calls = fitted[0].settings, len(fitted) > 1
+    several_views, metric = len(first.views) > 1, "accuracy %" if first.is_side else METRICS[first.task]
+    rows: list[tuple[str, ...]] = []
+    for results in fitted:
+        call = [f"call {results.settings.call}"] * several_calls
+        for row in best_sites(results.scores, first.is_side):
+            view = [str(row["view"])] * several_views
+            name = " · ".join([_name(results, row["category"], row["stream"]), *view, *call])
+            met, missed = exceeded_controls(results, row)
+            parts = [", ".join(met)] * bool(met) + [f"not shown: {', '.join(missed)}"] * bool(missed)
+            begin = score_text(row["first"], first.is_side)
+            rows.append((name, *site_cells(row, first.is_side), "; ".join(parts) or "–", str(row["n"]), begin))
+        for control in results.controls.scores if splits or not first.is_side else ():
+            view = [control.view] * (several_views and bool(control.view))
+            where = _name(results, control.category, control.stream)
+            name = " · ".join(filter(None, [f"control {control.name}", where, *view, *call]))
+            score, low, high, chance = (
+                score_text(value, first.is_side) for value in (control.score, *control.ci, control.chance)
+            )
+            p = "–" if control.p is None else f"{p_text(control.p)} (this control alone)"
+            rows.append((name, "", f"{score} [{low}, {high}]", chance, p, "", str(control.n), ""))
+    headings = (
+        "category" if first.is_side else "stream",
+        "best site",
+        f"{metric} [95 %]",
+        "chance",
+        "family-wise p",
+        "exceeds",
+        "n",
+        "first iteration",
+    )
+    notes = [_TIES, _LEGEND + (_OF_SIDE if first.is_side else _OF_LABEL)]
+    overflow = "split" if splits else "leave out"
+    return Table.of(", ".join(_title(fitted, several_views)), headings, rows, notes=notes, overflow=overflow)
+
+
+def _title(fitted: Sequence[ProbeResults], several_views: bool) -> Iterator[str]:
+    settings = fitted[0].settings
+    yield f"{settings.target}: best site per stream" if not settings.is_side else "Best site per stream"
+    if not settings.is_side:
+        yield settings.task
+    if not several_views:
+        yield f"view {settings.views[0]}"
+    if len(fitted) == 1 and settings.window == 1:
+        yield f"call {settings.call}"
+    if settings.align_to:
+        yield f"from {settings.align_to.partition('#')[0]} on"
+    if settings.random_weights:
+        yield "RANDOM WEIGHTS"
+
+
+def _name(results: ProbeResults, category: str, stream: str) -> str:
+    """Return the category, and for a target that is no side the stream."""
+    if results.settings.is_side:
+        return str(category)  # as --categories takes it
+    pooled = results.settings.categories == (EVERYWHERE,)
+    return " · ".join(filter(None, ["" if pooled else str(category), label_of(stream) if stream else ""]))
+
+
+def exceeded_controls(results: ProbeResults, row: "pd.Series") -> tuple[list[str], list[str]]:
+    """The controls that a site is shown to exceed, and those that it is not shown to exceed; chance among them."""
+    exceeds = results.controls.exceeds(row["category"], row["view"], row["site"], row["p_fwe"])
+    return [name for name in exceeds if exceeds[name]], [name for name in exceeds if exceeds[name] is False]

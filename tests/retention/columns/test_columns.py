@@ -208,7 +208,7 @@ def test_axes_and_titles_name_the_share_they_show(tmp_path: Path) -> None:
     assert SideTableDisplay.from_table(table).title.startswith("Accuracy of answers (%) where")
     axes = KnowledgeActionDisplay.from_table(table).plot().ax_
     assert axes is not None
-    assert axes.get_ylabel() == "accuracy of answers (%)"
+    assert axes.figure.get_supylabel() == "accuracy of answers (%)"
 
 
 def test_answers_that_cannot_be_read_are_no_cube_that_missed(tmp_path: Path) -> None:
