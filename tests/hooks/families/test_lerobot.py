@@ -23,7 +23,7 @@ from probe_kit.hooks import Observation, load_policy
 from probe_kit.hooks.conformance.subject import examples_for
 from probe_kit.hooks.families.molmoact2.packing import JointFrame, SteppedUnits
 from probe_kit.hooks.families.pi0.adapter import Pi05
-from probe_kit.hooks.families.pi0_fast.adapter import Pi0Fast, Pi0FastSize, sized
+from probe_kit.hooks.families.pi0_fast.adapter import Pi0Fast
 from probe_kit.hooks.families.shared.lerobot.normaliser import Bounds, Normaliser, Units
 from probe_kit.hooks.families.shared.lerobot.pipelines import (
     POSTPROCESSOR,
@@ -37,7 +37,7 @@ from probe_kit.hooks.families.shared.lerobot.pipelines import (
 from probe_kit.hooks.families.shared.lerobot.policy import TEXT_FILES
 from probe_kit.hooks.families.shared.lerobot.window import STEP, PictureWindow, read_window
 from probe_kit.hooks.registry import find_family
-from probe_kit.models.pi0 import Pi0Size, resized
+from probe_kit.models.pi0 import PaliGemmaSize, Pi0Size, resized
 from tests.support import (
     eo1_checkpoints,
     groot_checkpoints,
@@ -243,9 +243,9 @@ def test_pi05_acts_as_lerobots_own_loading_processors_and_policy_bit_for_bit(
 ) -> None:
     modes = {"VISUAL": "IDENTITY", "STATE": mode, "ACTION": mode}
     before, behind = save_pipelines(folder, normalization_mapping=modes, dtype=dtype)
-    with resized(modeling_pi05, Pi0Size.from_file(folder / "dims.json")):
-        theirs = modeling_pi05.PI05Policy.from_pretrained(folder).eval()
     every = Pi05.load(str(folder))
+    with resized(modeling_pi05, Pi0Size.from_file(folder / "dims.json"), every.config):
+        theirs = modeling_pi05.PI05Policy.from_pretrained(folder).eval()
     for shown in (CAMERAS, CAMERAS[:1]):
         ours = every.with_cameras(shown)
         for seed, one in enumerate(seen()):
@@ -283,7 +283,7 @@ def _fast_acts_as_lerobot(folder: Path, patch: pytest.MonkeyPatch) -> Any:
     ours, fast = Pi0Fast.load(str(folder)), fast_processor(folder / "fast")
     for name, own in (("AutoTokenizer", ours.tokenizer), ("AutoProcessor", fast)):
         patch.setattr(modeling_pi0_fast, name, SimpleNamespace(from_pretrained=lambda *_, own=own, **__: own))
-    with sized(Pi0FastSize.from_file(folder / "dims.json"), ours.config):
+    with resized(modeling_pi0_fast, PaliGemmaSize.from_file(folder / "dims.json"), ours.config):
         theirs = modeling_pi0_fast.PI0FastPolicy.from_pretrained(folder).eval()
     for one in seen():
         packed = before(raw(one, {"base": one.image}))

@@ -45,10 +45,9 @@ from probe_kit.hooks.families.shared.lerobot.policy import checked_steps
 from probe_kit.hooks.families.shared.loading import DTYPES
 from probe_kit.hooks.families.shared.taps import TOWER, Note, Stack, recording_weights, shares
 from probe_kit.hooks.outputs import Produce, RecordedRun, stacked
-from probe_kit.models.building import build_empty, building_device, replaced
+from probe_kit.models.building import Gate, build_empty, building_device, replaced
 from probe_kit.models.checkpoint_files import load_pretrained
 from probe_kit.models.decoding import PromptKV
-from probe_kit.models.pi0 import Gate
 
 RELEASED: dict[str, Any] = {
     "text_config": {
