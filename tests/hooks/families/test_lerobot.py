@@ -26,16 +26,15 @@ from probe_kit.hooks.families.pi0.adapter import Pi05
 from probe_kit.hooks.families.pi0_fast.adapter import Pi0Fast
 from probe_kit.hooks.families.shared.lerobot.normaliser import Bounds, Normaliser, Units
 from probe_kit.hooks.families.shared.lerobot.pipelines import (
+    CROP,
     POSTPROCESSOR,
     PREPROCESSOR,
-    SavedStep,
-    check_fields,
     check_steps,
     known_values,
     tokenizer_folder,
 )
 from probe_kit.hooks.families.shared.lerobot.policy import TEXT_FILES
-from probe_kit.hooks.families.shared.lerobot.window import STEP, PictureWindow, read_window
+from probe_kit.hooks.families.shared.lerobot.window import PictureWindow, read_window
 from probe_kit.hooks.registry import find_family
 from probe_kit.models.pi0 import PaliGemmaSize, Pi0Size, resized
 from tests.support import (
@@ -439,10 +438,14 @@ def test_a_prompt_without_the_state_is_refused(tmp_path: Path) -> None:
         ("tokenizer_processor", "padding", "do_not_pad", "longest"),
     ],
 )
-def test_a_value_that_changes_numbers_is_refused(name: str, field: str, value: str, plain: str) -> None:
-    check_fields(SavedStep(name, {field: plain}, None), "pipeline.json")
+def test_a_value_that_changes_numbers_is_refused(
+    name: str, field: str, value: str, plain: str, tmp_path: Path
+) -> None:
+    write_steps(tmp_path, [{"registry_name": name, "config": {field: plain}}], PREPROCESSOR)
+    check_steps(tmp_path, PREPROCESSOR, (name,))
+    write_steps(tmp_path, [{"registry_name": name, "config": {field: value}}], PREPROCESSOR)
     with pytest.raises(CheckpointError, match=f"says {field}: '{value}'"):
-        check_fields(SavedStep(name, {field: value}, None), "pipeline.json")
+        check_steps(tmp_path, PREPROCESSOR, (name,))
 
 
 def test_a_step_that_stands_twice_is_refused(tmp_path: Path) -> None:
@@ -542,7 +545,7 @@ CAMERA = "observation.images.base"
 
 
 def write_step(folder: Path, config: dict[str, object]) -> None:
-    steps = [{"registry_name": STEP, "config": config}]
+    steps = [{"registry_name": CROP, "config": config}]
     (folder / "policy_preprocessor.json").write_text(json.dumps({"steps": steps}), encoding="utf-8")
 
 

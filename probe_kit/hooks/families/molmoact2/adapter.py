@@ -275,9 +275,7 @@ class MolmoAct2(PackedPolicy):
         checkpoint_path: then the folder of the VLM's configuration and tokenizer.
         """
         config = super().parse_config(folder, evaluation)
-        config.steps = read_steps(folder, config)
-        for name, value in config.steps.packing.items():
-            setattr(config, name, value)
+        read_steps(config, folder)
         config.input_features = in_packed_order(config, folder)
         config.checkpoint_path = str(inside_or_hub(folder, config.checkpoint_path))
         return config
@@ -308,7 +306,7 @@ class MolmoAct2(PackedPolicy):
 
     def own_units(self, feature: str, kind: str) -> SteppedUnits | None:
         """The units of lerobot's steps: numbers that a mask leaves unscaled, clamps, and frames of joints."""
-        units, steps = super().own_units(feature, kind), self.config.steps
+        units, steps = super().own_units(feature, kind), self.config
         if units is None:
             return None
         assert isinstance(units, Normaliser)

@@ -17,7 +17,7 @@ from probe_kit.errors import CheckpointError, InstructionError, ObservationError
 from probe_kit.hooks.families.shared.kinds import STATE
 from probe_kit.hooks.families.shared.lerobot.flow import PackedRow, label_groups
 from probe_kit.hooks.families.shared.lerobot.normaliser import Normaliser
-from probe_kit.hooks.families.shared.lerobot.pipelines import MASKED, check_same, every_step
+from probe_kit.hooks.families.shared.lerobot.pipelines import MASKED, check_same, step_fields
 
 
 @dataclass(frozen=True)
@@ -127,42 +127,26 @@ _SAME = {
 """Fields of the packing step that are read from the configuration, under its name."""
 
 
-@dataclass(frozen=True)
-class MolmoAct2Steps:
-    """The processor steps of one checkpoint. packing: fields that count over those of the configuration.
+def read_steps(config: Any, folder: Path) -> None:
+    """Put what the saved steps say into lerobot's configuration; without a packing step, it says so itself.
 
     state_frame, action_frame: of the joints. clamps_state, clamps_action: whether numbers are moved to -1 to 1.
     unclamped: (D,) True for numbers of the state that the clamp leaves out; None for those without statistics.
-    """
-
-    packing: Mapping[str, Any]
-    state_frame: JointFrame
-    action_frame: JointFrame
-    clamps_state: bool
-    clamps_action: bool
-    unclamped: NDArray[np.bool_] | None
-
-
-def read_steps(folder: Path, config: Any) -> MolmoAct2Steps:
-    """The saved steps; without a packing step, those that lerobot makes of the configuration.
-
     Raises CheckpointError for frames that are none, and for a packing step of another configuration.
     """
-    saved = {step.name: step.config for step in every_step(folder)}
-    if _PACK not in saved:
-        frame = _frame(vars(config), folder)
-        return MolmoAct2Steps({}, frame, frame, clamps_state=True, clamps_action=True, unclamped=None)
-    check_same(folder, _PACK, saved[_PACK], {name: getattr(config, theirs) for name, theirs in _SAME.items()})
-    state_frame, action_frame = (_frame(saved.get(name, {}), folder) for name in _FRAMES)
+    saved = step_fields(folder)
+    if (packing := saved.get(_PACK)) is None:
+        config.state_frame = config.action_frame = _frame(vars(config), folder)
+        config.clamps_state, config.clamps_action, config.unclamped = True, True, None
+        return
+    check_same(folder, _PACK, packing, {name: getattr(config, theirs) for name, theirs in _SAME.items()})
+    for name in _PACKED:
+        if name in packing:
+            setattr(config, name, packing[name])
+    config.state_frame, config.action_frame = (_frame(saved.get(name, {}), folder) for name in _FRAMES)
     scaled = (saved.get(_CLAMP_STATE, {}).get("normalization_masks") or {}).get(STATE, [])
-    return MolmoAct2Steps(
-        {name: saved[_PACK][name] for name in _PACKED if name in saved[_PACK]},
-        state_frame,
-        action_frame,
-        clamps_state=_CLAMP_STATE in saved,
-        clamps_action=_CLAMP_ACTION in saved,
-        unclamped=~np.array(scaled, bool),
-    )
+    config.clamps_state, config.clamps_action = _CLAMP_STATE in saved, _CLAMP_ACTION in saved
+    config.unclamped = ~np.array(scaled, bool)
 
 
 def _frame(fields: Mapping[str, Any], folder: Path) -> JointFrame:
