@@ -21,10 +21,10 @@ from safetensors.torch import load_file, save_file
 from probe_kit.errors import CheckpointError, InstructionError, ObservationError, ProbeKitError
 from probe_kit.hooks import Observation, load_policy
 from probe_kit.hooks.conformance.subject import examples_for
-from probe_kit.hooks.families.molmoact2.packing import JointFrame, SteppedUnits
+from probe_kit.hooks.families.molmoact2.packing import FramedUnits, JointFrame
 from probe_kit.hooks.families.pi0.adapter import Pi05
 from probe_kit.hooks.families.pi0_fast.adapter import Pi0Fast
-from probe_kit.hooks.families.shared.lerobot.normaliser import Bounds, Normaliser, Units
+from probe_kit.hooks.families.shared.lerobot.normaliser import Bounds, Normaliser
 from probe_kit.hooks.families.shared.lerobot.pipelines import (
     CROP,
     POSTPROCESSOR,
@@ -501,12 +501,11 @@ STATE_LOW, STATE_HIGH = np.array([-1.0, 0.0], np.float32), np.array([1.0, 0.5], 
 INSIDE, BELOW, ABOVE = (
     np.array([row], np.float32) for row in ((0.9, 0.5), (-1.1, 0.2), (0.0, 0.6))
 )  # fmt: skip
-NONE = np.zeros(2, bool)
-BOUNDED: dict[str, Units] = {
+BOUNDED: dict[str, Normaliser] = {
     "MIN_MAX": Normaliser("MIN_MAX", STATE_LOW, STATE_HIGH, 1e-8, "file"),
     "QUANTILES": Normaliser("QUANTILES", STATE_LOW, STATE_HIGH, 1e-8, "file"),
-    "clipped": Bounds(STATE_LOW, STATE_HIGH, "file"),
-    "clamped": SteppedUnits(Normaliser("QUANTILES", STATE_LOW, STATE_HIGH, 1e-8, "file"), NONE, True, NONE),
+    "clipped": Bounds("BOUNDS", STATE_LOW, STATE_HIGH, 0.0, "file"),
+    "clamped": Normaliser("QUANTILES", STATE_LOW, STATE_HIGH, 1e-8, "file", clamped=True),
 }
 
 
@@ -527,15 +526,14 @@ def test_more_than_five_deviations_from_the_mean_are_unusual() -> None:
 def test_numbers_without_statistics_are_never_unusual() -> None:
     nothing = np.zeros(0, np.float32)
     assert not Normaliser("IDENTITY", nothing, nothing, 0.0, "file").unusual(1e9 * BELOW).any()
-    masked = SteppedUnits(
-        Normaliser("MIN_MAX", STATE_LOW, STATE_HIGH, 1e-8, "file"), np.array([True, False]), True, NONE
-    )
+    plain = np.array([True, False])
+    masked = Normaliser("MIN_MAX", STATE_LOW, STATE_HIGH, 1e-8, "file", plain=plain, clamped=True)
     assert masked.unusual(BELOW).tolist() == [[False, False]]
 
 
 def test_recorded_joints_are_compared_in_the_frame_of_the_statistics() -> None:
     frame = JointFrame(np.array([-1], np.float32), np.array([2], np.float32))
-    units = SteppedUnits(Normaliser("MIN_MAX", STATE_LOW, STATE_HIGH, 1e-8, "file"), NONE, True, NONE, frame)
+    units = FramedUnits("MIN_MAX", STATE_LOW, STATE_HIGH, 1e-8, "file", clamped=True, frame=frame)
     values = np.array([[2.0, 0.2], [0.0, 0.2]], np.float32)
     assert units.unusual(values).tolist() == [[False, False], [True, False]]
     np.testing.assert_allclose(units.restore(units.normalise(values[:1])), values[:1])

@@ -37,9 +37,8 @@ from probe_kit.hooks.checkpoints.folders import inside_or_hub
 from probe_kit.hooks.contract.model import Tap
 from probe_kit.hooks.contract.sites import Site, kv_stream
 from probe_kit.hooks.families.molmoact2 import EXPERT, LAYERWISE
-from probe_kit.hooks.families.molmoact2.packing import STEPS, Packing, SteppedUnits, in_packed_order, read_steps
+from probe_kit.hooks.families.molmoact2.packing import STEPS, FramedUnits, Packing, in_packed_order, read_steps
 from probe_kit.hooks.families.shared.lerobot.flow import PackedPolicy
-from probe_kit.hooks.families.shared.lerobot.normaliser import Normaliser
 from probe_kit.hooks.families.shared.lerobot.pipelines import Inert
 from probe_kit.hooks.families.shared.lerobot.policy import checked_steps
 from probe_kit.hooks.families.shared.loading import DTYPES
@@ -304,19 +303,21 @@ class MolmoAct2(PackedPolicy):
         """The VLM's configuration and tokenizer."""
         return {"vlm": Path(self.config.checkpoint_path)}
 
-    def own_units(self, feature: str, kind: str) -> SteppedUnits | None:
+    def own_units(self, feature: str, kind: str) -> FramedUnits | None:
         """The units of lerobot's steps: numbers that a mask leaves unscaled, clamps, and frames of joints."""
-        units, steps = super().own_units(feature, kind), self.config
+        units, config = super().own_units(feature, kind), self.config
         if units is None:
             return None
-        assert isinstance(units, Normaliser)
-        numbers = self.state_numbers if kind == "STATE" else self._action_numbers
+        is_state = kind == "STATE"
+        numbers = self.state_numbers if is_state else self._action_numbers
         stored = load_file(self.folder / units.source) if units.mode != "IDENTITY" else {}
-        unscaled = _of_width(~stored.get(f"{feature}.mask", np.ones(0, bool)).astype(bool), numbers)
-        if kind != "STATE":
-            return SteppedUnits(units, unscaled, steps.clamps_action, unscaled, steps.action_frame)
-        unclamped = unscaled if steps.unclamped is None else _of_width(steps.unclamped, numbers)
-        return SteppedUnits(units, unscaled, steps.clamps_state, unclamped, steps.state_frame)
+        plain = _of_width(~stored.get(f"{feature}.mask", np.ones(0, bool)).astype(bool), numbers)
+        clamped = np.full(numbers, config.clamps_state if is_state else config.clamps_action)
+        if is_state:
+            clamped &= ~(plain if config.unclamped is None else _of_width(config.unclamped, numbers))
+        frame = config.state_frame if is_state else config.action_frame
+        statistics = (units.mode, units.low, units.high, units.eps, units.source)
+        return FramedUnits(*statistics, plain=plain, clamped=clamped, frame=frame)
 
     # -- acting ------------------------------------------------------------------------------------------
 

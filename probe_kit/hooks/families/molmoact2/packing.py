@@ -48,28 +48,10 @@ SAME_FRAME = JointFrame(np.zeros(0, np.float32), np.zeros(0, np.float32))
 
 
 @dataclass(frozen=True)
-class SteppedUnits:
-    """Statistics between a joint frame and a clamp.
+class FramedUnits(Normaliser):
+    """Statistics of joints in the data set's frame."""
 
-    unscaled: (D,) True for numbers that stay as they are, such as a gripper. clamp: whether numbers are moved to
-    -1 to 1. unclamped: (D,) True for numbers of the state that the clamp leaves out.
-    """
-
-    units: Normaliser
-    unscaled: NDArray[np.bool_]
-    clamp: bool
-    unclamped: NDArray[np.bool_]
     frame: JointFrame = SAME_FRAME
-
-    @property
-    def mode(self) -> str:
-        """The kind of map."""
-        return self.units.mode
-
-    @property
-    def source(self) -> str:
-        """The file the statistics come from."""
-        return self.units.source
 
     def normalise(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """Physical units to the numbers the network reads; (..., D).
@@ -77,32 +59,28 @@ class SteppedUnits:
         Raises ObservationError for a number that stays as it is and lies outside -1 to 1, as lerobot does.
         """
         entered = self.frame.entered(values)
-        outside = (np.abs(entered) > 1) & self.unscaled
+        outside = (np.abs(entered) > 1) & self.plain
         if outside.any():
             number = int(np.argwhere(outside)[0][-1])
             raise ObservationError(
                 f"number {number} of the state is {entered[outside][0]:g}; this checkpoint reads it as it is, "
                 "between -1 and 1 (normalize_gripper is off). Give it in these units"
             )
-        mapped = np.where(self.unscaled, entered, self.units.normalise(entered))
-        if self.clamp:
-            mapped = np.where(self.unclamped, mapped, mapped.clip(-1, 1))
-        return mapped.astype(np.float32)
+        return super().normalise(entered)
 
     def restore(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """Network output to physical units; (..., D)."""
-        inside = values.clip(-1, 1) if self.clamp else values
-        return self.frame.left(np.where(self.unscaled, inside, self.units.restore(inside)))
+        return self.frame.left(super().restore(values))
 
     def slopes(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """(..., D) of `restore` at these outputs of the network; 0 where it clips."""
-        slopes = np.where(self.unscaled, 1, self.units.slopes(values)).astype(np.float32)
+        slopes = super().slopes(values)
         slopes[..., : len(self.frame.signs)] *= self.frame.signs
-        return np.asarray(((np.abs(values) <= 1) | (not self.clamp)) * slopes, np.float32)
+        return slopes
 
     def unusual(self, values: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """(..., D): as without the clamp; numbers that stay as they are have no statistics."""
-        return np.asarray(self.units.unusual(self.frame.entered(values)) & ~self.unscaled)
+        """(..., D) in the frame of the statistics."""
+        return super().unusual(self.frame.entered(values))
 
 
 # -- settings of processor steps ------------------------------------------------------------------------------
