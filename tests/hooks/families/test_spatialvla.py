@@ -500,8 +500,3 @@ def test_an_instruction_cannot_smuggle_in_pictures_or_actions(tmp_path: Path, te
 def test_a_new_line_that_melts_into_the_one_behind_it_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InstructionError, match="merges with the new line"):
         speech(tmp_path).prompt("put the cube on the star\n")
-
-
-def test_bytes_serve_checkpoints_without_a_tokenizer(tmp_path: Path) -> None:
-    ids = Speech.of(CONFIG, tmp_path, None, lowercase=True, tokenizer="bytes").prompt("Go")
-    assert ids == [IMAGE] * 9 + [2, *(3 + byte for byte in b"go\n")]
