@@ -29,9 +29,8 @@ from safetensors.torch import load_file
 from torch import Tensor
 from transformers import AutoTokenizer
 
-from probe_kit.hooks.families.pi0_fast.adapter import Pi0FastSize, sized
 from probe_kit.models.building import replaced
-from probe_kit.models.pi0 import Pi0Size, resized
+from probe_kit.models.pi0 import PaliGemmaSize, Pi0Size, resized
 
 MODULES: dict[str, Any] = {"pi0": modeling_pi0, "pi05": modeling_pi05, "pi0_fast": modeling_pi0_fast}
 POLICIES: dict[str, Callable[[Any], Any]] = {
@@ -53,10 +52,11 @@ def lerobots_policy(checkpoint: Path) -> Any:
     config.compile_model, config.device = False, "cpu"
     if config.type == "pi0_fast":
         config.text_tokenizer_name = str(checkpoint)
-        with sized(Pi0FastSize.from_file(checkpoint / "dims.json"), config), packaged_fast(checkpoint):
+        size = PaliGemmaSize.from_file(checkpoint / "dims.json")
+        with resized(modeling_pi0_fast, size, config), packaged_fast(checkpoint):
             policy: Any = POLICIES[config.type](config)
     else:
-        with resized(MODULES[config.type], Pi0Size.from_file(checkpoint / "dims.json")):
+        with resized(MODULES[config.type], Pi0Size.from_file(checkpoint / "dims.json"), config):
             policy = POLICIES[config.type](config)
     tensors = load_file(checkpoint / "model.safetensors")
     tensors.setdefault(EMBEDDING, tensors[HEAD])

@@ -153,33 +153,8 @@ def golden_pi0() -> Path:
 
 
 @pytest.fixture(scope="session")
-def golden_pi05() -> Path:
-    return _golden("pi05")
-
-
-@pytest.fixture(scope="session")
 def golden_pi0_fast() -> Path:
     return _golden("pi0_fast")
-
-
-@pytest.fixture(scope="session")
-def golden_molmoact2() -> Path:
-    return _golden("molmoact2")
-
-
-@pytest.fixture(scope="session")
-def golden_groot() -> Path:
-    return _golden("groot")
-
-
-@pytest.fixture(scope="session")
-def golden_xvla() -> Path:
-    return _golden("xvla")
-
-
-@pytest.fixture(scope="session")
-def golden_smolvla() -> Path:
-    return _golden("smolvla")
 
 
 @pytest.fixture(scope="session")
@@ -188,23 +163,8 @@ def golden_openvla() -> Path:
 
 
 @pytest.fixture(scope="session")
-def golden_prismatic() -> Path:
-    return _golden("prismatic")
-
-
-@pytest.fixture(scope="session")
 def golden_magma() -> Path:
     return _golden("magma")
-
-
-@pytest.fixture(scope="session")
-def golden_xiaomi() -> Path:
-    return _golden("xiaomi_r0")
-
-
-@pytest.fixture(scope="session")
-def golden_internvla() -> Path:
-    return _golden("internvla_m1")
 
 
 @pytest.fixture(scope="session")

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from types import ModuleType
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -76,6 +76,34 @@ def frequencies(count: int, longest: float) -> Tensor:
     """
     exponents = -math.log(longest) * torch.arange(count, dtype=torch.float32) / count
     return torch.exp(exponents.double()).float()
+
+
+_SINUSOID, _LONGEST_PERIOD = 256, 10000
+
+
+class TimeEmbedder(nn.Module):
+    """A moment of a flow, or a step of a diffusion, as a vector."""
+
+    def __init__(self, width: int, bias: bool) -> None:
+        super().__init__()
+        self.mlp = nn.Sequential(
+            nn.Linear(_SINUSOID, width, bias=bias), nn.SiLU(), nn.Linear(width, width, bias=bias)
+        )
+
+    def forward(self, moments: Tensor) -> Tensor:
+        """(B, D) of (B,) numbers; cosines stand before sines."""
+        angles = moments[:, None].float() * frequencies(_SINUSOID // 2, _LONGEST_PERIOD).to(moments.device)
+        sinusoid = torch.cat([angles.cos(), angles.sin()], dim=-1)
+        # The released models round the sinusoid to the precision of their weights.
+        return cast(Tensor, self.mlp(sinusoid.to(next(self.mlp.parameters()).dtype)))
+
+
+class Gate(nn.Module):
+    """Scales what half a block adds to the stream; a module, so that hooks can capture what is added."""
+
+    def forward(self, computed: Tensor, gate: Tensor) -> Tensor:
+        """(B, T, D) of (B, T, D) and (B, 1, D)."""
+        return computed * gate
 
 
 def without_precision(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -29,9 +29,9 @@ from transformers import Qwen2_5_VLConfig, Qwen2_5_VLForConditionalGeneration
 
 from probe_kit._system.bounded_files import load_json, load_yaml
 from probe_kit.errors import CheckpointError, UsageError
-from probe_kit.models.building import build_empty, fill_rotary, frequencies, without_precision
+from probe_kit.models.building import TimeEmbedder, build_empty, fill_rotary, without_precision
 from probe_kit.models.config_file import ConfigFile, Count, Index, part
-from probe_kit.models.qwen import IMAGE, QwenInputs
+from probe_kit.models.qwen import IMAGE, QwenInputs, qwen2_5_vl_config
 
 RUN_FILE, DIMS_FILE = "config.yaml", "dims.json"
 JSON_FILE = "config.json"
@@ -344,27 +344,11 @@ class QueryTransformer(nn.Module):
 
 # -- the diffusion head ---------------------------------------------------------------------------------------
 
-_SINUSOID = 256
-_LONGEST_PERIOD = 10000
 _EPSILON = 1e-6
 
 
 def _norm(width: int) -> nn.LayerNorm:
     return nn.LayerNorm(width, eps=_EPSILON, elementwise_affine=False)
-
-
-class TimeEmbedder(nn.Module):
-    """A step of the diffusion as a vector."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.mlp = nn.Sequential(nn.Linear(_SINUSOID, width), nn.SiLU(), nn.Linear(width, width))
-
-    def forward(self, steps: Tensor) -> Tensor:
-        """(B, D) of (B,) int64; cosines stand before sines."""
-        angles = steps[:, None].float() * frequencies(_SINUSOID // 2, _LONGEST_PERIOD).to(steps.device)
-        sinusoid = torch.cat([angles.cos(), angles.sin()], dim=-1)
-        return cast(Tensor, self.mlp(sinusoid.to(next(self.mlp.parameters()).dtype)))
 
 
 class _Embedder(nn.Module):
@@ -422,7 +406,7 @@ class DiffusionTransformer(nn.Module):
         # Of a version that read past actions; inference never calls it.
         self.history_embedder = _Embedder(config.action_dim, config.width)
         self.x_embedder = _Embedder(config.action_dim, config.width)
-        self.t_embedder = TimeEmbedder(config.width)
+        self.t_embedder = TimeEmbedder(config.width, bias=True)
         self.z_embedder = _ConditionEmbedder(query.width, config.width, query.queries)
         self.blocks = nn.ModuleList(Block(config.width, config.heads) for _ in range(config.blocks))
         self.final_layer = FinalLayer(config.width, config.action_dim)
@@ -572,28 +556,12 @@ def build_internvla(config: InternVLAConfig, dtype: torch.dtype, device: str = "
 
 def full_size_internvla() -> InternVLANetwork:
     """The released size on the meta device: Qwen2.5-VL-3B, DINOv2 ViT-S, 64 queries, DiT-B."""
-    vision = {
-        "depth": 32,
-        "hidden_size": 1280,
-        "intermediate_size": 3420,
-        "num_heads": 16,
-        "out_hidden_size": 2048,
-    }
-    text = {
-        "vocab_size": 151936,
-        "hidden_size": 2048,
-        "intermediate_size": 11008,
-        "num_hidden_layers": 36,
-        "num_attention_heads": 16,
-        "num_key_value_heads": 2,
-        "rope_parameters": {"rope_type": "default", "rope_theta": 1000000.0, "mrope_section": [16, 24, 24]},
-    }
     queries = {
         "qformer_start_layer": 36, "qformer_end_layer": 37, "num_query_tokens": 64, "input_dim": 2048,
         "output_dim": 768,
     }  # fmt: skip
     run = {"framework": {"framework_py": FRAMEWORKS[0], "layer_qformer": queries}}
-    vlm = {"vision_config": vision, "text_config": text, "tie_word_embeddings": True}
+    vlm = qwen2_5_vl_config("3B").to_dict()
     return build_internvla(InternVLAConfig.from_values(run, vlm, "released"), torch.float32)
 
 

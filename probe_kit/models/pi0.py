@@ -8,23 +8,23 @@ What half a block computes is multiplied by that gate before it is added. lerobo
 module ever holds what is added; here one does. Parameters and results stay lerobot's, bit for bit.
 """
 
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from types import MethodType, ModuleType
+from types import MethodType
 from typing import Any, Self, cast
 
 import torch
-from lerobot.policies.pi0 import modeling_pi0
 from lerobot.policies.pi0.configuration_pi0 import PI0Config
 from lerobot.policies.pi0.modeling_pi0 import PI0Policy
-from lerobot.policies.pi05 import modeling_pi05
 from lerobot.policies.pi05.configuration_pi05 import PI05Config
 from lerobot.policies.pi05.modeling_pi05 import PI05Policy
 from torch import Tensor, nn
 
 from probe_kit._system.bounded_files import load_json
-from probe_kit.models.building import building_device, replaced
+from probe_kit.models.building import Gate, building_device, replaced
 from probe_kit.models.config_file import ConfigFile, Count
 
 _VLM = "paligemma_with_expert.paligemma"
@@ -43,23 +43,13 @@ LM_HEAD = f"model.{_VLM}.lm_head.weight"
 EMBEDDING = f"model.{_VLM}.model.language_model.embed_tokens.weight"
 
 
-def current_pi0_keys(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The same tensors of a pi0 under the names lerobot 0.6 uses."""
-    return _renamed(tensors, (*_MOVED, *_TIME_OF_PI0))
-
-
-def current_pi05_keys(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The same tensors of a pi0.5 under the names lerobot 0.6 uses."""
-    return _renamed(tensors, (*_MOVED, *_TIME_OF_PI05))
-
-
-def current_pi0_fast_keys(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The same tensors of a pi0-FAST under the names lerobot 0.6 uses."""
-    return _renamed(tensors, _MOVED)
-
-
-def _renamed(tensors: Mapping[str, Tensor], names: Sequence[tuple[str, str]]) -> dict[str, Tensor]:
+def current_keys(tensors: Mapping[str, Tensor], names: Sequence[tuple[str, str]] = _MOVED) -> dict[str, Tensor]:
+    """The same tensors under the names lerobot 0.6 uses; by default those of a pi0-FAST."""
     return {_current(name, names): tensor for name, tensor in tensors.items() if not name.startswith(STATISTICS)}
+
+
+current_pi0_keys = partial(current_keys, names=(*_MOVED, *_TIME_OF_PI0))
+current_pi05_keys = partial(current_keys, names=(*_MOVED, *_TIME_OF_PI05))
 
 
 def _current(name: str, names: Sequence[tuple[str, str]]) -> str:
@@ -94,8 +84,14 @@ class SiglipSize(ConfigFile, extra="forbid"):
     patch: Count
 
 
-class SizeFile(ConfigFile):
-    """Every dimension that a policy's `config.json` cannot express."""
+class PaliGemmaSize(ConfigFile):
+    """Every dimension that the `config.json` of a policy on PaliGemma cannot express."""
+
+    network = "pi0-FAST"
+
+    vlm: GemmaSize
+    vision: SiglipSize
+    vocab_size: Count
 
     @classmethod
     def from_file(cls, path: Path) -> Self:
@@ -107,30 +103,31 @@ class SizeFile(ConfigFile):
         return self.model_dump()
 
 
-class Pi0Size(SizeFile):
-    """Every dimension of a pi0 that its `config.json` cannot express."""
+class Pi0Size(PaliGemmaSize):
+    """The same of a policy with an expert beside it."""
 
     network = "pi0"
 
-    vlm: GemmaSize
     expert: GemmaSize
-    vision: SiglipSize
-    vocab_size: Count
 
 
-def build_pi0(config: PI0Config, size: Pi0Size | None = None, device: str = "cpu") -> PI0Policy:
-    """A `PI0Policy` in eval mode with uninitialised weights.
+def build_resized[Policy: nn.Module](
+    policy: Callable[[Any], Policy], config: Any, size: PaliGemmaSize | None, device: str
+) -> Policy:
+    """One of lerobot's policies on PaliGemma in eval mode with uninitialised weights.
 
-    size: None for the released dimensions (Gemma 2B + 300M, SigLIP So400m).
+    size: None for the released dimensions (Gemma 2B, an expert of 300M, SigLIP So400m).
     device: `meta` serves to look at names and shapes. A policy that will act is built on the CPU, because the
     embedding scale and the rotary frequencies are buffers no checkpoint holds.
     """
-    device = building_device(device)
-    config.device = device
-    with resized(modeling_pi0, size), torch.device(device):
-        policy = PI0Policy(config)
-    policy.eval()
-    return cast(PI0Policy, policy)
+    config.device = building_device(device)
+    with resized(sys.modules[policy.__module__], size, config), torch.device(config.device):
+        return policy(config).eval()
+
+
+def build_pi0(config: PI0Config, size: Pi0Size | None = None, device: str = "cpu") -> PI0Policy:
+    """A `PI0Policy`; see `build_resized`."""
+    return cast(PI0Policy, build_resized(PI0Policy, config, size, device))
 
 
 def full_size_pi0() -> PI0Policy:
@@ -139,75 +136,48 @@ def full_size_pi0() -> PI0Policy:
 
 
 @contextmanager
-def resized(module: ModuleType, size: Pi0Size | None) -> Iterator[None]:
-    """Inside, lerobot's module of pi0 or pi0.5 builds networks of this size; None for the released one."""
+def resized(module: Any, size: PaliGemmaSize | None, policy_config: Any) -> Iterator[None]:
+    """Inside, lerobot's module of such a policy builds networks of this size; None for the released one."""
     if size is None:
         yield
         return
+    paligemma, expert = module.PaliGemmaForConditionalGenerationWithPiGemma, getattr(size, "expert", None)
+
+    def build_paligemma(config: Any) -> Any:
+        config._vocab_size = size.vocab_size
+        config.text_config.vocab_size = size.vocab_size
+        tower = config.vision_config
+        tower.hidden_size = size.vision.hidden
+        tower.num_hidden_layers = size.vision.layers
+        tower.num_attention_heads = size.vision.heads
+        tower.intermediate_size = size.vision.inter
+        tower.patch_size = size.vision.patch
+        tower.projection_dim = size.vlm.width
+        tower.image_size = policy_config.image_resolution[0]  # pi0-FAST leaves it at that of the released tower
+        return paligemma(config=config)
+
     replacements: dict[str, Callable[..., Any]] = {
-        "get_gemma_config": lambda variant: size.vlm if variant == "gemma_2b" else size.expert,
-        "PaliGemmaForConditionalGenerationWithPiGemma": sized_paligemma(
-            module, size.vlm, size.vision, size.vocab_size
-        ),
-        "PiGemmaForCausalLM": _sized_expert(module, size),
+        "get_gemma_config": lambda variant: expert if expert and variant != "gemma_2b" else size.vlm,
+        "PaliGemmaForConditionalGenerationWithPiGemma": build_paligemma,
     }
+    if expert:
+        gemma = module.PiGemmaForCausalLM
+
+        def build_expert(config: Any) -> Any:
+            config.vocab_size = size.vocab_size
+            return gemma(config=config)
+
+        replacements["PiGemmaForCausalLM"] = build_expert
     with replaced(module, replacements):
         yield
-
-
-def sized_paligemma(
-    module: Any, vlm: GemmaSize, vision: SiglipSize, vocab_size: int, image_side: int | None = None
-) -> Callable[..., Any]:
-    """A stand-in for lerobot's PaliGemma in `module` while a network of these sizes is built.
-
-    image_side: in pixels, where lerobot leaves it at that of the released tower.
-    """
-    real = module.PaliGemmaForConditionalGenerationWithPiGemma
-
-    def build(config: Any) -> Any:
-        config._vocab_size = vocab_size
-        config.text_config.vocab_size = vocab_size
-        tower = config.vision_config
-        tower.hidden_size = vision.hidden
-        tower.num_hidden_layers = vision.layers
-        tower.num_attention_heads = vision.heads
-        tower.intermediate_size = vision.inter
-        tower.patch_size = vision.patch
-        tower.projection_dim = vlm.width
-        tower.image_size = image_side or tower.image_size
-        return real(config=config)
-
-    return build
-
-
-def _sized_expert(module: Any, size: Pi0Size) -> Callable[..., Any]:
-    real = module.PiGemmaForCausalLM
-
-    def build(config: Any) -> Any:
-        config.vocab_size = size.vocab_size
-        return real(config=config)
-
-    return build
 
 
 # -- pi0.5 ----------------------------------------------------------------------------------------------------
 
 
-class Gate(nn.Module):
-    """The addition of half a block to the stream: its output, times the gate of the norm in front of it."""
-
-    def forward(self, computed: Tensor, gate: Tensor) -> Tensor:
-        """(B, T, D) of (B, T, D) and (B, 1, D)."""
-        return computed * gate
-
-
 def build_pi05(config: PI05Config, size: Pi0Size | None = None, device: str = "cpu") -> PI05Policy:
-    """A `PI05Policy` in eval mode with uninitialised weights; see `build_pi0`."""
-    device = building_device(device)
-    config.device = device
-    with resized(modeling_pi05, size), torch.device(device):
-        policy = PI05Policy(config)
-    policy.eval()
+    """A `PI05Policy`; see `build_resized`."""
+    policy = build_resized(PI05Policy, config, size, device)
     for block in policy.model.paligemma_with_expert.gemma_expert.model.layers:
         _attach_gates(block)
     return cast(PI05Policy, policy)

@@ -23,10 +23,9 @@ from transformers import (
 from transformers.models.qwen2_vl.image_processing_pil_qwen2_vl import Qwen2VLImageProcessorPil, smart_resize
 from transformers.models.qwen2_vl.image_processing_qwen2_vl import Qwen2VLImageProcessor
 
-from probe_kit._system.bounded_files import load_json
 from probe_kit.errors import CheckpointError, ObservationError
 from probe_kit.models.building import build_empty, fill_rotary
-from probe_kit.models.checkpoint_files import Renames
+from probe_kit.models.checkpoint_files import PROCESSOR_FILE, Renames, processor_settings
 
 QWEN2_5_NAMES: Renames = (
     (r"^visual\.", "model.visual."),
@@ -103,8 +102,8 @@ def full_size_qwen2_5_vl(size: str) -> Any:
     return build_qwen2_5_vl(qwen2_5_vl_config(size), torch.float32)
 
 
-def full_size_qwen3_vl(size: str) -> Any:
-    """A released size on the meta device."""
+def qwen3_vl_config(size: str) -> Qwen3VLConfig:
+    """Return the configuration of a released size."""
     text = {
         **_QWEN3[size],
         "num_key_value_heads": 8,
@@ -120,8 +119,12 @@ def full_size_qwen3_vl(size: str) -> Any:
     tied = size in _TIED
     vision_sizes = _QWEN3_SMALL_VISION if tied else _QWEN3_VISION
     vision = {**vision_sizes, "out_hidden_size": text["hidden_size"], "patch_size": 16}
-    config = Qwen3VLConfig(text_config=text, vision_config=vision, tie_word_embeddings=tied)
-    return build_qwen3_vl(config, torch.float32)
+    return Qwen3VLConfig(text_config=text, vision_config=vision, tie_word_embeddings=tied)
+
+
+def full_size_qwen3_vl(size: str) -> Any:
+    """A released size on the meta device."""
+    return build_qwen3_vl(qwen3_vl_config(size), torch.float32)
 
 
 # -- batches of prompts ---------------------------------------------------------------------------------------
@@ -221,7 +224,6 @@ def pack_inputs(
 
 # -- pictures -------------------------------------------------------------------------------------------------
 
-SETTINGS_FILE = "preprocessor_config.json"
 _NEEDED = ("patch_size", "temporal_patch_size", "merge_size", "image_mean", "image_std")
 _OPTIONAL = ("do_resize", "do_rescale", "rescale_factor", "do_normalize", "resample", "do_convert_rgb")
 _LONGEST_RATIO = 200
@@ -251,15 +253,8 @@ class QwenPictures:
         patch, temporal, merge: what the network was built with. Raises CheckpointError if the file is missing,
         lacks a number, or was made for another network.
         """
-        file = folder / SETTINGS_FILE
-        if not file.is_file():
-            raise CheckpointError(
-                f"{file} is missing; it defines the size of this checkpoint's pictures. "
-                "It comes with the checkpoint, or with the vision-language model it was made of"
-            )
-        values = load_json(file)
-        if missing := [name for name in _NEEDED if name not in values]:
-            raise CheckpointError(f"{file} lacks {', '.join(missing)}")
+        values = processor_settings(folder, _NEEDED, (*_OPTIONAL, "size", "min_pixels", "max_pixels"))
+        file = folder / PROCESSOR_FILE
         stored_sizes = tuple(int(values[name]) for name in _NEEDED[:3])
         if stored_sizes != (patch, temporal, merge):
             raise CheckpointError(

@@ -28,11 +28,11 @@ from probe_kit._system.bounded_files import load_json
 from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.hashing import sha256_json
 from probe_kit.models.bounds import check_deviations
-from probe_kit.models.building import build_empty, fill_rotary, frequencies, without_precision
+from probe_kit.models.building import Gate, TimeEmbedder, build_empty, fill_rotary, without_precision
 from probe_kit.models.checkpoint_files import chosen_name
 from probe_kit.models.config_file import STORED_TYPE, ConfigFile, Count, part
 from probe_kit.models.decoding import PromptKV
-from probe_kit.models.qwen import IMAGE, QwenInputs
+from probe_kit.models.qwen import IMAGE, QwenInputs, qwen3_vl_config
 
 MODEL_TYPE = "mibot"
 
@@ -93,8 +93,6 @@ Cache = tuple[Tensor, Tensor]
 Angles = tuple[Tensor, Tensor]
 """Cosines and sines of the own positions, (B, T, E) each."""
 
-_SINUSOID = 256
-_LONGEST_PERIOD = 10000
 _MODULATIONS = 6
 
 
@@ -111,24 +109,6 @@ class Projector(nn.Module):
     def forward(self, features: Tensor) -> Tensor:
         """(…, outputs) from (…, inputs)."""
         return cast(Tensor, self.layers(features))
-
-
-class TimeEmbedder(nn.Module):
-    """A moment of the flow as a vector."""
-
-    def __init__(self, width: int) -> None:
-        super().__init__()
-        self.mlp = nn.Sequential(
-            nn.Linear(_SINUSOID, width, bias=False), nn.SiLU(), nn.Linear(width, width, bias=False)
-        )
-
-    def forward(self, moments: Tensor) -> Tensor:
-        """(B, D) of (B,) float32 moments in thousandths; cosines stand before sines."""
-        angles = moments[:, None].float() * frequencies(_SINUSOID // 2, _LONGEST_PERIOD).to(moments.device)
-        sinusoid = torch.cat([angles.cos(), angles.sin()], dim=-1)
-        # The released model rounds the sinusoid to the precision of its weights.
-        precision = next(self.mlp.parameters()).dtype
-        return cast(Tensor, self.mlp(sinusoid.to(precision)))
 
 
 class Attention(nn.Module):
@@ -181,14 +161,6 @@ class GatedMLP(nn.Module):
         return cast(Tensor, self.down_proj(functional.silu(self.gate_proj(stream)) * self.up_proj(stream)))
 
 
-class Gate(nn.Module):
-    """Scales what is added to the stream; a module, so that hooks can capture what is added."""
-
-    def forward(self, gate: Tensor, added: Tensor) -> Tensor:
-        """(B, T, D) of gate (B, 1, D) and (B, T, D)."""
-        return gate * added
-
-
 class Layer(nn.Module):
     """Attention, then an MLP. Each writes into the stream through a gate, and the sum is normalised at once.
 
@@ -211,10 +183,10 @@ class Layer(nn.Module):
         modulation = (self.adaln_table + moment).chunk(_MODULATIONS, dim=1)
         shift, scale, gate = modulation[:3]
         read = self.attn(self.input_layernorm(stream) * (1 + scale) + shift, cache, rotation, mask)
-        stream = self.middle_layernorm(stream + self.attn_gate(gate, read))
+        stream = self.middle_layernorm(stream + self.attn_gate(read, gate))
         shift, scale, gate = modulation[3:]
         written = self.mlp(self.post_layernorm(stream) * (1 + scale) + shift)
-        return cast(Tensor, self.final_layernorm(stream + self.mlp_gate(gate, written)))
+        return cast(Tensor, self.final_layernorm(stream + self.mlp_gate(written, gate)))
 
 
 class FlowTransformer(nn.Module):
@@ -264,7 +236,7 @@ class XiaomiNetwork(nn.Module):
         self.state_projector = Projector(config.state_dim, flow.width)
         self.action_projector = Projector(config.action_dim, flow.width)
         self.action_output_layer = Projector(flow.width, config.action_dim)
-        self.t_embedder = TimeEmbedder(flow.width)
+        self.t_embedder = TimeEmbedder(flow.width, bias=False)
         self.t_projector = Projector(flow.width, 6 * flow.width, layers=1, bias=True)
         self.sink = nn.Embedding(1, flow.width)
         self.prompt_kv = PromptKV(int(config.vlm.text_config.num_hidden_layers))
@@ -327,32 +299,8 @@ def build_xiaomi(config: XiaomiConfig, dtype: torch.dtype, device: str = "meta")
 
 def full_size_xiaomi() -> XiaomiNetwork:
     """The released size on the meta device: Qwen3-VL-4B and 16 layers of flow transformer."""
-    vision = {
-        "depth": 24,
-        "hidden_size": 1024,
-        "intermediate_size": 4096,
-        "num_heads": 16,
-        "out_hidden_size": 2560,
-        "deepstack_visual_indexes": [5, 11, 17],
-    }
-    text = {
-        "hidden_size": 2560,
-        "intermediate_size": 9728,
-        "num_hidden_layers": 36,
-        "num_attention_heads": 32,
-        "num_key_value_heads": 8,
-        "head_dim": 128,
-        "rope_parameters": {
-            "rope_type": "default",
-            "rope_theta": 5000000.0,
-            "mrope_section": [24, 20, 20],
-            "mrope_interleaved": True,
-        },
-    }
-    vlm = Qwen3VLConfig(vision_config=vision, text_config=text, tie_word_embeddings=True)
-    return build_xiaomi(
-        XiaomiConfig.read({"vlm_config": vlm, "state_dim": 32, "action_dim": 32}, "released"), torch.float32
-    )
+    values = {"vlm_config": qwen3_vl_config("4B"), "state_dim": 32, "action_dim": 32}
+    return build_xiaomi(XiaomiConfig.read(values, "released"), torch.float32)
 
 
 # -- robots ---------------------------------------------------------------------------------------------------

@@ -49,7 +49,6 @@ def settings(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> As
         categories=("color",),
         items=2,
         scene=SMALL,
-        options={"tokenizer": "bytes"},
         env_workers=0,
     )
 
@@ -71,7 +70,7 @@ def test_every_episode_has_its_answer_and_the_run_is_whole(asked: Run) -> None:
     assert question.startswith('Do you see the gray shape? If yes, specify where: "left" or "right".')
     ask = asked.settings["ask"]
     assert (ask["prompt"], ask["picture_size"], ask["template_sha256"]) == ("p1", "224x224", P1.sha256)
-    assert asked.label == "prismatic · tiny · tokenizer=bytes · p1 · 224×224"
+    assert asked.label == "prismatic · tiny · p1 · 224×224"
 
 
 def test_a_question_by_letter_keeps_what_every_layer_would_answer(settings: AskSettings, asked: Run) -> None:
@@ -83,7 +82,7 @@ def test_a_question_by_letter_keeps_what_every_layer_would_answer(settings: AskS
     assert margins[:, -1] == pytest.approx(asked.episodes["margin"].to_numpy(), abs=1e-5)
     assert margins[:, :-1].std() > 0
     assert model.unembedding is not None
-    letters = [model.tokenizer.encode(letter)[-1] for letter in "AB"]  # type: ignore[attr-defined]
+    letters = [model.tokenizer.encode(model.lead + letter)[-1] for letter in "AB"]  # type: ignore[attr-defined]
     for layer, site in enumerate(asked.sites("answer")):
         logits = model.unembedding.logits(torch.from_numpy(np.array(asked.column(site, "last")[:1])))
         assert margins[0, layer] == pytest.approx(float(logits[0, letters[0]] - logits[0, letters[1]]), abs=1e-6)
@@ -280,7 +279,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def ask(suite: Suite, folder: Path, *arguments: str) -> Result:
     few = ["--suite", str(suite.folder), "--categories", "color", "--items", "2", "--env-workers", "0"]
-    model = ["--model", "prismatic", "--checkpoint", str(folder), "-M", "tokenizer=bytes"]
+    model = ["--model", "prismatic", "--checkpoint", str(folder)]
     return CliRunner().invoke(app, ["ask", *model, *few, *arguments])
 
 

@@ -68,7 +68,7 @@ CASES = {
             Site("action", 2, iteration=6): (("mean", "mean:action"), 32),
         },
         ("unnorm_key", "mine"),
-        {"tokenizer": "bytes", "unnorm_key": "bridge_orig"},
+        {"unnorm_key": "bridge_orig"},
     ),
     "spatialvla": Case(
         "spatialvla",

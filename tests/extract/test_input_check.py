@@ -103,7 +103,7 @@ def test_questions_are_checked_by_the_logits_of_their_answers(small_suite: Any, 
     folder = write_checkpoint(tmp_path / "tiny", model_type="prismatic")
     settings = AskSettings(
         "prismatic", str(folder), suite=small_suite.folder, categories=("color",), items=2,
-        scene=SceneSpec(picture_size=(224, 224)), options={"tokenizer": "bytes"}, env_workers=0,
+        scene=SceneSpec(picture_size=(224, 224)), env_workers=0,
     )  # fmt: skip
     assert ask_run(settings, tmp_path / "shown").certificate["input_check"] == BOTH
     unseen = ask_run(settings.changed(picture="none"), tmp_path / "unseen")

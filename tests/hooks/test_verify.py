@@ -134,8 +134,7 @@ def test_the_tensors_take_as_many_bytes_as_the_published_file(
 @pytest.fixture(params=["pi0", "smolvla"])
 def reference(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[str, Path]:
     """A golden reference a test may damage, as (family, folder)."""
-    folder = request.getfixturevalue(f"golden_{request.param}")
-    return request.param, Path(shutil.copytree(folder, tmp_path / request.param))
+    return request.param, Path(shutil.copytree(GOLDEN / request.param, tmp_path / request.param))
 
 
 @pytest.mark.parametrize("damage", ["deleted", "renamed", "mis-shaped", "nan"])

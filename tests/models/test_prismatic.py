@@ -183,8 +183,7 @@ def test_every_part_has_the_precision_that_is_asked_for_whatever_the_file_says(a
 
 
 @pytest.mark.slow
-def test_the_full_size_has_the_released_number_of_parameters() -> None:
-    assert sum(parameter.numel() for parameter in full_size_openvla().parameters()) == 7_541_237_184
+def test_openvla_is_a_prismatic_of_the_released_size() -> None:
     assert full_size_prismatic().state_dict().keys() == full_size_openvla().state_dict().keys()
 
 

@@ -1,4 +1,4 @@
-"""The whole network, against its own parts put together another way, and against the recorded original."""
+"""The whole network, against its own parts put together another way."""
 
 import json
 from pathlib import Path
@@ -11,12 +11,10 @@ from scipy.stats import norm
 from torch import Tensor
 
 from probe_kit.errors import CheckpointError, UsageError
-from probe_kit.hooks.checkpoints.weights import load_weights, read_weights
 from probe_kit.models.decoding import Packed
 from probe_kit.models.spatialvla import (
     DEPTH_SIDE,
     MARGIN,
-    Intrinsics,
     PictureSettings,
     PositionEmbedding3D,
     SpatialVLAConfig,
@@ -25,9 +23,7 @@ from probe_kit.models.spatialvla import (
     build_spatialvla,
     depth_input,
     estimate_depth,
-    full_size_spatialvla,
     known_cameras,
-    point_places,
     prepare_picture,
 )
 from probe_kit.models.spatialvla_actions import ActionBins, equal_mass_edges
@@ -151,22 +147,6 @@ def test_cached_steps_choose_what_one_pass_over_prompt_and_actions_would_choose(
     ).logits[:, -6:]
     torch.testing.assert_close(decoded.logits, whole, rtol=0, atol=2e-5)
     assert torch.equal(decoded.ids, whole.argmax(dim=-1))
-
-
-@pytest.mark.slow
-@torch.inference_mode()
-def test_padding_and_other_rows_change_nothing(built: SpatialVLANetwork) -> None:
-    rows = [prompt(3, seed=1), prompt(8, seed=2)]
-    looked = pictures(2)
-    cameras = torch.stack([CAMERA, CAMERA * torch.tensor([[1.2], [1.1], [1.0]])])
-    packed = Packed.of(rows, 0)
-    together = built.decode(packed.ids, packed.mask, built.look(looked, cameras).features, steps=4)
-    for row in (0, 1):
-        one = Packed.of([rows[row]], 0)
-        alone = built.decode(
-            one.ids, one.mask, built.look(looked[row : row + 1], cameras[row : row + 1]).features, 4
-        )
-        torch.testing.assert_close(together.logits[row : row + 1], alone.logits, rtol=0, atol=2e-5)
 
 
 @torch.inference_mode()
@@ -305,37 +285,6 @@ def test_bfloat16_runs_with_pictures_and_depth_in_float32() -> None:
     assert torch.isfinite(made.decode(packed.ids, packed.mask, features, 3).logits).all()
 
 
-def test_the_full_size_has_the_released_number_of_parameters() -> None:
-    full = full_size_spatialvla()
-    assert sum(parameter.numel() for parameter in full.parameters()) == 4_027_854_731
-    assert len(full.state_dict()) == 1382
-
-
-# -- the recorded original -------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-@torch.inference_mode()
-def test_hidden_states_logits_and_ids_are_the_originals(golden_spatialvla: Path) -> None:
-    folder = golden_spatialvla / "checkpoint"
-    made = build_spatialvla(SpatialVLAConfig.from_folder(folder), torch.float32)
-    weights = read_weights(folder)
-    load_weights(made, weights, weights.tensors, assign=True)
-    made.embed_actions()
-    with np.load(golden_spatialvla / "reference.npz") as arrays:
-        recorded = {name: torch.from_numpy(arrays[name]) for name in arrays.files}
-    ids, mask = recorded["input_ids"], recorded["attention_mask"].bool()
-    features = made.look(recorded["pixel_values"], recorded["intrinsic"]).features
-    output = made(made.embed(ids, features), mask)
-    close = {"rtol": 0, "atol": 5e-5}
-    torch.testing.assert_close(torch.stack(output.hidden_states), recorded["hidden_states"], **close)
-    torch.testing.assert_close(output.logits, recorded["logits"], **close)
-    steps = len(recorded["generated_ids"])
-    decoded = made.decode(ids, mask, features, steps)
-    assert torch.equal(decoded.ids[0], recorded["generated_ids"])
-    torch.testing.assert_close(decoded.logits[0], recorded["generated_step_logits"], **close)
-
-
 def domain_pictures() -> Tensor:
     """A dark, a bright and a striped one."""
     noise = torch.rand((3, 3, SIDE, SIDE), generator=torch.Generator().manual_seed(0))
@@ -405,21 +354,6 @@ def test_the_margin_is_a_mirror_and_the_range_is_minus_one_to_one() -> None:
     torch.testing.assert_close(depth_input(torch.full((1, 3, 64, 64), 0.5)), torch.zeros(1, 3, 384, 384))
 
 
-@torch.inference_mode()
-def test_the_depth_of_the_original_is_reproduced(golden_spatialvla: Path) -> None:
-    folder = golden_spatialvla / "checkpoint"
-    made = build_spatialvla(SpatialVLAConfig.from_folder(folder), torch.float32)
-    weights = read_weights(folder)
-    load_weights(made, weights, weights.tensors, assign=True)
-    with np.load(golden_spatialvla / "reference.npz") as arrays:
-        recorded = {name: torch.from_numpy(arrays[name]) for name in arrays.files}
-    pixels = recorded["pixel_values"]
-    torch.testing.assert_close(depth_input(pixels)[..., ::8, ::8], recorded["zoe_pixel_values_sub"])
-    depth = estimate_depth(made.vision_zoe_model, pixels)
-    torch.testing.assert_close(depth.metres, recorded["depth"], rtol=0, atol=5e-5)
-    torch.testing.assert_close(depth.domains, recorded["domain_logits"], rtol=0, atol=5e-5)
-
-
 @pytest.mark.parametrize(("side", "patch", "points"), [(56, 14, 2), (48, 16, 4), (42, 14, 1)])
 def test_points_project_back_to_the_middles_of_a_patchs_parts(side: int, patch: int, points: int) -> None:
     """Seen through the camera again, every point lies where it was measured, at the depth of its part."""
@@ -460,17 +394,6 @@ def test_the_code_is_a_value_then_sines_then_cosines_of_doubling_frequency() -> 
         expected = torch.stack([placed, *(torch.sin(a) for a in angles), *(torch.cos(a) for a in angles)])
         torch.testing.assert_close(code[0, 1, 9 * axis : 9 * axis + 9], expected)
     assert embedding(points).shape == (1, 2, 8)
-
-
-def test_the_places_of_the_original_are_reproduced(golden_spatialvla: Path) -> None:
-    with np.load(golden_spatialvla / "reference.npz") as arrays:
-        places, metres, camera, points = (arrays[name] for name in ("uv_h", "depth", "intrinsic", "xyz"))
-    side = metres.shape[-1]
-    patch = side // int(points.shape[1] ** 0.5)
-    resolution = int((points.shape[2] / 3) ** 0.5)
-    np.testing.assert_array_equal(point_places(side, patch, resolution).numpy(), places)
-    found = back_project(torch.from_numpy(metres), torch.from_numpy(camera), patch, resolution)
-    np.testing.assert_allclose(found.numpy(), points, rtol=0, atol=5e-5)
 
 
 CONFIG = SpatialVLAConfig.from_json(config_values())
@@ -526,17 +449,6 @@ def test_a_matrix_that_is_no_cameras_is_refused() -> None:
     broken = {"default": {"width": 4, "height": 3, "intrinsic": [[0, 0, 1], [0, 1, 1], [0, 0, 1]]}}
     with pytest.raises(CheckpointError, match="intrinsic_config of default"):
         known_cameras({"intrinsic_config": broken}, "file")
-
-
-def test_pictures_and_camera_are_the_originals(golden_spatialvla: Path) -> None:
-    folder = golden_spatialvla / "checkpoint"
-    with np.load(golden_spatialvla / "reference.npz") as arrays:
-        recorded = {name: arrays[name] for name in ("image_uint8", "pixel_values", "intrinsic_raw", "intrinsic")}
-    chosen = PictureSettings.of(SpatialVLAConfig.from_folder(folder), folder)
-    np.testing.assert_array_equal(prepare_picture(recorded["image_uint8"], chosen)[None], recorded["pixel_values"])
-    height, width = recorded["image_uint8"].shape[:2]
-    camera = Intrinsics(recorded["intrinsic_raw"], width, height)
-    np.testing.assert_array_equal(camera.at(chosen.side), recorded["intrinsic"])
 
 
 AXES = ("theta", "phi", "r", "roll", "pitch", "yaw")
@@ -641,17 +553,11 @@ def test_bins_of_another_checkpoint_are_refused() -> None:
         bins(action_config={})
 
 
-def test_the_originals_tables_are_reproduced_exactly(golden_spatialvla: Path) -> None:
+def test_the_stored_edges_are_those_of_the_gaussians_beside_them(golden_spatialvla: Path) -> None:
     values = json.loads((golden_spatialvla / "checkpoint" / "processor_config.json").read_text(encoding="utf-8"))
     model = json.loads((golden_spatialvla / "checkpoint" / "config.json").read_text(encoding="utf-8"))
     first, actions = model["action_token_begin_idx"], model["spatial_token_num"]
     own = ActionBins.of(values, first, actions, "golden")
-    with np.load(golden_spatialvla / "reference.npz") as arrays:
-        recorded = {name: arrays[name] for name in ("tok_actions", "tok_ids", "tok_decoded", "decode_table")}
-    np.testing.assert_array_equal(own.ids(recorded["tok_actions"]), recorded["tok_ids"])
-    np.testing.assert_allclose(own.values(recorded["tok_ids"]), recorded["tok_decoded"], rtol=0, atol=1e-12)
-    every = np.repeat(np.arange(len(recorded["decode_table"]))[:, None], 3, axis=1)
-    np.testing.assert_allclose(own.values(every), recorded["decode_table"], rtol=0, atol=1e-12)
     gaussian = ActionBins.of({k: v for k, v in values.items() if k != "bin_policy"}, first, actions, "golden")
     for ours, stored in zip(gaussian.edges, own.edges, strict=True):
         np.testing.assert_allclose(ours, stored, rtol=0, atol=1e-12)

@@ -191,7 +191,7 @@ NATIVE = {
                         "temperature": 0.6, "top_k": "7"},
     ),
     "openvla of one tower, Mistral and a tokenizer file": Case(
-        "openvla", single_tower_mistral, {"tokenizer": None}, slow=True,
+        "openvla", single_tower_mistral, slow=True,
         instructions=("Put the cube on the star", "take the red cube to the star", "Put the cube on the shape"),
     ),
     "openvla, golden": Case("openvla", golden("openvla"), {"unnorm_key": "bridge_orig"}, slow=True),

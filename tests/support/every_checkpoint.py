@@ -23,7 +23,6 @@ from tests.support import (
     xvla_checkpoints,
 )
 
-_BYTES = {"tokenizer": "bytes"}
 WRITERS: dict[str, tuple[Callable[[Path], Path], dict[str, Any]]] = {
     "pi0": (pi0_checkpoints.write_intact, {}),
     "pi05": (pi05_checkpoints.write_pi05, {}),
@@ -33,8 +32,8 @@ WRITERS: dict[str, tuple[Callable[[Path], Path], dict[str, Any]]] = {
     "xvla": (xvla_checkpoints.write_xvla, {}),
     "eo1": (eo1_checkpoints.write_eo1, {}),
     "smolvla": (smolvla_checkpoints.write_smolvla, {}),
-    "openvla": (prismatic_checkpoints.write_checkpoint, _BYTES),
-    "prismatic": (prismatic_checkpoints.write_checkpoint, _BYTES),
+    "openvla": (prismatic_checkpoints.write_checkpoint, {}),
+    "prismatic": (prismatic_checkpoints.write_checkpoint, {}),
     "spatialvla": (spatialvla_checkpoints.write_checkpoint, {}),
     "magma": (magma_checkpoints.write_checkpoint, {"unnorm_key": "bridge_orig"}),
     "xiaomi-r0": (xiaomi_checkpoints.write_checkpoint, {"robot": "bridge_delta"}),

@@ -37,12 +37,12 @@ def write_pi0_fast(
     from lerobot.configs.types import FeatureType, PolicyFeature
     from lerobot.policies.pi0_fast.configuration_pi0_fast import PI0FastConfig
 
-    from probe_kit.hooks.families.pi0_fast.adapter import Pi0FastSize, build_pi0_fast
+    from probe_kit.hooks.families.pi0_fast.adapter import build_pi0_fast
     from probe_kit.models.building import initialise
-    from probe_kit.models.pi0 import GemmaSize, SiglipSize
+    from probe_kit.models.pi0 import GemmaSize, PaliGemmaSize, SiglipSize
 
     fast = write_fast_tokenizer(folder / "fast")
-    size = Pi0FastSize(
+    size = PaliGemmaSize(
         vlm=GemmaSize(width=32, depth=3, mlp_dim=48, num_heads=8, num_kv_heads=1, head_dim=8),
         vision=SiglipSize(hidden=24, layers=2, heads=3, inter=40, patch=8),
         vocab_size=write_text_tokenizer(folder, fast, further_words),

@@ -2,12 +2,13 @@
 
 import json
 from pathlib import Path
+from string import ascii_letters
 from typing import Any
 
 import torch
 from safetensors.torch import save_file
-from tokenizers import Regex, Tokenizer
-from tokenizers.models import WordLevel
+from tokenizers import Regex, Tokenizer, decoders
+from tokenizers.models import BPE, WordLevel
 from tokenizers.normalizers import Lowercase
 from tokenizers.pre_tokenizers import Sequence, Split
 
@@ -49,8 +50,8 @@ def config_values(vision: str = FUSED, language: str = "llama2-7b-pure", **field
 
 
 def write_checkpoint(folder: Path, shards: int = 1, seed: int = 1, **fields: Any) -> Path:
-    """Write config and weights; with more than one shard also the index that names them."""
-    folder.mkdir(parents=True, exist_ok=True)
+    """Write config, tokenizer and weights; with more than one shard also the index that names them."""
+    write_letters(folder)
     values = config_values(**fields)
     (folder / "config.json").write_text(json.dumps(values), encoding="utf-8")
     network = build_prismatic(PrismaticConfig.from_json(values), torch.float32, device="cpu")
@@ -139,13 +140,29 @@ def write_release(cache: Path, seed: int = 1, towers_inside: bool = False, publi
     return folder
 
 
+def write_letters(folder: Path) -> Path:
+    """A tokenizer that knows every text: byte b has id 3 + b, a letter with the space before it one of its own."""
+    bytes_of = {chr(byte) if byte < 128 else f"<0x{byte:02X}>": 3 + byte for byte in range(256)}
+    merges = [(" ", letter) for letter in ascii_letters]
+    pairs = {" " + letter: 259 + number for number, letter in enumerate(ascii_letters)}
+    special = {"<unk>": 0, "<s>": 1, "</s>": 2}
+    tokenizer = Tokenizer(BPE(special | bytes_of | pairs, merges, unk_token="<unk>", byte_fallback=True))
+    tokenizer.decoder = decoders.Sequence([decoders.ByteFallback(), decoders.Fuse()])
+    return _save(tokenizer, folder)
+
+
 def write_tokenizer(folder: Path) -> Path:
-    """A word-level tokenizer; it does not add the beginning of the sequence by itself."""
+    """A word-level tokenizer."""
     tokenizer = Tokenizer(
         WordLevel({word: index for index, word in enumerate(dict.fromkeys(WORDS))}, unk_token="<unk>")
     )
     tokenizer.normalizer = Lowercase()
     tokenizer.pre_tokenizer = Sequence([Split(" ", "removed"), Split(Regex(r"\?|\n"), "isolated")])
+    return _save(tokenizer, folder)
+
+
+def _save(tokenizer: Tokenizer, folder: Path) -> Path:
+    """The file does not add the beginning of a text."""
     tokenizer.add_special_tokens(["<unk>", "<s>", "</s>"])
     folder.mkdir(parents=True, exist_ok=True)
     tokenizer.save(str(folder / "tokenizer.json"))

@@ -44,9 +44,9 @@ IMAGE = len(WORDS)
 FIRST_ACTION = IMAGE + 1
 
 
-def config_values(bins: dict[str, Any] = BINS, **fields: Any) -> dict[str, Any]:
+def config_values(**fields: Any) -> dict[str, Any]:
     """The content of a `config.json`."""
-    actions = int(bins["total"])
+    actions = int(BINS["total"])
     return {
         "model_type": "spatialvla",
         "architectures": ["SpatialVLAForConditionalGeneration"],
@@ -132,11 +132,11 @@ def _depth() -> dict[str, Any]:
     }
 
 
-def edges(bins: dict[str, Any] = BINS) -> dict[str, dict[str, list[float]]]:
+def edges() -> dict[str, dict[str, list[float]]]:
     """The `bin_policy` of a `processor_config.json`: uneven edges, finer around the middle."""
     policy: dict[str, dict[str, list[float]]] = {}
     for group in ("translation", "rotation"):
-        for name, count in bins[group].items():
+        for name, count in BINS[group].items():
             low, high = _LIMITS.get(name.removesuffix("_bins"), (-1, 1))
             even = np.linspace(-1, 1, int(count) + 1)
             uneven = even * np.abs(even) ** 0.4
@@ -144,15 +144,15 @@ def edges(bins: dict[str, Any] = BINS) -> dict[str, dict[str, list[float]]]:
     return policy
 
 
-def processor_values(bins: dict[str, Any] = BINS, **fields: Any) -> dict[str, Any]:
+def processor_values(**fields: Any) -> dict[str, Any]:
     """The content of a `processor_config.json`."""
     statistics = {"q01": [-0.03] * 6 + [0.0], "q99": [0.03] * 6 + [1.0], "mask": [True] * 6 + [False]}
     camera = {"width": 640, "height": 480, "intrinsic": [[623.588, 0, 319.501], [0, 623.588, 239.545], [0, 0, 1]]}
     return {
         "processor_class": "SpatialVLAProcessor",
         "action_chunk_size": 4,
-        "action_config": {"distribution": "gaussian", "num_bins": bins, "use_spherical": True},
-        "bin_policy": edges(bins),
+        "action_config": {"distribution": "gaussian", "num_bins": BINS, "use_spherical": True},
+        "bin_policy": edges(),
         "intrinsic_config": {"bridge_orig/1.0.0": camera, "default": camera},
         "min_sigma": 0.0,
         "num_obs_steps": 1,
@@ -193,23 +193,17 @@ def write_checkpoint(
     folder: Path,
     shards: int = 2,
     seed: int = 1,
-    bins: dict[str, Any] = BINS,
     processor: dict[str, Any] | None = None,
-    tokenizer: bool = True,
     **fields: Any,
 ) -> Path:
     """Write every file of a released checkpoint. processor: changes to `processor_config.json`."""
     folder.mkdir(parents=True, exist_ok=True)
-    built = network(seed, bins=bins, **fields)
-    _write(folder / "config.json", config_values(bins, **fields))
-    _write(folder / "processor_config.json", processor_values(bins, **(processor or {})))
+    built = network(seed, **fields)
+    _write(folder / "config.json", config_values(**fields))
+    _write(folder / "processor_config.json", processor_values(**(processor or {})))
     _write(folder / "preprocessor_config.json", preprocessor_values(built.config.side))
-    if tokenizer:
-        write_tokenizer(folder, int(bins["total"]))
+    write_tokenizer(folder)
     tensors = {name: tensor.contiguous() for name, tensor in built.state_dict().items()}
-    if shards == 1:
-        save_file(tensors, folder / "model.safetensors")
-        return folder
     place = {
         name: f"model-{index % shards + 1:05d}-of-{shards:05d}.safetensors" for index, name in enumerate(tensors)
     }
@@ -220,7 +214,7 @@ def write_checkpoint(
     return folder
 
 
-def write_tokenizer(folder: Path, actions: int = BINS["total"], more: tuple[str, ...] = ()) -> Path:
+def write_tokenizer(folder: Path, more: tuple[str, ...] = ()) -> Path:
     """A byte-fallback BPE tokenizer with the released files' added tokens, and `more` before the actions."""
     tokenizer = Tokenizer(
         BPE(
@@ -233,7 +227,7 @@ def write_tokenizer(folder: Path, actions: int = BINS["total"], more: tuple[str,
     )
     tokenizer.normalizer = Replace(" ", "▁")
     tokenizer.decoder = Decoders([Unreplace("▁", " "), ByteFallback(), Fuse()])
-    added = ["<image>", *more, *(f"<ACTION{index:05d}>" for index in range(actions))]
+    added = ["<image>", *more, *(f"<ACTION{index:05d}>" for index in range(BINS["total"]))]
     tokenizer.add_special_tokens([AddedToken(token, normalized=False) for token in (*_SPECIAL, *added)])
     folder.mkdir(parents=True, exist_ok=True)
     tokenizer.save(str(folder / "tokenizer.json"))

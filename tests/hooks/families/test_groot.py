@@ -22,7 +22,6 @@ from torchvision.transforms import v2
 from probe_kit.errors import CheckpointError, InstructionError, UsageError, WeightsError
 from probe_kit.hooks import Observation, Site, capture, edit
 from probe_kit.hooks.conformance.subject import examples_for
-from probe_kit.hooks.families.groot import network
 from probe_kit.hooks.families.groot.adapter import Groot
 from tests.support.groot_checkpoints import CHUNK, HORIZON, TAG, write_groot, write_nvidias
 from tests.support.pi05_checkpoints import HIGH, LEAST, LOW, MOST
@@ -525,14 +524,3 @@ def test_without_a_bridge_the_expert_reads_the_norm_of_the_backbone(
     assert list(policy.streams) == ["backbone", "expert"]
     with capture(policy, policy.sites()):
         assert np.isfinite(policy.act(seen, [0])).all()
-
-
-@pytest.mark.slow  # seconds for three billion parameters, on the meta device
-def test_the_default_size_has_the_layers_that_the_family_names() -> None:
-    policy = network.full_size_groot()
-    head = policy._groot_model.action_head
-    layers = (policy._groot_model.backbone.language_model.layers, head.vl_self_attention.transformer_blocks,
-              head.model.transformer_blocks)  # fmt: skip
-    assert [len(own) for own in layers] == [16, 4, 32]
-    assert head.num_inference_timesteps == 4
-    assert sum(own.numel() for own in policy.parameters()) == 3_144_016_000

@@ -21,23 +21,22 @@ from safetensors.torch import load_file, save_file
 from probe_kit.errors import CheckpointError, InstructionError, ObservationError, ProbeKitError
 from probe_kit.hooks import Observation, load_policy
 from probe_kit.hooks.conformance.subject import examples_for
-from probe_kit.hooks.families.molmoact2.packing import JointFrame, SteppedUnits
+from probe_kit.hooks.families.molmoact2.packing import FramedUnits, JointFrame
 from probe_kit.hooks.families.pi0.adapter import Pi05
-from probe_kit.hooks.families.pi0_fast.adapter import Pi0Fast, Pi0FastSize, sized
-from probe_kit.hooks.families.shared.lerobot.normaliser import Bounds, Normaliser, Units
+from probe_kit.hooks.families.pi0_fast.adapter import Pi0Fast
+from probe_kit.hooks.families.shared.lerobot.normaliser import Bounds, Normaliser
 from probe_kit.hooks.families.shared.lerobot.pipelines import (
+    CROP,
     POSTPROCESSOR,
     PREPROCESSOR,
-    SavedStep,
-    check_fields,
     check_steps,
     known_values,
     tokenizer_folder,
 )
 from probe_kit.hooks.families.shared.lerobot.policy import TEXT_FILES
-from probe_kit.hooks.families.shared.lerobot.window import STEP, PictureWindow, read_window
+from probe_kit.hooks.families.shared.lerobot.window import PictureWindow, read_window
 from probe_kit.hooks.registry import find_family
-from probe_kit.models.pi0 import Pi0Size, resized
+from probe_kit.models.pi0 import PaliGemmaSize, Pi0Size, resized
 from tests.support import (
     eo1_checkpoints,
     groot_checkpoints,
@@ -243,9 +242,9 @@ def test_pi05_acts_as_lerobots_own_loading_processors_and_policy_bit_for_bit(
 ) -> None:
     modes = {"VISUAL": "IDENTITY", "STATE": mode, "ACTION": mode}
     before, behind = save_pipelines(folder, normalization_mapping=modes, dtype=dtype)
-    with resized(modeling_pi05, Pi0Size.from_file(folder / "dims.json")):
-        theirs = modeling_pi05.PI05Policy.from_pretrained(folder).eval()
     every = Pi05.load(str(folder))
+    with resized(modeling_pi05, Pi0Size.from_file(folder / "dims.json"), every.config):
+        theirs = modeling_pi05.PI05Policy.from_pretrained(folder).eval()
     for shown in (CAMERAS, CAMERAS[:1]):
         ours = every.with_cameras(shown)
         for seed, one in enumerate(seen()):
@@ -283,7 +282,7 @@ def _fast_acts_as_lerobot(folder: Path, patch: pytest.MonkeyPatch) -> Any:
     ours, fast = Pi0Fast.load(str(folder)), fast_processor(folder / "fast")
     for name, own in (("AutoTokenizer", ours.tokenizer), ("AutoProcessor", fast)):
         patch.setattr(modeling_pi0_fast, name, SimpleNamespace(from_pretrained=lambda *_, own=own, **__: own))
-    with sized(Pi0FastSize.from_file(folder / "dims.json"), ours.config):
+    with resized(modeling_pi0_fast, PaliGemmaSize.from_file(folder / "dims.json"), ours.config):
         theirs = modeling_pi0_fast.PI0FastPolicy.from_pretrained(folder).eval()
     for one in seen():
         packed = before(raw(one, {"base": one.image}))
@@ -439,10 +438,14 @@ def test_a_prompt_without_the_state_is_refused(tmp_path: Path) -> None:
         ("tokenizer_processor", "padding", "do_not_pad", "longest"),
     ],
 )
-def test_a_value_that_changes_numbers_is_refused(name: str, field: str, value: str, plain: str) -> None:
-    check_fields(SavedStep(name, {field: plain}, None), "pipeline.json")
+def test_a_value_that_changes_numbers_is_refused(
+    name: str, field: str, value: str, plain: str, tmp_path: Path
+) -> None:
+    write_steps(tmp_path, [{"registry_name": name, "config": {field: plain}}], PREPROCESSOR)
+    check_steps(tmp_path, PREPROCESSOR, (name,))
+    write_steps(tmp_path, [{"registry_name": name, "config": {field: value}}], PREPROCESSOR)
     with pytest.raises(CheckpointError, match=f"says {field}: '{value}'"):
-        check_fields(SavedStep(name, {field: value}, None), "pipeline.json")
+        check_steps(tmp_path, PREPROCESSOR, (name,))
 
 
 def test_a_step_that_stands_twice_is_refused(tmp_path: Path) -> None:
@@ -498,12 +501,11 @@ STATE_LOW, STATE_HIGH = np.array([-1.0, 0.0], np.float32), np.array([1.0, 0.5], 
 INSIDE, BELOW, ABOVE = (
     np.array([row], np.float32) for row in ((0.9, 0.5), (-1.1, 0.2), (0.0, 0.6))
 )  # fmt: skip
-NONE = np.zeros(2, bool)
-BOUNDED: dict[str, Units] = {
+BOUNDED: dict[str, Normaliser] = {
     "MIN_MAX": Normaliser("MIN_MAX", STATE_LOW, STATE_HIGH, 1e-8, "file"),
     "QUANTILES": Normaliser("QUANTILES", STATE_LOW, STATE_HIGH, 1e-8, "file"),
-    "clipped": Bounds(STATE_LOW, STATE_HIGH, "file"),
-    "clamped": SteppedUnits(Normaliser("QUANTILES", STATE_LOW, STATE_HIGH, 1e-8, "file"), NONE, True, NONE),
+    "clipped": Bounds("BOUNDS", STATE_LOW, STATE_HIGH, 0.0, "file"),
+    "clamped": Normaliser("QUANTILES", STATE_LOW, STATE_HIGH, 1e-8, "file", clamped=True),
 }
 
 
@@ -524,15 +526,14 @@ def test_more_than_five_deviations_from_the_mean_are_unusual() -> None:
 def test_numbers_without_statistics_are_never_unusual() -> None:
     nothing = np.zeros(0, np.float32)
     assert not Normaliser("IDENTITY", nothing, nothing, 0.0, "file").unusual(1e9 * BELOW).any()
-    masked = SteppedUnits(
-        Normaliser("MIN_MAX", STATE_LOW, STATE_HIGH, 1e-8, "file"), np.array([True, False]), True, NONE
-    )
+    plain = np.array([True, False])
+    masked = Normaliser("MIN_MAX", STATE_LOW, STATE_HIGH, 1e-8, "file", plain=plain, clamped=True)
     assert masked.unusual(BELOW).tolist() == [[False, False]]
 
 
 def test_recorded_joints_are_compared_in_the_frame_of_the_statistics() -> None:
     frame = JointFrame(np.array([-1], np.float32), np.array([2], np.float32))
-    units = SteppedUnits(Normaliser("MIN_MAX", STATE_LOW, STATE_HIGH, 1e-8, "file"), NONE, True, NONE, frame)
+    units = FramedUnits("MIN_MAX", STATE_LOW, STATE_HIGH, 1e-8, "file", clamped=True, frame=frame)
     values = np.array([[2.0, 0.2], [0.0, 0.2]], np.float32)
     assert units.unusual(values).tolist() == [[False, False], [True, False]]
     np.testing.assert_allclose(units.restore(units.normalise(values[:1])), values[:1])
@@ -542,7 +543,7 @@ CAMERA = "observation.images.base"
 
 
 def write_step(folder: Path, config: dict[str, object]) -> None:
-    steps = [{"registry_name": STEP, "config": config}]
+    steps = [{"registry_name": CROP, "config": config}]
     (folder / "policy_preprocessor.json").write_text(json.dumps({"steps": steps}), encoding="utf-8")
 
 

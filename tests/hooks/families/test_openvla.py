@@ -83,7 +83,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def fused(folder: Path) -> OpenVLA:
-    return load_openvla(str(folder), tokenizer="bytes", unnorm_key="bridge_orig")
+    return load_openvla(str(folder), unnorm_key="bridge_orig")
 
 
 @pytest.fixture(scope="module")
@@ -95,7 +95,7 @@ def mistral(tmp_path_factory: pytest.TempPathFactory) -> OpenVLA:
 
 @pytest.fixture(scope="module")
 def golden(golden_openvla: Path) -> OpenVLA:
-    return load_openvla(str(golden_openvla / "checkpoint"), tokenizer="bytes", unnorm_key="bridge_orig")
+    return load_openvla(str(golden_openvla / "checkpoint"), unnorm_key="bridge_orig")
 
 
 # -- prompt ----------------------------------------------------------------------------------------------------
@@ -103,7 +103,7 @@ def golden(golden_openvla: Path) -> OpenVLA:
 
 def test_the_prompt_is_lower_case_and_ends_with_one_empty_token(fused: OpenVLA) -> None:
     text = "In: What action should the robot take to put the cube on the star?\nOut:"
-    expected = [1, *(3 + byte for byte in text.encode()), 29]
+    expected = [*fused.tokenizer.encode(text), 29]
     assert fused.prompt("Put the Cube on the star") == expected
     assert fused.with_empty_token(expected) == expected
 
@@ -132,12 +132,14 @@ def test_the_first_release_gets_vicunas_prompt(tmp_path: Path) -> None:
 def test_another_split_of_the_prompt_than_llamas_is_refused_at_full_vocabulary(tmp_path: Path) -> None:
     text = config_values()["text_config"] | {"vocab_size": 32064, "pad_token_id": 32000}
     folder = write_checkpoint(tmp_path, vision=SINGLE, text_config=text)
-    policy = load_openvla(str(folder), tokenizer="bytes", unnorm_key="bridge_orig")
+    policy = load_openvla(str(folder), unnorm_key="bridge_orig")
     with pytest.raises(CheckpointError, match="512, 29901, 1724"):
         policy.prompt("put the cube on the star")
 
 
-def test_without_a_tokenizer_the_missing_files_are_named(folder: Path, observation: Observation) -> None:
+def test_without_a_tokenizer_the_missing_files_are_named(tmp_path: Path, observation: Observation) -> None:
+    folder = write_checkpoint(tmp_path)
+    (folder / "tokenizer.json").unlink()
     policy = load_openvla(str(folder), unnorm_key="bridge_orig")
     with pytest.raises(CheckpointError, match=r"tokenizer\.json and tokenizer_config\.json are missing") as caught:
         policy.act([observation], [0])
@@ -169,9 +171,7 @@ def test_the_gripper_is_open_or_closed_and_the_rest_in_units_of_the_data(
 
 def test_other_statistics_give_other_units_for_the_same_tokens(golden_openvla: Path) -> None:
     checkpoint = str(golden_openvla / "checkpoint")
-    policies = [
-        load_openvla(checkpoint, unnorm_key=key, tokenizer="bytes") for key in ("bridge_orig", "other_set")
-    ]
+    policies = [load_openvla(checkpoint, unnorm_key=key) for key in ("bridge_orig", "other_set")]
     assert [policy.card.settings["unnorm_key"] for policy in policies] == ["bridge_orig", "other_set"]
     assert policies[0].card.settings["action_statistics"] != policies[1].card.settings["action_statistics"]
 
@@ -191,7 +191,7 @@ def test_statistics_that_fine_tuning_wrote_are_found_beside_the_weights(folder: 
 
 def test_actions_of_another_number_of_dimensions_are_refused(tmp_path: Path, observation: Observation) -> None:
     two_arms = {"two_arms": {"action": {"q01": [0.0] * 14, "q99": [1.0] * 14}}}
-    policy = load_openvla(str(write_checkpoint(tmp_path, norm_stats=two_arms)), tokenizer="bytes")
+    policy = load_openvla(str(write_checkpoint(tmp_path, norm_stats=two_arms)))
     assert policy.streams["action"].iterations == 14
     with pytest.raises(CheckpointError, match="14 dimensions"):
         policy.act([observation], [0])
@@ -214,8 +214,7 @@ def test_the_centre_crop_changes_what_the_model_sees_and_is_written_down(
     folder: Path, observation: Observation
 ) -> None:
     whole, middle = (
-        load_openvla(str(folder), centre_crop=crop, tokenizer="bytes", unnorm_key="bridge_orig")
-        for crop in (False, True)
+        load_openvla(str(folder), centre_crop=crop, unnorm_key="bridge_orig") for crop in (False, True)
     )
     edge = observation.image.copy()
     edge[:2] = 255 - edge[:2]
@@ -235,7 +234,7 @@ def test_a_prismatic_model_without_actions_is_refused(tmp_path: Path) -> None:
 
 
 def test_bfloat16_is_exactly_the_files_weights_rounded(folder: Path, observation: Observation) -> None:
-    policy = load_openvla(str(folder), dtype="bfloat16", tokenizer="bytes", unnorm_key="bridge_orig")
+    policy = load_openvla(str(folder), dtype="bfloat16", unnorm_key="bridge_orig")
     exact = load_openvla(str(folder), unnorm_key="bridge_orig")
     assert policy.card.dtype == "bfloat16"
     assert policy.card.exact
@@ -253,7 +252,7 @@ def test_an_option_of_another_family_is_refused() -> None:
 
 def test_drawn_actions_repeat_by_their_seed_and_name_actions_only(folder: Path, observation: Observation) -> None:
     """At a temperature random weights, which put out any token when greedy, choose among the 256 of actions."""
-    policy = load_openvla(str(folder), tokenizer="bytes", temperature=0.6, unnorm_key="bridge_orig")
+    policy = load_openvla(str(folder), temperature=0.6, unnorm_key="bridge_orig")
     chunks = [policy.act([observation], [seed]) for seed in (1, 1, 2)]
     np.testing.assert_array_equal(chunks[0], chunks[1])
     assert np.abs(chunks[0] - chunks[2]).max() > 0
@@ -263,7 +262,7 @@ def test_drawn_actions_repeat_by_their_seed_and_name_actions_only(folder: Path, 
     both = policy.act([other, observation], [5, 1])
     np.testing.assert_array_equal(both[1], chunks[0][0])
     with pytest.raises(UsageError, match="temperature"):
-        load_openvla(str(folder), tokenizer="bytes", temperature=-1.0, unnorm_key="bridge_orig")
+        load_openvla(str(folder), temperature=-1.0, unnorm_key="bridge_orig")
 
 
 @pytest.mark.slow
@@ -271,14 +270,12 @@ def test_draws_as_the_release_does_are_of_the_50_likeliest_tokens_of_actions(
     folder: Path, observation: Observation
 ) -> None:
     """At a temperature that makes all kept tokens alike: the first of the seven tokens has 50 values, not 256."""
-    policy = load_openvla(
-        str(folder), tokenizer="bytes", temperature=1e6, top_k="checkpoint", unnorm_key="bridge_orig"
-    )
+    policy = load_openvla(str(folder), temperature=1e6, top_k="checkpoint", unnorm_key="bridge_orig")
     assert policy.card.settings["top_k"] == "50"
     seen = [observation] * 300
     found = policy.infer_without_acting(seen, range(300))[:, 0, 0]
     assert 40 < len(set(found.tolist())) <= 51  # two tokens name the last bin's neighbour alike
-    everything = load_openvla(str(folder), tokenizer="bytes", temperature=1e6, unnorm_key="bridge_orig")
+    everything = load_openvla(str(folder), temperature=1e6, unnorm_key="bridge_orig")
     assert "top_k" not in everything.card.settings
     assert len(set(everything.infer_without_acting(seen, range(300))[:, 0, 0].tolist())) > 100
 
@@ -288,10 +285,7 @@ def test_pictures_resized_as_tensors_are_near_those_of_pil_and_not_the_same(
 ) -> None:
     """bfloat16 keeps eight bits; the filter is the same."""
     smooth = np.linspace(0, 255, 48 * 64 * 3).reshape(48, 64, 3).astype(np.uint8)
-    pil, tensor = (
-        load_openvla(str(folder), tokenizer="bytes", resize=way, unnorm_key="bridge_orig")
-        for way in ("pil", "tensor")
-    )
+    pil, tensor = (load_openvla(str(folder), resize=way, unnorm_key="bridge_orig") for way in ("pil", "tensor"))
     ours, theirs = (policy.pixel_values([smooth]).numpy() for policy in (pil, tensor))
     assert ours.shape == theirs.shape
     difference = np.abs(ours - theirs).max()

@@ -10,8 +10,6 @@ import numpy as np
 import pytest
 import torch
 from lerobot.lerobot_types import TransitionKey
-from lerobot.policies.pi0_fast import modeling_pi0_fast
-from lerobot.policies.pi0_fast.configuration_pi0_fast import PI0FastConfig
 from lerobot.policies.pi0_fast.processor_pi0_fast import Pi0FastPrepareStateAndLanguageTokenizerProcessorStep
 from numpy.typing import NDArray
 from safetensors.torch import load_file, save_file
@@ -23,7 +21,6 @@ from tokenizers.pre_tokenizers import ByteLevel
 from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.hooks import Observation, capture
 from probe_kit.hooks.conformance.subject import examples_for
-from probe_kit.hooks.families.pi0_fast import adapter as network
 from probe_kit.hooks.families.pi0_fast.adapter import ActionText, FastTokenizer, Pi0Fast
 from tests.support.pi0_fast_checkpoints import (
     ACTIONS,
@@ -326,18 +323,3 @@ def test_head_and_embedding_may_be_stored_as_one(untrained: Pi0Fast, tmp_path: P
     save_file(tensors, tmp_path / "model.safetensors")
     loaded = Pi0Fast.load(str(tmp_path)).network.state_dict()
     assert torch.equal(loaded[left_out], tensors[kept])
-
-
-@pytest.mark.slow
-def test_the_released_size_has_the_tensors_of_lerobots_policy(monkeypatch: pytest.MonkeyPatch) -> None:
-    """On the meta device; lerobot's tokenizers are on the hub, and have no parameter."""
-    for name in ("AutoProcessor", "AutoTokenizer"):
-        monkeypatch.setattr(modeling_pi0_fast, name, network._NO_TOKENIZER)
-    ours = network.full_size_pi0_fast().state_dict()
-    config = PI0FastConfig(device="cpu")
-    config.device = "meta"
-    with torch.device("meta"):
-        lerobots = modeling_pi0_fast.PI0FastPolicy(config).state_dict()
-    assert {name: tensor.shape for name, tensor in ours.items()} == {
-        name: tensor.shape for name, tensor in lerobots.items()
-    }

@@ -32,7 +32,6 @@ from probe_kit.hooks.checkpoints.checkpoint import hub_name
 from probe_kit.hooks.checkpoints.folders import checkpoint_folder
 from probe_kit.hooks.families.openvla.adapter import load_openvla
 from probe_kit.hooks.families.prismatic.adapter import (
-    ByteTokenizer,
     FileTokenizer,
     Prismatic,
     find_tokenizer,
@@ -50,7 +49,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Prismatic:
     folder = write_checkpoint(
         tmp_path_factory.mktemp("phi"), vision="dinoclip-vit-l-336px", language="phi-2-3b", model_type="prismatic"
     )
-    return load_prismatic(str(folder), tokenizer="bytes", steps=3)
+    return load_prismatic(str(folder), steps=3)
 
 
 def test_both_streams_together_are_the_hidden_states_of_one_pass(
@@ -87,10 +86,10 @@ def test_the_last_site_of_a_tower_is_what_the_projector_reads(model: Prismatic, 
 
 def test_roles_name_what_every_position_is(model: Prismatic, observation: Observation) -> None:
     """Beginning, patches, then a byte per letter; the last one belongs to the other stream. The frame is Phi's."""
-    asked = replace(observation, instruction="Why?")
-    longer = replace(observation, instruction="Why not?")
+    asked = replace(observation, instruction="1+1?")
+    longer = replace(observation, instruction="1+1=2+0?")
     short, long = model.roles([asked, longer])["backbone"]
-    patches, prompt, start = model.network.patches, len("Input: Why?\nOutput:"), len("Input: ")
+    patches, prompt, start = model.network.patches, len("Input: 1+1?\nOutput:"), len("Input: ")
     assert short.spans == (
         ("special", 0, 1),
         ("image.primary", 1, 1 + patches),
@@ -128,7 +127,7 @@ def test_chats_begin_with_their_system_prompt(language: str) -> None:
 def test_what_is_spoken_goes_on_from_the_prefill(tmp_path: Path, observation: Observation) -> None:
     """Against as many steps of one decoding, and without the towers being run once more."""
     folder = str(write_checkpoint(tmp_path, model_type="prismatic"))
-    vlm, whole = (load_prismatic(folder, tokenizer="bytes", steps=steps) for steps in (1, 6))
+    vlm, whole = (load_prismatic(folder, steps=steps) for steps in (1, 6))
     reading = vlm.read([Prompt(observation, "Which?", ("A", "B"))])
     decoded = whole.generate(whole.pixel_values([observation.image]), [whole.prompt("Which?")])
     with torch.inference_mode():
@@ -141,7 +140,7 @@ def test_what_is_spoken_goes_on_from_the_prefill(tmp_path: Path, observation: Ob
 def test_a_reading_compares_what_may_stand_behind_the_prompt(
     model: Prismatic, tmp_path: Path, observation: Observation
 ) -> None:
-    vlm = load_prismatic(str(write_checkpoint(tmp_path, model_type="prismatic")), tokenizer="bytes")
+    vlm = load_prismatic(str(write_checkpoint(tmp_path, model_type="prismatic")))
     reading = vlm.read([Prompt(observation, "Which?", ("A", "B"))])
     ids = vlm.tokenizer.encode("In: Which?\nOut:")
     logits = vlm.generate(vlm.pixel_values([observation.image]), [ids]).logits[0, 0]
@@ -497,14 +496,14 @@ def test_a_run_names_the_published_language_model(language: str, width: int, lay
 
 def test_the_first_folder_that_has_a_tokenizer_wins(tmp_path: Path) -> None:
     write_tokenizer(tmp_path / "base")
-    found = find_tokenizer([tmp_path / "adapter", tmp_path / "base"], None, 1, 320)
+    found = find_tokenizer([tmp_path / "adapter", tmp_path / "base"], None, 1)
     assert found == FileTokenizer(tmp_path / "base", 1)
 
 
 def test_a_folder_that_was_asked_for_is_the_only_place(tmp_path: Path) -> None:
     write_tokenizer(tmp_path / "base")
     with pytest.raises(CheckpointError, match="elsewhere"):
-        find_tokenizer([tmp_path / "base"], str(tmp_path / "elsewhere"), 1, 320)
+        find_tokenizer([tmp_path / "base"], str(tmp_path / "elsewhere"), 1)
 
 
 def test_the_beginning_comes_from_the_tokenizers_files_before_the_models(tmp_path: Path) -> None:
@@ -524,9 +523,3 @@ def test_an_unknown_word_is_an_error_that_shows_the_tokens(tmp_path: Path) -> No
     write_tokenizer(tmp_path)
     with pytest.raises(InstructionError, match="<unk>"):
         FileTokenizer(tmp_path, 1).encode("put the zebra")
-
-
-def test_bytes_know_every_text_and_need_room_for_256_of_them() -> None:
-    assert ByteTokenizer(1).encode("zé\n") == [1, 125, 198, 172, 13]
-    with pytest.raises(CheckpointError, match="259"):
-        find_tokenizer([], "bytes", 1, 128)

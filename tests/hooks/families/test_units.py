@@ -18,8 +18,7 @@ from tests.support.every_checkpoint import WRITERS
 from tests.support.groot_checkpoints import write_nvidias
 
 UNITS = {"action": {"q01": [-0.5] * 7, "q99": [0.5] * 7, "mask": [True] * 6 + [False]}}
-BYTES = {"tokenizer": "bytes"}
-FAMILIES: dict[str, dict[str, Any]] = {"openvla": BYTES, "spatialvla": {}, "magma": {}, "internvla-m1": {}}
+FAMILIES = ("openvla", "spatialvla", "magma", "internvla-m1")
 DEFAULTS = {
     "openvla": {"unnorm_key": "bridge_orig"},
     "spatialvla": {"unnorm_key": "bridge_orig/1.0.0"},
@@ -36,13 +35,13 @@ def tuned(family: str, folder: Path, *names: str) -> Path:
     return place
 
 
-@pytest.mark.parametrize("family", list(FAMILIES))
+@pytest.mark.parametrize("family", FAMILIES)
 def test_what_fine_tuning_wrote_stands_alone_and_the_only_set_needs_no_name(family: str, tmp_path: Path) -> None:
     place = tuned(family, tmp_path / "tuned", "my_arm")
-    assert load_policy(family, str(place), **FAMILIES[family]).card.settings["unnorm_key"] == "my_arm"
+    assert load_policy(family, str(place)).card.settings["unnorm_key"] == "my_arm"
     for name in DEFAULTS[family].values():
         with pytest.raises(UsageError, match=rf"no action statistics of '{name}'.*my_arm"):
-            load_policy(family, str(place), unnorm_key=name, **FAMILIES[family])
+            load_policy(family, str(place), unnorm_key=name)
 
 
 @pytest.mark.slow
@@ -53,8 +52,8 @@ def test_several_sets_have_to_be_chosen_from_before_anything_is_loaded(family: s
     with pytest.raises(UsageError, match=f"with -M unnorm_key=NAME: {other}, my_arm"):
         find_family(family).whose_units(str(place))
     with pytest.raises(UsageError, match=f"with -M unnorm_key=NAME: {other}, my_arm"):
-        load_policy(family, str(place), **FAMILIES[family])
-    chosen = load_policy(family, str(place), unnorm_key="my_arm", **FAMILIES[family])
+        load_policy(family, str(place))
+    chosen = load_policy(family, str(place), unnorm_key="my_arm")
     assert chosen.card.settings["unnorm_key"] == "my_arm"
 
 
@@ -110,8 +109,6 @@ def test_the_plan_prints_whose_units_are_used(tmp_path: Path) -> None:
         "openvla",
         "--checkpoint",
         str(place),
-        "-M",
-        "tokenizer=bytes",
         "--items",
         "12",
     ]

@@ -19,7 +19,6 @@ from safetensors.torch import load_file, save_file
 from probe_kit.errors import CheckpointError, ObservationError, UsageError, WeightsError
 from probe_kit.hooks import Observation, Site, capture, edit
 from probe_kit.hooks.conformance.subject import examples_for
-from probe_kit.hooks.families.xvla import adapter as network
 from probe_kit.hooks.families.xvla.adapter import Xvla
 from tests.support.xvla_checkpoints import CHUNK, DOMAIN, DOMAINS, TEXT, to_authors_layout, write_xvla
 
@@ -294,11 +293,3 @@ def test_absolute_poses_are_captured_and_not_carried_out(tmp_path: Path, seen: l
     policy = Xvla.load(str(folder), random_weights=True)
     assert "20 dimensions" in str(policy.embodiment_mismatch())
     assert policy.infer_without_acting(seen, [0]).shape == (1, CHUNK, 20)
-
-
-@pytest.mark.slow  # seconds for a network of 0.9 billion parameters, on the meta device
-def test_florence_large_has_the_layers_that_the_family_names() -> None:
-    policy = network.full_size_xvla()
-    assert len(policy.model.vlm.language_model.encoder.layers) == 12
-    assert len(policy.model.transformer.blocks) == 24
-    assert sum(own.numel() for own in policy.parameters()) == 879_851_096

@@ -31,8 +31,8 @@ from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.sites import PADDING
 from probe_kit.hooks.families.eo1 import INTERVENTIONS
 from probe_kit.hooks.families.shared.kinds import IMAGES, STATE
-from probe_kit.hooks.families.shared.lerobot.flow import PackedBatch, PackedPolicy, Tokens, chat_labels
-from probe_kit.hooks.families.shared.lerobot.pipelines import PREPROCESSOR, check_same, saved_steps
+from probe_kit.hooks.families.shared.lerobot.flow import PackedPolicy, Tokens, chat_labels
+from probe_kit.hooks.families.shared.lerobot.pipelines import check_same, step_fields
 from probe_kit.hooks.families.shared.lerobot.policy import checked_steps
 from probe_kit.hooks.families.shared.taps import Stack, kept_prompt, token_stack
 from probe_kit.models.building import build_empty, building_device, fill_rotary, replaced
@@ -121,7 +121,7 @@ class Eo1(PackedPolicy):
     def parse_config(cls, folder: Path, evaluation: Any) -> Any:
         """lerobot's configuration, with what the processor files say: lerobot packs as they do."""
         config = super().parse_config(folder, evaluation)
-        saved = {step.name: step.config for step in saved_steps(folder, PREPROCESSOR)}
+        saved = step_fields(folder)
         template = saved.get(TEMPLATE, {})
         features = template.get("input_features") or {}
         pictures = [name for name, feature in features.items() if feature["type"] == "VISUAL"] or None
@@ -155,7 +155,9 @@ class Eo1(PackedPolicy):
         """The vision-language model's, with the tokens of states and actions."""
         return self.packing._processor.tokenizer
 
-    def pack(self, observations: Sequence[Observation], state: NDArray[np.float32]) -> PackedBatch:
+    def pack(
+        self, observations: Sequence[Observation], state: NDArray[np.float32]
+    ) -> tuple[dict[str, Tensor], list[Tokens]]:
         """See the base; also for a text that holds one of the chat's own marks, or no word."""
         tasks = [observation.instruction for observation in observations]
         for task in tasks:
@@ -172,7 +174,7 @@ class Eo1(PackedPolicy):
         content, chat = TransitionKey.COMPLEMENTARY_DATA, {TransitionKey.OBSERVATION: pictures}
         packed = self.packing(template({**chat, content: {"task": tasks}}))[content]
         inputs = {name: torch.as_tensor(values) for name, values in packed.items() if name != "task"}
-        return PackedBatch({**inputs, STATE: torch.from_numpy(state)}, self._labelled(inputs))
+        return {**inputs, STATE: torch.from_numpy(state)}, self._labelled(inputs)
 
     def _labelled(self, packed: Mapping[str, Tensor]) -> list[Tokens]:
         """Ids and roles of every row, up to the actions."""

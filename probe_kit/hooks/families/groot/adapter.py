@@ -28,8 +28,9 @@ from probe_kit.hooks.families.groot.network import (
     nvidias_config,
 )
 from probe_kit.hooks.families.groot.packing import NvidiasPictures, Packing, Steps, lerobots_rule, read_steps
-from probe_kit.hooks.families.groot.units import BoundedUnits, StateUnits, action_units, state_units
+from probe_kit.hooks.families.groot.units import action_units, state_units
 from probe_kit.hooks.families.shared.lerobot.flow import PackedPolicy
+from probe_kit.hooks.families.shared.lerobot.normaliser import Normaliser
 from probe_kit.hooks.families.shared.qwen import merger_norm
 from probe_kit.hooks.families.shared.taps import TOWER, Stack
 from probe_kit.hooks.outputs import Produce, RecordedRun, numpy_of
@@ -126,7 +127,7 @@ class Groot(PackedPolicy):
     def _steps(self) -> Steps:
         return read_steps(self.folder, self.config, self.config.resize, self.config.letterbox)
 
-    def own_units(self, feature: str, kind: str) -> BoundedUnits | StateUnits:
+    def own_units(self, feature: str, kind: str) -> Normaliser:
         """The units in the processors. Raises CheckpointError."""
         del feature
         steps = self._steps

@@ -33,7 +33,14 @@ from probe_kit.errors import CheckpointError, InstructionError
 from probe_kit.hooks.checkpoints.checkpoint import shard_name
 from probe_kit.hooks.families.shared.kinds import IMAGES, STATE
 from probe_kit.hooks.families.shared.lerobot.flow import PackedRow, chat_labels
-from probe_kit.hooks.families.shared.lerobot.pipelines import check_values
+from probe_kit.hooks.families.shared.lerobot.pipelines import (
+    POSTPROCESSOR,
+    PREPROCESSOR,
+    SavedStep,
+    check_pipelines,
+    check_values,
+    saved_steps,
+)
 from probe_kit.models.checkpoint_files import load_pretrained
 
 PROCESSOR_FILE = "processor_config.json"
@@ -334,36 +341,29 @@ def _nvidias_steps(folder: Path, config: GrootConfig, settings: Mapping[str, Any
 
 
 def _lerobots_steps(folder: Path, config: GrootConfig) -> Steps:
-    steps = []
-    for name in ("policy_preprocessor", "policy_postprocessor"):
-        path = folder / f"{name}.json"
-        if not path.is_file():
-            raise CheckpointError(f"{path} is missing: without it pictures, state and actions have no meaning")
-        content = read_json_object(path, CheckpointError, "Download the checkpoint again")
-        steps += [step for entry in content.get("steps", []) if (step := _saved(folder, path, entry)) is not None]
+    check_pipelines(folder)
+    saved = [step for name in (PREPROCESSOR, POSTPROCESSOR) for step in saved_steps(folder, name)]
+    steps = [_built(folder, step) for step in saved if step.name not in _HARMLESS]
     # What the configuration says of the gripper counts, as in lerobot, not what the step was saved with.
     _apply_groot_action_decode_transform(SimpleNamespace(steps=steps), config.action_decode_transform)
     return _select_steps(steps, "policy_preprocessor.json and policy_postprocessor.json")
 
 
-def _saved(folder: Path, path: Path, entry: Mapping[str, Any]) -> Any:
-    """One step of a saved pipeline; never by the name of a class, which could be any."""
-    name = str(entry.get("registry_name"))
-    if name in _HARMLESS:
-        return None
-    if name not in _STEPS:
+def _built(folder: Path, saved: SavedStep) -> Any:
+    """lerobot's object of a saved step; never by the name of a class, which could be any."""
+    if saved.name not in _STEPS:
         raise CheckpointError(
-            f"{path} has the step {name!r}, which changes numbers in a way probe_kit does not know. Known are "
-            f"{', '.join((*_STEPS, *_HARMLESS))}"
+            f"{folder} has the step {saved.name!r}, which changes numbers in a way probe_kit does not know. Known "
+            f"are {', '.join((*_STEPS, *_HARMLESS))}"
         )
     try:
-        step = _STEPS[name](**entry.get("config", {}))
+        step = _STEPS[saved.name](**saved.config)
     except TypeError as error:
-        raise CheckpointError(f"{path}: the step {name} cannot be built ({error})") from error
-    if (state := entry.get("state_file")) is not None:
-        file = folder / shard_name(state)
+        raise CheckpointError(f"{folder}: the step {saved.name} cannot be built ({error})") from error
+    if saved.state is not None:
+        file = folder / shard_name(saved.state)
         if not file.is_file():
-            raise CheckpointError(f"{file} is missing: it holds the statistics of {name}")
+            raise CheckpointError(f"{file} is missing: it holds the statistics of {saved.name}")
         try:
             step.load_state_dict(load_file(file))
         except (SafetensorError, OSError, RuntimeError) as error:

@@ -15,112 +15,32 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import CheckpointError
 from probe_kit.hooks.families.groot.packing import StateFields
-from probe_kit.hooks.families.shared.lerobot.normaliser import USUAL_DEVIATIONS, outside
-from probe_kit.models.bounds import check_bounds, check_deviations
+from probe_kit.hooks.families.shared.lerobot.normaliser import Normaliser
 
 _TURN = 2 * np.pi
 
 
 @dataclass(frozen=True)
-class BoundedUnits:
-    """Numbers between −1 and 1. low, high: (D,) float32, what these stand for.
-
-    clamp: whether values outside are moved to the bounds. sign: the number that becomes −1 or 1, as LIBERO's
-    gripper; None where there is none. deviations: (D,) numbers that are mapped by mean and deviation, which stand
-    in `low` and `high`, and never clamped; None for none.
-    """
-
-    low: NDArray[np.float32]
-    high: NDArray[np.float32]
-    mode: str
-    source: str
-    clamp: bool = True
-    sign: int | None = None
-    deviations: NDArray[np.bool_] | None = None
-
-    def __post_init__(self) -> None:
-        check_bounds(self.low[~self._scored], self.high[~self._scored], self.source)
-        if self._scored.any():
-            check_deviations(self.low[self._scored], self.high[self._scored], self.source)
-
-    @property
-    def _scored(self) -> NDArray[np.bool_]:
-        return np.zeros(len(self.low), bool) if self.deviations is None else self.deviations
-
-    def normalise(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Physical units to the numbers the network reads; (..., D). A number without a range becomes 0."""
-        span = self.high - self.low
-        mapped = np.where(span == 0, 0, 2 * (values - self.low) / np.where(span == 0, 1, span) - 1)
-        mapped = mapped.clip(-1, 1) if self.clamp else mapped
-        if self._scored.any():
-            still = self.high == 0  # NVIDIA leaves a number without deviation as it is
-            scores = np.where(still, values, (values - self.low) / np.where(still, 1, self.high))
-            mapped = np.where(self._scored, scores, mapped)
-        return np.asarray(mapped, np.float32)
-
-    def restore(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Network output to physical units; (..., D)."""
-        inside = values.clip(-1, 1) if self.clamp else values
-        restored = np.asarray((inside + 1) * 0.5 * (self.high - self.low) + self.low, np.float32)
-        if self._scored.any():
-            scores = np.where(self.high == 0, values, values * self.high + self.low)
-            restored = np.asarray(np.where(self._scored, scores, restored), np.float32)
-        if self.sign is not None:
-            restored[..., self.sign] = -np.sign(2 * restored[..., self.sign] - 1)
-        return restored
-
-    def slopes(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(..., D) of `restore` at these outputs of the network; 0 where it clamps or jumps."""
-        inside = (np.abs(values) <= 1) | self._scored if self.clamp else np.ones(values.shape, bool)
-        scores = np.where(self.high == 0, 1, self.high)
-        slopes = np.where(self._scored, scores, (self.high - self.low) / 2).astype(np.float32) * inside
-        if self.sign is not None:
-            slopes[..., self.sign] = 0
-        return np.asarray(slopes, np.float32)
-
-    def unusual(self, values: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """(..., D): outside the bounds, or far from the mean."""
-        beyond = outside(values, self.low, self.high)
-        if not self._scored.any():
-            return beyond
-        far = np.abs(values - self.low) > USUAL_DEVIATIONS * self.high
-        return np.asarray(np.where(self._scored, far, beyond))
-
-
-@dataclass(frozen=True)
-class StateUnits:
-    """The state as NVIDIA's processor gives it to the network. bounded: of every physical number.
+class StateUnits(Normaliser):
+    """The state as NVIDIA's processor gives it to the network.
 
     angles: (begin, end) of the groups in which the sines of all numbers, then their cosines stand for the numbers.
     excluded: whether the network reads zeros in their place.
     """
 
-    bounded: BoundedUnits
     angles: tuple[tuple[int, int], ...] = ()
     excluded: bool = False
 
     @property
-    def mode(self) -> str:
-        """The kinds of map."""
-        if self.excluded:
-            return "EXCLUDED (zeros)"
-        return f"{self.bounded.mode} and SIN_COS" if self.angles else self.bounded.mode
-
-    @property
-    def source(self) -> str:
-        """The files the statistics come from."""
-        return self.bounded.source
-
-    @property
     def numbers(self) -> int:
         """The count of numbers that the network reads."""
-        return len(self.bounded.low) + sum(end - begin for begin, end in self.angles)
+        return len(self.low) + sum(end - begin for begin, end in self.angles)
 
     def normalise(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """Physical units to the numbers the network reads; (..., D) to (..., numbers)."""
         if self.excluded:
             return np.zeros((*values.shape[:-1], self.numbers), np.float32)
-        mapped, position = self.bounded.normalise(values), 0
+        mapped, position = super().normalise(values), 0
         parts = []
         for begin, end in self.angles:
             angles = values[..., begin:end]
@@ -128,22 +48,12 @@ class StateUnits:
             position = end
         return np.asarray(np.concatenate([*parts, mapped[..., position:]], -1), np.float32)
 
-    def restore(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Raise CheckpointError for numbers that have no way back to a state."""
-        if self.angles or self.excluded:
-            raise CheckpointError(f"{self.source}: a state that is {self.mode} has no way back to physical units")
-        return self.bounded.restore(values)
-
-    def slopes(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(..., D) of `restore`."""
-        return self.bounded.slopes(values)
-
     def unusual(self, values: NDArray[np.float32]) -> NDArray[np.bool_]:
         """(..., D): outside the bounds, or far from the mean; never of what is not read.
 
         An angle in radians comes back after a turn; one in degrees lies outside the bounds and beyond a turn.
         """
-        beyond = self.bounded.unusual(values)
+        beyond = super().unusual(values)
         for begin, end in self.angles:
             beyond[..., begin:end] &= np.abs(values[..., begin:end]) > _TURN
         return np.zeros_like(beyond) if self.excluded else beyond
@@ -151,7 +61,7 @@ class StateUnits:
 
 def state_units(
     step: GrootN17PackInputsStep, numbers: int, source: str, fields: StateFields | None = None
-) -> BoundedUnits | StateUnits:
+) -> Normaliser:
     """The units of lerobot's packing step, or of NVIDIA's processor where its `fields` are there.
 
     Raises CheckpointError where it would let the state pass unchanged.
@@ -161,7 +71,7 @@ def state_units(
     if not step.normalize_min_max:
         raise CheckpointError(f"{source} does not normalise the state: its units are unknown")
     low, high = _bounds((step.stats or {}).get("observation.state", {}), numbers, "observation.state", source)
-    return BoundedUnits(low, high, "MIN_MAX", source, clamp=step.clip_outliers)
+    return Normaliser("MIN_MAX", low, high, 0.0, source, clamped=step.clip_outliers)
 
 
 def action_units(
@@ -169,7 +79,7 @@ def action_units(
     numbers: int,
     source: str,
     fields: StateFields | None = None,
-) -> BoundedUnits:
+) -> Normaliser:
     """The units of lerobot's step that decodes actions. fields: of NVIDIA's processor file, if it is there.
 
     Raises CheckpointError for statistics that are missing, and for actions relative to the state: they have no
@@ -183,9 +93,8 @@ def action_units(
     jumps = step.libero_gripper_action and numbers >= 7
     if jumps and not step.libero_gripper_binarize:
         raise CheckpointError(f"{source} asks for a gripper between −1 and 1 that lerobot does not write itself")
-    return BoundedUnits(
-        low, high, "MIN_MAX", source, clamp=step.clip_normalized_action, sign=numbers - 1 if jumps else None
-    )
+    sign = numbers - 1 if jumps else None
+    return Normaliser("MIN_MAX", low, high, 0.0, source, clamped=step.clip_normalized_action, sign=sign)
 
 
 def _nvidias_state(step: GrootN17PackInputsStep, numbers: int, source: str, fields: StateFields) -> StateUnits:
@@ -196,9 +105,13 @@ def _nvidias_state(step: GrootN17PackInputsStep, numbers: int, source: str, fiel
     low, high, scored, ends = _side_by_side(keys, statistics, names, fields.deviations, f"{source}: the state")
     if len(low) != numbers:
         raise CheckpointError(f"{source} has statistics of {len(low)} numbers; the state has {numbers}")
-    mode = _mode(names, scored)
-    bounded = BoundedUnits(low, high, mode, source, step.clip_outliers, deviations=scored)
-    units = StateUnits(bounded, tuple(ends[key] for key in keys if key in fields.angles), fields.excluded)
+    angles = tuple(ends[key] for key in keys if key in fields.angles)
+    mode = f"{_mode(names, scored)} and SIN_COS" if angles else _mode(names, scored)
+    mode = "EXCLUDED (zeros)" if fields.excluded else mode
+    clamped = ~scored & step.clip_outliers
+    units = StateUnits(
+        mode, low, high, 0.0, source, scored=scored, clamped=clamped, angles=angles, excluded=fields.excluded
+    )
     if units.numbers > step.max_state_dim:
         raise CheckpointError(
             f"{source}: the state with its sines and cosines has {units.numbers} numbers; the network reads "
@@ -242,7 +155,7 @@ def _mode(names: tuple[str, str], scored: NDArray[np.bool_]) -> str:
 
 def _grouped(
     step: GrootN17ActionDecodeStep, numbers: int, source: str, scored: Collection[str] = ()
-) -> BoundedUnits:
+) -> Normaliser:
     """The groups of NVIDIA's statistics side by side, in the order of the configuration.
 
     scored: groups that are mapped by mean and deviation.
@@ -266,7 +179,7 @@ def _grouped(
         raise CheckpointError(f"{source} has no action 'gripper', which LIBERO's convention is about")
     sign = begin if step.action_decode_transform is not None else None
     low, high, flags = low[:numbers], high[:numbers], flags[:numbers]
-    return BoundedUnits(low, high, _mode(names, flags), source, sign=sign, deviations=flags)
+    return Normaliser(_mode(names, flags), low, high, 0.0, source, scored=flags, clamped=~flags, sign=sign)
 
 
 def _bounds(

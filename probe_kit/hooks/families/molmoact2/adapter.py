@@ -37,18 +37,16 @@ from probe_kit.hooks.checkpoints.folders import inside_or_hub
 from probe_kit.hooks.contract.model import Tap
 from probe_kit.hooks.contract.sites import Site, kv_stream
 from probe_kit.hooks.families.molmoact2 import EXPERT, LAYERWISE
-from probe_kit.hooks.families.molmoact2.packing import STEPS, Packing, SteppedUnits, in_packed_order, read_steps
+from probe_kit.hooks.families.molmoact2.packing import STEPS, FramedUnits, Packing, in_packed_order, read_steps
 from probe_kit.hooks.families.shared.lerobot.flow import PackedPolicy
-from probe_kit.hooks.families.shared.lerobot.normaliser import Normaliser
 from probe_kit.hooks.families.shared.lerobot.pipelines import Inert
 from probe_kit.hooks.families.shared.lerobot.policy import checked_steps
 from probe_kit.hooks.families.shared.loading import DTYPES
 from probe_kit.hooks.families.shared.taps import TOWER, Note, Stack, recording_weights, shares
 from probe_kit.hooks.outputs import Produce, RecordedRun, stacked
-from probe_kit.models.building import build_empty, building_device, replaced
+from probe_kit.models.building import Gate, build_empty, building_device, replaced
 from probe_kit.models.checkpoint_files import load_pretrained
 from probe_kit.models.decoding import PromptKV
-from probe_kit.models.pi0 import Gate
 
 RELEASED: dict[str, Any] = {
     "text_config": {
@@ -276,9 +274,7 @@ class MolmoAct2(PackedPolicy):
         checkpoint_path: then the folder of the VLM's configuration and tokenizer.
         """
         config = super().parse_config(folder, evaluation)
-        config.steps = read_steps(folder, config)
-        for name, value in config.steps.packing.items():
-            setattr(config, name, value)
+        read_steps(config, folder)
         config.input_features = in_packed_order(config, folder)
         config.checkpoint_path = str(inside_or_hub(folder, config.checkpoint_path))
         return config
@@ -307,19 +303,21 @@ class MolmoAct2(PackedPolicy):
         """The VLM's configuration and tokenizer."""
         return {"vlm": Path(self.config.checkpoint_path)}
 
-    def own_units(self, feature: str, kind: str) -> SteppedUnits | None:
+    def own_units(self, feature: str, kind: str) -> FramedUnits | None:
         """The units of lerobot's steps: numbers that a mask leaves unscaled, clamps, and frames of joints."""
-        units, steps = super().own_units(feature, kind), self.config.steps
+        units, config = super().own_units(feature, kind), self.config
         if units is None:
             return None
-        assert isinstance(units, Normaliser)
-        numbers = self.state_numbers if kind == "STATE" else self._action_numbers
+        is_state = kind == "STATE"
+        numbers = self.state_numbers if is_state else self._action_numbers
         stored = load_file(self.folder / units.source) if units.mode != "IDENTITY" else {}
-        unscaled = _of_width(~stored.get(f"{feature}.mask", np.ones(0, bool)).astype(bool), numbers)
-        if kind != "STATE":
-            return SteppedUnits(units, unscaled, steps.clamps_action, unscaled, steps.action_frame)
-        unclamped = unscaled if steps.unclamped is None else _of_width(steps.unclamped, numbers)
-        return SteppedUnits(units, unscaled, steps.clamps_state, unclamped, steps.state_frame)
+        plain = _of_width(~stored.get(f"{feature}.mask", np.ones(0, bool)).astype(bool), numbers)
+        clamped = np.full(numbers, config.clamps_state if is_state else config.clamps_action)
+        if is_state:
+            clamped &= ~(plain if config.unclamped is None else _of_width(config.unclamped, numbers))
+        frame = config.state_frame if is_state else config.action_frame
+        statistics = (units.mode, units.low, units.high, units.eps, units.source)
+        return FramedUnits(*statistics, plain=plain, clamped=clamped, frame=frame)
 
     # -- acting ------------------------------------------------------------------------------------------
 

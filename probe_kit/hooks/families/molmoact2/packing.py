@@ -17,7 +17,7 @@ from probe_kit.errors import CheckpointError, InstructionError, ObservationError
 from probe_kit.hooks.families.shared.kinds import STATE
 from probe_kit.hooks.families.shared.lerobot.flow import PackedRow, label_groups
 from probe_kit.hooks.families.shared.lerobot.normaliser import Normaliser
-from probe_kit.hooks.families.shared.lerobot.pipelines import MASKED, check_same, every_step
+from probe_kit.hooks.families.shared.lerobot.pipelines import MASKED, check_same, step_fields
 
 
 @dataclass(frozen=True)
@@ -48,28 +48,10 @@ SAME_FRAME = JointFrame(np.zeros(0, np.float32), np.zeros(0, np.float32))
 
 
 @dataclass(frozen=True)
-class SteppedUnits:
-    """Statistics between a joint frame and a clamp.
+class FramedUnits(Normaliser):
+    """Statistics of joints in the data set's frame."""
 
-    unscaled: (D,) True for numbers that stay as they are, such as a gripper. clamp: whether numbers are moved to
-    -1 to 1. unclamped: (D,) True for numbers of the state that the clamp leaves out.
-    """
-
-    units: Normaliser
-    unscaled: NDArray[np.bool_]
-    clamp: bool
-    unclamped: NDArray[np.bool_]
     frame: JointFrame = SAME_FRAME
-
-    @property
-    def mode(self) -> str:
-        """The kind of map."""
-        return self.units.mode
-
-    @property
-    def source(self) -> str:
-        """The file the statistics come from."""
-        return self.units.source
 
     def normalise(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """Physical units to the numbers the network reads; (..., D).
@@ -77,32 +59,28 @@ class SteppedUnits:
         Raises ObservationError for a number that stays as it is and lies outside -1 to 1, as lerobot does.
         """
         entered = self.frame.entered(values)
-        outside = (np.abs(entered) > 1) & self.unscaled
+        outside = (np.abs(entered) > 1) & self.plain
         if outside.any():
             number = int(np.argwhere(outside)[0][-1])
             raise ObservationError(
                 f"number {number} of the state is {entered[outside][0]:g}; this checkpoint reads it as it is, "
                 "between -1 and 1 (normalize_gripper is off). Give it in these units"
             )
-        mapped = np.where(self.unscaled, entered, self.units.normalise(entered))
-        if self.clamp:
-            mapped = np.where(self.unclamped, mapped, mapped.clip(-1, 1))
-        return mapped.astype(np.float32)
+        return super().normalise(entered)
 
     def restore(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """Network output to physical units; (..., D)."""
-        inside = values.clip(-1, 1) if self.clamp else values
-        return self.frame.left(np.where(self.unscaled, inside, self.units.restore(inside)))
+        return self.frame.left(super().restore(values))
 
     def slopes(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """(..., D) of `restore` at these outputs of the network; 0 where it clips."""
-        slopes = np.where(self.unscaled, 1, self.units.slopes(values)).astype(np.float32)
+        slopes = super().slopes(values)
         slopes[..., : len(self.frame.signs)] *= self.frame.signs
-        return np.asarray(((np.abs(values) <= 1) | (not self.clamp)) * slopes, np.float32)
+        return slopes
 
     def unusual(self, values: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """(..., D): as without the clamp; numbers that stay as they are have no statistics."""
-        return np.asarray(self.units.unusual(self.frame.entered(values)) & ~self.unscaled)
+        """(..., D) in the frame of the statistics."""
+        return super().unusual(self.frame.entered(values))
 
 
 # -- settings of processor steps ------------------------------------------------------------------------------
@@ -127,42 +105,26 @@ _SAME = {
 """Fields of the packing step that are read from the configuration, under its name."""
 
 
-@dataclass(frozen=True)
-class MolmoAct2Steps:
-    """The processor steps of one checkpoint. packing: fields that count over those of the configuration.
+def read_steps(config: Any, folder: Path) -> None:
+    """Put what the saved steps say into lerobot's configuration; without a packing step, it says so itself.
 
     state_frame, action_frame: of the joints. clamps_state, clamps_action: whether numbers are moved to -1 to 1.
     unclamped: (D,) True for numbers of the state that the clamp leaves out; None for those without statistics.
-    """
-
-    packing: Mapping[str, Any]
-    state_frame: JointFrame
-    action_frame: JointFrame
-    clamps_state: bool
-    clamps_action: bool
-    unclamped: NDArray[np.bool_] | None
-
-
-def read_steps(folder: Path, config: Any) -> MolmoAct2Steps:
-    """The saved steps; without a packing step, those that lerobot makes of the configuration.
-
     Raises CheckpointError for frames that are none, and for a packing step of another configuration.
     """
-    saved = {step.name: step.config for step in every_step(folder)}
-    if _PACK not in saved:
-        frame = _frame(vars(config), folder)
-        return MolmoAct2Steps({}, frame, frame, clamps_state=True, clamps_action=True, unclamped=None)
-    check_same(folder, _PACK, saved[_PACK], {name: getattr(config, theirs) for name, theirs in _SAME.items()})
-    state_frame, action_frame = (_frame(saved.get(name, {}), folder) for name in _FRAMES)
+    saved = step_fields(folder)
+    if (packing := saved.get(_PACK)) is None:
+        config.state_frame = config.action_frame = _frame(vars(config), folder)
+        config.clamps_state, config.clamps_action, config.unclamped = True, True, None
+        return
+    check_same(folder, _PACK, packing, {name: getattr(config, theirs) for name, theirs in _SAME.items()})
+    for name in _PACKED:
+        if name in packing:
+            setattr(config, name, packing[name])
+    config.state_frame, config.action_frame = (_frame(saved.get(name, {}), folder) for name in _FRAMES)
     scaled = (saved.get(_CLAMP_STATE, {}).get("normalization_masks") or {}).get(STATE, [])
-    return MolmoAct2Steps(
-        {name: saved[_PACK][name] for name in _PACKED if name in saved[_PACK]},
-        state_frame,
-        action_frame,
-        clamps_state=_CLAMP_STATE in saved,
-        clamps_action=_CLAMP_ACTION in saved,
-        unclamped=~np.array(scaled, bool),
-    )
+    config.clamps_state, config.clamps_action = _CLAMP_STATE in saved, _CLAMP_ACTION in saved
+    config.unclamped = ~np.array(scaled, bool)
 
 
 def _frame(fields: Mapping[str, Any], folder: Path) -> JointFrame:

@@ -20,7 +20,7 @@ from probe_kit.hooks.checkpoints.checkpoint import SMALL_FILES
 from probe_kit.hooks.contract.card import ARM
 from probe_kit.hooks.contract.model import Policy
 from probe_kit.hooks.contract.observation import Observation, checked_picture
-from probe_kit.hooks.families.prismatic.adapter import BYTES, PrismaticModel, find_tokenizer
+from probe_kit.hooks.families.prismatic.adapter import PrismaticModel, find_tokenizer
 from probe_kit.hooks.families.prismatic.checkpoint import (
     checkpoint_folders,
     load_checkpoint,
@@ -104,7 +104,7 @@ class OpenVLA(PrismaticModel, Policy):
             embodiment=f"{ARM}, units of {statistics.key}",
             chunk=1,
             execute=1,
-            notes=(*self.card.notes, *self._notes(tokenizer)),
+            notes=(*self.card.notes, *self._notes()),
             settings={
                 **self.card.settings,
                 "unnorm_key": self.statistics.key,
@@ -117,15 +117,13 @@ class OpenVLA(PrismaticModel, Policy):
             },
         )
 
-    def _notes(self, tokenizer: str | None) -> tuple[str, ...]:
+    def _notes(self) -> tuple[str, ...]:
         notes = [f"actions in the units and at the rate of {self.statistics.key}", f"prompt: {self.template!r}"]
         if self.crop:
             notes.append(f"pictures: middle {CROP_AREA:.0%} of the area")
         if self.temperature:
             among = "all" if self.top is None else f"the {self.top} likeliest"
             notes.append(f"action tokens drawn at temperature {self.temperature:g} among {among}")
-        if tokenizer == BYTES:
-            notes.append("development tokenizer: bytes, which no model was trained with")
         return tuple(notes)
 
     # -- acting ------------------------------------------------------------------------------------------
@@ -247,7 +245,7 @@ def check_openvla_words(
     """See `Family.words`."""
     folders = checkpoint_folders(checkpoint, SMALL_FILES)
     config = PrismaticConfig.from_folder(folders[-1])
-    text = find_tokenizer(folders, tokenizer, config.text.bos_token_id, config.action_vocabulary)
+    text = find_tokenizer(folders, tokenizer, config.text.bos_token_id)
     template = _template(prompt, config)
     room = int(config.text.max_position_embeddings) - (config.towers[0].image_size // _PATCH) ** 2 - DIMENSIONS
     for instruction in instructions:

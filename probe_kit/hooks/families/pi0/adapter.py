@@ -33,7 +33,6 @@ from probe_kit.hooks.families.shared.lerobot.normaliser import (
     NO_STATISTICS,
     Normaliser,
     StatisticsFile,
-    Units,
     statistics_in,
 )
 from probe_kit.hooks.families.shared.lerobot.pipelines import CROP, Inert
@@ -112,7 +111,7 @@ class Pi0(PaliGemmaPolicy, LerobotFlow):
             settings["openness"] = evaluation.openness
         return settings
 
-    def units_of(self, feature: str, kind: str) -> Units:
+    def units_of(self, feature: str, kind: str) -> Normaliser:
         """The checkpoint's own; where it has none, those of its evaluation. Raises CheckpointError for both."""
         requested = self.evaluation.statistics
         if (
@@ -139,7 +138,7 @@ class Pi0(PaliGemmaPolicy, LerobotFlow):
             "proprio, or none if its numbers are metres and radians"
         )
 
-    def _stored(self, feature: str, kind: str) -> Units | None:
+    def _stored(self, feature: str, kind: str) -> Normaliser | None:
         try:
             return self.own_units(feature, kind)
         except CheckpointError:

@@ -16,8 +16,8 @@ Source: arXiv 2501.09747; decoding as in `UniversalActionProcessor`, which lerob
 """
 
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -57,18 +57,9 @@ from probe_kit.hooks.families.shared.taps import (
 )
 from probe_kit.hooks.families.shared.token_decoder import chooser
 from probe_kit.hooks.outputs import Arrays, Produce, RecordedRun, numpy_of
-from probe_kit.models.building import building_device, replaced
-from probe_kit.models.config_file import Count
+from probe_kit.models.building import replaced
 from probe_kit.models.decoding import PromptKV
-from probe_kit.models.pi0 import (
-    EMBEDDING,
-    LM_HEAD,
-    GemmaSize,
-    SiglipSize,
-    SizeFile,
-    current_pi0_fast_keys,
-    sized_paligemma,
-)
+from probe_kit.models.pi0 import EMBEDDING, LM_HEAD, PaliGemmaSize, build_resized, current_keys
 
 FILES = ("tokenizer.json", "processor_config.json")
 _BROKEN = "\ufffd"
@@ -201,24 +192,10 @@ _NO_TOKENIZER = SimpleNamespace(from_pretrained=lambda *_, **__: None)
 # -- the network ----------------------------------------------------------------------------------------------
 
 
-class Pi0FastSize(SizeFile):
-    """Every dimension of a pi0-FAST that its `config.json` cannot express."""
-
-    network = "pi0-FAST"
-
-    vlm: GemmaSize
-    vision: SiglipSize
-    vocab_size: Count
-
-
-def build_pi0_fast(config: PI0FastConfig, size: Pi0FastSize | None = None, device: str = "cpu") -> PI0FastPolicy:
-    """A `PI0FastPolicy` in eval mode with uninitialised weights and without tokenizers; see `build_pi0`."""
-    device = building_device(device)
-    config.device = device
-    no_tokenizers = {"AutoProcessor": _NO_TOKENIZER, "AutoTokenizer": _NO_TOKENIZER}
-    with sized(size, config), replaced(modeling_pi0_fast, no_tokenizers), torch.device(device):
-        policy = PI0FastPolicy(config)
-    policy.eval()
+def build_pi0_fast(config: PI0FastConfig, size: PaliGemmaSize | None = None, device: str = "cpu") -> PI0FastPolicy:
+    """A `PI0FastPolicy` without tokenizers; see `build_resized`."""
+    with replaced(modeling_pi0_fast, {"AutoProcessor": _NO_TOKENIZER, "AutoTokenizer": _NO_TOKENIZER}):
+        policy = build_resized(PI0FastPolicy, config, size, device)
     joint: Any = policy.model.paligemma_with_expert
     joint.prompt_kv = PromptKV(len(joint.paligemma.model.language_model.layers))
     return cast(PI0FastPolicy, policy)
@@ -227,21 +204,6 @@ def build_pi0_fast(config: PI0FastConfig, size: Pi0FastSize | None = None, devic
 def full_size_pi0_fast() -> PI0FastPolicy:
     """The released size, on the meta device."""
     return build_pi0_fast(PI0FastConfig(device="cpu"), device="meta")
-
-
-@contextmanager
-def sized(size: Pi0FastSize | None, config: PI0FastConfig) -> Iterator[None]:
-    """Inside, lerobot's module builds a network of this size; None for the released one."""
-    if size is None:
-        yield
-        return
-    build = sized_paligemma(modeling_pi0_fast, size.vlm, size.vision, size.vocab_size, config.image_resolution[0])
-    replacements: dict[str, Callable[..., Any]] = {
-        "get_gemma_config": lambda _: size.vlm,
-        "PaliGemmaForConditionalGenerationWithPiGemma": build,
-    }
-    with replaced(modeling_pi0_fast, replacements):
-        yield
 
 
 def decode_tokens(
@@ -323,7 +285,7 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
     interventions = FAST
     # Its head puts out tokens, and is read.
     tied: ClassVar[Mapping[str, str]] = {EMBEDDING: LM_HEAD, LM_HEAD: EMBEDDING}
-    current_names = current_pi0_fast_keys
+    current_names = current_keys
 
     acting_stream = "action"
     prompt_tokens = ALL_BUT_LAST
@@ -345,7 +307,7 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
             raise UsageError(f"captured_tokens is {captured}; expected 1 to {most}")
         chooser(config.evaluation.temperature or 0, ())
         sizes = sizes_file(folder)
-        return build_pi0_fast(config, None if sizes is None else Pi0FastSize.from_file(sizes))
+        return build_pi0_fast(config, None if sizes is None else PaliGemmaSize.from_file(sizes))
 
     @property
     def temperature(self) -> float:

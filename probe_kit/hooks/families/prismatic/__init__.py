@@ -7,7 +7,7 @@ from probe_kit.hooks.families.shared.kinds import answering_family
 TOKENIZER = Option(
     "tokenizer",
     str,
-    "Folder of another tokenizer; bytes: for development checkpoints.",
+    "Folder of another tokenizer.",
     "the checkpoint's",
     is_path=True,
 )

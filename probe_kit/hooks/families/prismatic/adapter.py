@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import takewhile
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -86,28 +86,8 @@ def frame_of(language_id: str) -> TextFrame:
 
 # -- tokenizers -----------------------------------------------------------------------------------------------
 
-BYTES = "bytes"
-"""Asks for `ByteTokenizer`."""
 
-
-class TextTokenizer(Protocol):
-    """The methods that an adapter needs. special: ids that stand for no text."""
-
-    @property
-    def special(self) -> frozenset[int]:
-        """Ids that stand for no text."""
-
-    def encode(self, text: str) -> list[int]:
-        """Ids, the beginning-of-sequence token first. Raises InstructionError for a word it does not know."""
-
-    def inside(self, text: str, start: int, stop: int) -> list[bool]:
-        """Per id of `encode(text)` whether it holds any of the characters from `start` to `stop`."""
-
-    def decode(self, ids: Sequence[int]) -> str:
-        """The text of ids that the model put out, without special tokens."""
-
-
-def id_behind(tokenizer: TextTokenizer, prompt: str, answer: str) -> int:
+def id_behind(tokenizer: "FileTokenizer", prompt: str, answer: str) -> int:
     """The first id of `answer` behind `prompt`. Raises UsageError if it changes the prompt's own ids."""
     return first_behind(tokenizer.encode(prompt), tokenizer.encode(prompt + answer), answer)
 
@@ -146,45 +126,11 @@ class FileTokenizer(TokenizerFile):
         return self.words(ids)
 
 
-@dataclass(frozen=True)
-class ByteTokenizer:
-    """UTF-8 bytes as ids 3 … 258, for development checkpoints that come without a tokenizer.
+def find_tokenizer(folders: Sequence[Path], tokenizer: str | None, beginning: int | None) -> FileTokenizer:
+    """The checkpoint's tokenizer, or the one in the folder `tokenizer`.
 
-    No model was trained with it, so a trained checkpoint would read noise.
+    Raises CheckpointError naming the missing files.
     """
-
-    beginning: int
-
-    @property
-    def special(self) -> frozenset[int]:
-        """The beginning-of-sequence token."""
-        return frozenset({self.beginning})
-
-    def encode(self, text: str) -> list[int]:
-        """Ids, the beginning-of-sequence token first."""
-        return [self.beginning, *(3 + byte for byte in text.encode())]
-
-    def inside(self, text: str, start: int, stop: int) -> list[bool]:
-        """Per id whether it is a byte of these characters."""
-        before, length = (len(part.encode()) for part in (text[:start], text[start:stop]))
-        return [False] + [before <= position < before + length for position in range(len(text.encode()))]
-
-    def decode(self, ids: Sequence[int]) -> str:
-        """The bytes among the ids as text."""
-        return bytes(number - 3 for number in ids if 3 <= number < 259).decode(errors="replace").strip()
-
-
-def find_tokenizer(
-    folders: Sequence[Path], tokenizer: str | None, beginning: int | None, vocabulary: int
-) -> TextTokenizer:
-    """The checkpoint's tokenizer, or the one in the folder `tokenizer`, or bytes if that is asked for.
-
-    vocabulary: the number of text ids the model has. Raises CheckpointError naming the missing files.
-    """
-    if tokenizer == BYTES:
-        if vocabulary < 259:
-            raise CheckpointError(f"bytes need 259 text ids; this checkpoint has {vocabulary}")
-        return ByteTokenizer(1 if beginning is None else beginning)
     places = list(folders) if tokenizer is None else [Path(tokenizer).expanduser()]
     for folder in places:
         if (folder / TOKENIZER_FILE).is_file():
@@ -192,8 +138,7 @@ def find_tokenizer(
     raise CheckpointError(
         f"{TOKENIZER_FILE} and {SETTINGS_FILE} are missing in {' and '.join(map(str, places))}. The tokenizer "
         "comes with the checkpoint: copy these files from the model's page, or from the model it was fine-tuned "
-        f"from, or name their folder with -M tokenizer=DIR. For a development checkpoint that has none: "
-        f"-M tokenizer={BYTES}"
+        "from, or name their folder with -M tokenizer=DIR"
     )
 
 
@@ -249,11 +194,10 @@ class PrismaticModel(TokenDecoder):
         return torch.from_numpy(np.stack(rows)).to(self.loaded.device)
 
     @cached_property
-    def tokenizer(self) -> TextTokenizer:
+    def tokenizer(self) -> FileTokenizer:
         """The checkpoint's. Raises CheckpointError naming the files that are missing."""
         folders = [*self.loaded.folders, *filter(None, [self._text_folder])]
-        beginning = self.config.text.bos_token_id
-        return find_tokenizer(folders, self._chosen_tokenizer, beginning, self.config.action_vocabulary)
+        return find_tokenizer(folders, self._chosen_tokenizer, self.config.text.bos_token_id)
 
     @abstractmethod
     def prompt(self, instruction: str) -> list[int]:
@@ -324,8 +268,8 @@ class Prismatic(PrismaticModel, SpeakingModel):
 
     @property
     def lead(self) -> str:
-        """A space, as words begin with one behind every frame; none for bytes, where it is a token of its own."""
-        return "" if isinstance(self.tokenizer, ByteTokenizer) else " "
+        """A space, as words begin with one behind every frame."""
+        return " "
 
     def _settings(self) -> dict[str, str]:
         return {**super()._settings(), "frame": self.frame.around("[question]")}

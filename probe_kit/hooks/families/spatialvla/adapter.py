@@ -29,7 +29,7 @@ from probe_kit.hooks.contract.model import Policy, Tap
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.hooks.contract.roles import Roles
 from probe_kit.hooks.contract.sites import IMAGE_ROLE, Site, Stream
-from probe_kit.hooks.families.prismatic.adapter import BYTES, TextTokenizer, find_tokenizer
+from probe_kit.hooks.families.prismatic.adapter import FileTokenizer, find_tokenizer
 from probe_kit.hooks.families.shared.action_statistics import ActionStatistics, open_or_closed
 from probe_kit.hooks.families.shared.kinds import TOKENS
 from probe_kit.hooks.families.shared.loading import DTYPES, Loaded, load_network
@@ -125,7 +125,7 @@ class Speech:
     """The way from an instruction to ids.
 
     template: with a place for the instruction. lowercase: as in training; the released evaluation does not.
-    tokenizer_choice: None for the checkpoint's, a folder, or `bytes`.
+    tokenizer_choice: None for the checkpoint's, or a folder.
     """
 
     config: SpatialVLAConfig
@@ -142,17 +142,16 @@ class Speech:
         return cls(config, folder, template_of(prompt or "bare", PROMPTS), lowercase, tokenizer)
 
     @cached_property
-    def tokenizer(self) -> TextTokenizer:
+    def tokenizer(self) -> FileTokenizer:
         """Raises CheckpointError naming files that are missing, or ids that are not this model's."""
         config = self.config
-        tokenizer = find_tokenizer([self.folder], self.tokenizer_choice, config.beginning, config.image_token)
-        if self.tokenizer_choice != BYTES:
-            for token, expected in (("<image>", config.image_token), ("<ACTION00000>", config.first_action)):
-                if (ids := tokenizer.encode(token)[1:]) != [expected]:
-                    raise CheckpointError(
-                        f"the tokenizer reads {token} as {ids}; the model expects {expected}. It belongs to "
-                        "another checkpoint: take the tokenizer files from the model's own page"
-                    )
+        tokenizer = find_tokenizer([self.folder], self.tokenizer_choice, config.beginning)
+        for token, expected in (("<image>", config.image_token), ("<ACTION00000>", config.first_action)):
+            if (ids := tokenizer.encode(token)[1:]) != [expected]:
+                raise CheckpointError(
+                    f"the tokenizer reads {token} as {ids}; the model expects {expected}. It belongs to "
+                    "another checkpoint: take the tokenizer files from the model's own page"
+                )
         return tokenizer
 
     def prompt(self, instruction: str) -> list[int]:
@@ -261,8 +260,6 @@ class SpatialVLA(TokenDecoder, Policy):
             notes.append("decoding limited to the slot of every token, which the original does not do")
         if self._preset is not None:
             notes.append(f"camera: that of {self.camera}, whatever takes the picture")
-        if self.speech.tokenizer_choice == BYTES:
-            notes.append("development tokenizer: bytes, which no model was trained with")
         return tuple(notes)
 
     # -- inputs ------------------------------------------------------------------------------------------

@@ -44,7 +44,7 @@ from probe_kit.hooks.families.shared.lerobot.pipelines import (
     TOKENIZER,
     check_pipelines,
     check_steps,
-    every_step,
+    step_fields,
     text_length,
     tokenizer_folder,
 )
@@ -136,43 +136,33 @@ _MEAN, _DOMAIN = "xvla_imagenet_normalize", "xvla_add_domain_id"
 STEPS = ("xvla_image_to_float", _MEAN, _DOMAIN)
 
 
-@dataclass(frozen=True)
-class XvlaSteps:
-    """The settings of one checkpoint. domain: the robot's number. tokenizer: its name, None where no file has one.
+def read_steps(config: Any, folder: Path, domain: int | None) -> None:
+    """Put what the processor files say into lerobot's configuration; `domain` counts over theirs.
 
-    imagenet: whether pictures are normalised with ImageNet's mean and deviation. length: positions of the text.
-    """
-
-    domain: int
-    imagenet: bool
-    tokenizer: str | None
-    length: int | None
-
-
-def read_steps(folder: Path, domain: int | None, pictures: Sequence[str] = ()) -> XvlaSteps:
-    """Read the processor files; `domain` counts over theirs. pictures: keys of all. Raises CheckpointError.
-
-    lerobot takes robot 0 where nothing names one: here it is an error, and so is a step that changes numbers in
-    another way.
+    domain: the robot's number. imagenet: whether pictures are normalised with ImageNet's mean and deviation.
+    tokenizer_name: also the folder in the checkpoint.
+    Raises CheckpointError. lerobot takes robot 0 where nothing names one: here it is an error, and so is a step
+    that changes numbers in another way.
     """
     check_pipelines(folder)
     check_steps(folder, POSTPROCESSOR, (*NORMALISERS, *STEPS))
-    configs: dict[str, Mapping[str, Any]] = {step.name: step.config for step in every_step(folder)}
+    fields = step_fields(folder)
     for name in STEPS:
-        keys = configs.get(name, {}).get("image_keys")
-        if keys is not None and (left_out := sorted(set(pictures) - set(keys))):
+        keys = fields.get(name, {}).get("image_keys")
+        if keys is not None and (left_out := sorted(set(config.image_features) - set(keys))):
             raise CheckpointError(
                 f"{folder}: the step {name!r} leaves out {', '.join(left_out)} (image_keys); every picture is "
                 "treated alike here. Take a checkpoint whose image_keys are null or name all"
             )
-    if domain is None and _DOMAIN not in configs:
+    if domain is None and _DOMAIN not in fields:
         raise CheckpointError(f"{folder} names no robot; say whose soft prompts are read with -M domain=N")
-    text, length = configs.get(TOKENIZER, {}), text_length(folder)
+    text = fields.get(TOKENIZER, {})
     if text.get("padding", "max_length") != "max_length":
         raise CheckpointError(f"{folder} pads its text in another way than behind its end up to a fixed length")
-    tokenizer = str(saved) if (saved := tokenizer_folder(folder)) is not None else text.get("tokenizer_name")
-    robot = configs.get(_DOMAIN, {}).get("domain_id", 0) if domain is None else domain
-    return XvlaSteps(int(robot), _MEAN in configs, tokenizer, length)
+    config.domain = int(fields.get(_DOMAIN, {}).get("domain_id", 0) if domain is None else domain)
+    config.imagenet = _MEAN in fields
+    config.tokenizer_name = str(tokenizer_folder(folder) or text.get("tokenizer_name") or config.tokenizer_name)
+    config.tokenizer_max_length = text_length(folder) or config.tokenizer_max_length
 
 
 # -- the adapter ----------------------------------------------------------------------------------------------
@@ -213,8 +203,7 @@ class Xvla(DenoisingPolicy):
     def parse_config(cls, folder: Path, evaluation: Any) -> Any:
         """lerobot's configuration, with what the processor files say."""
         config = super().parse_config(folder, evaluation)
-        config.steps = read_steps(folder, evaluation.domain, tuple(config.image_features))
-        config.tokenizer_max_length = config.steps.length or config.tokenizer_max_length
+        read_steps(config, folder, evaluation.domain)
         config.picture = evaluation.picture or ("padded" if config.resize_imgs_with_padding else None)
         if config.picture and config.resize_imgs_with_padding is None:
             height, width = next(iter(config.image_features.values())).shape[-2:]
@@ -230,21 +219,13 @@ class Xvla(DenoisingPolicy):
                 f"{folder} has a state of {numbers} numbers and reads {config.max_state_dim}: lerobot leaves out "
                 "the rest. Take the original configuration"
             )
-        if not 0 <= config.steps.domain < config.num_domains:
-            raise UsageError(
-                f"-M domain={config.steps.domain}: {folder} has the robots 0 to {config.num_domains - 1}"
-            )
+        if not 0 <= config.domain < config.num_domains:
+            raise UsageError(f"-M domain={config.domain}: {folder} has the robots 0 to {config.num_domains - 1}")
         return build_xvla(config)
-
-    @property
-    def steps(self) -> XvlaSteps:
-        """The settings in the processor files besides units."""
-        steps: XvlaSteps = self.config.steps
-        return steps
 
     def further_settings(self) -> dict[str, str]:
         """The robot whose soft prompts are read, and how pictures come to their size."""
-        return {"domain": str(self.steps.domain), "picture": str(self.config.picture)}
+        return {"domain": str(self.config.domain), "picture": str(self.config.picture)}
 
     def _notes(self) -> tuple[str, ...]:
         if self.config.picture is None:
@@ -272,7 +253,7 @@ class Xvla(DenoisingPolicy):
 
     @property
     def _tokenizer_folder(self) -> Path:
-        name = self.steps.tokenizer or self.config.tokenizer_name
+        name = self.config.tokenizer_name
         inside = (self.folder / "tokenizer.json").is_file() and not Path(name).is_dir()
         return self.folder if inside else checkpoint_folder(name, SMALL_FILES)
 
@@ -304,11 +285,11 @@ class Xvla(DenoisingPolicy):
                     f"the picture of {camera} is {tuple(picture.shape[-2:])}; this checkpoint resizes nothing and "
                     f"expects {expected}"
                 )
-            if self.steps.imagenet:
+            if self.config.imagenet:
                 batch[f"{IMAGES}{camera}"] = (picture - mean.to(picture)) / deviation.to(picture)
         if not self.config.use_proprio:
             del batch[STATE]
-        batch["domain_id"] = torch.full((len(observations),), self.steps.domain, device=self.config.device)
+        batch["domain_id"] = torch.full((len(observations),), self.config.domain, device=self.config.device)
         return batch
 
     @property

@@ -4,7 +4,6 @@ import re
 from abc import abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
@@ -184,14 +183,6 @@ class PackedRow(NamedTuple):
         return list(zip(self.inputs["input_ids"][0].tolist(), self.labels, strict=True))
 
 
-@dataclass(frozen=True)
-class PackedBatch:
-    """Packed observations. inputs: what the network reads. rows: of each, its prompt without the actions."""
-
-    inputs: dict[str, Tensor]
-    rows: list[Tokens]
-
-
 def chat_labels(
     ids: Sequence[int], pictures: Iterable[str], picture: int, words: tuple[int, int], state: int | None = None
 ) -> list[str]:
@@ -223,16 +214,18 @@ class PackedPolicy(DenoisingPolicy):
     def packing(self) -> Any:
         """lerobot's packing; it has the `tokenizer`, and `row` and `batch` for `pack`."""
 
-    def pack(self, observations: Sequence[Observation], state: NDArray[np.float32]) -> PackedBatch:
-        """The observations as the network reads them. state: (B, numbers) as it reads them.
+    def pack(
+        self, observations: Sequence[Observation], state: NDArray[np.float32]
+    ) -> tuple[dict[str, Tensor], list[Tokens]]:
+        """The observations as the network reads them, and of each its prompt without the actions.
 
-        Raises InstructionError for a text that it cannot take in.
+        state: (B, numbers) as the network reads them. Raises InstructionError for a text that it cannot take in.
         """
         rows: list[PackedRow] = [
             self.packing.row(self.pictures_of(observation), observation.instruction, numbers)
             for observation, numbers in zip(observations, state, strict=True)
         ]
-        return PackedBatch(self.packing.batch(rows), [row.tokens for row in rows])
+        return self.packing.batch(rows), [row.tokens for row in rows]
 
     @cached_property
     def tokenizer(self) -> Any:
@@ -247,13 +240,13 @@ class PackedPolicy(DenoisingPolicy):
         self, observations: Sequence[Observation], state: NDArray[np.float32] | None = None
     ) -> dict[str, Tensor]:
         """Return a batch in lerobot's keys. state: (B, numbers) as the network reads them."""
-        packed = self.pack(observations, self.state(observations) if state is None else state)
-        return {name: tensor.to(self.config.device) for name, tensor in packed.inputs.items()}
+        inputs, _ = self.pack(observations, self.state(observations) if state is None else state)
+        return {name: tensor.to(self.config.device) for name, tensor in inputs.items()}
 
     def roles(self, observations: Sequence[Observation]) -> dict[str, list[Roles]]:
         """Roles from the packing itself; streams besides the acting one have the backbone's tokens."""
         state = self.read_state(observations)
-        rows = self.pack(observations, self._no_state(len(observations)) if state is None else state).rows
+        _, rows = self.pack(observations, self._no_state(len(observations)) if state is None else state)
         prompts = Roles.padded([[label for _, label in row] for row in rows])
         suffix = [Roles.from_labels(self.suffix_labels())] * len(rows)
         return {name: suffix if name == self.acting_stream else prompts for name in self.streams}
@@ -264,7 +257,7 @@ class PackedPolicy(DenoisingPolicy):
         blank, state = np.zeros((height, width, 3), np.uint8), np.zeros(ARM_NUMBERS, np.float32)
         cameras = dict.fromkeys(self.shown_cameras[1:], blank)
         observations = [Observation(blank, state, text, cameras=cameras) for text in instructions]
-        rows = [self.pack([observation], self._no_state(1)).rows[0] for observation in observations]
+        rows = [self.pack([observation], self._no_state(1))[1][0] for observation in observations]
         return [tuple(number for number, role in row if role in self.word_roles) for row in rows]
 
     @classmethod

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,39 +40,19 @@ _NEEDED = {
 }
 
 
-class Units(Protocol):
-    """Between physical units and the numbers of a network. mode, source: what it is and whence, in words."""
-
-    @property
-    def mode(self) -> str:
-        """The kind of map."""
-
-    @property
-    def source(self) -> str:
-        """The file the statistics come from."""
-
-    def normalise(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Physical units to the numbers the network reads; (..., D)."""
-
-    def restore(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Network output to physical units; (..., D)."""
-
-    def slopes(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(..., D) by how much `restore` changes per unit of these outputs of the network.
-
-        0 for a number that jumps, and where `restore` clips.
-        """
-
-    def unusual(self, values: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """(..., D) which physical values lie far from those of the statistics, also where `normalise` clips."""
+Mask = NDArray[np.bool_] | bool
 
 
 @dataclass(frozen=True)
 class Normaliser:
-    """An affine map per dimension, in lerobot's conventions (`NormalizerProcessorStep`, lerobot 0.6).
+    """A map per dimension between physical units and the numbers of a network, in lerobot's conventions.
 
-    mode: MEAN_STD, MIN_MAX, QUANTILES, QUANTILE10 or IDENTITY. low, high: the two statistics, (D,) float32.
-    source: the file they come from.
+    mode: MEAN_STD, MIN_MAX, QUANTILES, QUANTILE10, IDENTITY, or several in words. low, high: (D,) float32, what
+    stands for -1 and 1; mean and deviation of numbers that are `scored`. eps: in place of a range or beside a
+    deviation. source: the file they come from.
+    scored: (D,) which numbers are mapped by mean and deviation; None for what `mode` says. plain: those that stay
+    as they are. clamped: those of the network that are moved to -1 to 1. sign: the action that becomes −1 or 1,
+    as LIBERO's gripper; None where there is none.
     Raises CheckpointError for statistics that are not finite, or whose scale is not positive.
     """
 
@@ -81,51 +61,80 @@ class Normaliser:
     high: NDArray[np.float32]
     eps: float
     source: str
+    scored: NDArray[np.bool_] | None = None
+    plain: Mask = False
+    clamped: Mask = False
+    sign: int | None = None
 
     def __post_init__(self) -> None:
-        if self.mode != "IDENTITY":
-            (check_deviations if self.mode == "MEAN_STD" else check_bounds)(self.low, self.high, self.source)
+        scored = self._scored
+        if self.low.shape != self.high.shape:
+            check_bounds(self.low, self.high, self.source)  # which names the shapes
+        if self.mode != "IDENTITY" and not scored.all():
+            check_bounds(self.low[~scored], self.high[~scored], self.source)
+        if scored.any():
+            check_deviations(self.low[scored], self.high[scored], self.source)
         if not (np.isfinite(self.eps) and self.eps >= 0):
             raise CheckpointError(f"{self.source}: eps is {self.eps}; expected a small positive number")
 
-    def normalise(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Physical units to the numbers the network reads; (..., D)."""
-        if self.mode == "IDENTITY":
-            return values
-        if self.mode == "MEAN_STD":
-            return np.asarray((values - self.low) / (self.high + self.eps), np.float32)
+    @property
+    def _scored(self) -> NDArray[np.bool_]:
+        return np.full(self.low.shape, self.mode == "MEAN_STD") if self.scored is None else self.scored
+
+    @property
+    def _span(self) -> NDArray[np.float32]:
         # eps where the number never changed, as lerobot has it: any other value then lies far outside [-1, 1].
-        span = np.where(self.high == self.low, self.eps, self.high - self.low)
-        return np.asarray(2 * (values - self.low) / span - 1, np.float32)
+        return np.asarray(np.where(self.high == self.low, self.eps, self.high - self.low), np.float32)
+
+    def normalise(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Physical units to the numbers the network reads; (..., D). Without range and eps, 0."""
+        mapped = values
+        if self.mode != "IDENTITY":
+            span, deviation = self._span, self.high + self.eps
+            bounded = np.where(span == 0, 0, 2 * (values - self.low) / np.where(span == 0, 1, span) - 1)
+            still = deviation == 0  # NVIDIA leaves a number without deviation as it is
+            scores = np.where(still, values, (values - self.low) / np.where(still, 1, deviation))
+            mapped = np.where(self.plain, values, np.where(self._scored, scores, bounded))
+        return np.asarray(np.where(self.clamped, mapped.clip(-1, 1), mapped), np.float32)
 
     def restore(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """Network output to physical units; (..., D)."""
+        restored = self._line(np.where(self.clamped, values.clip(-1, 1), values))
+        if self.sign is not None:
+            restored[..., self.sign] = -np.sign(2 * restored[..., self.sign] - 1)
+        return restored
+
+    def _line(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(..., D): `restore` without what clamps or jumps."""
         if self.mode == "IDENTITY":
-            return values
-        if self.mode == "MEAN_STD":  # without eps, as in lerobot: not quite the inverse of `normalise`
-            return np.asarray(values * self.high + self.low, np.float32)
-        span = np.where(self.high == self.low, self.eps, self.high - self.low)
-        return np.asarray((values + 1) / 2 * span + self.low, np.float32)
+            return np.asarray(values, np.float32)
+        bounded = (values + 1) / 2 * self._span + self.low
+        # Without eps, as in lerobot: not quite the inverse of `normalise`.
+        scores = np.where(self.high + self.eps == 0, values, values * self.high + self.low)
+        return np.asarray(np.where(self.plain, values, np.where(self._scored, scores, bounded)), np.float32)
 
     def slopes(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(..., D) of `restore`, which is a line in each of the D numbers."""
-        # By two points, so that the slope is that of `restore` in every mode.
-        low, high = (self.restore(np.full_like(values, value)) for value in (0, 1))
-        return np.asarray(high - low, np.float32)
+        """(..., D) by how much `restore` changes per unit of these outputs; 0 where it clamps or jumps.
+
+        By two points, so that the slope is that of `restore` in every mode.
+        """
+        low, high = (self._line(np.full_like(values, value)) for value in (0, 1))
+        slopes = np.asarray(np.where(self.clamped & (np.abs(values) > 1), 0, high - low), np.float32)
+        if self.sign is not None:
+            slopes[..., self.sign] = 0
+        return slopes
 
     def unusual(self, values: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """(..., D): more than five deviations from the mean, or outside the bounds."""
+        """(..., D) which physical values are more than five deviations from the mean, or outside the bounds.
+
+        Also where `normalise` clamps; never of numbers without statistics.
+        """
         if self.mode == "IDENTITY":
             return np.zeros(values.shape, bool)
-        if self.mode == "MEAN_STD":
-            return np.asarray(np.abs(values - self.low) > USUAL_DEVIATIONS * (self.high + self.eps))
-        return outside(values, self.low, self.high)
-
-
-def outside(values: NDArray[np.float32], low: NDArray[np.float32], high: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """(..., D) which values lie outside their bounds (D,), but for rounding."""
-    slack = _ROUNDING * (high - low) + _EPS
-    return np.asarray((values < low - slack) | (values > high + slack))
+        far = np.abs(values - self.low) > USUAL_DEVIATIONS * (self.high + self.eps)
+        slack = _ROUNDING * (self.high - self.low) + _EPS
+        beyond = (values < self.low - slack) | (values > self.high + slack)
+        return np.asarray(np.where(self._scored, far, beyond) & ~np.asarray(self.plain))
 
 
 def read_normaliser(folder: Path, pipeline: str, feature: str, kind: str) -> Normaliser:
@@ -218,44 +227,31 @@ SHIPPED = ("bridge",)
 NO_STATISTICS = "none"
 FILES = ("dataset_statistics.json", "bridge_statistics.json", "statistics.json")
 """Under these names a checkpoint's folder may hold them."""
-_BOUND_EPS = 1e-8
 _OPEN = 0.5
 """Of the network's own number for the gripper, which ends in 1 for open and 0 for closed."""
 
 
 @dataclass(frozen=True)
-class Bounds:
-    """p01 to -1 and p99 to 1. A state is clipped there; an action keeps its last number, open above a half.
-
-    low, high: (D,) float32. source: what they come from. The rest is the interface of `Normaliser`.
-    """
-
-    low: NDArray[np.float32]
-    high: NDArray[np.float32]
-    source: str
-    mode: str = "BOUNDS"
+class Bounds(Normaliser):
+    """p01 to -1 and p99 to 1. A state is clipped there; an action keeps its last number, open above a half."""
 
     def normalise(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """Physical units to the numbers the network reads; (..., D)."""
-        scaled = 2 * (values - self.low) / (self.high - self.low + _BOUND_EPS) - 1
+        scaled = 2 * (values - self.low) / (self.high - self.low + _EPS) - 1
         return np.asarray(scaled.clip(-1, 1), np.float32)
 
     def restore(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """Network output to physical units, and the gripper to 1 open or 0 closed; (..., D)."""
-        metres = np.asarray((values + 1) / 2 * (self.high - self.low) + self.low, np.float32)
+        metres = super().restore(values)
         # From the number of the network itself, which the statistics do not scale.
         metres[..., -1] = values[..., -1] > _OPEN
         return metres
 
     def slopes(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """(..., D) of `restore`; 0 of the gripper, which is open or closed."""
-        slopes = np.asarray((self.high - self.low) / 2, np.float32) * np.ones_like(values)
+        slopes = super().slopes(values)
         slopes[..., -1] = 0
         return slopes
-
-    def unusual(self, values: NDArray[np.float32]) -> NDArray[np.bool_]:
-        """(..., D): outside the bounds, where `normalise` clips."""
-        return outside(values, self.low, self.high)
 
 
 @dataclass(frozen=True)
@@ -302,7 +298,7 @@ class StatisticsFile:
             )
         if not np.isfinite([low, high]).all() or (high < low).any():
             raise CheckpointError(f"the statistics {self.name} of {part} are not finite or p99 lies below p01")
-        return Bounds(low.astype(np.float32), high.astype(np.float32), self.name)
+        return Bounds("BOUNDS", low.astype(np.float32), high.astype(np.float32), 0.0, self.name)
 
 
 def _shipped(name: str) -> bytes:

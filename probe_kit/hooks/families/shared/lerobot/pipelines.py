@@ -33,7 +33,7 @@ def known_values(
     """
     extra = {name: value for name, value in values.items() if name not in read_fields and name not in unread}
     changing = {
-        name: inert[name] for name, value in extra.items() if name in inert and not _is_inert(value, inert[name])
+        name: inert[name] for name, value in extra.items() if name in inert and not _is_one_of(value, inert[name])
     }
     if changing:
         requested = ", ".join(f"{name}: {extra[name]!r}" for name in changing)
@@ -56,8 +56,8 @@ def known_values(
     return {name: value for name, value in values.items() if name in read_fields}
 
 
-def _is_inert(value: Any, plain: tuple[Any, ...] | None) -> bool:
-    """Whether a value is one of these; True is not 1 here."""
+def _is_one_of(value: Any, plain: tuple[Any, ...] | None) -> bool:
+    """Whether a value is one of these, which None is for any; True is not 1 here."""
     return plain is None or any(value == candidate and type(value) is type(candidate) for candidate in plain)
 
 
@@ -169,9 +169,10 @@ def saved_steps(folder: Path, pipeline: str) -> tuple[SavedStep, ...]:
     )
 
 
-def every_step(folder: Path) -> tuple[SavedStep, ...]:
-    """The steps before the policy, then those behind it."""
-    return (*saved_steps(folder, PREPROCESSOR), *saved_steps(folder, POSTPROCESSOR))
+def step_fields(folder: Path) -> dict[str, Mapping[str, Any]]:
+    """The fields of every saved step by its name, those before the policy first."""
+    steps = (*saved_steps(folder, PREPROCESSOR), *saved_steps(folder, POSTPROCESSOR))
+    return {step.name: step.config for step in steps}
 
 
 def check_pipelines(folder: Path) -> None:
@@ -199,20 +200,12 @@ def check_steps(folder: Path, pipeline: str, family_steps: Collection[str]) -> N
                 f"{folder / pipeline}.json has the step {step.name!r} twice; probe_kit takes one of each. Save "
                 "the pipeline that the policy was trained with"
             )
-        check_fields(step, f"{folder / pipeline}.json")
+        check_values(step.config, _FIELDS.get(step.name, {}), f"{folder / pipeline}.json: the step {step.name!r}")
         if pictures := _normalised_pictures(folder, step):
             raise CheckpointError(
                 f"{folder} normalises {', '.join(pictures)} by statistics ({step.name}), which probe_kit does "
                 "not. Take a checkpoint whose norm_map has VISUAL: IDENTITY"
             )
-
-
-def check_fields(step: SavedStep, source: str) -> None:
-    """Raise CheckpointError for a field of a known step that probe_kit does not honour with its value.
-
-    source: the file, for messages.
-    """
-    check_values(step.config, _FIELDS.get(step.name, {}), f"{source}: the step {step.name!r}")
 
 
 def check_values(values: Mapping[str, Any], honoured: Mapping[str, tuple[Any, ...] | None], subject: str) -> None:
@@ -227,13 +220,10 @@ def check_values(values: Mapping[str, Any], honoured: Mapping[str, tuple[Any, ..
                 f"{subject} has the field {name}: {value!r}, which may change numbers in a way probe_kit does not "
                 f"know. Known are {fields}. If it changes nothing, remove it from a copy of the file"
             )
-        plain = honoured[name]
-        if plain is not None and not any(
-            value == candidate and type(value) is type(candidate) for candidate in plain
-        ):
+        if not _is_one_of(value, plain := honoured[name]):
             raise CheckpointError(
                 f"{subject} says {name}: {value!r}, which probe_kit does not repeat. Supported is "
-                f"{' or '.join(map(repr, plain))}: take a checkpoint that was trained so"
+                f"{' or '.join(map(repr, plain or ()))}: take a checkpoint that was trained so"
             )
 
 
@@ -250,8 +240,7 @@ def check_same(folder: Path, step: str, saved: Mapping[str, Any], configured: Ma
 
 def tokenizer_name(folder: Path) -> str | None:
     """The name of the tokenizer in the saved step; None where no step has one."""
-    step = next((step for step in saved_steps(folder, PREPROCESSOR) if step.name == TOKENIZER), None)
-    name = None if step is None else step.config.get("tokenizer_name")
+    name = step_fields(folder).get(TOKENIZER, {}).get("tokenizer_name")
     return name if isinstance(name, str) and name else None
 
 
@@ -280,15 +269,13 @@ def _normalised_pictures(folder: Path, step: SavedStep) -> list[str]:
 
 def adds_state(folder: Path) -> bool:
     """Whether lerobot adds the state to what the policy puts out."""
-    return any(step.name in RELATIVE and bool(step.config.get("enabled")) for step in every_step(folder))
+    fields = step_fields(folder)
+    return any(fields.get(name, {}).get("enabled") for name in RELATIVE)
 
 
 def text_length(folder: Path) -> int | None:
     """Positions that the text is padded to; None where no step says."""
-    step = next((step for step in saved_steps(folder, PREPROCESSOR) if step.name == TOKENIZER), None)
-    if step is None:
-        return None
-    length = step.config.get("max_length")
+    length = step_fields(folder).get(TOKENIZER, {}).get("max_length")
     return None if length is None else int(length)
 
 

@@ -32,7 +32,6 @@ from probe_kit.hooks.contract.sites import PADDING, Site
 from probe_kit.hooks.families.shared.kinds import IMAGES, STATE, Evaluation, cameras_of
 from probe_kit.hooks.families.shared.lerobot.normaliser import (
     Normaliser,
-    Units,
     from_buffers,
     read_buffers,
     read_normaliser,
@@ -550,16 +549,16 @@ class LerobotPolicy(Policy):
         return {}
 
     @cached_property
-    def state_units(self) -> Units:
+    def state_units(self) -> Normaliser:
         """Metres and radians to what the network reads. Raises CheckpointError if nothing says."""
         return self.units_of(STATE, "STATE")
 
     @cached_property
-    def action_units(self) -> Units:
+    def action_units(self) -> Normaliser:
         """The units that turn the network's output into metres and radians. Raises CheckpointError."""
         return self.units_of("action", "ACTION")
 
-    def units_of(self, feature: str, kind: str) -> Units:
+    def units_of(self, feature: str, kind: str) -> Normaliser:
         """The units of one feature, STATE or ACTION."""
         if (units := self.own_units(feature, kind)) is not None:
             return units
@@ -568,7 +567,7 @@ class LerobotPolicy(Policy):
             "its units are unknown"
         )
 
-    def own_units(self, feature: str, kind: str) -> Units | None:
+    def own_units(self, feature: str, kind: str) -> Normaliser | None:
         """The units in the checkpoint's processor files or old buffers; None if it normalises nothing."""
         pipeline = PREPROCESSOR if kind == "STATE" else POSTPROCESSOR
         self._check_steps(self.folder, pipeline)  # behind the policy only actions depend on them

@@ -12,10 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torchvision.transforms.v2 import functional
 
-from probe_kit._system.bounded_files import load_json
 from probe_kit.errors import CheckpointError, ObservationError
-
-STEP = "image_crop_resize_processor"
+from probe_kit.hooks.families.shared.lerobot.pipelines import CROP, PREPROCESSOR, step_fields
 
 
 @dataclass(frozen=True)
@@ -55,17 +53,14 @@ def read_window(folder: Path, camera: str, size: tuple[int, int] | None = None) 
 
     Raises CheckpointError if the step holds something else than lerobot writes.
     """
-    path = folder / "policy_preprocessor.json"
-    steps = load_json(path)["steps"] if path.is_file() else []
-    for step in steps:
-        if step["registry_name"] == STEP:
-            try:
-                crop = (step["config"].get("crop_params_dict") or {}).get(camera)
-                after = step["config"].get("resize_size")
-                return PictureWindow(_crop(*crop) if crop else None, _size(*after) if after else None, size)
-            except TypeError as error:
-                raise CheckpointError(f"{path}: {STEP} cannot be read: {error}") from error
-    return PictureWindow()
+    fields = step_fields(folder).get(CROP)
+    if fields is None:
+        return PictureWindow()
+    crop, after = (fields.get("crop_params_dict") or {}).get(camera), fields.get("resize_size")
+    try:
+        return PictureWindow(_crop(*crop) if crop else None, _size(*after) if after else None, size)
+    except TypeError as error:
+        raise CheckpointError(f"{folder / PREPROCESSOR}.json: {CROP} cannot be read: {error}") from error
 
 
 def squashed(image: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.uint8]:
