@@ -43,7 +43,7 @@ from tests.support.plans import make_plan
 
 BACKBONE = StoredStream("backbone", 19, 512, None, 816, ("mean", "last", "mean:language", "mean:image"))
 EXPERT = StoredStream("expert", 19, 64, 10, 51, ("mean", "mean:action"))
-RECORDING = "probe_kit.runs.checking"
+RECORDING = "probe_kit.runs.array_store"
 Seconds = tuple[float, float]
 
 

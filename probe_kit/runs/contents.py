@@ -134,7 +134,7 @@ def _expected(key: str) -> bool:
         top in ILLUSTRATIONS
         or (top == DATA and "/c/" in below)
         or (top in BUNDLES and below.partition("/")[0].endswith(PARTIAL))
-        or key.endswith((".tmp", ".partial"))
+        or key.endswith(".tmp")
     )
 
 

@@ -16,9 +16,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, BinaryIO
 
-from zarr.abc.store import Store
-from zarr.storage import LocalStore
-
 from probe_kit._system.drafts import draft_of
 from probe_kit.errors import FULL_DISK, DiskSpaceError, RunDamagedError, SettingsMismatchError
 from probe_kit.runs.layout import COLUMNS, DATA, RUN_FILE
@@ -40,7 +37,7 @@ def check_size(key: str, size: int, where: object) -> None:
         )
 
 
-_DRAFTS = ("*.tmp", "*/*.tmp", f"{DATA}/**/*.partial", f"{COLUMNS}/**/*.partial")
+_DRAFTS = ("*.tmp", "*/*.tmp", f"{DATA}/**/*.tmp", f"{COLUMNS}/**/*.tmp")
 """Patterns of what a killed process leaves: objects without their final name."""
 _PIECE = 1 << 20
 """Bytes that are hashed at a time: they stay in the processor's cache."""
@@ -54,9 +51,6 @@ class Folder:
     """A folder on a file system that knows hard links and `flock`. `str()` gives what the user called it.
 
     Its methods are the contract of a location, which `store.Bucket` keeps too.
-
-    Zarr's own `LocalStore` reads and writes the arrays: the object_store library takes twice the processor time to
-    read them (docs/notes/storage.md).
     """
 
     def __init__(self, path: Path) -> None:
@@ -112,11 +106,15 @@ class Folder:
         """Whether there is an object of that key."""
         return _inside(key) and (self._path / key).is_file()
 
-    def read(self, key: str) -> bytes:
-        """All of one object. Raises FileNotFoundError."""
+    def read(self, key: str, part: slice | None = None) -> bytes:
+        """All of one object, or a part of its bytes. Raises FileNotFoundError."""
         path = self._object(key)
-        check_size(key, path.stat().st_size, self)
-        return path.read_bytes()
+        if part is None:
+            check_size(key, path.stat().st_size, self)
+            return path.read_bytes()
+        with path.open("rb") as file:
+            file.seek(part.start)
+            return file.read(part.stop - part.start)
 
     def pieces(self, key: str) -> Iterator[memoryview]:
         """One object from its beginning to its end; a piece is good until the next one is asked for.
@@ -190,10 +188,6 @@ class Folder:
     def remove(self, folder: str) -> None:
         """Remove everything below `folder`, if there is anything."""
         shutil.rmtree(self._path / folder, ignore_errors=True)
-
-    def store(self, folder: str, read_only: bool = False) -> Store:
-        """Return Zarr's store for the group or array that lies in `folder`."""
-        return LocalStore(self._path / folder, read_only=read_only)
 
     def _object(self, key: str) -> Path:
         """The path of an object. Raises FileNotFoundError for what is no plain file, or not in the folder.

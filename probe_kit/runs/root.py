@@ -279,6 +279,11 @@ class Root:
             entry["name"]: StoredStream(**{**entry, **lists}) for entry, lists in zip(entries, tuples, strict=True)
         }
 
+    @cached_property
+    def metadata(self) -> dict[str, Sum]:
+        """Length and hash of the metadata of all arrays, by key in `data.zarr`."""
+        return {key.removeprefix(f"{DATA}/"): stored for key, stored in self.card.objects.items()}
+
     @property
     def own_settings(self) -> dict[str, Any]:
         """The settings of the card."""

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from zarr.abc.store import Store
 
 from probe_kit.env.scoring import DEFAULT_RULE, check_rule
 from probe_kit.errors import (
@@ -21,6 +20,7 @@ from probe_kit.errors import (
     UsageError,
 )
 from probe_kit.hooks.contract.sites import Site, Stream, resolve_view
+from probe_kit.runs.array_store import ArrayStore
 from probe_kit.runs.arrays import (
     Rows,
     StoredInputs,
@@ -30,7 +30,6 @@ from probe_kit.runs.arrays import (
     role_mask,
     token_blocks,
 )
-from probe_kit.runs.checking import CheckedStore
 from probe_kit.runs.columns import Columns, find_columns
 from probe_kit.runs.commits import (
     Commit,
@@ -657,15 +656,14 @@ class Run:
         return Rows(open_array(self.data, f"{stream}/{kind}"), self._numbers)
 
     @property
-    def data(self) -> Store:
+    def data(self) -> ArrayStore:
         """The arrays of the committed episodes as Zarr reads them; every object is checked as it is read."""
-        store = self.location.store(DATA, read_only=True)
-        return CheckedStore(store, self._sums, lambda key: f"{self.location}/{DATA}/{key}", self._advice)
+        return ArrayStore(self.location, DATA, self._sums, self._advice, read_only=True)
 
     @cached_property
     def _sums(self) -> dict[str, Sum]:
         """Sums of all objects of `data.zarr`, by key: metadata, and those that commits name."""
-        sums = {key.removeprefix(f"{DATA}/"): expected for key, expected in self.root.card.objects.items()}
+        sums = dict(self.root.metadata)
         for commit in self._commits.values():
             sums |= commit.objects
         return sums

@@ -12,9 +12,8 @@ A store may be busy or away for a while: from its first answer on, every request
 it has answered once, the address is more likely wrong, and it is given up within seconds.
 """
 
-import asyncio
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from datetime import timedelta
@@ -23,10 +22,6 @@ from io import SEEK_SET, BufferedReader, RawIOBase
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Literal
 from urllib.parse import urlsplit
-
-from zarr.abc.store import ByteRequest, Store
-from zarr.core.buffer import Buffer, BufferPrototype
-from zarr.storage import WrapperStore
 
 from probe_kit._system.imports import require
 from probe_kit.errors import SettingsMismatchError, StoreError, UsageError
@@ -101,18 +96,18 @@ class Bucket:
 
     @cached_property
     def _patient(self) -> "ObjectStore":
-        return self._below("")
+        return self._client(quick=False)
 
     @cached_property
     def _quick(self) -> "ObjectStore":
-        return self._below("", quick=True)
+        return self._client(quick=True)
 
-    def _below(self, folder: str, quick: bool = False) -> "ObjectStore":
+    def _client(self, quick: bool) -> "ObjectStore":
         from obstore.store import from_url
 
         with self.explained_errors():
             store: ObjectStore = from_url(
-                f"{self._url}/{folder}".rstrip("/"),
+                self._url,
                 retry_config={
                     "retry_timeout": _QUICK if quick else PATIENCE,
                     "max_retries": 10 if quick else 10_000,  # the timeout is to end it, not the count
@@ -189,11 +184,13 @@ class Bucket:
             return False
         return True
 
-    def read(self, key: str) -> bytes:
+    def read(self, key: str, part: slice | None = None) -> bytes:
         """See `Folder.read`: one request."""
         import obstore
 
         def content(objects: Any) -> bytes:
+            if part is not None:
+                return bytes(obstore.get_range(objects, key, start=part.start, end=part.stop))
             answer = obstore.get(objects, key)
             check_size(key, answer.meta["size"], self)
             return bytes(answer.bytes())
@@ -280,12 +277,6 @@ class Bucket:
         if keys:
             self._answer(lambda objects: obstore.delete(objects, keys))
 
-    def store(self, folder: str, read_only: bool = False) -> Store:
-        """Zarr's own, over obstore; its errors are those of `explained_errors`."""
-        from zarr.storage import ObjectStore
-
-        return _PatientStore(ObjectStore(self._below(folder), read_only=read_only), self)
-
     # -- runs ------------------------------------------------------------------------------------------
 
     def begin(self, objects: Mapping[str, bytes], last: str) -> None:
@@ -321,62 +312,6 @@ def pauses_for(time_to_repeat: timedelta) -> Iterator[float]:
     while time.monotonic() + pause <= end:
         yield pause
         pause = min(2 * pause, LONGEST_PAUSE)
-
-
-class _PatientStore(WrapperStore[Store]):
-    """A store of Zarr whose errors are those of its bucket, and that waits for them to pass.
-
-    obstore repeats most requests, but not an answer that breaks off. Of Zarr's operations it covers those that
-    `CheckedStore`, `RecordingStore` and `BlankStore` pass on.
-    """
-
-    def __init__(self, store: Store, bucket: Bucket) -> None:
-        super().__init__(store)
-        self._bucket = bucket
-
-    def _with_store(self, store: Store) -> "_PatientStore":
-        return _PatientStore(store, self._bucket)
-
-    async def _answer[T](self, request: Callable[[], Awaitable[T]]) -> T:
-        from obstore.exceptions import GenericError
-
-        pauses = pauses_for(PATIENCE)
-        with self._bucket.explained_errors():
-            while True:
-                try:
-                    return await request()
-                except GenericError:
-                    pause = next(pauses, None)
-                    if pause is None:
-                        raise
-                await asyncio.sleep(pause)
-
-    async def get(
-        self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None
-    ) -> Buffer | None:
-        """One object or a part of it."""
-        return await self._answer(lambda: self._store.get(key, prototype, byte_range))
-
-    async def get_ranges(
-        self, key: str, byte_ranges: Sequence[ByteRequest | None], *, prototype: BufferPrototype, **how: Any
-    ) -> AsyncIterator[Sequence[tuple[int, Buffer | None]]]:
-        """Parts of one."""
-        # Not repeated: parts that were handed on already would come twice.
-        with self._bucket.explained_errors():
-            async for group in super().get_ranges(key, byte_ranges, prototype=prototype, **how):
-                yield group
-
-    async def exists(self, key: str) -> bool:
-        """Whether it exists."""
-        return await self._answer(lambda: self._store.exists(key))
-
-    async def set(self, key: str, value: Buffer) -> None:
-        """Write one."""
-        await self._answer(lambda: self._store.set(key, value))
-
-    async def delete(self, key: str) -> None:
-        """Remove one."""
-        await self._answer(lambda: self._store.delete(key))
 
 
 class _Ranges(RawIOBase):

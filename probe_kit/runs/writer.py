@@ -16,8 +16,8 @@ from zarr.storage import MemoryStore
 
 from probe_kit.errors import SettingsMismatchError
 from probe_kit.hashing import canonical_json
+from probe_kit.runs.array_store import ArrayStore
 from probe_kit.runs.arrays import ROOM, WRITE_ALL, create_arrays, create_inputs, write_row
-from probe_kit.runs.checking import RecordingStore
 from probe_kit.runs.commits import (
     Commit,
     Seconds,
@@ -424,7 +424,7 @@ class RunWriter[PlanT: WrittenPlan]:
     def _write_objects(self, episode: EpisodeRecord) -> Commit:
         """Everything of an episode but its commit, which is returned."""
         planned = episode.planned
-        store = RecordingStore(self.location.store(DATA))
+        store = ArrayStore(self.location, DATA, self.root.metadata)
         for kind, by_stream in episode.arrays.items():
             for stream, values in by_stream.items():
                 array = zarr.open_array(store, path=f"{stream}/{kind}", mode="r+", zarr_format=3, config=WRITE_ALL)
@@ -437,7 +437,7 @@ class RunWriter[PlanT: WrittenPlan]:
             write_row(store, f"{INPUTS}/{name}", planned.index, values)
         for key, content in episode.pictures.items():
             self.location.write(key, content)
-        self.location.flush(f"{DATA}/{key}" for key in store.sums)
+        self.location.flush(f"{DATA}/{key}" for key in store.written)
         parts = {
             "run": self.root.identity,
             "episode": planned.index,
@@ -447,7 +447,7 @@ class RunWriter[PlanT: WrittenPlan]:
             "roles": json.loads(json.dumps(episode.roles)),
             "provenance": name_of(self.provenance),
             "control_steps": [int(step) for step in episode.control_steps],
-            "objects": store.sums,
+            "objects": store.written,
             "pictures": {key: Sum.of(content) for key, content in episode.pictures.items()},
         }
         optional = {

@@ -13,12 +13,12 @@ from pathlib import Path
 
 import numpy as np
 from zarr.core.buffer import Buffer
-from zarr.storage import LocalStore
 
 from probe_kit.extract.plan import Plan
 from probe_kit.extract.rollout.capturing import EpisodeBuffers
 from probe_kit.extract.rollout.worker import Rollout
 from probe_kit.runs import verify, writer
+from probe_kit.runs.array_store import ArrayStore
 from probe_kit.runs.commits import Commit
 from probe_kit.runs.layout import StoredStream
 from probe_kit.runs.store import Location, locate
@@ -59,14 +59,14 @@ def extract(run: str, plan: Plan) -> None:
 def die_at(point: str) -> None:
     """Arrange for a SIGKILL before or after an object or a commit of the third episode is written."""
     when, what = point.split("-")
-    put, commit = LocalStore.set, writer.write_commit
+    put, commit = ArrayStore.set, writer.write_commit
     calls = {"put": 0, "commit": 0}
 
     def reached(here: str, thing: str) -> None:
         if (here, thing, calls[thing]) == (when, what, FATAL[thing]):
             os.kill(os.getpid(), signal.SIGKILL)
 
-    async def deadly_put(store: LocalStore, key: str, value: Buffer) -> None:
+    async def deadly_put(store: ArrayStore, key: str, value: Buffer) -> None:
         calls["put"] += "/c/" in key
         reached("before", "put")
         await put(store, key, value)
@@ -79,7 +79,7 @@ def die_at(point: str) -> None:
         reached("after", "commit")
         return written
 
-    LocalStore.set = deadly_put
+    ArrayStore.set = deadly_put
     writer.write_commit = deadly_commit
 
 

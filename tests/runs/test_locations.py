@@ -35,7 +35,7 @@ from probe_kit.extract import ExtractSettings, extract_run
 from probe_kit.hooks import Site
 from probe_kit.runs import Run, open_run, seal, verify_run
 from probe_kit.runs import store as buckets
-from probe_kit.runs.checking import BlankStore
+from probe_kit.runs.array_store import ArrayStore
 from probe_kit.runs.folder import Folder
 from probe_kit.runs.layout import COLUMNS
 from probe_kit.runs.run import NotSealedWarning
@@ -118,19 +118,23 @@ class LocationContract:
     def test_a_group_is_built_as_if_nothing_of_a_killed_process_lay_there(self, location: Location) -> None:
         location.begin(BEGINNING, "run.json")
         for stamp in ("a", "b"):
-            store = BlankStore(location.store("columns.zarr/x"))
+            store = ArrayStore(location, "columns.zarr/x", {})
             group = zarr.open_group(store, mode="w", zarr_format=3, attributes={"stamp": stamp})
             group.create_array("y", shape=(2,), dtype="f4")[:] = ord(stamp)
             assert {key for key in store.sums if "y" in key} == {"y/zarr.json", "y/c/0"}
-        group = zarr.open_group(location.store("columns.zarr/x", read_only=True), mode="r")
+        group = zarr.open_group(ArrayStore(location, "columns.zarr/x", store.sums, read_only=True), mode="r")
         assert (group.attrs["stamp"], group["y"][1]) == ("b", ord("b"))
         assert set(location.keys("columns.zarr")) == {f"columns.zarr/x/{key}" for key in store.sums}
 
     def test_arrays_are_stored_and_a_missing_chunk_is_an_error(self, location: Location) -> None:
-        array = zarr.create_array(location.store("data.zarr"), name="x", shape=(4, 3), chunks=(1, 3), dtype="f4")
+        store = ArrayStore(location, "data.zarr", {})
+        array = zarr.create_array(store, name="x", shape=(4, 3), chunks=(1, 3), dtype="f4")
         array[:2] = np.ones((2, 3))
         reading = zarr.open_array(
-            location.store("data.zarr", read_only=True), path="x", mode="r", config={"read_missing_chunks": False}
+            ArrayStore(location, "data.zarr", store.written, read_only=True),
+            path="x",
+            mode="r",
+            config={"read_missing_chunks": False},
         )
         np.testing.assert_array_equal(reading[1], 1)
         with pytest.raises(zarr.errors.ChunkNotFoundError):

@@ -254,7 +254,7 @@ def test_leftovers_of_a_killed_process_are_cleared_by_the_next_owner(
 ) -> None:
     run = Path(shutil.copytree(whole, tmp_path / "run"))
     aside = ("commits", "times", "failed", "certificates", "provenance", "sealed", "frames", "videos")
-    data = ("data.zarr/backbone/pooled/c/0/x.partial", "columns.zarr/x/zarr.json")
+    data = ("data.zarr/backbone/pooled/c/0/x.tmp", "columns.zarr/x/zarr.json")
     for orphan in (*(f"{folder}/abc.tmp" for folder in aside), *data):
         (run / orphan).parent.mkdir(parents=True, exist_ok=True)
         (run / orphan).write_text("torn", encoding="utf-8")
