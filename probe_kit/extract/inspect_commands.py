@@ -121,7 +121,7 @@ def _ready(family: "Family") -> str:
 
 
 def _model_rows(name: str | None) -> list[dict[str, Any]]:
-    from probe_kit.extract.plan import weights_needed
+    from probe_kit.extract.sizes import weights_needed
     from probe_kit.hooks.registry import find_family, own_families, third_party_families
 
     families = list(own_families().values())

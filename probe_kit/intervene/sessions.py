@@ -35,7 +35,6 @@ from probe_kit.extract.sources.inputs import (
     hardly_changed,
     with_input,
 )
-from probe_kit.extract.sources.player import Row
 from probe_kit.extract.sources.scene_source import ScenePlayer, Seen, scene_row
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.checkpoints.checkpoint import cached_folder, pinned_commits
@@ -46,8 +45,10 @@ from probe_kit.hooks.family import SIZE
 from probe_kit.intervene.outcomes import Choice, PairRow, has_sides, items_of
 from probe_kit.intervene.places import Chunk, Given, Pair, check_pairs
 from probe_kit.runs.layout import FIRST_FRAME, stored_inputs_of
-from probe_kit.runs.reader import OF_SCENE, origin_of
+from probe_kit.runs.plan import Row
+from probe_kit.runs.reader import origin_of
 from probe_kit.runs.run import Run
+from probe_kit.runs.run_source import OF_SCENE
 from probe_kit.suite.items import Episode, Item, Layout, check_wordings, counterparts_of, in_words
 from probe_kit.train.run_suite import suite_of
 

@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from probe_kit._terminal.notebook import facts_html
 from probe_kit.env.scoring import DEFAULT_RULE, check_rule
 from probe_kit.errors import (
     NoTrajectoryError,
@@ -19,6 +20,7 @@ from probe_kit.errors import (
     UnknownSiteError,
     UsageError,
 )
+from probe_kit.hooks.contract.card import streams_text
 from probe_kit.hooks.contract.sites import Site, Stream, resolve_view
 from probe_kit.runs.array_store import ArrayStore
 from probe_kit.runs.arrays import (
@@ -41,6 +43,7 @@ from probe_kit.runs.commits import (
     stamp_of,
 )
 from probe_kit.runs.layout import (
+    CAPTURE_ONLY,
     DATA,
     DATASET,
     ENVIRONMENT,
@@ -52,6 +55,7 @@ from probe_kit.runs.layout import (
     VectorKind,
     stored_inputs_of,
 )
+from probe_kit.runs.plan import RowColumns, while_growing
 from probe_kit.runs.provenance import (
     Provenance,
     check_provenances,
@@ -59,9 +63,9 @@ from probe_kit.runs.provenance import (
     read_certificate,
     read_provenances,
 )
-from probe_kit.runs.reader import Origin, RunSource, run_html, run_text, select_items
 from probe_kit.runs.records import RESTORE, Sum
-from probe_kit.runs.root import read_label, read_root, while_growing
+from probe_kit.runs.root import read_label, read_root
+from probe_kit.runs.run_source import Origin, RunSource, select_items
 from probe_kit.runs.store import Location, locate
 from probe_kit.runs.trajectories import Trajectories, judged, watch, with_outcomes
 
@@ -148,10 +152,34 @@ class Run:
             _ = self._certificates
 
     def __repr__(self) -> str:
-        return run_text(self)
+        random = ", RANDOM WEIGHTS" if self.random_weights else ""
+        random += ", CAPTURE ONLY (it did not act)" if CAPTURE_ONLY in self._outcomes else ""
+        return f"<Run {self.label}{random} on {self.suite}: {self._progress}, at {self.location}>"
 
     def _repr_html_(self) -> str:
-        return run_html(self)
+        weights = "scripted, no weights" if self.weights_sha256 is None else f"sha256 {self.weights_sha256[:12]}"
+        facts = {
+            "suite": self.suite,
+            "weights": f"RANDOM ({weights})" if self.random_weights else weights,
+            "episodes": self._progress,
+            "outcomes": ", ".join(f"{name} {count}" for name, count in self._outcomes.items()),
+            "streams": streams_text(self.streams.values()),
+            "at": self.location.name if Path(str(self.location)).is_absolute() else str(self.location),
+        }
+        advice = "run.episodes is the table, run.column(site) one site of it"
+        return facts_html(f"Run of {self.label}", facts, advice)
+
+    @property
+    def _progress(self) -> str:
+        committed = len(self.episodes)
+        return f"{committed} episodes" if committed == self.planned else f"{committed} of {self.planned} episodes"
+
+    @property
+    def _outcomes(self) -> dict[str, int]:
+        """Count the episodes by outcome."""
+        if self.episodes.empty:
+            return {}
+        return {str(name): int(count) for name, count in self.episodes["outcome"].value_counts().items()}
 
     @property
     def path(self) -> Path:
@@ -396,12 +424,12 @@ class Run:
         return {str(row["item_id"]): str(row["category"]) for row in self.root.plan}
 
     @cached_property
-    def _plan_of_items(self) -> list[dict[str, Any]]:
+    def _plan_of_items(self) -> list[RowColumns]:
         """The plan of the items that are shown, in all wordings."""
         return [e for e in self.root.plan if self.item_ids is None or e["item_id"] in self.item_ids]
 
     @cached_property
-    def _plan(self) -> list[dict[str, Any]]:
+    def _plan(self) -> list[RowColumns]:
         return [e for e in self._plan_of_items if self.wording is None or e["wording"] == self.wording]
 
     @cached_property

@@ -26,10 +26,11 @@ from probe_kit.runs.columns import columns_folder, find_columns, seal_key, write
 from probe_kit.runs.commits import Commit, numbered, read_commit, read_failures, seconds_and_problems
 from probe_kit.runs.contents import StoredObject, sizes_of, stored_objects, stray_keys
 from probe_kit.runs.layout import COLUMNS, COMMITS, DATA, SEALED, StoredStream, VectorKind
+from probe_kit.runs.plan import count_plans
 from probe_kit.runs.provenance import check_provenances, read_certificate, read_provenances
 from probe_kit.runs.records import RESTORE, digest_of, is_hash_name
 from probe_kit.runs.results import BUNDLES, bundle_keys, read_bundle
-from probe_kit.runs.root import Root, count_plans, read_label, read_root
+from probe_kit.runs.root import Root, read_label, read_root
 from probe_kit.runs.run import Run, read_run
 from probe_kit.runs.store import Location, locate
 

@@ -13,7 +13,9 @@ from numpy.typing import DTypeLike, NDArray
 from probe_kit.errors import CaptureChangedActionError
 from probe_kit.hooks.contract.sites import view_names
 from probe_kit.runs.arrays import NOT_A_NUMBER
-from probe_kit.runs.layout import MEAN_VIEW, LaterViews, StoredStream
+from probe_kit.runs.layout import LATER, MEAN_VIEW, LaterViews, StoredStream
+from probe_kit.runs.plan import Row
+from probe_kit.runs.writer import EpisodeRecord
 
 if TYPE_CHECKING:
     import torch
@@ -67,6 +69,15 @@ class EpisodeBuffers:
             tokens.fill(0)
         for later in self.later.values():
             later.fill(NOT_A_NUMBER)
+
+    def record(self, planned: Row, outcome: Mapping[str, Any], **fields: Any) -> EpisodeRecord:
+        """The part of the episode that the run stores. fields: of an `EpisodeRecord`."""
+        arrays: dict[str, Mapping[str, NDArray[Any]]] = {
+            "pooled": self.pooled, "tokens": self.tokens, LATER: self.later,
+        }  # fmt: skip
+        return EpisodeRecord(
+            planned, outcome, arrays, self.roles, lens_margins=self.lens_margins, **fields
+        )  # fmt: skip
 
     def keep_roles(self, roles: "dict[str, Roles]") -> None:
         """Begin the next captured inference."""

@@ -22,13 +22,13 @@ from probe_kit.errors import IgnoredInputsError, InstructionError, PolicyFailedE
 from probe_kit.extract.rollout.capturing import FEWEST_FOR_THREADS, Capturer, stored_streams
 from probe_kit.extract.settings import ExtractSettings
 from probe_kit.extract.sources.inputs import INSTRUCTION, PICTURE, blank_of, same_input, with_input
-from probe_kit.extract.sources.player import Row
 from probe_kit.extract.sources.source import Source, check_predictions
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.checkpoints.third_party import begin_randomness, copied, while_acting
 from probe_kit.hooks.contract.declared import PLAIN, Rotation
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.runs.layout import StoredStream
+from probe_kit.runs.plan import Row
 from probe_kit.runs.provenance import INPUT_CHECK
 
 if TYPE_CHECKING:

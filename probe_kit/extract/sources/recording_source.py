@@ -21,7 +21,7 @@ from probe_kit.extract.sources.lerobot_folder import (
     open_lerobot,
 )
 from probe_kit.extract.sources.lerobot_meta import IMAGE
-from probe_kit.extract.sources.player import SIDE, Answer, InputsPlayer, Opens, Row
+from probe_kit.extract.sources.player import SIDE, Answer, InputsPlayer, Opens
 from probe_kit.extract.sources.recording import LeRobotSource, Pairs
 from probe_kit.extract.sources.source import (
     MOST_UNUSUAL,
@@ -37,6 +37,7 @@ from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.observation import ARM_NUMBERS, Observation
 from probe_kit.hooks.families.shared.kinds import ACTION, IMAGES, STATE
 from probe_kit.runs.layout import CAPTURE_ONLY, DATASET, OTHER_ACTIONS, RECORDED_EPISODES, TRUTHS
+from probe_kit.runs.plan import Row
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy

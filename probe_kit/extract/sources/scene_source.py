@@ -14,13 +14,14 @@ from probe_kit._system.counting import counted
 from probe_kit.env import Act2AnswerEnv, Idle, SceneSpec, ScriptedExpert
 from probe_kit.env.act2answer import Recorder
 from probe_kit.errors import SceneError, UsageError
-from probe_kit.extract.sources.player import Answer, Ending, Opens, Player, Row
+from probe_kit.extract.sources.player import Answer, Ending, Opens, Player
 from probe_kit.extract.sources.scene import SceneSettings
 from probe_kit.extract.sources.source import FIRST_EPISODES, Played, Source, check_units, unusual_shares
 from probe_kit.hashing import derive_seed, sha256_json
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.sites import CAMERA
 from probe_kit.runs.layout import CAPTURE_ONLY, FIRST_FRAME
+from probe_kit.runs.plan import Row
 from probe_kit.runs.small_frames import FILM_HEIGHT, shrink
 from probe_kit.suite import Episode, Suite, default_suite, load_suite
 from probe_kit.suite.build import ITEMS, default_folder

@@ -22,8 +22,9 @@ from probe_kit.hooks.contract.observation import Observation
 
 if TYPE_CHECKING:
     from probe_kit.env import SceneSpec
-    from probe_kit.extract.sources.player import Opens, Row
+    from probe_kit.extract.sources.player import Opens
     from probe_kit.hooks import Policy
+    from probe_kit.runs.plan import Row
     from probe_kit.suite import Suite
 
 
