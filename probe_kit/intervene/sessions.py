@@ -35,7 +35,7 @@ from probe_kit.extract.sources.inputs import (
     hardly_changed,
     with_input,
 )
-from probe_kit.extract.sources.scene_source import ScenePlayer, Seen, scene_row
+from probe_kit.extract.sources.scene_source import ScenePlayer, scene_row
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.checkpoints.checkpoint import cached_folder, pinned_commits
 from probe_kit.hooks.checkpoints.third_party import copied, while_acting
@@ -260,7 +260,7 @@ class SceneSession(ReplaySession):
         """
         episodes = self.run.episodes
         rows = np.flatnonzero((episodes["item_id"] == item).to_numpy())
-        frames: dict[Layout, Seen] = {}
+        frames: dict[Layout, tuple[Observation, dict[str, Any]]] = {}
         pairs = []
         for row in rows:
             record = episodes.iloc[int(row)]
@@ -270,7 +270,7 @@ class SceneSession(ReplaySession):
                 planned = scene_row(0, Episode(worded, layout), int(record["scene_seed"]), 0)
                 frames[layout] = self.stage.look(planned)
                 frames[_OTHER[layout]], tiles = self.stage.look_swapped(), self.stage.tile_masks()
-            stored, drawn = record.get(FIRST_FRAME), frames[layout].facts[FIRST_FRAME]
+            stored, drawn = record.get(FIRST_FRAME), frames[layout][1][FIRST_FRAME]
             if stored is not None and stored != drawn:
                 raise OtherFramesError(
                     f"the first frame of {record['episode_id']}, drawn again, is {drawn[:12]}; "
@@ -279,8 +279,8 @@ class SceneSession(ReplaySession):
                 )
             pairs.append(
                 Pair(
-                    clean=frames[layout].observation,
-                    source=frames[_OTHER[layout]].observation,
+                    clean=frames[layout][0],
+                    source=frames[_OTHER[layout]][0],
                     seed=derive_seed(int(record["policy_seed"]), "inference", 0),
                     toward=-1 if record["side_correct"] == "left" else 1,
                     group=str(record["group_id"]),

@@ -18,7 +18,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from datetime import timedelta
 from functools import cached_property
-from io import SEEK_SET, BufferedReader, RawIOBase
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Literal
 from urllib.parse import urlsplit
@@ -28,7 +28,6 @@ from probe_kit.errors import SettingsMismatchError, StoreError, UsageError
 from probe_kit.runs.folder import Folder, check_size
 
 if TYPE_CHECKING:
-    from obstore import ReadableFile
     from obstore.store import ObjectStore
 
 
@@ -202,10 +201,8 @@ class Bucket:
         yield self.read(key)
 
     def open(self, key: str) -> BinaryIO:
-        """See `Folder.open`: ranges are requested when they are read."""
-        import obstore
-
-        return BufferedReader(_Ranges(self._answer(lambda objects: obstore.open_reader(objects, key)), self))
+        """See `Folder.open`: all of it is fetched at once."""
+        return BytesIO(self.read(key))
 
     def read_all(self, folder: str, suffix: str) -> dict[str, bytes]:
         """See `Folder.read_all`: a listing, then requests side by side. What is gone by then is left out."""
@@ -312,28 +309,6 @@ def pauses_for(time_to_repeat: timedelta) -> Iterator[float]:
     while time.monotonic() + pause <= end:
         yield pause
         pause = min(2 * pause, LONGEST_PAUSE)
-
-
-class _Ranges(RawIOBase):
-    """An object of obstore as Python's own file type, read by ranges."""
-
-    def __init__(self, file: "ReadableFile", bucket: Bucket) -> None:
-        self._file, self._bucket = file, bucket
-
-    def readable(self) -> bool:
-        return True
-
-    def seekable(self) -> bool:
-        return True
-
-    def seek(self, offset: int, whence: int = SEEK_SET) -> int:
-        return self._file.seek(offset, whence)
-
-    def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
-        with self._bucket.explained_errors():
-            content = self._file.read(len(buffer))
-        buffer[: len(content)] = bytes(content)
-        return len(content)
 
 
 # -- the location of an address ----------------------------------------------------------------------------------

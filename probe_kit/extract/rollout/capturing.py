@@ -4,7 +4,6 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import cache
 from hashlib import sha256
-from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -160,24 +159,6 @@ def _memory(shape: tuple[int, ...], dtype: DTypeLike, pinned: bool) -> NDArray[A
     size = int(np.prod(shape)) * np.dtype(dtype).itemsize
     locked: NDArray[Any] = torch.empty(size, dtype=torch.uint8, pin_memory=True).numpy()
     return locked.view(dtype).reshape(shape)
-
-
-class BufferPool:
-    """A fixed number of buffers. Waiting for a free one is what keeps a GPU from outrunning the disk."""
-
-    def __init__(self, buffers: Sequence[EpisodeBuffers]) -> None:
-        self._free: SimpleQueue[EpisodeBuffers] = SimpleQueue()
-        for free in buffers:
-            self._free.put(free)
-
-    def take(self) -> EpisodeBuffers:
-        """Empty buffers; waits until some are given back."""
-        return self._free.get()
-
-    def give_back(self, buffers: EpisodeBuffers) -> None:
-        """Make buffers available to the next episode."""
-        buffers.clear()
-        self._free.put(buffers)
 
 
 FEWEST_FOR_THREADS = 10_000_000

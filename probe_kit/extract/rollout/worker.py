@@ -7,6 +7,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from queue import SimpleQueue
 from time import perf_counter
 from typing import Any, Self
 
@@ -17,7 +18,7 @@ from PIL import Image
 from probe_kit.env import save_gif
 from probe_kit.errors import ProbeKitError
 from probe_kit.extract.config_files import origin_of_process
-from probe_kit.extract.rollout.capturing import BufferPool, EpisodeBuffers
+from probe_kit.extract.rollout.capturing import EpisodeBuffers
 from probe_kit.extract.rollout.controllers import Controller, Inference, Turn, count_lost_words
 from probe_kit.extract.settings import Settings
 from probe_kit.extract.sources.player import (
@@ -98,17 +99,17 @@ class EpisodeSlot:
 class EpisodeLoop:
     """Plays episode after episode on two groups of players.
 
-    next_episode: what to play next, None for nothing. All slots of a group take their turn in one call of the
-    policy; a slot whose episode ends begins the next one at once.
+    free: empty buffers. next_episode: what to play next, None for nothing. All slots of a group take their turn in
+    one call of the policy; a slot whose episode ends begins the next one at once.
     """
 
     def __init__(
-        self, players: Sequence[AskablePlayer], controller: Controller, ring: BufferPool,
+        self, players: Sequence[AskablePlayer], controller: Controller, free: "SimpleQueue[EpisodeBuffers]",
         next_episode: Callable[[], Row | None], film: Callable[[Row], bool],
     ) -> None:  # fmt: skip
         slots = [EpisodeSlot(player) for player in players]
         self._groups = [slots[: len(slots) // 2], slots[len(slots) // 2 :]]
-        self._controller, self._pool = controller, ring
+        self._controller, self._free = controller, free
         self._next_episode, self._film = next_episode, film
 
     def __iter__(self) -> Iterator[Ended | Failed]:
@@ -127,8 +128,8 @@ class EpisodeLoop:
         begun = ended and slot.following is not None
         planned, slot.following, slot.playing = slot.following or self._next_episode(), None, None
         if planned is not None:
-            # `take` waits while all buffers are being written: a model cannot outrun the disk.
-            slot.playing = Playing(planned, self._pool.take(), begun)
+            # This waits while all buffers are being written: a model cannot outrun the disk.
+            slot.playing = Playing(planned, self._free.get(), begun)
             if not begun:
                 slot.player.ask("begin", planned, self._film(planned))
 
@@ -195,7 +196,8 @@ class EpisodeLoop:
             self._go_on(slot, playing, inference)
 
     def _give_up(self, slot: EpisodeSlot, playing: Playing, error: ProbeKitError) -> Failed:
-        self._pool.give_back(playing.buffers)
+        playing.buffers.clear()
+        self._free.put(playing.buffers)
         self._begin_next(slot)
         return Failed(playing.planned.index, f"{type(error).__name__}: {error}", traceback_of(error))
 
@@ -235,7 +237,9 @@ class Worker:
             # Two groups of players: one simulates while the model infers for the other, see `EpisodeLoop`.
             count = 2 * self._settings.machine.observations
             self._players = [self._open_player(position, stack) for position in range(count)]
-            self._ring = BufferPool([self._make_buffers() for _ in range(count + SPARE_BUFFERS)])
+            self._free: SimpleQueue[EpisodeBuffers] = SimpleQueue()
+            for _ in range(count + SPARE_BUFFERS):
+                self._free.put(self._make_buffers())
             # One thread: the writer remembers what it wrote of certificate and provenance, without a lock.
             self._thread = stack.enter_context(ThreadPoolExecutor(1, "probe-kit-writer"))
             # If a line above raised, the stack has closed what was open; from here on `__exit__` does.
@@ -272,7 +276,7 @@ class Worker:
             number = next_number()
             return None if number is None else self._writer.plan.episode(number)
 
-        playing = EpisodeLoop(self._players, self._controller, self._ring, next_episode, self._is_filmed)
+        playing = EpisodeLoop(self._players, self._controller, self._free, next_episode, self._is_filmed)
         for played in playing:
             if isinstance(played, Failed):
                 yield played
@@ -301,7 +305,8 @@ class Worker:
                 self._writer.write_certificate(self._certificate())
                 self._writer.write(record)
         finally:
-            self._ring.give_back(playing.buffers)
+            playing.buffers.clear()
+            self._free.put(playing.buffers)
         return Done(playing.planned.index, outcome)
 
     def _certificate(self) -> dict[str, Any]:

@@ -1,7 +1,6 @@
 """Opened recordings: chosen frames of a LeRobotDataset that lies here, and the player that shows them."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property, partial
 from importlib.metadata import version
 from itertools import groupby
@@ -51,14 +50,6 @@ NAMED = 0.01
 _LONGEST = 12
 """Tasks and numbers that are listed."""
 _TASK = "task_index"
-
-
-@dataclass(frozen=True)
-class Stretch:
-    """Chosen frames of one recorded episode under one instruction, at most 64. content: hash of its files."""
-
-    episode: int
-    content: str
 
 
 class RecordingSource(Source[LeRobotSource]):
@@ -153,7 +144,7 @@ class RecordingSource(Source[LeRobotSource]):
                         "policy_seed": derive_seed(seed, "policy", item),
                         "content_blake2b": content,
                     }
-                    yield Row(index, columns, Stretch(episode, content), tuple(stretch))
+                    yield Row(index, columns, frames=tuple(stretch))
                     index, part = index + 1, part + 1
 
     def _texts(self, episode: int) -> list[str]:
@@ -446,7 +437,9 @@ class RecordingPlayer(InputsPlayer):
         self._check_content(row)
         recording = self._recording
         names = [name for name in (STATE, ACTION) if recording.folder.width(name) is not None]
-        self._numbers = recording.reader.numbers(row.content.episode, [*names, *recording.folder.columns])
+        self._numbers = recording.reader.numbers(
+            row.columns["source_episode"], [*names, *recording.folder.columns]
+        )
         return self._see()
 
     def advance(self, actions: NDArray[np.float32]) -> Answer:
@@ -460,12 +453,12 @@ class RecordingPlayer(InputsPlayer):
 
     def _check_content(self, row: Row) -> None:
         """Raise RecordingError unless the files of an episode are those that the plan was made of."""
-        recording = self._recording
-        now = recording.folder.content_blake2b(row.content.episode, recording.features)
-        if now != row.content.content:
+        recording, planned = self._recording, row.columns["content_blake2b"]
+        now = recording.folder.content_blake2b(row.columns["source_episode"], recording.features)
+        if now != planned:
             raise RecordingError(
                 f"{recording.folder.path.name}: the files of {row.columns['item_id']} were changed after the run "
-                f"was planned: their hash was {row.content.content}, now it is {now}. Leave the data set as it is "
+                f"was planned: their hash was {planned}, now it is {now}. Leave the data set as it is "
                 "until the run ends"
             )
 
@@ -476,7 +469,7 @@ class RecordingPlayer(InputsPlayer):
 
     def _see(self) -> Observation:
         recording, frame = self._recording, self._frame
-        by_feature = recording.reader.pictures(self.row.content.episode, frame, recording.features)
+        by_feature = recording.reader.pictures(self.row.columns["source_episode"], frame, recording.features)
         pictures = {camera: by_feature[feature] for camera, feature in recording.settings.cameras}
         for camera, degrees in recording.settings.rotations:
             pictures[camera] = np.ascontiguousarray(np.rot90(pictures[camera], degrees // 90))

@@ -1,7 +1,7 @@
 """The opened scene: every item of a suite in both layouts, and the player whose arm carries out actions."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property, partial
 from hashlib import sha256
 from itertools import islice
@@ -32,14 +32,6 @@ if TYPE_CHECKING:
     from probe_kit.hooks import Policy
 
 
-@dataclass(frozen=True)
-class Seen:
-    """A first frame in which nothing moves. facts: what a run records of it."""
-
-    observation: Observation
-    facts: dict[str, Any]
-
-
 class ScenePlayer(Player):
     """Plays episodes of the scene.
 
@@ -58,16 +50,16 @@ class ScenePlayer(Player):
         self._shoot()
         return self._see() if self._played.script is None else self._follow_script()
 
-    def look(self, row: Row) -> Seen:
-        """Set up an episode and show its first frame; nothing on it moves."""
+    def look(self, row: Row) -> tuple[Observation, dict[str, Any]]:
+        """Set up an episode and show its first frame, in which nothing moves, with what a run records of it."""
         answer = self.answer("begin", (row, False))
         assert isinstance(answer, Observation)
-        return Seen(answer, self._facts)
+        return answer, self._facts
 
-    def look_swapped(self) -> Seen:
-        """Show the item's other layout in the state that this episode is in; facts: its hash alone."""
+    def look_swapped(self) -> tuple[Observation, dict[str, Any]]:
+        """Show the item's other layout in the state that this episode is in, with its hash."""
         observation, frame = self._env.observe_exchanged()
-        return Seen(self._observed(observation), {FIRST_FRAME: frame_sha256(frame)})
+        return self._observed(observation), {FIRST_FRAME: frame_sha256(frame)}
 
     def _set_up(self, row: Row) -> None:
         options = {"item": row.content.item, "layout": row.content.layout}
@@ -318,7 +310,7 @@ class SceneSource(Source[SceneSettings]):
         try:
             for row in self.rows(0)[:FIRST_EPISODES]:
                 try:
-                    states.append(player.look(row).observation.state)
+                    states.append(player.look(row)[0].state)
                 except SceneError as error:
                     failed = error
         finally:

@@ -90,11 +90,11 @@ def played(
 ) -> tuple[list[Ended | Failed], list[tuple[str, int]]]:
     log: list[tuple[str, int]] = []
     left = iter([Row(number, {"policy_seed": number}) for number in range(episodes)])
-    ring: Any = SimpleNamespace(take=lambda: object(), give_back=lambda _buffers: None)
+    free: Any = SimpleNamespace(get=lambda: SimpleNamespace(clear=lambda: None), put=lambda _buffers: None)
     stages: Any = [Quick(log, length, bad or set()) for _ in range(2 * batch)]
     controller: Any = Thinking(log, capture_only)
     next_episode: Callable[[], Any] = lambda: next(left, None)  # noqa: E731
-    return list(EpisodeLoop(stages, controller, ring, next_episode, lambda _planned: False)), log
+    return list(EpisodeLoop(stages, controller, free, next_episode, lambda _planned: False)), log
 
 
 @pytest.mark.parametrize("capture_only", [False, True])
