@@ -94,46 +94,32 @@ class Bucket:
     # -- requests --------------------------------------------------------------------------------------
 
     @cached_property
-    def _patient(self) -> "ObjectStore":
-        return self._client(quick=False)
-
-    @cached_property
-    def _quick(self) -> "ObjectStore":
-        return self._client(quick=True)
-
-    def _client(self, quick: bool) -> "ObjectStore":
+    def _objects(self) -> "ObjectStore":
         from obstore.store import from_url
 
         with self.explained_errors():
-            store: ObjectStore = from_url(
-                self._url,
-                retry_config={
-                    "retry_timeout": _QUICK if quick else PATIENCE,
-                    "max_retries": 10 if quick else 10_000,  # the timeout is to end it, not the count
-                    "backoff": {"max_backoff": timedelta(seconds=LONGEST_PAUSE)},
-                },
-            )
+            store: ObjectStore = from_url(self._url, retry_config={"max_retries": 0})  # `_answer` repeats
         return store
 
     def _answer[T](self, request: Callable[["ObjectStore"], T]) -> T:
         """Return the answer to a request, in our words.
 
-        obstore repeats requests that change nothing. Repeated here are a listing that breaks off, and a
-        conditional put or a deletion without an answer. All of them may be done twice.
+        Repeated are all requests that break off or get no answer, also a conditional put and a deletion: each of
+        them may be done twice.
         """
         from obstore.exceptions import GenericError
 
-        pauses = pauses_for(PATIENCE)
+        pauses = pauses_for(PATIENCE if self._answered else _QUICK)
         with self.explained_errors():
             while True:
                 try:
-                    answer = request(self._patient if self._answered else self._quick)
+                    answer = request(self._objects)
                 except FileNotFoundError:  # an answer too: the store is there, the object is not
                     self._answered = True
                     raise
                 except GenericError:
                     pause = next(pauses, None)
-                    if not self._answered or pause is None:
+                    if pause is None:
                         raise
                 else:
                     self._answered = True
