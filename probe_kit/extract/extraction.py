@@ -326,13 +326,6 @@ def _selects_only(settings: Settings, location: Location | None) -> bool:
         return not location.exists(RUN_FILE)
 
 
-def check_unloaded(settings: Settings, source: Source[Any]) -> None:
-    """Raise as `load` what a model, its options and its words say of a source before weights are loaded."""
-    check_meaningless(settings)
-    check_model(settings)
-    raise_together(task_of(settings).early_checks(settings, source, fetch=True))
-
-
 # -- the plan -------------------------------------------------------------------------------------------------
 
 

@@ -10,14 +10,13 @@ import fcntl
 import os
 import secrets
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, BinaryIO
 
-from probe_kit._system.drafts import draft_of
-from probe_kit.errors import FULL_DISK, DiskSpaceError, RunDamagedError, SettingsMismatchError
+from probe_kit.errors import FULL_DISK, DiskSpaceError, RunDamagedError
 from probe_kit.runs.layout import COLUMNS, DATA, RUN_FILE
 
 MOST_RECORD_BYTES, MOST_OBJECT_BYTES = 256 << 20, 4 << 30
@@ -37,6 +36,8 @@ def check_size(key: str, size: int, where: object) -> None:
         )
 
 
+DRAFT = ".tmp"
+"""Ending of an object without its final name yet."""
 _DRAFTS = ("*.tmp", "*/*.tmp", f"{DATA}/**/*.tmp", f"{COLUMNS}/**/*.tmp")
 """Patterns of what a killed process leaves: objects without their final name."""
 _PIECE = 1 << 20
@@ -209,26 +210,6 @@ class Folder:
         return self._path / key
 
     # -- runs ------------------------------------------------------------------------------------------
-
-    def begin(self, objects: Mapping[str, bytes], last: str) -> None:
-        """Begin with these objects; `last`, one of them, never appears without all others.
-
-        If another process is first, its objects stay. Raises SettingsMismatchError if something else is there.
-        """
-        with draft_of(self._path) as draft:
-            # Renamed, so that the folder appears with all objects or not at all. That fails where a folder with
-            # content lies: another process was first, or it is no run.
-            try:
-                for key, content in objects.items():
-                    (draft / key).parent.mkdir(parents=True, exist_ok=True)
-                    with _draft(draft / key, content) as file:
-                        file.rename(draft / key)
-                draft.rename(self._path)
-            except OSError as error:
-                if not self.exists(last):
-                    if not self._path.exists():
-                        raise
-                    raise SettingsMismatchError(f"{self} exists and is not a run; choose another --out") from error
 
     @contextmanager
     def locked(self, clear: Callable[[], None]) -> Iterator[None]:

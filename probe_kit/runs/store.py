@@ -1,12 +1,12 @@
 """The location at a path or URL: a folder, or a prefix in an object store through obstore (extra `remote`).
 
 Single objects appear complete or not at all, and `If-None-Match: *` creates them exclusively: that is all the
-commit protocol needs. Folders have locks and renaming besides, which are replaced as follows.
+commit protocol needs. Folders have locks besides. In a bucket no process can know that it is alone, so nothing
+that others may be writing is ever removed. There is little to remove: half an upload is no object, and objects
+without a commit are written again under the same key.
 
-* No process can know that it is alone, so nothing that others may be writing is ever removed. There is little to
-  remove: half an upload is no object, and objects without a commit are written again under the same key.
-* A run begins with its objects created one by one, `run.json` last. Two processes that begin at once create the
-  same bytes, or one of them is refused.
+A run begins with its objects created one by one, `run.json` last. Two processes that begin at once create the same
+bytes, or one of them is refused.
 
 A store may be busy or away for a while: from its first answer on, every request is repeated for `PATIENCE`. Before
 it has answered once, the address is more likely wrong, and it is given up within seconds.
@@ -25,7 +25,7 @@ from urllib.parse import urlsplit
 
 from probe_kit._system.imports import require
 from probe_kit.errors import SettingsMismatchError, StoreError, UsageError
-from probe_kit.runs.folder import Folder, check_size
+from probe_kit.runs.folder import DRAFT, Folder, check_size
 
 if TYPE_CHECKING:
     from obstore.store import ObjectStore
@@ -262,21 +262,6 @@ class Bucket:
 
     # -- runs ------------------------------------------------------------------------------------------
 
-    def begin(self, objects: Mapping[str, bytes], last: str) -> None:
-        """One after another, none over another's."""
-        strange = sorted(set(self.keys("")) - set(objects))
-        if strange and not self.exists(last):
-            raise SettingsMismatchError(f"{self} holds {strange[0]} but no run; choose another --out")
-        for key, content in objects.items():
-            if key != last and not self.create(key, content) and self.read(key) != content:
-                raise SettingsMismatchError(
-                    f"{self} holds the beginning of a run with another {key}: one of other settings, killed early "
-                    "or beginning now in another process. Choose another --out, or remove it"
-                )
-        # Tried on a real key, before the run exists: a store that cannot keep writers apart is refused at once.
-        check_exclusive(self, next(key for key in objects if key != last))
-        self.create(last, objects[last])
-
     @contextmanager
     def locked(self, clear: Callable[[], None]) -> Iterator[None]:
         """Nothing is locked."""
@@ -314,6 +299,30 @@ def check_exclusive(location: Location, key: str) -> None:
             f"{location}: the store created {key} a second time: it ignores conditional puts (If-None-Match), and "
             "cannot keep two writers apart. Use another store, or a folder"
         )
+
+
+def begin(location: Location, objects: Mapping[str, bytes], last: str) -> None:
+    """Begin with these objects, created one after another; `last`, one of them, never appears without all others.
+
+    A killed beginning is continued by the next one. If another process is first, its objects stay. Raises
+    SettingsMismatchError if something else is there.
+    """
+    present = {key for key in location.keys("") if not key.endswith(DRAFT)}
+    if (strange := sorted(present - set(objects))) and last not in present:
+        raise SettingsMismatchError(f"{location} holds {strange[0]} but no run; choose another --out")
+    for key, content in objects.items():
+        try:
+            same = key == last or location.create(key, content) or location.read(key) == content
+        except NotADirectoryError as error:
+            raise SettingsMismatchError(f"{location} is a file, not a folder; choose another --out") from error
+        if not same:
+            raise SettingsMismatchError(
+                f"{location} holds the beginning of a run with another {key}: one of other settings, killed early "
+                "or beginning now in another process. Choose another --out, or remove it"
+            )
+    # Tried on a real key, before the run exists: a store that cannot keep writers apart is refused at once.
+    check_exclusive(location, next(key for key in objects if key != last))
+    location.create(last, objects[last])
 
 
 def locate(where: str | Path | Location) -> Location:

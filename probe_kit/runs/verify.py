@@ -23,7 +23,7 @@ from probe_kit.hooks.family import imported
 from probe_kit.runs.array_store import ArrayStore
 from probe_kit.runs.arrays import Rows, create_array, open_array
 from probe_kit.runs.columns import columns_folder, find_columns, seal_key, write_seal
-from probe_kit.runs.commits import Commit, numbered, read_commit, read_failures, seconds_and_problems
+from probe_kit.runs.commits import Commit, numbered, read_commit, read_failures, read_seconds
 from probe_kit.runs.contents import StoredObject, sizes_of, stored_objects, stray_keys
 from probe_kit.runs.layout import COLUMNS, COMMITS, DATA, SEALED, StoredStream, VectorKind
 from probe_kit.runs.plan import count_plans
@@ -224,7 +224,7 @@ def _audit(location: Location, deep: bool) -> Audit:
     except RunDamagedError as error:  # whether objects are missing on purpose is not known
         return Audit(str(location), len(commits), planned, 0, False, deep, (*problems, str(error)))
     checked(lambda: _check_records(root, commits), None)
-    problems += seconds_and_problems(root, commits)[1]
+    checked(lambda: read_seconds(root, commits), None)
     failures = checked(lambda: len(read_failures(root)), 0)
     columns = checked(lambda: find_columns(root, commits), None)
     for home in BUNDLES:

@@ -52,7 +52,7 @@ from probe_kit.runs.provenance import (
 from probe_kit.runs.records import Sum
 from probe_kit.runs.results import BUNDLES, bundle_keys
 from probe_kit.runs.root import Label, Root, find_continuable, new_card, read_root
-from probe_kit.runs.store import Location
+from probe_kit.runs.store import Location, begin
 from probe_kit.runs.trajectories import create_trajectories
 
 
@@ -147,7 +147,7 @@ class RunWriter:
         self.settings = json.loads(canonical_json(settings))
         self._label = label or str(self.settings["model"])
         if not location.exists(RUN_FILE):
-            location.begin(self._beginning(), last=RUN_FILE)
+            begin(location, self._beginning(), last=RUN_FILE)
         self.root = while_growing(location, self._continued)
         self.plan = plan.numbered({row["episode_id"]: row["episode"] for row in self.root.plan})
 

@@ -39,7 +39,7 @@ from probe_kit.runs.array_store import ArrayStore
 from probe_kit.runs.folder import Folder
 from probe_kit.runs.layout import COLUMNS
 from probe_kit.runs.run import NotSealedWarning
-from probe_kit.runs.store import Location, check_exclusive, locate
+from probe_kit.runs.store import Location, begin, check_exclusive, locate
 from probe_kit.suite import Suite, build_suite
 from probe_kit.train import load_results, train_probes
 from tests.runs.contents import objects
@@ -57,7 +57,7 @@ class LocationContract:
         raise AssertionError("a subclass gives the location")
 
     def test_the_first_object_of_a_key_stays(self, location: Location) -> None:
-        location.begin(BEGINNING, "run.json")
+        begin(location, BEGINNING, "run.json")
         assert location.create("commits/1.json", b"first")
         assert not location.create("commits/1.json", b"second")
         assert location.read("commits/1.json") == b"first"
@@ -105,18 +105,18 @@ class LocationContract:
         assert location.exists("failed-not/1.json")
 
     def test_a_run_begins_with_all_its_objects_once(self, location: Location) -> None:
-        location.begin(BEGINNING, "run.json")
-        location.begin({**BEGINNING, "run.json": b"of another process, which was second"}, "run.json")
+        begin(location, BEGINNING, "run.json")
+        begin(location, {**BEGINNING, "run.json": b"of another process, which was second"}, "run.json")
         assert {key: location.read(key) for key in location.keys("")} == BEGINNING
 
     def test_a_location_that_holds_something_else_is_left_alone(self, location: Location) -> None:
         location.write("thesis.txt", b"do not touch")
         with pytest.raises(SettingsMismatchError, match="choose another --out"):
-            location.begin(BEGINNING, "run.json")
+            begin(location, BEGINNING, "run.json")
         assert location.keys("") == ["thesis.txt"]
 
     def test_a_group_is_built_as_if_nothing_of_a_killed_process_lay_there(self, location: Location) -> None:
-        location.begin(BEGINNING, "run.json")
+        begin(location, BEGINNING, "run.json")
         for stamp in ("a", "b"):
             store = ArrayStore(location, "columns.zarr/x", {})
             group = zarr.open_group(store, mode="w", zarr_format=3, attributes={"stamp": stamp})
@@ -169,7 +169,7 @@ class TestBucket(LocationContract):
     def test_the_beginning_of_another_run_is_refused(self, location: Location) -> None:
         location.write("plan.json", b"another plan")
         with pytest.raises(SettingsMismatchError, match=r"another plan\.json"):
-            location.begin(BEGINNING, "run.json")
+            begin(location, BEGINNING, "run.json")
         assert not location.exists("run.json")
 
     def test_a_bucket_that_does_not_exist_is_named_in_words(self, location: Location) -> None:  # noqa: ARG002

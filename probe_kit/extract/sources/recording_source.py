@@ -212,12 +212,6 @@ class RecordingSource(Source[LeRobotSource]):
         Raises RecordingError for cameras, states or files that do not fit, UnitsError for states far outside the
         checkpoint's statistics, and CheckpointError for a checkpoint without statistics.
         """
-        fitted, policy = self.fitted(policy)
-        fitted.check_recorded_units(policy, accept_units)
-        return fitted, policy
-
-    def fitted(self, policy: "Policy") -> "tuple[Self, Policy]":
-        """Fit the source to a policy as `check` does, whatever the units."""
         card = policy.card
         raise_together(self.early_checks(card.cameras, policy.state_numbers, card.checkpoint))
         fitted = self.mapped(card.cameras)
@@ -232,6 +226,7 @@ class RecordingSource(Source[LeRobotSource]):
         chunk = predicted_once(policy, fitted.example(fitted.instructions[0]))
         fitted.prediction = chunk.shape[0], chunk.shape[1]
         fitted.other_actions = fitted._other_actions(policy, chunk.shape[1], numbers.get(ACTION))
+        fitted.check_recorded_units(policy, accept_units)
         return fitted, policy
 
     def check_recorded_units(self, policy: "Policy", accepted: bool) -> None:
