@@ -309,7 +309,7 @@ def begin(location: Location, objects: Mapping[str, bytes], last: str) -> None:
     """
     present = {key for key in location.keys("") if not key.endswith(DRAFT)}
     if (strange := sorted(present - set(objects))) and last not in present:
-        raise SettingsMismatchError(f"{location} holds {strange[0]} but no run; choose another --out")
+        raise SettingsMismatchError(f"{location} holds {strange[0]} and is not a run; choose another --out")
     for key, content in objects.items():
         try:
             same = key == last or location.create(key, content) or location.read(key) == content

@@ -44,7 +44,7 @@ class _Trial:
 
     environment: OwnEnvironment
     episodes: list[EnvEpisode]
-    shown: list[list[Step]]
+    steps: list[list[Step]]
 
     def __init__(self, source: EnvSource) -> None:
         self.source = source
@@ -64,12 +64,12 @@ class _Trial:
         self.episodes = [episode for _, episode in first[:EPISODES]]
 
     def play(self) -> None:
-        self.shown = [self._play(self.environment, episode) for episode in self.episodes]
+        self.steps = [self._play(self.environment, episode) for episode in self.episodes]
 
     def facts_are_constant(self) -> None:
-        after = [step for steps in self.shown for step in steps[1:]]
+        after = [step for steps in self.steps for step in steps[1:]]
         names = sorted(after[0].facts) if after else []
-        for steps in self.shown:
+        for steps in self.steps:
             for number, step in enumerate(steps):
                 if number or step.facts:
                     fact_values(step.facts, names, f"{self.source.name}, step() {number}")
@@ -77,7 +77,7 @@ class _Trial:
     def repeats(self) -> None:
         """The first episode again, behind the other one."""
         again = self._play(self.environment, self.episodes[0])
-        _check_equal(self.shown[0], again, "the same episode, played again behind another one")
+        _check_equal(self.steps[0], again, "the same episode, played again behind another one")
 
     def repeats_elsewhere(self) -> None:
         """Repeat the first episode in a new environment, as each process opens its own."""
@@ -86,7 +86,7 @@ class _Trial:
             again = self._play(other, self.episodes[0])
         finally:
             self._close(other)
-        _check_equal(self.shown[0], again, "the same episode in a second environment")
+        _check_equal(self.steps[0], again, "the same episode in a second environment")
 
     def close(self) -> None:
         if "environment" in vars(self):
