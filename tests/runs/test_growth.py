@@ -268,8 +268,12 @@ def test_a_kill_while_a_run_grows_loses_nothing(
 def test_a_run_that_was_killed_before_its_first_plan_says_so_and_begins(
     small_suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def killed(*_: object) -> bool:
-        raise KilledError
+    create = Folder.create
+
+    def killed(location: Folder, key: str, content: bytes) -> bool:
+        if key == plan_key(0):
+            raise KilledError
+        return create(location, key, content)
 
     with monkeypatch.context() as patched, suppress(KilledError):
         patched.setattr(Folder, "create", killed)
