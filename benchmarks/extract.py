@@ -20,9 +20,7 @@ import zarr
 
 from probe_kit.env import SceneSpec
 from probe_kit.extract import Extraction, ExtractSettings, prepare
-from probe_kit.extract.plan import Plan
 from probe_kit.extract.rollout.capturing import EpisodeBuffers
-from probe_kit.extract.rollout.worker import Rollout
 from probe_kit.hooks import Observation
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.models.building import initialise
@@ -30,8 +28,9 @@ from probe_kit.models.embedded import tiny
 from probe_kit.models.pi0 import GemmaSize, Pi0Size, SiglipSize, build_pi0
 from probe_kit.runs import open_run, seal
 from probe_kit.runs.layout import CODECS, StoredStream
+from probe_kit.runs.plan import Plan
 from probe_kit.runs.store import locate
-from probe_kit.runs.writer import RunWriter
+from probe_kit.runs.writer import EpisodeRecord, RunWriter
 from probe_kit.suite import Suite, build_suite
 from tests.support.plans import make_plan
 
@@ -52,7 +51,7 @@ def activations(draw: np.random.Generator, shape: tuple[int, ...]) -> np.ndarray
     return (draw.normal(size=shape) * scale).astype(np.float32)
 
 
-def synthetic(plan: Plan, stream: StoredStream, number: int, with_tokens: bool) -> Rollout:
+def synthetic(plan: Plan, stream: StoredStream, number: int, with_tokens: bool) -> EpisodeRecord:
     """One episode of such numbers."""
     draw = np.random.default_rng(number)
     buffers = EpisodeBuffers([stream], 1, with_tokens, pinned=False)
@@ -61,7 +60,7 @@ def synthetic(plan: Plan, stream: StoredStream, number: int, with_tokens: bool) 
         bits = activations(draw, (*stream.lead, stream.tokens, stream.width)).view(np.uint32) >> 16
         buffers.tokens[stream.name][0][..., : stream.tokens, :] = bits
     buffers.roles.append({stream.name: [("image.main", 0, 768), ("language", 768, stream.tokens)]})
-    return Rollout(plan.episodes[number], {"outcome": "oob"}, buffers, [], control_steps=[0])
+    return buffers.record(plan.episodes[number], {"outcome": "oob"}, control_steps=[0])
 
 
 def bench_codecs(suite: Suite, folder: Path, width: int) -> None:
@@ -79,10 +78,10 @@ def bench_codecs(suite: Suite, folder: Path, width: int) -> None:
         bench_codec(codec, plan, rollouts, folder / codec, raw, disk)
 
 
-def disk_rate(folder: Path, rollouts: list[Rollout]) -> float:
+def disk_rate(folder: Path, rollouts: list[EpisodeRecord]) -> float:
     """MB per second of the same tokens in one plain file per episode, each flushed to the disk."""
     folder.mkdir()
-    arrays = [rollout.buffers.tokens["backbone"][0, :, :TOKENS] for rollout in rollouts]
+    arrays = [rollout.arrays["tokens"]["backbone"][0, :, :TOKENS] for rollout in rollouts]
 
     def write() -> None:
         for number, array in enumerate(arrays):
@@ -94,12 +93,14 @@ def disk_rate(folder: Path, rollouts: list[Rollout]) -> float:
     return sum(array.nbytes for array in arrays) / 1e6 / wall
 
 
-def bench_codec(codec: str, plan: Plan, rollouts: list[Rollout], path: Path, raw: float, disk: float) -> None:
+def bench_codec(
+    codec: str, plan: Plan, rollouts: list[EpisodeRecord], path: Path, raw: float, disk: float
+) -> None:
     """One line of the table of codecs."""
     writer = RunWriter(
         locate(path), plan, {"captured_calls": 1, "tokens": "all", "codec": codec, "model": "synthetic"}
     )
-    wall, cpu = seconds(lambda: [writer.write(rollout.record) for rollout in rollouts])
+    wall, cpu = seconds(lambda: [writer.write(rollout) for rollout in rollouts])
     size = sum(p.stat().st_size for p in (path / "data.zarr/backbone/tokens").rglob("*") if p.is_file())
     run = open_run(path, allow_partial=True)
     read, _ = seconds(lambda: run.tokens(SITE))
@@ -114,7 +115,7 @@ def bench_columns(suite: Suite, folder: Path, episodes: int, width: int) -> None
     settings = {"captured_calls": 1, "tokens": "pooled", "codec": "zstd", "model": "synthetic"}
     writer = RunWriter(locate(folder / "columns"), plan, settings)
     for number in range(episodes):
-        writer.write(synthetic(plan, stream, number, False).record)
+        writer.write(synthetic(plan, stream, number, False))
     rows = open_run(folder / "columns", allow_partial=True).rows("backbone")
     values = np.stack([rows[position] for position in range(episodes)])
     print(f"\none column of {episodes} episodes, {values.nbytes / 1e6:.0f} MB in all\nstore            ms")

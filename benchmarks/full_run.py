@@ -22,12 +22,12 @@ import tests_of_checkout  # noqa: F401
 from numpy.typing import NDArray
 
 from probe_kit.env import SceneSpec
-from probe_kit.extract.plan import Plan
-from probe_kit.extract.sources.player import Ending, Row
+from probe_kit.extract.sources.player import Ending
 from probe_kit.extract.sources.scene_source import ScenePlayer
 from probe_kit.extract.sources.source import Played as PlayerOptions
 from probe_kit.runs import Run, open_run, seal
 from probe_kit.runs.layout import COMMITS, StoredStream
+from probe_kit.runs.plan import Plan, Row
 from probe_kit.runs.store import locate
 from probe_kit.runs.thumbnails import as_thumbnail, thumbnail_key
 from probe_kit.runs.writer import EpisodeRecord, RunWriter

@@ -26,15 +26,13 @@ import numpy as np
 import tests_of_checkout  # noqa: F401
 
 from probe_kit.env import SceneSpec
-from probe_kit.extract.plan import Plan
 from probe_kit.extract.rollout.capturing import EpisodeBuffers
-from probe_kit.extract.rollout.worker import Rollout
-from probe_kit.extract.sources.player import Row
 from probe_kit.extract.sources.scene import SceneSettings
 from probe_kit.extract.sources.scene_source import SceneSource, scene_row
 from probe_kit.runs import open_run, seal, verify_run
 from probe_kit.runs.commits import NOT_MEASURED, Commit, commit_key, write_commit, write_seconds
 from probe_kit.runs.layout import DATA, StoredStream
+from probe_kit.runs.plan import Plan, Row
 from probe_kit.runs.records import HASH
 from probe_kit.runs.store import locate
 from probe_kit.runs.writer import EpisodeRecord, RunWriter
@@ -43,7 +41,7 @@ from tests.support.plans import make_plan
 
 BACKBONE = StoredStream("backbone", 19, 512, None, 816, ("mean", "last", "mean:language", "mean:image"))
 EXPERT = StoredStream("expert", 19, 64, 10, 51, ("mean", "mean:action"))
-RECORDING = "probe_kit.runs.checking"
+RECORDING = "probe_kit.runs.array_store"
 Seconds = tuple[float, float]
 
 
@@ -59,7 +57,7 @@ def medians(turns: list[Seconds]) -> Seconds:
     return statistics.median(turn[0] for turn in turns), statistics.median(turn[1] for turn in turns)
 
 
-def episode(plan: Plan, number: int) -> Rollout:
+def episode(plan: Plan, number: int) -> EpisodeRecord:
     """Residual-like numbers: every channel has a scale of its own."""
     draw, buffers = np.random.default_rng(number), EpisodeBuffers(list(plan.streams), 1, True, pinned=False)
     spans: dict[str, list[tuple[str, int, int]]] = {}
@@ -70,9 +68,7 @@ def episode(plan: Plan, number: int) -> Rollout:
         buffers.tokens[stream.name][0][..., : stream.tokens, :] = bits
         spans[stream.name] = [("language", 0, stream.tokens)]
     buffers.roles.append(spans)
-    return Rollout(
-        plan.episodes[number], {"outcome": "oob", "side_placed": "none"}, buffers, [], control_steps=[0]
-    )
+    return buffers.record(plan.episodes[number], {"outcome": "oob", "side_placed": "none"}, control_steps=[0])
 
 
 def settings(codec: str) -> dict[str, Any]:
@@ -85,7 +81,7 @@ def bench_writing(suite: Suite, folder: Path, width: int, repeats: int) -> None:
     """Two episodes of tokens through the whole write path; the three ways take turns."""
     stream = replace(BACKBONE, width=width)
     plan = make_plan(suite, [stream], 0, 1, True)
-    records = [episode(plan, number).record for number in range(2)]
+    records = [episode(plan, number) for number in range(2)]
     raw = 2 * stream.raw_bytes(True) / 1e6
     ways: dict[str, Callable[[bytes], str] | None] = {
         "blake2b": None, "crc32c": lambda content: f"{google_crc32c.value(content):064x}",
@@ -151,7 +147,7 @@ def bench_verifying(suite: Suite, run: Path, gigabytes: float, repeats: int) -> 
     plan = make_plan(suite, [stream], 0, 1, True)
     many = tuple(_numbered(plan.episodes[0], number) for number in range(episodes))
     writer = RunWriter(locate(run), _of_many(suite, plan, many), settings("none"))
-    record = episode(plan, 0).record
+    record = episode(plan, 0)
     with writer.owned():
         for planned in many:
             writer.write(replace(record, planned=planned))
@@ -182,7 +178,7 @@ def large_run(suite: Suite, run: Path, episodes: int) -> None:
     first = plan.episodes[0]
     many = tuple(_numbered(first, number) for number in range(episodes))
     writer = RunWriter(locate(run), _of_many(suite, plan, many), settings("zstd"))
-    writer.write(episode(writer.plan, 0).record)
+    writer.write(episode(writer.plan, 0))
     model = writer.root.location.read(commit_key(0))
     commit = json.loads(model)
     del commit[HASH]

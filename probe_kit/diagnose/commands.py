@@ -20,10 +20,10 @@ from probe_kit.intervene.commands import PairTable
 
 if TYPE_CHECKING:
     from probe_kit.extract.extraction import Extraction
-    from probe_kit.extract.sources.player import Row
     from probe_kit.intervene import ReplaySource
     from probe_kit.intervene.outcomes import PairRow
     from probe_kit.runs import Run
+    from probe_kit.runs.plan import Row
     from probe_kit.runs.store import Location
 
 _ACTING = frozenset(

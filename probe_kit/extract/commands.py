@@ -153,13 +153,12 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
     """Print the plan of a run, how much it stores and where."""
     from rich.table import Table
 
-    from probe_kit.extract.plan import space_needed
+    from probe_kit.extract.sizes import space_needed
     from probe_kit.runs.run_folders import in_units
-    from probe_kit.runs.writer import growth_at
+    from probe_kit.runs.writer import growth_words
 
     plan, identity, free = extraction.plan, extraction.identity(), location.free_bytes()
     calibrated, measures = extraction.calibration, extraction.settings.machine.batch == "auto"
-    growth = growth_at(location, plan.to_json()["episodes"])
     needed = in_units(sum(space_needed(extraction.further_plan(location), extraction.settings).values()))
     weights = "not read" if extraction.declared else (identity["weights_sha256"] or "scripted")[:12]
     source = f" ({extraction.declared}; the weights were not read)" if extraction.declared and plan.streams else ""
@@ -169,7 +168,7 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
         "units": _units(extraction.settings),
         "protocol": _protocol(identity),
         **extraction.source.describe(plan.episodes),
-        "grows": growth.words if growth else "",
+        "grows": growth_words(location, plan),
         "streams": ("; ".join(_describe(s) for s in plan.streams) or "none") + source,
         "acts": _acts(identity, extraction.settings.source.subject),
         "activations": f"{plan.sites} sites, {plan.bytes / 1e6:,.1f} MB before compression",
@@ -189,7 +188,7 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
 
 def _weights(extraction: "Extraction") -> str:
     """Memory and download of a model whose size is known."""
-    from probe_kit.extract.plan import weights_needed
+    from probe_kit.extract.sizes import weights_needed
 
     model: Any = getattr(extraction.controller, "model", None)
     loaded, requested = None if model is None else model.card.parameters, extraction.settings.model
@@ -250,7 +249,7 @@ def print_sufficiency(extraction: "Extraction") -> None:
 
 def check_size(extraction: "Extraction", location: "Location", agreed: bool) -> None:
     """Raise DiskSpaceError for more than 64 GB, unless that was agreed to."""
-    from probe_kit.extract.plan import space_needed
+    from probe_kit.extract.sizes import space_needed
     from probe_kit.runs.run_folders import in_units
 
     needed = sum(space_needed(extraction.further_plan(location), extraction.settings).values())

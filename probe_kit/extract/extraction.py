@@ -20,25 +20,26 @@ from probe_kit._terminal.notebook import notebook_progress
 from probe_kit.errors import DiskSpaceError, EpisodesFailedError, MissingExtraError, UsageError
 from probe_kit.extract.config_files import CONFIG, portable
 from probe_kit.extract.parts import SCRIPTED
-from probe_kit.extract.plan import Plan, planned_sizes, space_needed
 from probe_kit.extract.rollout.calibration import Calibration
 from probe_kit.extract.rollout.controllers import Controller
 from probe_kit.extract.rollout.tasks import task_of
 from probe_kit.extract.rollout.worker import Worker
 from probe_kit.extract.settings import AskSettings, ExtractSettings, Settings, run_label
-from probe_kit.extract.sources.player import Done, Event, Failed, Row
+from probe_kit.extract.sizes import planned_sizes, space_needed
+from probe_kit.extract.sources.player import Done, Event, Failed
 from probe_kit.extract.sources.source import Source, raise_together
 from probe_kit.hashing import canonical_json, sha256_json
 from probe_kit.hooks.registry import find_family, get_family
 from probe_kit.runs.commits import failure_key
 from probe_kit.runs.layout import RUN_FILE, StoredStream
+from probe_kit.runs.plan import Plan, Row, further_rows
 from probe_kit.runs.provenance import provenance_here
-from probe_kit.runs.root import label_run, read_root
+from probe_kit.runs.root import find_continuable, label_run
 from probe_kit.runs.run import Run, open_run
 from probe_kit.runs.run_folders import check_if_full
 from probe_kit.runs.store import Location, check_exclusive, locate
 from probe_kit.runs.verify import seal
-from probe_kit.runs.writer import RunWriter, check_other_settings, further_rows
+from probe_kit.runs.writer import RunWriter, check_other_settings
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Model
@@ -84,7 +85,7 @@ class Extraction:
         decoder = {} if self.plan.decoder is None else {"decoder": self.plan.decoder}
         return provenance_here(self.settings.machine.device, dtype) | decoder
 
-    def writer(self, location: Location) -> RunWriter[Plan]:
+    def writer(self, location: Location) -> RunWriter:
         """A writer of the run at `location`, which it begins or continues.
 
         Raises SettingsMismatchError if other settings are there.
@@ -100,7 +101,7 @@ class Extraction:
         # Without the weights' hash there is no name yet.
         return self.settings.folder_name("…" if self.declared else sha256_json(hashed)[:8])
 
-    def worker(self, writer: RunWriter[Plan], episodes: int) -> Worker:
+    def worker(self, writer: RunWriter, episodes: int) -> Worker:
         """A worker of this process, which plays so many episodes at most with the model that is loaded."""
         assert self.controller is not None
         return Worker(writer, self.settings, self.controller, self.source, episodes)
@@ -120,8 +121,8 @@ class Extraction:
         if self.declared:
             raise UsageError("this extraction was planned without its model; prepare it again with fetch=True")
         with location.explained_errors():
-            self._check_settings(location)
-            if not force and (addition := self.further_plan(location)).episodes:
+            addition = self.further_plan(location)
+            if not force and addition.episodes:
                 check_if_full(space_needed(addition, self.settings), location)
             writer = self.writer(location)
             with writer.owned():
@@ -135,29 +136,20 @@ class Extraction:
                 seal(location)
         return open_run(location)
 
-    def _check_settings(self, location: Location) -> None:
-        """Raise SettingsMismatchError if a run with other settings is there: before its plan is compared."""
-        if location.exists(RUN_FILE):
-            root = read_root(location)
-            root.check_continuable()
-            check_other_settings(root.own_settings, json.loads(canonical_json(self.identity())), str(location))
-
     def further_plan(self, location: Location) -> Plan:
         """The plan of the episodes that the run at `location` does not plan yet: all of them where there is none.
 
         Raises SettingsMismatchError if the run there cannot grow by this plan, and RunDamagedError.
         """
-        if not location.exists(RUN_FILE):
+        root = find_continuable(location)
+        if root is None:
             return self.plan
-        root = read_root(location)
-        root.check_continuable()
-        added = {
-            planned["episode_id"]
-            for planned in further_rows(root.plan, self.plan.to_json()["episodes"], str(location))
-        }
+        if not self.declared:  # first of all: what has other settings has other episodes too
+            check_other_settings(root.own_settings, json.loads(canonical_json(self.identity())), str(location))
+        added = {row["episode_id"] for row in further_rows(root.plan, self.plan.columns, location)}
         return self.plan.only(row for row in self.plan.episodes if row.episode_id in added)
 
-    def _play(self, writer: RunWriter[Plan], remaining: list[int], progress: Progress | None) -> None:
+    def _play(self, writer: RunWriter, remaining: list[int], progress: Progress | None) -> None:
         total, committed, given_up = len(self.plan.episodes), 0, list[Failed]()
         with closing(play(self, writer, remaining)) as events:
             for event in events:
@@ -307,17 +299,16 @@ def _check_other_run(settings: Settings, source: Source[Any], location: Location
     """
     early = source.known_early()
     with location.explained_errors():
-        if early is None or not location.exists(RUN_FILE):
+        root = None if early is None else find_continuable(location)
+        if early is None or root is None:
             return
-        root = read_root(location)
-        root.check_continuable()
         decided = {name: value for name, value in settings.identity().items() if name not in _OF_THE_CHECKPOINT}
         requested = json.loads(canonical_json({**decided, **early}))
         stored = {name: root.own_settings[name] for name in requested if name in root.own_settings}
         check_other_settings(stored, {name: requested[name] for name in stored}, str(location))
         if root.plan:
             rows = task_of(settings).rows(settings, source)
-            further_rows(root.plan, [row.to_json() for row in rows], str(location))
+            further_rows(root.plan, [row.to_json() for row in rows], location)
 
 
 def _selects_only(settings: Settings, location: Location | None) -> bool:
@@ -333,13 +324,6 @@ def _selects_only(settings: Settings, location: Location | None) -> bool:
         return family is not None and bool(family.declared)
     with location.explained_errors():
         return not location.exists(RUN_FILE)
-
-
-def check_unloaded(settings: Settings, source: Source[Any]) -> None:
-    """Raise as `load` what a model, its options and its words say of a source before weights are loaded."""
-    check_meaningless(settings)
-    check_model(settings)
-    raise_together(task_of(settings).early_checks(settings, source, fetch=True))
 
 
 # -- the plan -------------------------------------------------------------------------------------------------
@@ -370,7 +354,7 @@ def _plan(
 # -- workers -----------------------------------------------------------------------------------------------------
 
 
-def play(prepared: Extraction, writer: RunWriter[Plan], numbers: list[int]) -> Generator[Event]:
+def play(prepared: Extraction, writer: RunWriter, numbers: list[int]) -> Generator[Event]:
     """Play episodes where the settings say; yields `Done` of each, or `Failed` once it is given up.
 
     In this process with the model that is loaded, else in workers with one of their own, to which only episode
@@ -413,7 +397,7 @@ def play_episodes(
 
 
 def _played_here(
-    prepared: Extraction, writer: RunWriter[Plan], queue: TaskQueue[int], episodes: int
+    prepared: Extraction, writer: RunWriter, queue: TaskQueue[int], episodes: int
 ) -> Iterator[tuple[int, Event]]:
     with prepared.worker(writer, episodes) as worker:
         while not queue.finished:
@@ -437,7 +421,7 @@ def _gpus(settings: Settings, resources: Mapping[str, Any]) -> list[int]:
     return [1 if gpus else 0] * (settings.machine.workers or max(1, gpus))
 
 
-def _failure(writer: RunWriter[Plan], given_up: list[Failed], committed: int) -> EpisodesFailedError:
+def _failure(writer: RunWriter, given_up: list[Failed], committed: int) -> EpisodesFailedError:
     error = EpisodesFailedError(
         f"{counted(len(given_up), 'episode')} failed twice and were given up; {committed} others were finished "
         "and are kept. The same command tries them again; --partial reads the run without them"

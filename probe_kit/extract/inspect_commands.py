@@ -121,7 +121,7 @@ def _ready(family: "Family") -> str:
 
 
 def _model_rows(name: str | None) -> list[dict[str, Any]]:
-    from probe_kit.extract.plan import weights_needed
+    from probe_kit.extract.sizes import weights_needed
     from probe_kit.hooks.registry import find_family, own_families, third_party_families
 
     families = list(own_families().values())
@@ -304,8 +304,7 @@ def show_dataset(
     """
     from rich.table import Table
 
-    from probe_kit.extract.extraction import check_unloaded
-    from probe_kit.extract.rollout.tasks import task_of
+    from probe_kit.extract.extraction import load
     from probe_kit.extract.sources.recording_source import RecordingSource
 
     settings = ExtractSettings.of_command({**typed, "model": model or "pi0-tiny", "dataset": folder})
@@ -315,9 +314,9 @@ def show_dataset(
         facts = recording.facts()
     if model is not None:
         with err.status("loading the model"):
-            check_unloaded(settings, recording)
-            policy: Policy = task_of(settings).load(settings)  # scripts were refused
-            recording, policy = recording.fitted(policy)
+            prepared = load(settings.changed(accept_units=True))  # units are checked behind the table
+        recording = prepared.source  # type: ignore[assignment]
+        policy: Policy = prepared.controller.model  # type: ignore[union-attr]  # scripts were refused
         facts |= recording.facts_of(policy)
     table = Table(show_header=False, box=None)
     table.add_column(style="dim", no_wrap=True)

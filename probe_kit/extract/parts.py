@@ -8,6 +8,7 @@ option of the command line, and study files have the same fields.
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import typer
@@ -21,6 +22,7 @@ from probe_kit.errors import UsageError
 from probe_kit.extract.prompts import P1, Picture, Query, Template, find_template
 from probe_kit.hooks import family as hook_family
 from probe_kit.hooks.capturing.edits import Edit, Vectors
+from probe_kit.hooks.contract.card import EMBEDDED
 from probe_kit.hooks.contract.declared import ProtocolName, Rotation, read_pairs
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.runs.layout import AskTokens, Codec, FrameChoice, LaterViews, Tokens, VideoChoice
@@ -51,6 +53,16 @@ def count_or(word: str, option: str) -> Callable[[Any], Any]:
 def read_options(value: Any) -> Any:
     """KEY=VALUE texts as a dictionary, and a dictionary as it is."""
     return read_pairs(value) if isinstance(value, Sequence) and not isinstance(value, str) else dict(value or {})
+
+
+def is_here(text: str | None) -> bool:
+    """Whether a setting, such as a checkpoint, is a folder or file of this machine."""
+    if text in (None, "", EMBEDDED):
+        return False
+    try:
+        return Path(str(text)).expanduser().exists()
+    except (OSError, RuntimeError):  # no path at all, or ~name of an unknown user
+        return False
 
 
 OptionsByName = Annotated[dict[str, Any], BeforeValidator(read_options)]

@@ -6,11 +6,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from probe_kit.errors import UsageError
-from probe_kit.extract.parts import ActTask, ModelSettings
+from probe_kit.extract.parts import ActTask, ModelSettings, is_here
 from probe_kit.extract.sources.source import SourceSettings
 from probe_kit.hooks.contract.card import EMBEDDED
 from probe_kit.hooks.contract.declared import ACT2ANSWER, PLAIN, ProtocolRow, as_text
-from probe_kit.runs.reader import is_here
 
 if TYPE_CHECKING:
     from probe_kit.env import SceneSpec

@@ -128,7 +128,7 @@ def _step_through(
     past: list[Chunk] = []
     for call in count():
         assert isinstance(answer, Observation)
-        other = stage.look_swapped().observation if swapping else answer
+        other = stage.look_swapped()[0] if swapping else answer
         seed = derive_seed(planned.policy_seed, "inference", call)
         current = replace(pair, clean=answer, source=other, seed=seed, tiles=stage.tile_masks(), step=call)
         past.append(act(current, past))

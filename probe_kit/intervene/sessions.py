@@ -35,8 +35,7 @@ from probe_kit.extract.sources.inputs import (
     hardly_changed,
     with_input,
 )
-from probe_kit.extract.sources.player import Row
-from probe_kit.extract.sources.scene_source import ScenePlayer, Seen, scene_row
+from probe_kit.extract.sources.scene_source import ScenePlayer, scene_row
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.checkpoints.checkpoint import cached_folder, pinned_commits
 from probe_kit.hooks.checkpoints.third_party import copied, while_acting
@@ -46,8 +45,10 @@ from probe_kit.hooks.family import SIZE
 from probe_kit.intervene.outcomes import Choice, PairRow, has_sides, items_of
 from probe_kit.intervene.places import Chunk, Given, Pair, check_pairs
 from probe_kit.runs.layout import FIRST_FRAME, stored_inputs_of
-from probe_kit.runs.reader import OF_SCENE, origin_of
+from probe_kit.runs.plan import Row
+from probe_kit.runs.reader import origin_of
 from probe_kit.runs.run import Run
+from probe_kit.runs.run_source import OF_SCENE
 from probe_kit.suite.items import Episode, Item, Layout, check_wordings, counterparts_of, in_words
 from probe_kit.train.run_suite import suite_of
 
@@ -259,7 +260,7 @@ class SceneSession(ReplaySession):
         """
         episodes = self.run.episodes
         rows = np.flatnonzero((episodes["item_id"] == item).to_numpy())
-        frames: dict[Layout, Seen] = {}
+        frames: dict[Layout, tuple[Observation, dict[str, Any]]] = {}
         pairs = []
         for row in rows:
             record = episodes.iloc[int(row)]
@@ -269,7 +270,7 @@ class SceneSession(ReplaySession):
                 planned = scene_row(0, Episode(worded, layout), int(record["scene_seed"]), 0)
                 frames[layout] = self.stage.look(planned)
                 frames[_OTHER[layout]], tiles = self.stage.look_swapped(), self.stage.tile_masks()
-            stored, drawn = record.get(FIRST_FRAME), frames[layout].facts[FIRST_FRAME]
+            stored, drawn = record.get(FIRST_FRAME), frames[layout][1][FIRST_FRAME]
             if stored is not None and stored != drawn:
                 raise OtherFramesError(
                     f"the first frame of {record['episode_id']}, drawn again, is {drawn[:12]}; "
@@ -278,8 +279,8 @@ class SceneSession(ReplaySession):
                 )
             pairs.append(
                 Pair(
-                    clean=frames[layout].observation,
-                    source=frames[_OTHER[layout]].observation,
+                    clean=frames[layout][0],
+                    source=frames[_OTHER[layout]][0],
                     seed=derive_seed(int(record["policy_seed"]), "inference", 0),
                     toward=-1 if record["side_correct"] == "left" else 1,
                     group=str(record["group_id"]),

@@ -7,7 +7,7 @@ from enum import StrEnum
 from functools import cached_property
 from pathlib import Path
 from statistics import fmean
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -87,8 +87,7 @@ def scored(run: RunReader, score: str, with_side_words: bool = False) -> RunRead
         raise UsageError(f"score is {score!r}; expected one of {', '.join(SCORES)}")
     if ask_of(run) is None:
         return run
-    wrapped: RunReader = ScoredAnswers(run, score, with_side_words)
-    return wrapped
+    return cast("RunReader", ScoredAnswers(run, score, with_side_words))
 
 
 def left_out(runs: Sequence[RunReader]) -> list[str]:

@@ -19,13 +19,12 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
-from zarr.abc.store import Store
 from zarr.errors import ChunkNotFoundError
 
 from probe_kit.errors import RunDamagedError
 from probe_kit.hooks.contract.sites import Site
+from probe_kit.runs.array_store import ArrayStore
 from probe_kit.runs.arrays import bounded_codecs, open_array
-from probe_kit.runs.checking import CheckedStore
 from probe_kit.runs.commits import Commit, commit_key, stamp_of
 from probe_kit.runs.layout import COLUMNS, LATER, SEALED
 from probe_kit.runs.records import NAME_DIGITS, Record, Sum, Sums, named_by_hash
@@ -66,13 +65,9 @@ class Columns:
         )
 
     @property
-    def store(self) -> Store:
+    def store(self) -> ArrayStore:
         """The objects, each checked as it is read."""
-        store = self._location.store(self.folder, read_only=True)
-        return CheckedStore(store, self.sums, self._where, lambda _key: self.advice)
-
-    def _where(self, key: str) -> str:
-        return f"{self._location}/{self.folder}/{key}"
+        return ArrayStore(self._location, self.folder, self.sums, lambda _key: self.advice, read_only=True)
 
     def array(self, name: str) -> "zarr.Array[Any]":
         """One array, such as `backbone/pooled`."""
@@ -145,7 +140,7 @@ def _read_seals(root: Root, commits: Mapping[int, Commit]) -> list[Seal]:
         seal = Seal.parse(raw, name, advice, run=root.identity)
         if seal_key(seal.stamp) != key:
             raise RunDamagedError(f"{name} belongs to other episodes. {advice}")
-        # What a seal does not name does not exist for `CheckedStore`: the array would seem never written.
+        # What a seal does not name does not exist for `ArrayStore`: the array would seem never written.
         if lost := _metadata(root) - {*seal.objects}:
             raise RunDamagedError(f"{name} names no hash of {min(lost)}. {advice}")
         _check_lost(root, commits, seal, name, advice)

@@ -287,24 +287,14 @@ def write_seconds(root: Root, number: int, seconds: Seconds) -> None:
 
 
 def read_seconds(root: Root, commits: Mapping[int, Commit]) -> dict[int, Seconds]:
-    """Read the seconds by episode number, NaN where none are stored. Raises RunDamagedError for a wrong one."""
-    stored, problems = seconds_and_problems(root, commits)
-    if problems:
-        raise RunDamagedError(problems[0])
-    return {number: stored.get(number, NOT_MEASURED) for number in commits}
+    """Read the seconds by episode number, NaN where none are stored at all.
 
-
-def seconds_and_problems(root: Root, commits: Mapping[int, Commit]) -> tuple[dict[int, Seconds], list[str]]:
-    """The stored seconds by episode number, and a sentence per record that was changed or is missing."""
-    stored, problems = dict[int, Seconds](), []
+    Raises RunDamagedError for a record that was changed, or is missing among others.
+    """
+    stored = {}
     for number, key, raw in numbered(root.location, TIMES):
-        stored[number] = NOT_MEASURED
-        try:
-            record = SecondsRecord.parse(raw, f"{root.location}/{key}", _ADVICE, run=root.identity, episode=number)
-            stored[number] = Seconds(record.inference, record.simulation)
-        except RunDamagedError as error:
-            problems.append(str(error))
-    missing = [number for number in sorted(commits) if stored and number not in stored]
-    return stored, problems + [
-        f"{root.location}/{seconds_key(number)} is missing. {_ADVICE}" for number in missing
-    ]
+        record = SecondsRecord.parse(raw, f"{root.location}/{key}", _ADVICE, run=root.identity, episode=number)
+        stored[number] = Seconds(record.inference, record.simulation)
+    if stored and (missing := sorted(commits.keys() - stored.keys())):
+        raise RunDamagedError(f"{root.location}/{seconds_key(missing[0])} is missing. {_ADVICE}")
+    return {number: stored.get(number, NOT_MEASURED) for number in commits}

@@ -25,10 +25,11 @@ from probe_kit.runs.layout import (
     RUN_FILE,
     TRAJECTORY,
 )
+from probe_kit.runs.plan import plan_key
 from probe_kit.runs.provenance import certificate_keys
 from probe_kit.runs.records import RESTORE, Sum
 from probe_kit.runs.results import BUNDLES, HEAD, PARTIAL, TIMES, advice_for, bundle_keys, read_bundle
-from probe_kit.runs.root import LeftOut, Root, is_left_out, plan_key
+from probe_kit.runs.root import LeftOut, Root, is_left_out
 from probe_kit.runs.run import Run, open_run
 from probe_kit.runs.store import Location, locate
 
@@ -134,7 +135,7 @@ def _expected(key: str) -> bool:
         top in ILLUSTRATIONS
         or (top == DATA and "/c/" in below)
         or (top in BUNDLES and below.partition("/")[0].endswith(PARTIAL))
-        or key.endswith((".tmp", ".partial"))
+        or key.endswith(".tmp")
     )
 
 

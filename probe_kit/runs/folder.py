@@ -10,17 +10,13 @@ import fcntl
 import os
 import secrets
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, BinaryIO
 
-from zarr.abc.store import Store
-from zarr.storage import LocalStore
-
-from probe_kit._system.drafts import draft_of
-from probe_kit.errors import FULL_DISK, DiskSpaceError, RunDamagedError, SettingsMismatchError
+from probe_kit.errors import FULL_DISK, DiskSpaceError, RunDamagedError
 from probe_kit.runs.layout import COLUMNS, DATA, RUN_FILE
 
 MOST_RECORD_BYTES, MOST_OBJECT_BYTES = 256 << 20, 4 << 30
@@ -40,7 +36,9 @@ def check_size(key: str, size: int, where: object) -> None:
         )
 
 
-_DRAFTS = ("*.tmp", "*/*.tmp", f"{DATA}/**/*.partial", f"{COLUMNS}/**/*.partial")
+DRAFT = ".tmp"
+"""Ending of an object without its final name yet."""
+_DRAFTS = ("*.tmp", "*/*.tmp", f"{DATA}/**/*.tmp", f"{COLUMNS}/**/*.tmp")
 """Patterns of what a killed process leaves: objects without their final name."""
 _PIECE = 1 << 20
 """Bytes that are hashed at a time: they stay in the processor's cache."""
@@ -54,9 +52,6 @@ class Folder:
     """A folder on a file system that knows hard links and `flock`. `str()` gives what the user called it.
 
     Its methods are the contract of a location, which `store.Bucket` keeps too.
-
-    Zarr's own `LocalStore` reads and writes the arrays: the object_store library takes twice the processor time to
-    read them (docs/notes/storage.md).
     """
 
     def __init__(self, path: Path) -> None:
@@ -112,11 +107,15 @@ class Folder:
         """Whether there is an object of that key."""
         return _inside(key) and (self._path / key).is_file()
 
-    def read(self, key: str) -> bytes:
-        """All of one object. Raises FileNotFoundError."""
+    def read(self, key: str, part: slice | None = None) -> bytes:
+        """All of one object, or a part of its bytes. Raises FileNotFoundError."""
         path = self._object(key)
-        check_size(key, path.stat().st_size, self)
-        return path.read_bytes()
+        if part is None:
+            check_size(key, path.stat().st_size, self)
+            return path.read_bytes()
+        with path.open("rb") as file:
+            file.seek(part.start)
+            return file.read(part.stop - part.start)
 
     def pieces(self, key: str) -> Iterator[memoryview]:
         """One object from its beginning to its end; a piece is good until the next one is asked for.
@@ -191,10 +190,6 @@ class Folder:
         """Remove everything below `folder`, if there is anything."""
         shutil.rmtree(self._path / folder, ignore_errors=True)
 
-    def store(self, folder: str, read_only: bool = False) -> Store:
-        """Return Zarr's store for the group or array that lies in `folder`."""
-        return LocalStore(self._path / folder, read_only=read_only)
-
     def _object(self, key: str) -> Path:
         """The path of an object. Raises FileNotFoundError for what is no plain file, or not in the folder.
 
@@ -215,26 +210,6 @@ class Folder:
         return self._path / key
 
     # -- runs ------------------------------------------------------------------------------------------
-
-    def begin(self, objects: Mapping[str, bytes], last: str) -> None:
-        """Begin with these objects; `last`, one of them, never appears without all others.
-
-        If another process is first, its objects stay. Raises SettingsMismatchError if something else is there.
-        """
-        with draft_of(self._path) as draft:
-            # Renamed, so that the folder appears with all objects or not at all. That fails where a folder with
-            # content lies: another process was first, or it is no run.
-            try:
-                for key, content in objects.items():
-                    (draft / key).parent.mkdir(parents=True, exist_ok=True)
-                    with _draft(draft / key, content) as file:
-                        file.rename(draft / key)
-                draft.rename(self._path)
-            except OSError as error:
-                if not self.exists(last):
-                    if not self._path.exists():
-                        raise
-                    raise SettingsMismatchError(f"{self} exists and is not a run; choose another --out") from error
 
     @contextmanager
     def locked(self, clear: Callable[[], None]) -> Iterator[None]:

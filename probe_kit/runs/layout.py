@@ -22,11 +22,13 @@ RUN/
 Every object is bound to the root by hashes, see `records`.
 """
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
-from typing import Any, Literal, get_args
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
+from pydantic import AfterValidator, ConfigDict, Field
+from pydantic.dataclasses import dataclass
 
 from probe_kit.hooks.contract.sites import QUANTITIES, Part, Site, Stream
 
@@ -99,24 +101,36 @@ def stored_inputs_of(settings: Mapping[str, Any]) -> Mapping[str, Any]:
     return described
 
 
-@dataclass(frozen=True)
+def check_distinct(names: Sequence[str]) -> Sequence[str]:
+    """Return the names. Raises ValueError if one stands twice."""
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise ValueError(f"{', '.join(twice)} stands twice; expected each name once")
+    return names
+
+
+_Count = Annotated[int, Field(gt=0, strict=True)]
+_Flag = Annotated[bool, Field(strict=True)]
+_Names = Annotated[tuple[str, ...], AfterValidator(check_distinct)]
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class StoredStream:
-    """The storage of one stream.
+    """The storage of one stream, also as `run.json` has it.
 
     tokens: sequence length T as the model packs it; views: the pooled views V, in storage order.
     """
 
     name: str
-    layers: int
-    width: int
-    iterations: int | None
-    tokens: int
-    views: tuple[str, ...]
+    layers: _Count
+    width: _Count
+    iterations: _Count | None
+    tokens: _Count
+    views: _Names
     part: Part | None = None
     label: str = ""
-    quantities: tuple[str, ...] = QUANTITIES
-    probed: bool = True
-    sums: bool = True
+    quantities: _Names = QUANTITIES
+    probed: _Flag = True
+    sums: _Flag = True
 
     @classmethod
     def of(cls, stream: Stream, tokens: int, views: tuple[str, ...]) -> "StoredStream":
@@ -124,10 +138,6 @@ class StoredStream:
         declared = {part.name: getattr(stream, part.name) for part in fields(Stream) if part.init}
         declared.pop("heads")  # which is not stored
         return cls(**declared, tokens=tokens, views=views)
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the values as stored in `run.json`."""
-        return {**asdict(self), "views": list(self.views), "quantities": list(self.quantities)}
 
     @property
     def stream(self) -> Stream:

@@ -216,11 +216,3 @@ def read_plain(raw: bytes, name: str, advice: str) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise RunDamagedError(f"{name} holds a {type(content).__name__}, not an object. {advice}")
     return content
-
-
-def expect(content: Mapping[str, Any], parts: Mapping[str, type], name: str, advice: str) -> None:
-    """Raise RunDamagedError unless `content` has these parts, each of its type."""
-    for part, kind in parts.items():
-        if type(content.get(part)) is not kind:  # a boolean is no number
-            actual = type(content[part]).__name__ if part in content else "nothing"
-            raise RunDamagedError(f"{name} has {actual} as {part!r}; expected {kind.__name__}. {advice}")

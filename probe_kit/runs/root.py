@@ -1,30 +1,22 @@
-"""The root of a run: `run.json`, the plan of its episodes, and its label.
+"""The root of a run: `run.json` with the plan that goes with it, and its label.
 
-    run.json              settings, streams, hashes of all arrays' metadata, and its own: the run's identity
-    plan/00000000.json    the first selection of a suite: its episodes, their order, their whole suite
-    plan/<n>.json         the n-th growth: the episodes it adds, and the order of all of them
-    label.json            the name of the run in tables, which may be changed at any time
+    run.json      settings, streams, hashes of all arrays' metadata, and its own: the run's identity
+    label.json    the name of the run in tables, which may be changed at any time
 
 Plans and commits name the identity, so that none counts in another run. `run.json` knows of no selection, so two
-runs of other items have one identity. A run grows by a further plan record; none is ever changed. Commits name the
-hash of the record that planned their episode. An episode keeps its number for ever; `order` is that of the same
-selection planned at once.
+runs of other items have one identity.
 """
 
-import re
-from bisect import bisect_right
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from itertools import count
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, NoReturn
+from typing import Any, ClassVar, NoReturn, NotRequired, TypedDict, cast
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator
+from pydantic import ConfigDict, field_serializer, field_validator
 
 from probe_kit.errors import ActivationsLeftOutError, RunDamagedError, RunNotFoundError, UsageError
 from probe_kit.hashing import sha256_json
-from probe_kit.hooks.contract.sites import Part
 from probe_kit.runs.layout import (
     DATA,
     DATASET,
@@ -33,191 +25,55 @@ from probe_kit.runs.layout import (
     LABEL_FILE,
     LEFT_OUT_FILE,
     MEAN_VIEW,
-    PLANS,
     RUN_FILE,
     SCHEMA_VERSION,
     TRAJECTORY,
     LaterViews,
     StoredStream,
     VectorKind,
+    check_distinct,
     stored_inputs_of,
 )
-from probe_kit.runs.records import RESTORE, Record, Sum, Sums, expect, read_plain
+from probe_kit.runs.plan import RowColumns, StoredPlan, plan_key, read_plans
+from probe_kit.runs.records import RESTORE, Record, Sum, Sums, read_plain
 from probe_kit.runs.run_folders import what_to_open
 from probe_kit.runs.store import Location, locate
-
-Row = dict[str, Any]
-_NUMBERED = re.compile(rf"{PLANS}/[0-9]{{8}}\.json")
-_SELECTION = {"suite": dict, "categories": list, "items": int}
-
-
-class PlanRecord(Record):
-    """One selection. tokens: T by stream, where pooled views alone are stored. order: of all episodes so far."""
-
-    kind: ClassVar[str] = "plan"
-    run: str
-    record: int
-    selection: dict[str, Any]
-    suite_parent: str | None
-    tokens: dict[str, int]
-    episodes: list[Row]
-    order: list[int]
-
-
-@dataclass(frozen=True)
-class StoredPlan:
-    """All plan records of a run together.
-
-    rows: the episodes in order. selection, suite_parent, tokens: of the newest record, see `PlanRecord`. extents:
-    planned episodes after each record. hashes: of the records, which the commits of their episodes name.
-    """
-
-    rows: Sequence[Row] = ()
-    selection: Mapping[str, Any] = field(default_factory=dict)
-    suite_parent: str | None = None
-    tokens: Mapping[str, int] = field(default_factory=dict)
-    extents: tuple[int, ...] = ()
-    hashes: tuple[str, ...] = ()
-
-    def hash_of(self, number: int) -> str:
-        """Hash of the record that added the episode of this number."""
-        return self.hashes[bisect_right(self.extents, number)]
-
-
-def plan_key(record: int) -> str:
-    """The key of the plan record of this number; 0 is the first selection."""
-    return f"{PLANS}/{record:08d}.json"
-
-
-def count_plans(location: Location) -> int:
-    """Return the number of plan records of a run. A run that begins right now may have none."""
-    return next(record for record in count() if not location.exists(plan_key(record)))
-
-
-def read_plans(location: Location, run: str, check_row: Callable[[Row, str], None]) -> StoredPlan:
-    """All plan records together; without any rows for a run that has none yet.
-
-    run: its identity. check_row: raises for a row that is none, given its file's name.
-    Raises RunDamagedError if a record is missing, was changed, or belongs elsewhere.
-    """
-    plan, by_number = StoredPlan(), dict[int, Row]()
-    for number in count():
-        name = f"{location}/{plan_key(number)}"
-        try:
-            raw = location.read(plan_key(number))
-        except FileNotFoundError:
-            break
-        record = PlanRecord.parse(raw, name, RESTORE, run=run, record=number)
-        _check_selection(record.selection, name)
-        for row in record.episodes:
-            check_row(row, name)
-            by_number[row["episode"]] = row
-        _check_order(record, len(plan.rows), by_number, name)
-        rows = [by_number[episode] for episode in record.order]
-        plan = StoredPlan(
-            rows, record.selection, record.suite_parent, record.tokens,
-            (*plan.extents, len(rows)), (*plan.hashes, record.hash),
-        )  # fmt: skip
-    missing = plan_key(len(plan.extents))
-    if later := [key for key in location.keys(PLANS) if _NUMBERED.fullmatch(key) and key > missing]:
-        raise RunDamagedError(f"{location}/{missing} is missing, though {later[0]} is there. {RESTORE}")
-    return plan
-
-
-def _check_selection(selection: Mapping[str, Any], name: str) -> None:
-    """Raise RunDamagedError unless it is a selection of a suite, of recordings, or of an environment."""
-    where = f"{name}: the selection"
-    for source in ("recording", "played"):
-        if source in selection:
-            expect(selection, {source: dict}, where, RESTORE)
-            expect(selection[source], {"name": str, "episodes": list}, where, RESTORE)
-            return
-    expect(selection, _SELECTION, where, RESTORE)
-    expect(selection["suite"], {"identity": str, "content_sha256": str, "seed_text": str}, where, RESTORE)
-    if "wordings" in selection:
-        expect(selection, {"wordings": dict}, where, RESTORE)
-        expect(selection["wordings"], {"names": list}, where, RESTORE)
-
-
-def _check_order(record: PlanRecord, before: int, by_number: Mapping[int, Row], name: str) -> None:
-    """Raise RunDamagedError unless new episodes are numbered on from `before`, and all of them have a place."""
-    numbers = [row["episode"] for row in record.episodes]
-    ids = {row["episode_id"] for row in by_number.values()}
-    expected = list(range(before + len(numbers)))
-    if numbers != expected[before:] or sorted(record.order) != expected or len(ids) != len(expected):
-        raise RunDamagedError(f"{name} numbers or orders its episodes in another way than plans do. {RESTORE}")
-
-
-def while_growing[Result](location: Location, read: Callable[[], Result]) -> Result:
-    """The result of `read`, called again if the run grew meanwhile: parts of two states do not fit together.
-
-    Raises what `read` raises.
-    """
-    while True:
-        before = count_plans(location)
-        try:
-            return read()
-        except RunDamagedError:
-            if count_plans(location) == before:
-                raise
-
 
 # -- the card ----------------------------------------------------------------------------------------------------
 
 
-_SETTINGS = {"model": str, "captured_calls": int, "tokens": str, "codec": str}
-"""The settings of every run, and their types."""
-_FURTHER = {"random_weights": bool, "suite": dict, "later_views": str}
-"""Further settings of every extracted run; a run that other code wrote may lack them."""
-_EPISODE = {
-    **dict.fromkeys(("episode_id", "item_id", "category", "group_id", "layout", "side_correct"), str),
-    "item_content_sha256": str,
-    "episode": int,
-}
-"""The columns of every planned episode of the scene, and their types."""
-_STRETCH = {
-    **dict.fromkeys(("episode_id", "item_id", "category", "group_id", "instruction", "content_blake2b"), str),
-    **dict.fromkeys(("episode", "source_episode", "first_frame", "frame_step", "frames"), int),
-}
-"""The same of a run on recordings."""
-_PLAYED = {
-    **dict.fromkeys(("episode_id", "item_id", "category", "group_id", "instruction"), str),
-    **dict.fromkeys(("episode", "env_episode", "env_seed"), int),
-}
-"""The same of a run in an environment of the user's own."""
-_INPUTS = {"inputs": dict, "columns": list, "names": dict}
-_OF_SOURCES = {DATASET: {"meta_blake2b": str, **_INPUTS}, ENVIRONMENT: {"revision": str, **_INPUTS}}
-"""The settings of recordings, or of an environment."""
+class _Inputs(TypedDict):
+    """Recordings or an environment, with shapes and names of the stored inputs."""
+
+    __pydantic_config__ = ConfigDict(extra="allow", strict=True)  # type: ignore[misc]  # pydantic's way
+    inputs: dict[str, Any]
+    columns: list[str]
+    names: dict[str, Any]
+    meta_blake2b: NotRequired[str]
+    revision: NotRequired[str | None]
+
+
+class _Settings(TypedDict):
+    """The settings of every run, and those that a run which other code wrote may lack."""
+
+    __pydantic_config__ = ConfigDict(extra="allow", strict=True)  # type: ignore[misc]
+    model: str
+    captured_calls: int
+    tokens: str
+    codec: str
+    random_weights: NotRequired[bool]
+    suite: NotRequired[dict[str, Any]]
+    later_views: NotRequired[str]
+    dataset: NotRequired[_Inputs]
+    environment: NotRequired[_Inputs]
+
+
+_OF_SCENES = ("layout", "side_correct", "item_content_sha256")
+_OF_RECORDINGS = ("instruction", "content_blake2b", "source_episode", "first_frame", "frame_step", "frames")
+_OF_ENVIRONMENTS = ("instruction", "env_episode", "env_seed")
+"""The columns that every planned row of a source has."""
 _CHUNKS = "/c/"
 """Between the name of an array and the position of a chunk in a key of Zarr v3."""
-
-
-def _distinct(names: list[str]) -> list[str]:
-    """The names. Raises ValueError if one stands twice."""
-    if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise ValueError(f"{', '.join(twice)} stands twice; expected each name once")
-    return names
-
-
-_Count = Annotated[int, Field(gt=0)]
-_Names = Annotated[list[str], AfterValidator(_distinct)]
-
-
-class StreamEntry(BaseModel):
-    """One stream in `run.json`, as `StoredStream`; without `tokens` unless every token is stored."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
-    name: str
-    layers: _Count
-    width: _Count
-    iterations: _Count | None
-    tokens: _Count = 1
-    views: _Names
-    part: Part | None
-    label: str
-    quantities: _Names
-    probed: bool
-    sums: bool
 
 
 class Card(Record):
@@ -225,16 +81,29 @@ class Card(Record):
 
     kind: ClassVar[str] = "card"
     schema_version: int
-    settings: dict[str, Any]
+    settings: _Settings
     settings_sha256: str
-    streams: list[StreamEntry]
+    streams: list[StoredStream]
     objects: Sums
+
+    @field_validator("streams", mode="before")
+    @classmethod
+    def _with_one_token(cls, streams: Any) -> Any:
+        """Streams have one token where a selection decides their number."""
+        return [{"tokens": 1, **stream} if isinstance(stream, dict) else stream for stream in streams]
 
     @field_validator("streams")
     @classmethod
-    def _check_names(cls, streams: list[StreamEntry]) -> list[StreamEntry]:
-        _distinct([stream.name for stream in streams])
+    def _check_names(cls, streams: list[StoredStream]) -> list[StoredStream]:
+        check_distinct([stream.name for stream in streams])
         return streams
+
+    @field_serializer("streams")
+    def _without_selected_tokens(self, streams: list[StoredStream]) -> list[dict[str, Any]]:
+        """Leave the number of tokens out, unless arrays are as long as that."""
+        selected = () if self.settings["tokens"] == "all" else ("tokens",)
+        entries = [asdict(stream) for stream in streams]
+        return [{name: value for name, value in entry.items() if name not in selected} for entry in entries]
 
 
 class LeftOut(Record):
@@ -273,16 +142,17 @@ class Root:
     @cached_property
     def own_streams(self) -> Mapping[str, StoredStream]:
         """The storage of every stream, by name; with one token where a selection decides their number."""
-        entries = [dict(entry) for entry in self.card.streams]
-        tuples = [{name: tuple(entry[name]) for name in ("views", "quantities")} for entry in entries]
-        return {
-            entry["name"]: StoredStream(**{**entry, **lists}) for entry, lists in zip(entries, tuples, strict=True)
-        }
+        return {stream.name: stream for stream in self.card.streams}
+
+    @cached_property
+    def metadata(self) -> dict[str, Sum]:
+        """Length and hash of the metadata of all arrays, by key in `data.zarr`."""
+        return {key.removeprefix(f"{DATA}/"): stored for key, stored in self.card.objects.items()}
 
     @property
     def own_settings(self) -> dict[str, Any]:
         """The settings of the card."""
-        return self.card.settings
+        return cast("dict[str, Any]", self.card.settings)
 
     def check_continuable(self) -> None:
         """Raise ActivationsLeftOutError for a copy without activations."""
@@ -325,10 +195,13 @@ class Root:
     @cached_property
     def stored_plan(self) -> StoredPlan:
         """The plan that all plan records make together."""
-        return read_plans(self.location, self.identity, self._check_row)
+        settings = self.own_settings
+        of_source = _OF_ENVIRONMENTS if ENVIRONMENT in settings else _OF_SCENES
+        columns = _OF_RECORDINGS if DATASET in settings else of_source
+        return read_plans(self.location, self.identity, columns)
 
     @property
-    def plan(self) -> Sequence[Row]:
+    def plan(self) -> Sequence[RowColumns]:
         """The planned episodes in order; none in a run that has no plan yet."""
         return self.stored_plan.rows
 
@@ -346,11 +219,8 @@ class Root:
         Raises RunDamagedError if the plan lacks the number of tokens of one.
         """
         tokens = self.stored_plan.tokens
-        lacking = [
-            entry.name
-            for entry in self.card.streams
-            if "tokens" not in entry.model_fields_set and entry.name not in tokens
-        ]
+        selected = self.own_streams if self.own_settings["tokens"] != "all" else ()
+        lacking = [name for name in selected if name not in tokens]
         if lacking and self.plan:
             name = f"{self.location}/{plan_key(len(self.stored_plan.extents) - 1)}"
             raise RunDamagedError(f"{name} says no number of tokens of {lacking[0]}. {RESTORE}")
@@ -359,13 +229,8 @@ class Root:
             for name, stream in self.own_streams.items()
         }
 
-    def _check_row(self, row: Any, name: str) -> None:
-        settings = self.own_settings
-        parts = _STRETCH if DATASET in settings else _PLAYED if ENVIRONMENT in settings else _EPISODE
-        expect(row if isinstance(row, dict) else {}, parts, name, RESTORE)
-
     @cached_property
-    def planned(self) -> dict[int, dict[str, Any]]:
+    def planned(self) -> dict[int, RowColumns]:
         """The same by number."""
         return {episode["episode"]: episode for episode in self.plan}
 
@@ -396,18 +261,13 @@ class Root:
         return ("pooled",) if self.later_views == "all" else ("pooled", "later")
 
 
-def new_card(
-    settings: Mapping[str, Any], streams: Iterable[Mapping[str, Any]], objects: Mapping[str, bytes]
-) -> Card:
-    """The card of a run that begins with these arrays' metadata.
-
-    streams: without the number of tokens, which a selection decides, unless every token is stored.
-    """
+def new_card(settings: Mapping[str, Any], streams: Iterable[StoredStream], objects: Mapping[str, bytes]) -> Card:
+    """The card of a run that begins with these arrays' metadata."""
     return Card(
         schema_version=SCHEMA_VERSION,
-        settings=dict(settings),
+        settings=cast("_Settings", dict(settings)),
         settings_sha256=sha256_json(settings),
-        streams=[StreamEntry.model_validate(stream) for stream in streams],
+        streams=list(streams),
         objects={key: Sum.of(content) for key, content in objects.items()},
     )
 
@@ -420,6 +280,14 @@ def read_root(location: Location) -> Root:
     root = find_root(location)
     if root is None:
         raise RunNotFoundError(f"{location} is not a run: it has no {RUN_FILE}. {what_to_open(str(location))}")
+    return root
+
+
+def find_continuable(location: Location) -> Root | None:
+    """Return the root as `find_root`. Raises ActivationsLeftOutError for a copy, to which nothing can be added."""
+    root = find_root(location)
+    if root is not None:
+        root.check_continuable()
     return root
 
 
@@ -438,22 +306,12 @@ def find_root(location: Location) -> Root | None:
             "run again, or read it with the version that made it"
         )
     card = Card.parse(raw, name, RESTORE)
-    if sha256_json(card.settings) != card.settings_sha256:
+    if sha256_json(cast("dict[str, Any]", card.settings)) != card.settings_sha256:
         raise RunDamagedError(f"{name}: the settings do not have the hash stored beside them. {RESTORE}")
-    _check_settings(card.settings, name)
     root = Root(location, card)
     if lost := {f"{DATA}/{array}/zarr.json" for array in root.arrays} - {*root.card.objects}:
         raise RunDamagedError(f"{name} names no hash of {min(lost)}. {RESTORE}")
     return root
-
-
-def _check_settings(settings: Mapping[str, Any], name: str) -> None:
-    optional = {part: kind for part, kind in _FURTHER.items() if part in settings}
-    expect(settings, {**_SETTINGS, **optional}, f"{name}: the settings", RESTORE)
-    for source, parts in _OF_SOURCES.items():
-        if source in settings:
-            expect(settings, {source: dict}, f"{name}: the settings", RESTORE)
-            expect(settings[source], parts, f"{name}: the {source}", RESTORE)
 
 
 # -- the label ---------------------------------------------------------------------------------------------------

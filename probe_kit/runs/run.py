@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from zarr.abc.store import Store
 
+from probe_kit._terminal.notebook import facts_html
 from probe_kit.env.scoring import DEFAULT_RULE, check_rule
 from probe_kit.errors import (
     NoTrajectoryError,
@@ -20,7 +20,9 @@ from probe_kit.errors import (
     UnknownSiteError,
     UsageError,
 )
+from probe_kit.hooks.contract.card import streams_text
 from probe_kit.hooks.contract.sites import Site, Stream, resolve_view
+from probe_kit.runs.array_store import ArrayStore
 from probe_kit.runs.arrays import (
     Rows,
     StoredInputs,
@@ -30,7 +32,6 @@ from probe_kit.runs.arrays import (
     role_mask,
     token_blocks,
 )
-from probe_kit.runs.checking import CheckedStore
 from probe_kit.runs.columns import Columns, find_columns
 from probe_kit.runs.commits import (
     Commit,
@@ -42,6 +43,7 @@ from probe_kit.runs.commits import (
     stamp_of,
 )
 from probe_kit.runs.layout import (
+    CAPTURE_ONLY,
     DATA,
     DATASET,
     ENVIRONMENT,
@@ -53,6 +55,7 @@ from probe_kit.runs.layout import (
     VectorKind,
     stored_inputs_of,
 )
+from probe_kit.runs.plan import RowColumns, while_growing
 from probe_kit.runs.provenance import (
     Provenance,
     check_provenances,
@@ -60,9 +63,9 @@ from probe_kit.runs.provenance import (
     read_certificate,
     read_provenances,
 )
-from probe_kit.runs.reader import Origin, RunSource, run_html, run_text, select_items
 from probe_kit.runs.records import RESTORE, Sum
-from probe_kit.runs.root import read_label, read_root, while_growing
+from probe_kit.runs.root import read_label, read_root
+from probe_kit.runs.run_source import Origin, RunSource, select_items
 from probe_kit.runs.store import Location, locate
 from probe_kit.runs.trajectories import Trajectories, judged, watch, with_outcomes
 
@@ -149,10 +152,34 @@ class Run:
             _ = self._certificates
 
     def __repr__(self) -> str:
-        return run_text(self)
+        random = ", RANDOM WEIGHTS" if self.random_weights else ""
+        random += ", CAPTURE ONLY (it did not act)" if CAPTURE_ONLY in self._outcomes else ""
+        return f"<Run {self.label}{random} on {self.suite}: {self._progress}, at {self.location}>"
 
     def _repr_html_(self) -> str:
-        return run_html(self)
+        weights = "scripted, no weights" if self.weights_sha256 is None else f"sha256 {self.weights_sha256[:12]}"
+        facts = {
+            "suite": self.suite,
+            "weights": f"RANDOM ({weights})" if self.random_weights else weights,
+            "episodes": self._progress,
+            "outcomes": ", ".join(f"{name} {count}" for name, count in self._outcomes.items()),
+            "streams": streams_text(self.streams.values()),
+            "at": self.location.name if Path(str(self.location)).is_absolute() else str(self.location),
+        }
+        advice = "run.episodes is the table, run.column(site) one site of it"
+        return facts_html(f"Run of {self.label}", facts, advice)
+
+    @property
+    def _progress(self) -> str:
+        committed = len(self.episodes)
+        return f"{committed} episodes" if committed == self.planned else f"{committed} of {self.planned} episodes"
+
+    @property
+    def _outcomes(self) -> dict[str, int]:
+        """Count the episodes by outcome."""
+        if self.episodes.empty:
+            return {}
+        return {str(name): int(count) for name, count in self.episodes["outcome"].value_counts().items()}
 
     @property
     def path(self) -> Path:
@@ -397,12 +424,12 @@ class Run:
         return {str(row["item_id"]): str(row["category"]) for row in self.root.plan}
 
     @cached_property
-    def _plan_of_items(self) -> list[dict[str, Any]]:
+    def _plan_of_items(self) -> list[RowColumns]:
         """The plan of the items that are shown, in all wordings."""
         return [e for e in self.root.plan if self.item_ids is None or e["item_id"] in self.item_ids]
 
     @cached_property
-    def _plan(self) -> list[dict[str, Any]]:
+    def _plan(self) -> list[RowColumns]:
         return [e for e in self._plan_of_items if self.wording is None or e["wording"] == self.wording]
 
     @cached_property
@@ -657,15 +684,14 @@ class Run:
         return Rows(open_array(self.data, f"{stream}/{kind}"), self._numbers)
 
     @property
-    def data(self) -> Store:
+    def data(self) -> ArrayStore:
         """The arrays of the committed episodes as Zarr reads them; every object is checked as it is read."""
-        store = self.location.store(DATA, read_only=True)
-        return CheckedStore(store, self._sums, lambda key: f"{self.location}/{DATA}/{key}", self._advice)
+        return ArrayStore(self.location, DATA, self._sums, self._advice, read_only=True)
 
     @cached_property
     def _sums(self) -> dict[str, Sum]:
         """Sums of all objects of `data.zarr`, by key: metadata, and those that commits name."""
-        sums = {key.removeprefix(f"{DATA}/"): expected for key, expected in self.root.card.objects.items()}
+        sums = dict(self.root.metadata)
         for commit in self._commits.values():
             sums |= commit.objects
         return sums

@@ -1,39 +1,33 @@
 """The location at a path or URL: a folder, or a prefix in an object store through obstore (extra `remote`).
 
 Single objects appear complete or not at all, and `If-None-Match: *` creates them exclusively: that is all the
-commit protocol needs. Folders have locks and renaming besides, which are replaced as follows.
+commit protocol needs. Folders have locks besides. In a bucket no process can know that it is alone, so nothing
+that others may be writing is ever removed. There is little to remove: half an upload is no object, and objects
+without a commit are written again under the same key.
 
-* No process can know that it is alone, so nothing that others may be writing is ever removed. There is little to
-  remove: half an upload is no object, and objects without a commit are written again under the same key.
-* A run begins with its objects created one by one, `run.json` last. Two processes that begin at once create the
-  same bytes, or one of them is refused.
+A run begins with its objects created one by one, `run.json` last. Two processes that begin at once create the same
+bytes, or one of them is refused.
 
 A store may be busy or away for a while: from its first answer on, every request is repeated for `PATIENCE`. Before
 it has answered once, the address is more likely wrong, and it is given up within seconds.
 """
 
-import asyncio
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from datetime import timedelta
 from functools import cached_property
-from io import SEEK_SET, BufferedReader, RawIOBase
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Literal
 from urllib.parse import urlsplit
 
-from zarr.abc.store import ByteRequest, Store
-from zarr.core.buffer import Buffer, BufferPrototype
-from zarr.storage import WrapperStore
-
 from probe_kit._system.imports import require
 from probe_kit.errors import SettingsMismatchError, StoreError, UsageError
-from probe_kit.runs.folder import Folder, check_size
+from probe_kit.runs.folder import DRAFT, Folder, check_size
 
 if TYPE_CHECKING:
-    from obstore import ReadableFile
     from obstore.store import ObjectStore
 
 
@@ -100,46 +94,32 @@ class Bucket:
     # -- requests --------------------------------------------------------------------------------------
 
     @cached_property
-    def _patient(self) -> "ObjectStore":
-        return self._below("")
-
-    @cached_property
-    def _quick(self) -> "ObjectStore":
-        return self._below("", quick=True)
-
-    def _below(self, folder: str, quick: bool = False) -> "ObjectStore":
+    def _objects(self) -> "ObjectStore":
         from obstore.store import from_url
 
         with self.explained_errors():
-            store: ObjectStore = from_url(
-                f"{self._url}/{folder}".rstrip("/"),
-                retry_config={
-                    "retry_timeout": _QUICK if quick else PATIENCE,
-                    "max_retries": 10 if quick else 10_000,  # the timeout is to end it, not the count
-                    "backoff": {"max_backoff": timedelta(seconds=LONGEST_PAUSE)},
-                },
-            )
+            store: ObjectStore = from_url(self._url, retry_config={"max_retries": 0})  # `_answer` repeats
         return store
 
     def _answer[T](self, request: Callable[["ObjectStore"], T]) -> T:
         """Return the answer to a request, in our words.
 
-        obstore repeats requests that change nothing. Repeated here are a listing that breaks off, and a
-        conditional put or a deletion without an answer. All of them may be done twice.
+        Repeated are all requests that break off or get no answer, also a conditional put and a deletion: each of
+        them may be done twice.
         """
         from obstore.exceptions import GenericError
 
-        pauses = pauses_for(PATIENCE)
+        pauses = pauses_for(PATIENCE if self._answered else _QUICK)
         with self.explained_errors():
             while True:
                 try:
-                    answer = request(self._patient if self._answered else self._quick)
+                    answer = request(self._objects)
                 except FileNotFoundError:  # an answer too: the store is there, the object is not
                     self._answered = True
                     raise
                 except GenericError:
                     pause = next(pauses, None)
-                    if not self._answered or pause is None:
+                    if pause is None:
                         raise
                 else:
                     self._answered = True
@@ -189,11 +169,13 @@ class Bucket:
             return False
         return True
 
-    def read(self, key: str) -> bytes:
+    def read(self, key: str, part: slice | None = None) -> bytes:
         """See `Folder.read`: one request."""
         import obstore
 
         def content(objects: Any) -> bytes:
+            if part is not None:
+                return bytes(obstore.get_range(objects, key, start=part.start, end=part.stop))
             answer = obstore.get(objects, key)
             check_size(key, answer.meta["size"], self)
             return bytes(answer.bytes())
@@ -205,10 +187,8 @@ class Bucket:
         yield self.read(key)
 
     def open(self, key: str) -> BinaryIO:
-        """See `Folder.open`: ranges are requested when they are read."""
-        import obstore
-
-        return BufferedReader(_Ranges(self._answer(lambda objects: obstore.open_reader(objects, key)), self))
+        """See `Folder.open`: all of it is fetched at once."""
+        return BytesIO(self.read(key))
 
     def read_all(self, folder: str, suffix: str) -> dict[str, bytes]:
         """See `Folder.read_all`: a listing, then requests side by side. What is gone by then is left out."""
@@ -280,28 +260,7 @@ class Bucket:
         if keys:
             self._answer(lambda objects: obstore.delete(objects, keys))
 
-    def store(self, folder: str, read_only: bool = False) -> Store:
-        """Zarr's own, over obstore; its errors are those of `explained_errors`."""
-        from zarr.storage import ObjectStore
-
-        return _PatientStore(ObjectStore(self._below(folder), read_only=read_only), self)
-
     # -- runs ------------------------------------------------------------------------------------------
-
-    def begin(self, objects: Mapping[str, bytes], last: str) -> None:
-        """One after another, none over another's."""
-        strange = sorted(set(self.keys("")) - set(objects))
-        if strange and not self.exists(last):
-            raise SettingsMismatchError(f"{self} holds {strange[0]} but no run; choose another --out")
-        for key, content in objects.items():
-            if key != last and not self.create(key, content) and self.read(key) != content:
-                raise SettingsMismatchError(
-                    f"{self} holds the beginning of a run with another {key}: one of other settings, killed early "
-                    "or beginning now in another process. Choose another --out, or remove it"
-                )
-        # Tried on a real key, before the run exists: a store that cannot keep writers apart is refused at once.
-        check_exclusive(self, next(key for key in objects if key != last))
-        self.create(last, objects[last])
 
     @contextmanager
     def locked(self, clear: Callable[[], None]) -> Iterator[None]:
@@ -323,84 +282,6 @@ def pauses_for(time_to_repeat: timedelta) -> Iterator[float]:
         pause = min(2 * pause, LONGEST_PAUSE)
 
 
-class _PatientStore(WrapperStore[Store]):
-    """A store of Zarr whose errors are those of its bucket, and that waits for them to pass.
-
-    obstore repeats most requests, but not an answer that breaks off. Of Zarr's operations it covers those that
-    `CheckedStore`, `RecordingStore` and `BlankStore` pass on.
-    """
-
-    def __init__(self, store: Store, bucket: Bucket) -> None:
-        super().__init__(store)
-        self._bucket = bucket
-
-    def _with_store(self, store: Store) -> "_PatientStore":
-        return _PatientStore(store, self._bucket)
-
-    async def _answer[T](self, request: Callable[[], Awaitable[T]]) -> T:
-        from obstore.exceptions import GenericError
-
-        pauses = pauses_for(PATIENCE)
-        with self._bucket.explained_errors():
-            while True:
-                try:
-                    return await request()
-                except GenericError:
-                    pause = next(pauses, None)
-                    if pause is None:
-                        raise
-                await asyncio.sleep(pause)
-
-    async def get(
-        self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None
-    ) -> Buffer | None:
-        """One object or a part of it."""
-        return await self._answer(lambda: self._store.get(key, prototype, byte_range))
-
-    async def get_ranges(
-        self, key: str, byte_ranges: Sequence[ByteRequest | None], *, prototype: BufferPrototype, **how: Any
-    ) -> AsyncIterator[Sequence[tuple[int, Buffer | None]]]:
-        """Parts of one."""
-        # Not repeated: parts that were handed on already would come twice.
-        with self._bucket.explained_errors():
-            async for group in super().get_ranges(key, byte_ranges, prototype=prototype, **how):
-                yield group
-
-    async def exists(self, key: str) -> bool:
-        """Whether it exists."""
-        return await self._answer(lambda: self._store.exists(key))
-
-    async def set(self, key: str, value: Buffer) -> None:
-        """Write one."""
-        await self._answer(lambda: self._store.set(key, value))
-
-    async def delete(self, key: str) -> None:
-        """Remove one."""
-        await self._answer(lambda: self._store.delete(key))
-
-
-class _Ranges(RawIOBase):
-    """An object of obstore as Python's own file type, read by ranges."""
-
-    def __init__(self, file: "ReadableFile", bucket: Bucket) -> None:
-        self._file, self._bucket = file, bucket
-
-    def readable(self) -> bool:
-        return True
-
-    def seekable(self) -> bool:
-        return True
-
-    def seek(self, offset: int, whence: int = SEEK_SET) -> int:
-        return self._file.seek(offset, whence)
-
-    def readinto(self, buffer: memoryview) -> int:  # type: ignore[override]
-        with self._bucket.explained_errors():
-            content = self._file.read(len(buffer))
-        buffer[: len(content)] = bytes(content)
-        return len(content)
-
-
 # -- the location of an address ----------------------------------------------------------------------------------
 
 
@@ -418,6 +299,30 @@ def check_exclusive(location: Location, key: str) -> None:
             f"{location}: the store created {key} a second time: it ignores conditional puts (If-None-Match), and "
             "cannot keep two writers apart. Use another store, or a folder"
         )
+
+
+def begin(location: Location, objects: Mapping[str, bytes], last: str) -> None:
+    """Begin with these objects, created one after another; `last`, one of them, never appears without all others.
+
+    A killed beginning is continued by the next one. If another process is first, its objects stay. Raises
+    SettingsMismatchError if something else is there.
+    """
+    present = {key for key in location.keys("") if not key.endswith(DRAFT)}
+    if (strange := sorted(present - set(objects))) and last not in present:
+        raise SettingsMismatchError(f"{location} holds {strange[0]} and is not a run; choose another --out")
+    for key, content in objects.items():
+        try:
+            same = key == last or location.create(key, content) or location.read(key) == content
+        except NotADirectoryError as error:
+            raise SettingsMismatchError(f"{location} is a file, not a folder; choose another --out") from error
+        if not same:
+            raise SettingsMismatchError(
+                f"{location} holds the beginning of a run with another {key}: one of other settings, killed early "
+                "or beginning now in another process. Choose another --out, or remove it"
+            )
+    # Tried on a real key, before the run exists: a store that cannot keep writers apart is refused at once.
+    check_exclusive(location, next(key for key in objects if key != last))
+    location.create(last, objects[last])
 
 
 def locate(where: str | Path | Location) -> Location:

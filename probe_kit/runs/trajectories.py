@@ -38,18 +38,17 @@ class Trajectories:
     """The trajectories of the committed episodes of a run, in their order.
 
     rows: of the array `trajectory`. steps: how many actions every committed episode had. where: the run's name.
-    Raises RunDamagedError if a channel that is read today is not among the stored ones.
+    Raises RunDamagedError if other channels are stored than those that are read today.
     """
 
     def __init__(self, rows: Rows, steps: Sequence[int], where: str) -> None:
         self._rows, self._steps, self._where = rows, steps, where
-        channels = [str(name) for name in cast("list[str]", self._rows.array.attrs["channels"])]
-        if lacking := [name for name in CHANNELS if name not in channels]:
+        channels = cast("list[str]", self._rows.array.attrs["channels"])
+        if channels != list(CHANNELS):
             raise RunDamagedError(
-                f"the trajectories of {where} lack {', '.join(lacking)}; another version of probe_kit stored "
-                "them. Read them with the version that the run's provenance names"
+                f"the trajectories of {where} have other channels than {', '.join(CHANNELS)}; another version of "
+                "probe_kit stored them. Read them with the version that the run's provenance names"
             )
-        self._columns = [channels.index(name) for name in CHANNELS]
 
     def __len__(self) -> int:
         return len(self._steps)
@@ -68,7 +67,7 @@ class Trajectories:
                 f"a trajectory of {self._where} has room for {len(row)} frames; its outcome says {frames - 1} "
                 "actions. Check the run with `probe-kit run verify --deep`"
             )
-        return Trajectory.of_frames(row[:frames, self._columns])
+        return Trajectory.of_frames(row[:frames])
 
 
 def judged(

@@ -20,16 +20,17 @@ from numpy.typing import NDArray
 from probe_kit.errors import MissingExtraError, ProbeKitError, RunDamagedError
 from probe_kit.hooks.contract.sites import PADDING
 from probe_kit.hooks.family import imported
+from probe_kit.runs.array_store import ArrayStore
 from probe_kit.runs.arrays import Rows, create_array, open_array
-from probe_kit.runs.checking import BlankStore
 from probe_kit.runs.columns import columns_folder, find_columns, seal_key, write_seal
-from probe_kit.runs.commits import Commit, numbered, read_commit, read_failures, seconds_and_problems
+from probe_kit.runs.commits import Commit, numbered, read_commit, read_failures, read_seconds
 from probe_kit.runs.contents import StoredObject, sizes_of, stored_objects, stray_keys
 from probe_kit.runs.layout import COLUMNS, COMMITS, DATA, SEALED, StoredStream, VectorKind
+from probe_kit.runs.plan import count_plans
 from probe_kit.runs.provenance import check_provenances, read_certificate, read_provenances
 from probe_kit.runs.records import RESTORE, digest_of, is_hash_name
 from probe_kit.runs.results import BUNDLES, bundle_keys, read_bundle
-from probe_kit.runs.root import Root, count_plans, read_label, read_root
+from probe_kit.runs.root import Root, read_label, read_root
 from probe_kit.runs.run import Run, read_run
 from probe_kit.runs.store import Location, locate
 
@@ -60,16 +61,16 @@ def _seal(run: Run) -> bool:
         return False
     run.location.remove(SEALED)  # nothing counts that is not whole
     folder = columns_folder(run.stamp)
-    store = BlankStore(run.location.store(folder))
+    store = ArrayStore(run.location, folder, {})  # what a killed process left there does not exist for it
     group = zarr.open_group(store, mode="w", zarr_format=3)
     for name in run.streams:
         for kind in run.root.vector_kinds:
             _write_vectors(run, name, kind, group)
         _write_roles(run, name, group)
     group.attrs["stamp"] = run.stamp
-    run.location.flush(f"{folder}/{key}" for key in store.sums)
+    run.location.flush(f"{folder}/{key}" for key in store.written)
     commits = {commit.episode: commit for commit in run.commits()}
-    write_seal(run.root, commits, store.sums)  # what makes them count, so last
+    write_seal(run.root, commits, store.written)  # what makes them count, so last
     _remove_former(run)
     return True
 
@@ -223,7 +224,7 @@ def _audit(location: Location, deep: bool) -> Audit:
     except RunDamagedError as error:  # whether objects are missing on purpose is not known
         return Audit(str(location), len(commits), planned, 0, False, deep, (*problems, str(error)))
     checked(lambda: _check_records(root, commits), None)
-    problems += seconds_and_problems(root, commits)[1]
+    checked(lambda: read_seconds(root, commits), None)
     failures = checked(lambda: len(read_failures(root)), 0)
     columns = checked(lambda: find_columns(root, commits), None)
     for home in BUNDLES:

@@ -1,12 +1,11 @@
 """Writing of a run: created once, then one committed episode at a time; it may grow and never gets smaller."""
 
 import json
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from math import prod
-from typing import Any, Protocol, Self
+from typing import Any, cast
 
 import numpy as np
 import zarr
@@ -16,8 +15,8 @@ from zarr.storage import MemoryStore
 
 from probe_kit.errors import SettingsMismatchError
 from probe_kit.hashing import canonical_json
+from probe_kit.runs.array_store import ArrayStore
 from probe_kit.runs.arrays import ROOM, WRITE_ALL, create_arrays, create_inputs, write_row
-from probe_kit.runs.checking import RecordingStore
 from probe_kit.runs.commits import (
     Commit,
     Seconds,
@@ -40,6 +39,7 @@ from probe_kit.runs.layout import (
     StoredStream,
     stored_inputs_of,
 )
+from probe_kit.runs.plan import Plan, PlanRecord, Row, StoredRow, further_rows, plan_key, while_growing
 from probe_kit.runs.provenance import (
     Provenance,
     check_other_provenance,
@@ -51,108 +51,28 @@ from probe_kit.runs.provenance import (
 )
 from probe_kit.runs.records import Sum
 from probe_kit.runs.results import BUNDLES, bundle_keys
-from probe_kit.runs.root import Label, PlanRecord, Root, new_card, plan_key, read_root, while_growing
-from probe_kit.runs.store import Location
+from probe_kit.runs.root import Label, Root, find_continuable, new_card, read_root
+from probe_kit.runs.store import Location, begin
 from probe_kit.runs.trajectories import create_trajectories
 
-Row = Mapping[str, Any]
-_NUMBER = "episode"
-"""The part of a row that depends on when its episode was added."""
 
+def growth_words(location: Location, plan: Plan) -> str:
+    """Return how the run at `location` grows by a plan, in a line; empty for no run, and where nothing changes.
 
-@dataclass(frozen=True)
-class Growth:
-    """A plan beside the one that is stored.
-
-    stored, requested: episodes of either. added: episodes that only the plan has. results: probes and
-    interventions that are stored with the run, such as `probes 1a2b3c4d5e6f`; after a growth they are of former
-    episodes.
+    Names the probes and interventions that are then of former episodes. Raises as `further_rows`,
+    ActivationsLeftOutError for a copy without activations, and RunDamagedError if the stored run was changed.
     """
-
-    stored: int
-    requested: int
-    added: int
-    results: tuple[str, ...] = ()
-
-    @property
-    def words(self) -> str:
-        """The growth in a line; empty where both plans are the same."""
-        if self.added:
-            stale = f"; of the former episodes only: {', '.join(self.results)}" if self.results else ""
-            return f"from {self.stored} to {self.requested} episodes; stored ones stay as they are{stale}"
-        if self.requested < self.stored:
-            return f"no: the run has {self.stored} episodes, these {self.requested} among them, and never shrinks"
+    root = find_continuable(location)
+    if root is None or not root.plan:
         return ""
-
-
-_CONTENT = "content_blake2b"
-"""Of recordings: hash of the files that hold an episode."""
-
-
-def further_rows(stored: Sequence[Row], requested: Sequence[Row], where: str) -> list[Row]:
-    """The rows of a plan that the stored one lacks; none if the stored one holds them all.
-
-    Raises SettingsMismatchError if both plan one episode differently, or if each has some that the other lacks.
-    """
-    was, now = ({row["episode_id"]: row for row in rows} for rows in (stored, requested))
-    for name in was.keys() & now.keys():
-        _check_equal(was[name], now[name], where)
-    added = [row for name, row in now.items() if name not in was]
-    lost = [row for name, row in was.items() if name not in now]
-    if added and lost:
-        raise SettingsMismatchError(
-            f"{where} has {_counted(stored)}; this command asks for {_counted(requested)}. A run grows and never "
-            f"gets smaller, and {len(lost)} of its episodes are not asked for (the first is "
-            f"{lost[0]['episode_id']}). Ask for at least what it has, or choose another --out"
-        )
-    return added
-
-
-def _check_equal(was: Row, now: Row, where: str) -> None:
-    """Raise SettingsMismatchError unless an episode is planned as it is stored, but for its number."""
-    # Every part, not the id alone: an item that was edited keeps its id, and has another content.
-    for part in sorted((was.keys() | now.keys()) - {_NUMBER}):
-        if was.get(part) != now.get(part):
-            if part == _CONTENT:
-                raise SettingsMismatchError(
-                    f"the files of the data set that hold {was['episode_id']} have changed since {where} began: "
-                    f"their {part} is stored as {was.get(part)!r}, here {now.get(part)!r}. Give the data set as "
-                    "it was, or choose another --out"
-                )
-            raise SettingsMismatchError(
-                f"{where} plans {was['episode_id']} otherwise: its {part} is stored as {was.get(part)!r}, here "
-                f"{now.get(part)!r}. Use the suite, the kind of --wordings and the version of probe_kit that the "
-                "run began with, or choose another --out"
-            )
-
-
-def _counted(rows: Sequence[Row]) -> str:
-    """Items by category, and the wordings they are asked in."""
-    items = {row["item_id"]: row["category"] for row in rows}
-    counts = ", ".join(f"{name} {count}" for name, count in sorted(Counter(items.values()).items()))
-    wordings = ", ".join(dict.fromkeys(row["wording"] for row in rows if "wording" in row))
-    return f"items of {counts}" + (f" in the wordings {wordings}" if wordings else "")
-
-
-def growth_at(location: Location, requested: Sequence[Row]) -> Growth | None:
-    """Return the growth of the run at `location` by a plan with these rows; None if none is there or has a plan.
-
-    Raises as `further_rows`, ActivationsLeftOutError for a copy without activations, and RunDamagedError if the
-    stored run was changed.
-    """
-    if not location.exists(RUN_FILE):
-        return None
-    root = read_root(location)
-    root.check_continuable()
-    stored = root.plan
-    if not stored:
-        return None
-    added = len(further_rows(stored, requested, str(location)))
-    results = [f"{home} {key}" for home in BUNDLES for key in bundle_keys(location, home)] if added else []
-    return Growth(len(stored), len(requested), added, tuple(results))
-
-
-# -- the writer --------------------------------------------------------------------------------------------------
+    stored, requested = len(root.plan), len(plan.episodes)
+    if further_rows(root.plan, plan.columns, location):
+        results = ", ".join(f"{home} {key}" for home in BUNDLES for key in bundle_keys(location, home))
+        stale = f"; of the former episodes only: {results}" if results else ""
+        return f"from {stored} to {requested} episodes; stored ones stay as they are{stale}"
+    if requested < stored:
+        return f"no: the run has {stored} episodes, these {requested} among them, and never shrinks"
+    return ""
 
 
 def check_other_settings(stored: dict[str, Any], requested: dict[str, Any], where: str) -> None:
@@ -178,40 +98,6 @@ def flat_settings(value: Any, prefix: str = "") -> dict[str, Any]:
     }
 
 
-class WrittenRow(Protocol):
-    """A row of a plan as the store knows it: its number in the run, and its id, the same in every selection."""
-
-    @property
-    def index(self) -> int:
-        """Its number in the run, where its objects lie."""
-
-    @property
-    def episode_id(self) -> str:
-        """Its id."""
-
-
-class WrittenPlan(Protocol):
-    """The rows that a writer is to store, and how their streams lie."""
-
-    @property
-    def episodes(self) -> Sequence[WrittenRow]:
-        """The rows, in order."""
-
-    @property
-    def streams(self) -> Sequence[StoredStream]:
-        """The captured streams."""
-
-    @property
-    def selection(self) -> dict[str, Any]:
-        """The selection; no part of the run's identity."""
-
-    def to_json(self) -> dict[str, Any]:
-        """`episodes` as flat columns, and `suite_parent`."""
-
-    def numbered(self, numbers: Mapping[str, int]) -> Self:
-        """The same rows with the numbers that a run has for their ids."""
-
-
 @dataclass(frozen=True)
 class EpisodeRecord:
     """All that is stored of one episode.
@@ -225,7 +111,7 @@ class EpisodeRecord:
     an answer by letter, left minus right at every layer.
     """
 
-    planned: WrittenRow
+    planned: Row
     outcome: Mapping[str, Any]
     arrays: Mapping[str, Mapping[str, NDArray[Any]]]
     roles: Sequence[Mapping[str, Sequence[tuple[str, int, int]]]]
@@ -239,7 +125,7 @@ class EpisodeRecord:
     lens_margins: Sequence[float] | None = None
 
 
-class RunWriter[PlanT: WrittenPlan]:
+class RunWriter:
     """Creates a run, continues the one that is there, or lets it grow; any number of processes may do so at once.
 
     plan: episodes to play. Those that the run lacks are appended to its plan; `self.plan` has the run's numbers.
@@ -251,7 +137,7 @@ class RunWriter[PlanT: WrittenPlan]:
     """
 
     def __init__(
-        self, location: Location, plan: PlanT, settings: dict[str, Any], provenance: Provenance | None = None,
+        self, location: Location, plan: Plan, settings: dict[str, Any], provenance: Provenance | None = None,
         label: str | None = None,
     ) -> None:  # fmt: skip
         self.location, self.plan = location, plan
@@ -261,7 +147,7 @@ class RunWriter[PlanT: WrittenPlan]:
         self.settings = json.loads(canonical_json(settings))
         self._label = label or str(self.settings["model"])
         if not location.exists(RUN_FILE):
-            location.begin(self._beginning(), last=RUN_FILE)
+            begin(location, self._beginning(), last=RUN_FILE)
         self.root = while_growing(location, self._continued)
         self.plan = plan.numbered({row["episode_id"]: row["episode"] for row in self.root.plan})
 
@@ -289,14 +175,9 @@ class RunWriter[PlanT: WrittenPlan]:
         if source := stored_inputs_of(self.settings):
             create_inputs(store, self.settings["captured_calls"], source["inputs"], self.settings["codec"])
         objects = {f"{DATA}/{key}": value.to_bytes() for key, value in arrays.items()}
-        card = new_card(self.settings, [self._without_length(stream) for stream in self.plan.streams], objects)
+        card = new_card(self.settings, self.plan.streams, objects)
         label = Label(run=card.hash, label=self._label)
         return {**objects, LABEL_FILE: label.to_bytes(), RUN_FILE: card.to_bytes()}
-
-    def _without_length(self, stream: StoredStream) -> dict[str, Any]:
-        """A stream as `run.json` has it: without its number of tokens, unless arrays are as long as that."""
-        entry = stream.to_json()
-        return entry if self._with_tokens else {name: value for name, value in entry.items() if name != "tokens"}
 
     def _continued(self) -> Root:
         """The root of the run that is there, whose plan now holds the one of this writer."""
@@ -312,8 +193,7 @@ class RunWriter[PlanT: WrittenPlan]:
 
     def _lacks(self, root: Root) -> bool:
         """Whether the run does not plan all of this writer's episodes yet. Raises SettingsMismatchError."""
-        rows = self.plan.to_json()["episodes"]
-        return not root.plan or bool(further_rows(root.plan, rows, str(self.location)))
+        return not root.plan or bool(further_rows(root.plan, self.plan.columns, self.location))
 
     def _grown(self) -> Root:
         """The root, once the run plans all of this writer's episodes."""
@@ -341,20 +221,20 @@ class RunWriter[PlanT: WrittenPlan]:
 
     def _record(self, root: Root) -> PlanRecord:
         """The plan record that adds to the run's plan those episodes of this writer's that it lacks."""
-        plan, before = self.plan.to_json(), root.stored_plan
+        rows, before = self.plan.columns, root.stored_plan
         numbers = {row["episode_id"]: row["episode"] for row in before.rows}
-        added = [row for row in plan["episodes"] if row["episode_id"] not in numbers]
+        added = [row for row in rows if row["episode_id"] not in numbers]
         numbers |= {row["episode_id"]: len(before.rows) + position for position, row in enumerate(added)}
         streams = () if self._with_tokens else self.plan.streams
         return PlanRecord(
             run=root.identity,
             record=len(before.extents),
             selection=json.loads(canonical_json(self.plan.selection)),
-            suite_parent=plan["suite_parent"],
+            suite_parent=self.plan.suite_parent,
             # A later selection may have shorter instructions only; the arrays of before keep their length.
             tokens={stream.name: max(stream.tokens, before.tokens.get(stream.name, 0)) for stream in streams},
-            episodes=[{**row, "episode": numbers[row["episode_id"]]} for row in added],
-            order=[numbers[row["episode_id"]] for row in plan["episodes"]],
+            episodes=[cast("StoredRow", {**row, "episode": numbers[row["episode_id"]]}) for row in added],
+            order=[numbers[row["episode_id"]] for row in rows],
         )
 
     @contextmanager
@@ -424,7 +304,7 @@ class RunWriter[PlanT: WrittenPlan]:
     def _write_objects(self, episode: EpisodeRecord) -> Commit:
         """Everything of an episode but its commit, which is returned."""
         planned = episode.planned
-        store = RecordingStore(self.location.store(DATA))
+        store = ArrayStore(self.location, DATA, self.root.metadata)
         for kind, by_stream in episode.arrays.items():
             for stream, values in by_stream.items():
                 array = zarr.open_array(store, path=f"{stream}/{kind}", mode="r+", zarr_format=3, config=WRITE_ALL)
@@ -437,7 +317,7 @@ class RunWriter[PlanT: WrittenPlan]:
             write_row(store, f"{INPUTS}/{name}", planned.index, values)
         for key, content in episode.pictures.items():
             self.location.write(key, content)
-        self.location.flush(f"{DATA}/{key}" for key in store.sums)
+        self.location.flush(f"{DATA}/{key}" for key in store.written)
         parts = {
             "run": self.root.identity,
             "episode": planned.index,
@@ -447,7 +327,7 @@ class RunWriter[PlanT: WrittenPlan]:
             "roles": json.loads(json.dumps(episode.roles)),
             "provenance": name_of(self.provenance),
             "control_steps": [int(step) for step in episode.control_steps],
-            "objects": store.sums,
+            "objects": store.written,
             "pictures": {key: Sum.of(content) for key, content in episode.pictures.items()},
         }
         optional = {

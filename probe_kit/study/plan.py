@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from probe_kit._system.counting import counted
 from probe_kit.errors import ProbeKitError, RunIncompleteError, RunNotFoundError, UsageError
-from probe_kit.extract.plan import planned_sizes, space_of
+from probe_kit.extract.sizes import planned_sizes, space_of
 from probe_kit.hooks.registry import family_names
 from probe_kit.runs import verify_run
 from probe_kit.runs.layout import RUN_FILE, StoredStream

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 from probe_kit._system.imports import lazy_names
 
 if TYPE_CHECKING:
+    from probe_kit.runs.array_run import ArrayRun
     from probe_kit.runs.reader import RunReader
     from probe_kit.statistics.folds import FOLD_UNITS, FoldUnit
-    from probe_kit.train.array_probe import ArrayProbes, ArrayRun, probe
+    from probe_kit.train.array_probe import ArrayProbes, probe
     from probe_kit.train.choices import CONTROLS, INCOMPLETE, SIDES, Control, Incomplete, Side
     from probe_kit.train.probe_sweep import Progress, train_probes
     from probe_kit.train.results.control_scores import ControlComparison, Controls, ControlScore, UntrainedScore

@@ -1,22 +1,19 @@
-"""`probe`: probes of plain arrays, without a run, a model or a folder; `ArrayRun`: a run made of arrays."""
+"""`probe`: probes of plain arrays, without a run, a model or a folder."""
 
 import tempfile
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
-from hashlib import sha256
 from pathlib import Path
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from probe_kit.errors import UnknownSiteError, UsageError
-from probe_kit.hashing import derive_seed, sha256_json
-from probe_kit.hooks.contract.sites import Site, Stream
-from probe_kit.runs.reader import Origin, RunSource
-from probe_kit.runs.store import Location, locate
+from probe_kit.errors import UsageError
+from probe_kit.hashing import derive_seed
+from probe_kit.hooks.contract.sites import Site
+from probe_kit.runs.array_run import ArrayRun
 from probe_kit.train.choices import EVERYWHERE, Task
 from probe_kit.train.probe_sweep import train_probes
 from probe_kit.train.results.probe_curve import ProbeCurve
@@ -25,169 +22,6 @@ from probe_kit.train.target import Target
 
 if TYPE_CHECKING:
     import pandas as pd
-
-    from probe_kit.runs.arrays import StoredInputs, TokenBlock
-
-
-# -- a run made of arrays ------------------------------------------------------------------------------------
-
-
-class NotPlayed:
-    """The parts of a `RunReader` that arrays in memory do not have; a class of your own may have some."""
-
-    recorded: bool = False
-    in_own_environment: bool = False
-    inputs: "StoredInputs | None" = None
-    captured_calls: int = 1
-    has_trajectories: bool = False
-    lens_margins: NDArray[np.float64] | None = None
-    settings: Mapping[str, Any] = MappingProxyType({})
-    certificate: Mapping[str, Any] = MappingProxyType({})
-    mixed: Sequence[str] = ()
-    origins: Sequence[Origin] = ()
-    stamp: str = ""
-    suite_parent: str | None = None
-    items: "pd.DataFrame | None" = None
-    planned_ids: Collection[str] = ()
-    failed: Mapping[str, str] = MappingProxyType({})
-    wording: str | None = None
-    wordings: Sequence[str] = ()
-    rule: str = "disc"  # the rule by which outcomes are stored; its module needs a scene
-    score: str = "text"
-
-
-@dataclass(frozen=True)
-class ArrayRun(NotPlayed):
-    """A `RunReader` over features in memory, for activations that were not recorded by probe_kit.
-
-    path: folder for the probe results. episodes: the table described in `RunReader.episodes`.
-    features: (E, D) per site and view, rows in the order of `episodes`. token_features: per site and role (None
-    for all tokens), (E, T, D) values and (E, T) mask. A site needs a pooled view too. control_features: (E, D) by
-    name, of controls of a label that never saw the model.
-    Raises UsageError if an array has another number of rows or dimensions.
-    """
-
-    path: Path
-    model: str
-    suite: str
-    episodes: "pd.DataFrame"
-    features: Mapping[tuple[Site, str], NDArray[np.floating]]
-    random_weights: bool = False
-    weights_sha256: str | None = None
-    token_features: Mapping[tuple[Site, str | None], tuple[NDArray[np.floating], NDArray[np.bool_]]] = field(
-        default_factory=dict
-    )
-    control_features: Mapping[str, NDArray[np.floating]] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        arrays = {f"features of {site}, view {view!r},": array for (site, view), array in self.features.items()}
-        arrays |= {f"features of the control {name!r}": array for name, array in self.control_features.items()}
-        for what, array in arrays.items():
-            if array.ndim != 2 or len(array) != len(self.episodes):
-                raise UsageError(
-                    f"{what} have shape {array.shape}; expected ({len(self.episodes)}, D), one row per episode"
-                )
-
-    @property
-    def label(self) -> str:
-        """The model's name."""
-        return self.model
-
-    @property
-    def location(self) -> Location:
-        """The folder `path`."""
-        return locate(self.path)
-
-    @property
-    def source(self) -> RunSource:
-        """The suite that it names."""
-        return RunSource("arrays", self.suite, f"it is made of arrays on {self.suite}")
-
-    @property
-    def seed_text(self) -> str:
-        """The suite, which sets its draws apart."""
-        return self.suite
-
-    @property
-    def all_wordings(self) -> Self:
-        """The run itself: it has no wordings."""
-        return self
-
-    @property
-    def planned(self) -> int:
-        """The number of its episodes."""
-        return len(self.episodes)
-
-    @property
-    def planned_items(self) -> Mapping[str, str]:
-        """The items of its episodes."""
-        return dict(zip(self.episodes["item_id"], self.episodes["category"], strict=True))
-
-    @property
-    def control_steps(self) -> NDArray[np.int64]:
-        """(E, 0): inferences in memory have no steps."""
-        return np.zeros((len(self.episodes), 0), np.int64)
-
-    @cached_property
-    def settings_sha256(self) -> str:
-        """Hash of all features: other arrays are another run."""
-        pooled = [[str(site), view, _sha256(array)] for (site, view), array in self.features.items()]
-        tokens = [
-            [str(site), f"tokens:{role}", _sha256(values), _sha256(mask)]
-            for (site, role), (values, mask) in self.token_features.items()
-        ]
-        controls = [[name, "control", _sha256(array)] for name, array in self.control_features.items()]
-        return sha256_json(sorted(pooled) + sorted(tokens) + sorted(controls))
-
-    @property
-    def streams(self) -> Mapping[str, Stream]:
-        """Streams by name, as far as their sites are there."""
-        return {name: self._stream(name) for name in dict.fromkeys(site.stream for site, _ in self.features)}
-
-    def views(self, stream: str) -> Sequence[str]:
-        """Views of a stream."""
-        return list(dict.fromkeys(view for site, view in self.features if site.stream == stream))
-
-    def sites(self, stream: str) -> Sequence[Site]:
-        """Sites of a stream, in the order of `features`."""
-        return list(dict.fromkeys(site for site, _ in self.features if site.stream == stream))
-
-    def column(self, site: Site, view: str) -> NDArray[np.float32]:
-        """(E, D) features of one site. Raises UnknownSiteError."""
-        if (site, view) not in self.features:
-            raise UnknownSiteError(f"there are no features of {site}, view {view!r}")
-        return self.features[site, view].astype(np.float32)
-
-    def tokens(self, site: Site, role: str | None = None) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """(E, T, D) values and (E, T) mask of one site. Raises UnknownSiteError."""
-        if (site, role) not in self.token_features:
-            raise UnknownSiteError(f"there are no tokens of {site}, role {role!r}")
-        values, mask = self.token_features[site, role]
-        return values.astype(np.float32), mask
-
-    def token_mask(self, site: Site, role: str | None = None) -> NDArray[np.bool_]:
-        """(E, T) mask of one site. Raises UnknownSiteError."""
-        return self.tokens(site, role)[1]
-
-    def iter_token_blocks(self, site: Site, role: str | None = None) -> Iterator["TokenBlock"]:
-        """All tokens of one site, as one block: they are in memory. Raises UnknownSiteError."""
-        from probe_kit.runs.arrays import TokenBlock
-
-        yield TokenBlock(0, *self.tokens(site, role))
-
-    def _stream(self, name: str) -> Stream:
-        sites = [(site, array) for (site, _), array in self.features.items() if site.stream == name]
-        steps = {site.iteration for site, _ in sites} - {None}
-        return Stream(
-            name,
-            layers=1 + max(site.layer for site, _ in sites),
-            width=sites[0][1].shape[1],
-            iterations=len(steps) or None,
-        )
-
-
-def _sha256(array: NDArray[np.generic]) -> str:
-    return sha256(np.ascontiguousarray(array).tobytes()).hexdigest()
 
 
 # -- probes of arrays ----------------------------------------------------------------------------------------

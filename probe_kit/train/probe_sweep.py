@@ -169,8 +169,9 @@ def train_probes(
         "incomplete": incomplete, "seed": seed, "call": call, "window": window, "align_to": align_to,
     }  # fmt: skip
     crew: dict[str, Any] = {"jobs": jobs, "device": device, "ray": ray, "progress": progress}
-    for reader in filter(None, (run, untrained)):
-        check_run(reader, categories)
+    check_run(run, categories)
+    if untrained is not None:
+        check_run(untrained, categories)
     sweep = Sweep.of(run, target, categories, **options)
     if device is not None and sweep.target.task != "binary":
         raise UsageError(

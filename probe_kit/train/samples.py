@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from probe_kit.errors import NonFiniteActivationError, UnknownSiteError
 from probe_kit.hooks.contract.sites import Site, resolve_view
 from probe_kit.runs.arrays import TokenBlock
-from probe_kit.runs.reader import RunReader, Tokens
+from probe_kit.runs.reader import RunReader
 from probe_kit.train.solver.arrays import Array, Features, RowSubset, to_device, to_numpy
 
 TOKENS = "tokens"
@@ -36,7 +36,7 @@ class Samples:
         return cls(column, np.ones(len(column), np.intp), column)
 
     @classmethod
-    def tokens(cls, blocks: Iterable[Tokens], mask: NDArray[np.bool_]) -> "Samples":
+    def tokens(cls, blocks: Iterable[TokenBlock], mask: NDArray[np.bool_]) -> "Samples":
         """One sample per token of `mask` (E, T), from blocks of positions; every episode has a token.
 
         Holds one block and the tokens themselves, no padding.

@@ -21,7 +21,6 @@ from probe_kit.errors import (
 )
 from probe_kit.extract import ExtractSettings, extract_run, prepare
 from probe_kit.extract.rollout.capturing import EpisodeBuffers
-from probe_kit.extract.rollout.worker import Rollout
 from probe_kit.hooks import Site
 from probe_kit.retention import retention_table
 from probe_kit.retention.displays import collect_figures
@@ -71,7 +70,7 @@ def write_run(where: Path, suite: Suite, later_views: LaterViews = "all") -> Run
                 buffers.tokens["backbone"][call] = 0x3F80 + call
         outcome = {"outcome": "oob", "side_placed": "none", "cube_x": 0.0, "cube_y": 0.0}
         steps = range(len(buffers.roles))
-        writer.write(Rollout(planned, outcome, buffers, [], control_steps=steps).record)
+        writer.write(buffers.record(planned, outcome, control_steps=steps))
     return open_run(writer.location)
 
 
@@ -293,7 +292,7 @@ def early(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Run:
             buffers.roles.append({"backbone": [("language", 0, 4), ("padding", 4, 6)]})
         outcome = {"outcome": "oob", "side_placed": "none", "cube_x": 0.0, "cube_y": 0.0}
         steps = range(len(buffers.roles))
-        writer.write(Rollout(planned, outcome, buffers, [], control_steps=steps).record)
+        writer.write(buffers.record(planned, outcome, control_steps=steps))
     seal(writer.location)
     return open_run(writer.location)
 

@@ -13,10 +13,11 @@ from torch import nn
 from probe_kit.errors import CheckpointError, InstructionError, UsageError
 from probe_kit.extract import AskSettings, ExtractSettings, prepare
 from probe_kit.extract.extraction import prepare_asks
-from probe_kit.extract.plan import Plan, weights_needed
+from probe_kit.extract.sizes import weights_needed
 from probe_kit.hooks import load_model
 from probe_kit.hooks.contract.sites import PADDING
 from probe_kit.hooks.registry import own_families
+from probe_kit.runs.plan import Plan
 from probe_kit.runs.run_folders import in_units
 from probe_kit.suite import Suite, build_suite, default_suite, load_suite
 from probe_kit.suite.sufficiency import sufficiencies

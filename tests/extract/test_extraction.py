@@ -306,7 +306,7 @@ def test_a_plan_names_the_content_of_every_item_and_the_suite_it_was_selected_fr
 def test_a_whole_suite_has_no_parent(small_suite: Suite, tmp_path: Path) -> None:
     settings = ExtractSettings("idle", suite=small_suite.folder, scene=SceneSpec(max_steps=1), env_workers=0)
     plan = make_plan(load_suite(small_suite.folder), [], 0, 1, False)
-    assert plan.to_json()["suite_parent"] is None
+    assert plan.suite_parent is None
     with pytest.raises(RuntimeError, match="enough"):
         extract_run(settings, tmp_path / "run", _stop)
     assert open_run(tmp_path / "run", allow_partial=True).suite_parent is None
@@ -329,7 +329,7 @@ def test_an_item_that_asks_or_shows_something_else_has_another_content(small_sui
 def test_an_item_has_one_content_in_all_of_its_wordings(small_suite: Suite) -> None:
     suite = small_suite.select(["color"], 2)
     plan = make_plan(suite, [], 0, 1, False, ("knowledge", "side"))
-    rows = plan.to_json()["episodes"]
+    rows = plan.columns
     assert {row["wording"] for row in rows} == {"knowledge", "side"}
     own = {item.item_id: item.content_sha256 for item in suite.items}
     assert all(row["item_content_sha256"] == own[row["item_id"]] for row in rows)

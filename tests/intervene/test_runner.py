@@ -22,6 +22,7 @@ from probe_kit.errors import (
     UsageError,
 )
 from probe_kit.extract import ExtractSettings
+from probe_kit.extract.config_files import origin_of_process
 from probe_kit.extract.sources.scene_source import ScenePlayer
 from probe_kit.intervene import (
     ImageSwap,
@@ -36,7 +37,6 @@ from probe_kit.intervene.runner import too_few_groups
 from probe_kit.intervene.sessions import ReplaySession, load_policy_of, open_session
 from probe_kit.retention import retention_table
 from probe_kit.runs import Run, open_run, verify_run
-from probe_kit.runs.reader import Origin
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
@@ -82,10 +82,10 @@ def test_the_other_layout_is_the_same_scene_with_its_pictures_exchanged(copy: Ru
     row, seed = session.planned(swapped), session.planned(original).columns["scene_seed"]
     planned = replace(row, columns={**row.columns, "scene_seed": seed})
     alone = ScenePlayer(session.scene)
-    looked = alone.look(planned)
+    looked, facts = alone.look(planned)
     alone.close()
-    np.testing.assert_array_equal(original.source.image, looked.observation.image)
-    assert looked.facts["first_frame_sha256"] == copy.episodes["first_frame_sha256"][swapped.row]
+    np.testing.assert_array_equal(original.source.image, looked.image)
+    assert facts["first_frame_sha256"] == copy.episodes["first_frame_sha256"][swapped.row]
     np.testing.assert_array_equal(original.source.image, swapped.clean.image)
     np.testing.assert_array_equal(swapped.source.image, original.clean.image)
     assert (original.clean.image != original.source.image).any()
@@ -275,7 +275,7 @@ def test_files_of_the_scene_are_those_of_the_run_as_long_as_they_are_there(
     run = open_run(copy.path)
     run.settings = {**run.settings, "scene": scene.to_json()}
     settings = ExtractSettings("pi0-tiny", scene=scene)
-    run.__dict__["origins"] = (Origin.of(settings.model, settings.source.files(), ""),)
+    run.__dict__["origins"] = (origin_of_process(settings, {}),)
     with open_session(run, ReplaySource(), lambda *_: twin) as session:
         assert session.scene.background == photo
     photo.unlink()

@@ -13,14 +13,13 @@ from pathlib import Path
 
 import numpy as np
 from zarr.core.buffer import Buffer
-from zarr.storage import LocalStore
 
-from probe_kit.extract.plan import Plan
 from probe_kit.extract.rollout.capturing import EpisodeBuffers
-from probe_kit.extract.rollout.worker import Rollout
 from probe_kit.runs import verify, writer
+from probe_kit.runs.array_store import ArrayStore
 from probe_kit.runs.commits import Commit
 from probe_kit.runs.layout import StoredStream
+from probe_kit.runs.plan import Plan
 from probe_kit.runs.store import Location, locate
 from probe_kit.suite import load_suite
 from tests.support.plans import make_plan
@@ -36,7 +35,7 @@ def plan_for(suite: Path) -> Plan:
     return make_plan(load_suite(suite), STREAMS, 0, 1, True)
 
 
-def rollout(plan: Plan, number: int) -> Rollout:
+def rollout(plan: Plan, number: int) -> writer.EpisodeRecord:
     """The same numbers for the same episode, always."""
     draw = np.random.default_rng(number)
     buffers = EpisodeBuffers(STREAMS, 1, True, pinned=False)
@@ -44,7 +43,7 @@ def rollout(plan: Plan, number: int) -> Rollout:
         buffers.pooled[stream.name][:] = draw.normal(size=buffers.pooled[stream.name].shape)
         buffers.tokens[stream.name][:] = draw.integers(0, 1 << 16, buffers.tokens[stream.name].shape)
     buffers.roles.append({stream.name: [("language", 0, stream.tokens)] for stream in STREAMS})
-    return Rollout(plan.episodes[number], {"outcome": "oob"}, buffers, [], control_steps=range(len(buffers.roles)))
+    return buffers.record(plan.episodes[number], {"outcome": "oob"}, control_steps=range(len(buffers.roles)))
 
 
 def extract(run: str, plan: Plan) -> None:
@@ -52,21 +51,21 @@ def extract(run: str, plan: Plan) -> None:
     writing = writer.RunWriter(locate(run), plan, SETTINGS)
     with writing.owned(), writing.location.explained_errors():
         for number in writing.remaining():
-            writing.write(rollout(plan, number).record)
+            writing.write(rollout(plan, number))
         verify.seal(run)
 
 
 def die_at(point: str) -> None:
     """Arrange for a SIGKILL before or after an object or a commit of the third episode is written."""
     when, what = point.split("-")
-    put, commit = LocalStore.set, writer.write_commit
+    put, commit = ArrayStore.set, writer.write_commit
     calls = {"put": 0, "commit": 0}
 
     def reached(here: str, thing: str) -> None:
         if (here, thing, calls[thing]) == (when, what, FATAL[thing]):
             os.kill(os.getpid(), signal.SIGKILL)
 
-    async def deadly_put(store: LocalStore, key: str, value: Buffer) -> None:
+    async def deadly_put(store: ArrayStore, key: str, value: Buffer) -> None:
         calls["put"] += "/c/" in key
         reached("before", "put")
         await put(store, key, value)
@@ -79,7 +78,7 @@ def die_at(point: str) -> None:
         reached("after", "commit")
         return written
 
-    LocalStore.set = deadly_put
+    ArrayStore.set = deadly_put
     writer.write_commit = deadly_commit
 
 

@@ -15,14 +15,13 @@ import zarr
 
 from probe_kit.errors import NoProbesError, RunDamagedError, RunIncompleteError, SettingsMismatchError
 from probe_kit.extract import Extraction, ExtractSettings
-from probe_kit.extract.plan import Plan
 from probe_kit.extract.prompts import QUERIES, phrases
 from probe_kit.runs import Run, open_run, seal, verify_run
 from probe_kit.runs.folder import Folder
-from probe_kit.runs.root import plan_key
+from probe_kit.runs.plan import Plan, plan_key
 from probe_kit.runs.store import locate
 from probe_kit.runs.thumbnails import as_thumbnail, thumbnail_key
-from probe_kit.runs.writer import RunWriter, growth_at
+from probe_kit.runs.writer import RunWriter, growth_words
 from probe_kit.suite import Suite
 from probe_kit.suite.items import Wording
 from probe_kit.train import load_results, train_probes
@@ -148,7 +147,7 @@ def test_the_plan_of_more_items_holds_the_plan_of_fewer(query: Any, small_suite:
         for items in (2, 4, 12):
             suite = small_suite.select([category], items)
             own = phrases(suite, query)
-            rows = make_plan(suite, [], 3, 1, False, ("knowledge", "side")).to_json()["episodes"]
+            rows = make_plan(suite, [], 3, 1, False, ("knowledge", "side")).columns
             plans.append({row["episode_id"]: {**row, "episode": None} for row in rows})
             named.append({item: phrase.text for item, phrase in own.items()})
         for fewer, more in ((0, 1), (1, 2)):
@@ -176,10 +175,8 @@ def test_fewer_items_play_nothing_and_the_run_stays_as_it_is(small_suite: Suite,
     run = extracted(tmp_path / "run", small_suite, COLOR[2:])
     before = files_of(run.path)
     fewer = plan_of(small_suite, COLOR[0])
-    growth = growth_at(run.location, fewer.to_json()["episodes"])
-    assert growth is not None
-    assert (growth.stored, growth.requested, growth.added) == (12, 4, 0)
-    assert "never shrinks" in growth.words
+    words = growth_words(run.location, fewer)
+    assert words == "no: the run has 12 episodes, these 4 among them, and never shrinks"
     assert writer_of(run.path, fewer).remaining() == []
     assert files_of(run.path) == before
 
@@ -271,8 +268,12 @@ def test_a_kill_while_a_run_grows_loses_nothing(
 def test_a_run_that_was_killed_before_its_first_plan_says_so_and_begins(
     small_suite: Suite, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def killed(*_: object) -> bool:
-        raise KilledError
+    create = Folder.create
+
+    def killed(location: Folder, key: str, content: bytes) -> bool:
+        if key == plan_key(0):
+            raise KilledError
+        return create(location, key, content)
 
     with monkeypatch.context() as patched, suppress(KilledError):
         patched.setattr(Folder, "create", killed)
@@ -328,11 +329,8 @@ def test_former_probes_and_seals_are_named_and_not_read(small_suite: Suite, tmp_
     run = extracted(tmp_path / "run", small_suite, [(["color"], 10, None)])
     key = train_probes(run, permutations=1).key
     plan = plan_of(small_suite, (["color"], 12, None))
-    growth = growth_at(run.location, plan.to_json()["episodes"])
-    assert growth is not None
-    assert growth.results == (f"probes {key}",)
     assert (
-        growth.words
+        growth_words(run.location, plan)
         == f"from 20 to 24 episodes; stored ones stay as they are; of the former episodes only: probes {key}"
     )
     play(writer_of(run.path, plan), plan)

@@ -35,11 +35,11 @@ from probe_kit.extract import ExtractSettings, extract_run
 from probe_kit.hooks import Site
 from probe_kit.runs import Run, open_run, seal, verify_run
 from probe_kit.runs import store as buckets
-from probe_kit.runs.checking import BlankStore
+from probe_kit.runs.array_store import ArrayStore
 from probe_kit.runs.folder import Folder
 from probe_kit.runs.layout import COLUMNS
 from probe_kit.runs.run import NotSealedWarning
-from probe_kit.runs.store import Location, check_exclusive, locate
+from probe_kit.runs.store import Location, begin, check_exclusive, locate
 from probe_kit.suite import Suite, build_suite
 from probe_kit.train import load_results, train_probes
 from tests.runs.contents import objects
@@ -57,7 +57,7 @@ class LocationContract:
         raise AssertionError("a subclass gives the location")
 
     def test_the_first_object_of_a_key_stays(self, location: Location) -> None:
-        location.begin(BEGINNING, "run.json")
+        begin(location, BEGINNING, "run.json")
         assert location.create("commits/1.json", b"first")
         assert not location.create("commits/1.json", b"second")
         assert location.read("commits/1.json") == b"first"
@@ -105,32 +105,36 @@ class LocationContract:
         assert location.exists("failed-not/1.json")
 
     def test_a_run_begins_with_all_its_objects_once(self, location: Location) -> None:
-        location.begin(BEGINNING, "run.json")
-        location.begin({**BEGINNING, "run.json": b"of another process, which was second"}, "run.json")
+        begin(location, BEGINNING, "run.json")
+        begin(location, {**BEGINNING, "run.json": b"of another process, which was second"}, "run.json")
         assert {key: location.read(key) for key in location.keys("")} == BEGINNING
 
     def test_a_location_that_holds_something_else_is_left_alone(self, location: Location) -> None:
         location.write("thesis.txt", b"do not touch")
         with pytest.raises(SettingsMismatchError, match="choose another --out"):
-            location.begin(BEGINNING, "run.json")
+            begin(location, BEGINNING, "run.json")
         assert location.keys("") == ["thesis.txt"]
 
     def test_a_group_is_built_as_if_nothing_of_a_killed_process_lay_there(self, location: Location) -> None:
-        location.begin(BEGINNING, "run.json")
+        begin(location, BEGINNING, "run.json")
         for stamp in ("a", "b"):
-            store = BlankStore(location.store("columns.zarr/x"))
+            store = ArrayStore(location, "columns.zarr/x", {})
             group = zarr.open_group(store, mode="w", zarr_format=3, attributes={"stamp": stamp})
             group.create_array("y", shape=(2,), dtype="f4")[:] = ord(stamp)
             assert {key for key in store.sums if "y" in key} == {"y/zarr.json", "y/c/0"}
-        group = zarr.open_group(location.store("columns.zarr/x", read_only=True), mode="r")
+        group = zarr.open_group(ArrayStore(location, "columns.zarr/x", store.sums, read_only=True), mode="r")
         assert (group.attrs["stamp"], group["y"][1]) == ("b", ord("b"))
         assert set(location.keys("columns.zarr")) == {f"columns.zarr/x/{key}" for key in store.sums}
 
     def test_arrays_are_stored_and_a_missing_chunk_is_an_error(self, location: Location) -> None:
-        array = zarr.create_array(location.store("data.zarr"), name="x", shape=(4, 3), chunks=(1, 3), dtype="f4")
+        store = ArrayStore(location, "data.zarr", {})
+        array = zarr.create_array(store, name="x", shape=(4, 3), chunks=(1, 3), dtype="f4")
         array[:2] = np.ones((2, 3))
         reading = zarr.open_array(
-            location.store("data.zarr", read_only=True), path="x", mode="r", config={"read_missing_chunks": False}
+            ArrayStore(location, "data.zarr", store.written, read_only=True),
+            path="x",
+            mode="r",
+            config={"read_missing_chunks": False},
         )
         np.testing.assert_array_equal(reading[1], 1)
         with pytest.raises(zarr.errors.ChunkNotFoundError):
@@ -165,7 +169,7 @@ class TestBucket(LocationContract):
     def test_the_beginning_of_another_run_is_refused(self, location: Location) -> None:
         location.write("plan.json", b"another plan")
         with pytest.raises(SettingsMismatchError, match=r"another plan\.json"):
-            location.begin(BEGINNING, "run.json")
+            begin(location, BEGINNING, "run.json")
         assert not location.exists("run.json")
 
     def test_a_bucket_that_does_not_exist_is_named_in_words(self, location: Location) -> None:  # noqa: ARG002

@@ -14,14 +14,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule, run_state_machine_as_test
 
-from probe_kit.extract.plan import Plan
 from probe_kit.extract.rollout.capturing import EpisodeBuffers
-from probe_kit.extract.rollout.worker import Rollout
 from probe_kit.runs import Run, open_run, seal, verify_run
 from probe_kit.runs.layout import StoredStream
+from probe_kit.runs.plan import Plan
 from probe_kit.runs.run import NotSealedWarning
 from probe_kit.runs.store import locate
-from probe_kit.runs.writer import RunWriter
+from probe_kit.runs.writer import EpisodeRecord, RunWriter
 from probe_kit.suite import Suite
 from tests.support.plans import make_plan
 
@@ -45,7 +44,7 @@ def choices(calls: int, tokens: str, codec: str) -> dict[str, Any]:
     return {"captured_calls": calls, "tokens": tokens, "codec": codec, "model": "synthetic"}
 
 
-def rollout(plan: Plan, number: int, calls: int) -> Rollout:
+def rollout(plan: Plan, number: int, calls: int) -> EpisodeRecord:
     """The same numbers for the same episode, always; odd ones end after their first inference."""
     draw, (stream,) = np.random.default_rng(number), plan.streams
     buffers = EpisodeBuffers([stream], calls, True, pinned=False)
@@ -56,19 +55,19 @@ def rollout(plan: Plan, number: int, calls: int) -> Rollout:
             0, 0x7F00, (*shape, stream.tokens, stream.width)
         )
         buffers.roles.append({"backbone": [("language", 0, stream.tokens)]})
-    return Rollout(plan.episodes[number], {"outcome": "oob"}, buffers, [], control_steps=range(len(buffers.roles)))
+    return buffers.record(plan.episodes[number], {"outcome": "oob"}, control_steps=range(len(buffers.roles)))
 
 
 def assert_reads_as_written(run: Run, plan: Plan, written: list[int], calls: int) -> None:
     """Every view of every site, by columns and by rows, and every token."""
     (stream,) = plan.streams
-    stored = [rollout(plan, number, calls).buffers for number in written]
+    stored = [rollout(plan, number, calls).arrays for number in written]
     for site in run.sites("backbone"):
         for call in range(calls):
             for position, view in enumerate(stream.views):
-                expected = [one.pooled["backbone"][(call, *stream.at(site), position)] for one in stored]
+                expected = [one["pooled"]["backbone"][(call, *stream.at(site), position)] for one in stored]
                 np.testing.assert_array_equal(run.column(site, view, call), np.stack(expected))
-            bits = np.stack([one.tokens["backbone"][(call, *stream.at(site))] for one in stored])
+            bits = np.stack([one["tokens"]["backbone"][(call, *stream.at(site))] for one in stored])
             values, _ = run.tokens(site, None, call)
             np.testing.assert_array_equal(values, (bits.astype(np.uint32) << 16).view(np.float32))
 
@@ -88,7 +87,7 @@ def test_columns_equal_rows_equal_what_was_written(
     with tempfile.TemporaryDirectory() as folder:
         writer = RunWriter(locate(Path(folder) / "run"), plan, choices(calls, "all", codec))
         for number in episodes:
-            writer.write(rollout(plan, number, calls).record)
+            writer.write(rollout(plan, number, calls))
         run = open_run(writer.location, allow_partial=True)
         assert not run.sealed
         assert_reads_as_written(run, plan, sorted(episodes), calls)
@@ -127,7 +126,7 @@ class Extraction(RuleBasedStateMachine):
     @rule(number=st.integers(0, 4))
     def write(self, number: int) -> None:
         """Also a second time, which changes nothing."""
-        self.writer.write(rollout(self.plan, number, self.calls).record)
+        self.writer.write(rollout(self.plan, number, self.calls))
         self.committed.add(number)
 
     @rule(number=st.integers(0, 4), commits=st.booleans())
@@ -143,7 +142,7 @@ class Extraction(RuleBasedStateMachine):
         where = "write_commit" if commits else "zarr.open_array"
         dies = nullcontext() if number in self.committed else pytest.raises(KilledError)
         with patch(f"probe_kit.runs.writer.{where}", die), dies:
-            self.writer.write(rollout(self.plan, number, self.calls).record)
+            self.writer.write(rollout(self.plan, number, self.calls))
         (self.folder / "run" / "commits").mkdir(exist_ok=True)
         (self.folder / "run" / "commits" / f"left{number}.tmp").write_text("half a commit", encoding="utf-8")
         self.resume()

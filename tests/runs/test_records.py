@@ -1,6 +1,5 @@
 """Records and bundles carry their hashes, reading checks them, and columns count by their seal."""
 
-import asyncio
 import errno
 import json
 import os
@@ -18,15 +17,11 @@ import zarr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
-from zarr.abc.store import ByteRequest
-from zarr.core.buffer import Buffer, BufferPrototype, default_buffer_prototype
-from zarr.storage import MemoryStore, WrapperStore
 
 from probe_kit.cli import app
 from probe_kit.errors import DiskSpaceError, RunDamagedError
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.runs import Run, open_run, root, seal
-from probe_kit.runs.checking import CheckedStore
 from probe_kit.runs.layout import INTERVENTIONS
 from probe_kit.runs.records import HASH, Record, Sum, Sums, as_record, read_record
 from probe_kit.runs.results import PARTIAL, bundle_keys, read_bundles, write_bundle
@@ -196,39 +191,6 @@ def test_a_complete_result_counts_beside_what_a_killed_process_left_of_it(tmp_pa
     location.write(f"{INTERVENTIONS}/{unfinished}/effects.json", b"{}")
     assert bundle_keys(location, INTERVENTIONS) == [KEY]
     assert read_bundles(location, INTERVENTIONS)[KEY].read("effects.json") == b"{}"
-
-
-KEYS = ("a", "b", "c", "d")
-
-
-class Staggered(WrapperStore[MemoryStore]):
-    """The objects come in another order than they were asked for."""
-
-    def __init__(self, store: MemoryStore, late: tuple[str, ...]) -> None:
-        super().__init__(store)
-        self._late = late
-
-    async def get(
-        self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None
-    ) -> Buffer | None:
-        for _ in range(20 * self._late.index(key)):
-            await asyncio.sleep(0)
-        return await super().get(key, prototype, byte_range)
-
-
-@pytest.mark.parametrize("order", [KEYS, KEYS[::-1], ("c", "a", "d", "b")])
-def test_of_several_wrong_objects_the_first_that_was_asked_for_is_named(order: tuple[str, ...]) -> None:
-    prototype = default_buffer_prototype()
-    objects = {key: prototype.buffer.from_bytes(blake2b(key.encode()).digest()) for key in KEYS}
-    sums = {key: Sum.of(value.to_bytes()) for key, value in objects.items()}
-    objects["b"], objects["d"] = objects["d"], objects["b"]
-    checked = CheckedStore(Staggered(MemoryStore(objects), order), sums, str, lambda _key: "Restore it")
-
-    async def read() -> None:
-        await asyncio.gather(*(checked.get(key, prototype) for key in KEYS))
-
-    with pytest.raises(RunDamagedError, match=r"^b has other bytes"):
-        asyncio.run(read())
 
 
 SITES = (Site("backbone", 2), Site("expert", 3, iteration=7))

@@ -22,14 +22,13 @@ from typer.testing import CliRunner
 from probe_kit._system.drafts import full_disk_in_words
 from probe_kit.cli import app
 from probe_kit.errors import DiskSpaceError
-from probe_kit.extract.plan import Plan
 from probe_kit.extract.rollout.capturing import EpisodeBuffers
-from probe_kit.extract.rollout.worker import Rollout
 from probe_kit.hooks.contract.sites import Site, Stream
 from probe_kit.runs import open_run, seal, verify_run
 from probe_kit.runs import writer as writers
 from probe_kit.runs.commits import commit_key
 from probe_kit.runs.layout import StoredStream
+from probe_kit.runs.plan import Plan
 from probe_kit.runs.results import Pieces
 from probe_kit.runs.store import locate
 from probe_kit.runs.writer import EpisodeRecord, RunWriter
@@ -54,16 +53,15 @@ def writer(small_suite: Suite, tmp_path: Path) -> RunWriter:
     return RunWriter(locate(tmp_path / "run"), make_plan(small_suite, [STREAM], 0, 1, True), SETTINGS)
 
 
-def rollout(writer: RunWriter, number: int, language: int) -> Rollout:
+def rollout(writer: RunWriter, number: int, language: int) -> EpisodeRecord:
     """Ones on the first `language` tokens, padding after them."""
     buffers = EpisodeBuffers([STREAM], 1, True, pinned=False)
     buffers.pooled["backbone"][:] = 1
     buffers.tokens["backbone"][..., :language, :] = 0x3F80
     spans = [("language", 0, language), ("padding", language, 300)]
     buffers.roles.append({"backbone": spans if language else spans[1:]})
-    return Rollout(
-        writer.plan.episodes[number], {"outcome": "oob"}, buffers, [], control_steps=range(len(buffers.roles))
-    )
+    steps = range(len(buffers.roles))
+    return buffers.record(writer.plan.episodes[number], {"outcome": "oob"}, control_steps=steps)
 
 
 def test_a_stored_stream_gives_back_all_that_the_model_declared() -> None:
@@ -74,11 +72,10 @@ def test_a_stored_stream_gives_back_all_that_the_model_declared() -> None:
 
 @pytest.mark.slow
 def test_a_block_of_padding_and_an_empty_row_are_stored_and_not_merely_missing(writer: RunWriter) -> None:
-    full, empty = rollout(writer, 0, 20), rollout(writer, 1, 20)
-    empty.buffers.clear()
-    empty.buffers.roles.append(full.buffers.roles[0])
-    writer.write(full.record)
-    writer.write(empty.record)
+    full, buffers = rollout(writer, 0, 20), EpisodeBuffers([STREAM], 1, True, pinned=False)
+    buffers.roles += full.roles
+    writer.write(full)
+    writer.write(buffers.record(writer.plan.episodes[1], {"outcome": "oob"}, control_steps=[0]))
     seal(writer.location)
     run = open_run(writer.location, allow_partial=True)
     column = run.column(Site("backbone", 1))
@@ -90,7 +87,7 @@ def test_a_block_of_padding_and_an_empty_row_are_stored_and_not_merely_missing(w
 
 def test_only_blocks_of_a_role_are_read(writer: RunWriter) -> None:
     for number, language in enumerate((20, 140)):
-        writer.write(rollout(writer, number, language).record)
+        writer.write(rollout(writer, number, language))
     run = open_run(writer.location, allow_partial=True)
     blocks = list(run.iter_token_blocks(Site("backbone", 0), "language"))
     assert [block.start for block in blocks] == [0, 128]
@@ -101,9 +98,9 @@ def test_only_blocks_of_a_role_are_read(writer: RunWriter) -> None:
 
 
 def test_a_second_commit_of_the_same_episode_changes_nothing(writer: RunWriter) -> None:
-    writer.write(rollout(writer, 0, 20).record)
+    writer.write(rollout(writer, 0, 20))
     commit = writer.location.read("commits/00000000.json")
-    writer.write(rollout(writer, 0, 20).record)
+    writer.write(rollout(writer, 0, 20))
     assert writer.location.read("commits/00000000.json") == commit
     assert verify_run(writer.location, deep=True).ok
 
@@ -254,7 +251,7 @@ def test_leftovers_of_a_killed_process_are_cleared_by_the_next_owner(
 ) -> None:
     run = Path(shutil.copytree(whole, tmp_path / "run"))
     aside = ("commits", "times", "failed", "certificates", "provenance", "sealed", "frames", "videos")
-    data = ("data.zarr/backbone/pooled/c/0/x.partial", "columns.zarr/x/zarr.json")
+    data = ("data.zarr/backbone/pooled/c/0/x.tmp", "columns.zarr/x/zarr.json")
     for orphan in (*(f"{folder}/abc.tmp" for folder in aside), *data):
         (run / orphan).parent.mkdir(parents=True, exist_ok=True)
         (run / orphan).write_text("torn", encoding="utf-8")

@@ -13,7 +13,7 @@ import pytest
 
 from probe_kit.errors import UsageError
 from probe_kit.extract import ExtractSettings
-from probe_kit.extract.plan import EPISODE, THUMBNAILS
+from probe_kit.extract.sizes import EPISODE, THUMBNAILS
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.runs.layout import StoredStream
 from probe_kit.study import LoadedStudy, StudyFileError, StudyPlan, load_study, make_table, plan_study

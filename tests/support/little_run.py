@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from probe_kit.env.scoring import CHANNELS
 from probe_kit.env.spec import SceneSpec
-from probe_kit.extract.plan import Plan
 from probe_kit.hashing import derive_seed
 from probe_kit.intervene import ConditionOutcomes, ImageSwap
 from probe_kit.intervene.outcomes import settings_of
 from probe_kit.runs import Run, open_run, seal
 from probe_kit.runs.commits import Seconds
 from probe_kit.runs.layout import StoredStream
+from probe_kit.runs.plan import Plan
 from probe_kit.runs.store import Location, locate
 from probe_kit.runs.thumbnails import as_thumbnail, thumbnail_key
 from probe_kit.runs.writer import EpisodeRecord, RunWriter

@@ -4,11 +4,10 @@ from collections.abc import Sequence
 from typing import Any
 
 from probe_kit.env import SceneSpec
-from probe_kit.extract.plan import Plan
-from probe_kit.extract.sources.player import Row
 from probe_kit.extract.sources.scene import SceneSettings
 from probe_kit.extract.sources.scene_source import SceneSource
 from probe_kit.runs.layout import LaterViews, StoredStream
+from probe_kit.runs.plan import Plan, Row
 from probe_kit.suite import Suite
 
 

@@ -4,11 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
-from probe_kit.extract.plan import Plan
-from probe_kit.extract.sources.player import SIDE, Row
+from probe_kit.extract.sources.player import SIDE
 from probe_kit.hashing import derive_seed
 from probe_kit.runs import Run, open_run, seal
 from probe_kit.runs.layout import CAPTURE_ONLY, DATASET, OTHER_ACTIONS, RECORDED_EPISODES, StoredStream
+from probe_kit.runs.plan import Plan, Row
 from probe_kit.runs.store import locate
 from probe_kit.runs.writer import EpisodeRecord, RunWriter
 from tests.support.little_run import certify

@@ -18,9 +18,10 @@ from probe_kit.errors import UsageError
 from probe_kit.extract.rollout.controllers import PolicyController
 from probe_kit.extract.rollout.worker import torch_threads
 from probe_kit.extract.settings import ExtractSettings
-from probe_kit.extract.sources.player import Ending, Row
+from probe_kit.extract.sources.player import Ending
 from probe_kit.extract.sources.source import Played, Source
 from probe_kit.hooks.contract.observation import Observation
+from probe_kit.runs.plan import Row
 
 # These are choices, not measurements: they decide how long a run takes, and no number of it.
 LARGEST = 64

@@ -4,7 +4,6 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import cache
 from hashlib import sha256
-from queue import SimpleQueue
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,7 +12,9 @@ from numpy.typing import DTypeLike, NDArray
 from probe_kit.errors import CaptureChangedActionError
 from probe_kit.hooks.contract.sites import view_names
 from probe_kit.runs.arrays import NOT_A_NUMBER
-from probe_kit.runs.layout import MEAN_VIEW, LaterViews, StoredStream
+from probe_kit.runs.layout import LATER, MEAN_VIEW, LaterViews, StoredStream
+from probe_kit.runs.plan import Row
+from probe_kit.runs.writer import EpisodeRecord
 
 if TYPE_CHECKING:
     import torch
@@ -67,6 +68,15 @@ class EpisodeBuffers:
             tokens.fill(0)
         for later in self.later.values():
             later.fill(NOT_A_NUMBER)
+
+    def record(self, planned: Row, outcome: Mapping[str, Any], **fields: Any) -> EpisodeRecord:
+        """The part of the episode that the run stores. fields: of an `EpisodeRecord`."""
+        arrays: dict[str, Mapping[str, NDArray[Any]]] = {
+            "pooled": self.pooled, "tokens": self.tokens, LATER: self.later,
+        }  # fmt: skip
+        return EpisodeRecord(
+            planned, outcome, arrays, self.roles, lens_margins=self.lens_margins, **fields
+        )  # fmt: skip
 
     def keep_roles(self, roles: "dict[str, Roles]") -> None:
         """Begin the next captured inference."""
@@ -149,24 +159,6 @@ def _memory(shape: tuple[int, ...], dtype: DTypeLike, pinned: bool) -> NDArray[A
     size = int(np.prod(shape)) * np.dtype(dtype).itemsize
     locked: NDArray[Any] = torch.empty(size, dtype=torch.uint8, pin_memory=True).numpy()
     return locked.view(dtype).reshape(shape)
-
-
-class BufferPool:
-    """A fixed number of buffers. Waiting for a free one is what keeps a GPU from outrunning the disk."""
-
-    def __init__(self, buffers: Sequence[EpisodeBuffers]) -> None:
-        self._free: SimpleQueue[EpisodeBuffers] = SimpleQueue()
-        for free in buffers:
-            self._free.put(free)
-
-    def take(self) -> EpisodeBuffers:
-        """Empty buffers; waits until some are given back."""
-        return self._free.get()
-
-    def give_back(self, buffers: EpisodeBuffers) -> None:
-        """Make buffers available to the next episode."""
-        buffers.clear()
-        self._free.put(buffers)
 
 
 FEWEST_FOR_THREADS = 10_000_000

@@ -22,13 +22,13 @@ from probe_kit.errors import IgnoredInputsError, InstructionError, PolicyFailedE
 from probe_kit.extract.rollout.capturing import FEWEST_FOR_THREADS, Capturer, stored_streams
 from probe_kit.extract.settings import ExtractSettings
 from probe_kit.extract.sources.inputs import INSTRUCTION, PICTURE, blank_of, same_input, with_input
-from probe_kit.extract.sources.player import Row
 from probe_kit.extract.sources.source import Source, check_predictions
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.checkpoints.third_party import begin_randomness, copied, while_acting
 from probe_kit.hooks.contract.declared import PLAIN, Rotation
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.runs.layout import StoredStream
+from probe_kit.runs.plan import Row
 from probe_kit.runs.provenance import INPUT_CHECK
 
 if TYPE_CHECKING:
@@ -435,7 +435,7 @@ class PolicyController(ModelController["Policy", Observation]):
         if self._source.own_units:
             check_predictions(chunks, len(turns))
         elif not self.capture_only:
-            _check_chunks(chunks, len(turns))
+            check_predictions(chunks, len(turns), ACTION_SIZE)
         return np.array(chunks)
 
     def _called(self, observations: Sequence[Observation], seeds: Sequence[int]) -> Any:
@@ -488,22 +488,6 @@ class PolicyController(ModelController["Policy", Observation]):
         with apply_edits(self.model, self._edits, observations, self._vectors) as edit_log:
             yield
         self._edit_log = [asdict(entry) for entry in edit_log.entries]
-
-
-def _check_chunks(chunks: NDArray[np.float32], count: int) -> None:
-    """Raise PolicyFailedError unless these are chunks of actions for so many observations.
-
-    Actions that are NaN cost their own episode only, so the environment is left to say that.
-    """
-    array = chunks if isinstance(chunks, np.ndarray) else None
-    shape = () if array is None else array.shape
-    fits = len(shape) == 3 and shape[0] == count and shape[1] >= 1 and shape[2] == ACTION_SIZE
-    if array is None or not fits or array.dtype != np.float32:
-        described = type(chunks).__name__ if array is None else f"ndarray of shape {shape} and {array.dtype}"
-        raise PolicyFailedError(
-            f"the policy gave a {described} for {count} observations; expected a numpy array "
-            f"({count}, chunk, {ACTION_SIZE}) of float32 actions"
-        )
 
 
 def _own_flags(flagged: object, count: int) -> NDArray[np.bool_] | None:

@@ -10,17 +10,17 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from probe_kit._system.bounded_files import parse_json, read_regular
 from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.extract.parts import SCRIPTED
-from probe_kit.extract.plan import PlannedSizes
 from probe_kit.extract.prompts import phrases
 from probe_kit.extract.rollout.answer_controller import AnswerController
 from probe_kit.extract.rollout.calibration import Calibration, calibrated
 from probe_kit.extract.rollout.controllers import Controller, PolicyController, ScriptedController
 from probe_kit.extract.settings import AskSettings, ExtractSettings, Settings
-from probe_kit.extract.sources.player import Row
+from probe_kit.extract.sizes import PlannedSizes
 from probe_kit.extract.sources.source import Source
 from probe_kit.hooks.checkpoints.checkpoint import CONFIG_FILE
 from probe_kit.hooks.checkpoints.third_party import with_origin
 from probe_kit.hooks.families.shared.kinds import STATE, cameras_of
+from probe_kit.runs.plan import Row
 
 if TYPE_CHECKING:
     from probe_kit.hooks import AnswerModel, Model, Policy

@@ -5,8 +5,9 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
+from queue import SimpleQueue
 from time import perf_counter
 from typing import Any, Self
 
@@ -16,8 +17,8 @@ from PIL import Image
 
 from probe_kit.env import save_gif
 from probe_kit.errors import ProbeKitError
-from probe_kit.extract.plan import Plan
-from probe_kit.extract.rollout.capturing import BufferPool, EpisodeBuffers
+from probe_kit.extract.config_files import origin_of_process
+from probe_kit.extract.rollout.capturing import EpisodeBuffers
 from probe_kit.extract.rollout.controllers import Controller, Inference, Turn, count_lost_words
 from probe_kit.extract.settings import Settings
 from probe_kit.extract.sources.player import (
@@ -30,51 +31,16 @@ from probe_kit.extract.sources.player import (
     LocalPlayer,
     ProcessPlayer,
     Request,
-    Row,
     traceback_of,
 )
 from probe_kit.extract.sources.source import Played, Source
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.runs.commits import Seconds
-from probe_kit.runs.layout import LATER, VIDEOS
-from probe_kit.runs.reader import ORIGIN, Origin
-from probe_kit.runs.small_frames import SmallFrames
+from probe_kit.runs.layout import VIDEOS
+from probe_kit.runs.plan import Row
+from probe_kit.runs.run_source import ORIGIN
 from probe_kit.runs.thumbnails import as_thumbnail, thumbnail_key
-from probe_kit.runs.writer import EpisodeRecord, RunWriter
-
-
-@dataclass(frozen=True)
-class Rollout:
-    """The result of one episode: its outcome record, its activations, and its frames if requested.
-
-    trajectory: (T + 1, C) float32 frames of the whole episode. instruction_ids: what the policy was delivered
-    as its instruction, None if it reads none or cannot say. control_steps: of every inference, how many actions of
-    the episode came before it. inputs: what was shown of recordings, see `Ending`.
-    """
-
-    planned: Row
-    outcome: dict[str, Any]
-    buffers: EpisodeBuffers
-    frames: list[NDArray[np.uint8]]
-    small_frames: SmallFrames = ()
-    trajectory: NDArray[np.float32] | None = None
-    instruction_ids: Sequence[int] | None = None
-    control_steps: Sequence[int] = ()
-    seconds: Seconds = field(default_factory=Seconds)
-    inputs: Mapping[str, NDArray[Any]] | None = None
-
-    @property
-    def record(self) -> EpisodeRecord:
-        """The part that the run stores."""
-        buffers = self.buffers
-        arrays: dict[str, dict[str, NDArray[Any]]] = {
-            "pooled": {**buffers.pooled}, "tokens": {**buffers.tokens}, LATER: {**buffers.later},
-        }  # fmt: skip
-        return EpisodeRecord(
-            self.planned, self.outcome, arrays, buffers.roles, self.trajectory, self.instruction_ids,
-            control_steps=self.control_steps, seconds=self.seconds, inputs=self.inputs or {},
-            lens_margins=buffers.lens_margins,
-        )  # fmt: skip
+from probe_kit.runs.writer import RunWriter
 
 
 @dataclass
@@ -105,17 +71,17 @@ class Playing:
         assert self.observation is not None
         return Turn(self.observation, self.planned, len(self.control_steps), self.buffers, self.past)
 
-    def ended(self, ending: Ending) -> Rollout:
-        """The result, with the counts of flagged steps, where the policy can tell, and of lost words."""
+    def outcome(self, ending: Ending) -> dict[str, Any]:
+        """The outcome, with the counts of flagged steps, where the policy can tell, and of lost words."""
         counts = {} if self.flagged is None else {
             "inferences": len(self.control_steps), "flagged_steps": self.flagged,
         }  # fmt: skip
         counts |= {"lost_words": self.lost_words} if self.lost_words else {}
-        return Rollout(
-            self.planned, {**ending.outcome, **self.columns, **counts}, self.buffers, ending.frames,
-            ending.small_frames, ending.trajectory, self.instruction_ids, self.control_steps,
-            Seconds(self.seconds, ending.seconds), ending.inputs,
-        )  # fmt: skip
+        return {**ending.outcome, **self.columns, **counts}
+
+
+Ended = tuple[Playing, Ending]
+"""An episode that was played to its end, and how it ended."""
 
 
 class EpisodeSlot:
@@ -133,21 +99,21 @@ class EpisodeSlot:
 class EpisodeLoop:
     """Plays episode after episode on two groups of players.
 
-    next_episode: what to play next, None for nothing. All slots of a group take their turn in one call of the
-    policy; a slot whose episode ends begins the next one at once.
+    free: empty buffers. next_episode: what to play next, None for nothing. All slots of a group take their turn in
+    one call of the policy; a slot whose episode ends begins the next one at once.
     """
 
     def __init__(
-        self, players: Sequence[AskablePlayer], controller: Controller, ring: BufferPool,
+        self, players: Sequence[AskablePlayer], controller: Controller, free: "SimpleQueue[EpisodeBuffers]",
         next_episode: Callable[[], Row | None], film: Callable[[Row], bool],
     ) -> None:  # fmt: skip
         slots = [EpisodeSlot(player) for player in players]
         self._groups = [slots[: len(slots) // 2], slots[len(slots) // 2 :]]
-        self._controller, self._pool = controller, ring
+        self._controller, self._free = controller, free
         self._next_episode, self._film = next_episode, film
 
-    def __iter__(self) -> Iterator[Rollout | Failed]:
-        """Rollouts in the order they end."""
+    def __iter__(self) -> Iterator[Ended | Failed]:
+        """Episodes in the order they end."""
         for group in self._groups:
             for slot in group:
                 self._begin_next(slot)
@@ -162,8 +128,8 @@ class EpisodeLoop:
         begun = ended and slot.following is not None
         planned, slot.following, slot.playing = slot.following or self._next_episode(), None, None
         if planned is not None:
-            # `take` waits while all buffers are being written: a model cannot outrun the disk.
-            slot.playing = Playing(planned, self._pool.take(), begun)
+            # This waits while all buffers are being written: a model cannot outrun the disk.
+            slot.playing = Playing(planned, self._free.get(), begun)
             if not begun:
                 slot.player.ask("begin", planned, self._film(planned))
 
@@ -183,7 +149,7 @@ class EpisodeLoop:
             playing.flagged = (playing.flagged or 0) + inference.flagged
         slot.player.ask("advance", inference.actions, then=then)
 
-    def _settle(self, group: list[EpisodeSlot]) -> Iterator[Rollout | Failed]:
+    def _settle(self, group: list[EpisodeSlot]) -> Iterator[Ended | Failed]:
         """Collect answers until the group can take its turn together.
 
         If all its episodes ended at once, and no player has begun the next one, that is done during the other
@@ -200,7 +166,7 @@ class EpisodeLoop:
                     playing.observation = answer
                 else:
                     assert isinstance(answer, Ending)
-                    yield playing.ended(answer)
+                    yield playing, answer
                     self._begin_next(slot, ended=True)
             if not any(slot.playing and (slot.playing.observation or slot.playing.ahead) for slot in group):
                 return
@@ -230,7 +196,8 @@ class EpisodeLoop:
             self._go_on(slot, playing, inference)
 
     def _give_up(self, slot: EpisodeSlot, playing: Playing, error: ProbeKitError) -> Failed:
-        self._pool.give_back(playing.buffers)
+        playing.buffers.clear()
+        self._free.put(playing.buffers)
         self._begin_next(slot)
         return Failed(playing.planned.index, f"{type(error).__name__}: {error}", traceback_of(error))
 
@@ -252,7 +219,7 @@ class Worker:
 
     def __init__(
         self,
-        writer: RunWriter[Plan],
+        writer: RunWriter,
         settings: Settings,
         controller: Controller,
         source: Source[Any],
@@ -270,7 +237,9 @@ class Worker:
             # Two groups of players: one simulates while the model infers for the other, see `EpisodeLoop`.
             count = 2 * self._settings.machine.observations
             self._players = [self._open_player(position, stack) for position in range(count)]
-            self._ring = BufferPool([self._make_buffers() for _ in range(count + SPARE_BUFFERS)])
+            self._free: SimpleQueue[EpisodeBuffers] = SimpleQueue()
+            for _ in range(count + SPARE_BUFFERS):
+                self._free.put(self._make_buffers())
             # One thread: the writer remembers what it wrote of certificate and provenance, without a lock.
             self._thread = stack.enter_context(ThreadPoolExecutor(1, "probe-kit-writer"))
             # If a line above raised, the stack has closed what was open; from here on `__exit__` does.
@@ -307,12 +276,12 @@ class Worker:
             number = next_number()
             return None if number is None else self._writer.plan.episode(number)
 
-        playing = EpisodeLoop(self._players, self._controller, self._ring, next_episode, self._is_filmed)
+        playing = EpisodeLoop(self._players, self._controller, self._free, next_episode, self._is_filmed)
         for played in playing:
             if isinstance(played, Failed):
                 yield played
             else:
-                self._pending.append(self._thread.submit(self._write, played))
+                self._pending.append(self._thread.submit(self._write, *played))
             yield from self._written(wait=False)
         yield from self._written(wait=True)
 
@@ -320,40 +289,41 @@ class Worker:
         while self._pending and (wait or self._pending[0].done()):
             yield self._pending.popleft().result()
 
-    def _write(self, rollout: Rollout) -> Done:
+    def _write(self, playing: Playing, ending: Ending) -> Done:
         """On the writing thread."""
+        outcome = playing.outcome(ending)
         try:
-            rollout.buffers.wait()  # copies from a GPU may still be under way
+            playing.buffers.wait()  # copies from a GPU may still be under way
+            record = playing.buffers.record(
+                playing.planned, outcome, trajectory=ending.trajectory, instruction_ids=playing.instruction_ids,
+                control_steps=playing.control_steps, seconds=Seconds(playing.seconds, ending.seconds),
+                inputs=ending.inputs or {}, pictures=self._pictures(playing.planned, outcome, ending),
+                frames=len(ending.small_frames) or None if self._settings.machine.frames == "all" else None,
+            )  # fmt: skip
             with self._writer.location.explained_errors():
                 # Not before: the certificate holds fire counts and proofs, which the first inference gives.
                 self._writer.write_certificate(self._certificate())
-                self._writer.write(
-                    replace(rollout.record, pictures=self._pictures(rollout), frames=self._frame_count(rollout))
-                )
+                self._writer.write(record)
         finally:
-            self._ring.give_back(rollout.buffers)
-        return Done(rollout.planned.index, rollout.outcome)
+            playing.buffers.clear()
+            self._free.put(playing.buffers)
+        return Done(playing.planned.index, outcome)
 
     def _certificate(self) -> dict[str, Any]:
         """The controller's, and the origin of this process."""
         certificate = self._controller.certificate()
-        card = certificate["policy"]
-        checkpoint, repositories = str(card.get("checkpoint") or ""), card.get("repositories", {})
-        origin = Origin.of(self._settings.model, self._settings.source.files(), checkpoint, repositories)
-        return {**certificate, ORIGIN: origin.to_json()}
+        return {**certificate, ORIGIN: origin_of_process(self._settings, certificate["policy"]).to_json()}
 
-    def _pictures(self, rollout: Rollout) -> dict[str, bytes]:
+    def _pictures(self, planned: Row, outcome: Mapping[str, Any], ending: Ending) -> dict[str, bytes]:
         """Content by key of what is kept for people."""
-        small = rollout.small_frames
-        thumbnails = (
-            {thumbnail_key(rollout.planned.index): as_thumbnail(small, self._settings.machine.frames)}
-            if small
-            else {}
-        )
-        return thumbnails | (dict([_film(rollout)]) if rollout.frames else {})
-
-    def _frame_count(self, rollout: Rollout) -> int | None:
-        return len(rollout.small_frames) or None if self._settings.machine.frames == "all" else None
+        pictures = {}
+        if ending.small_frames:
+            frames = as_thumbnail(ending.small_frames, self._settings.machine.frames)
+            pictures[thumbnail_key(planned.index)] = frames
+        if ending.frames:
+            name = f"{planned.index:08d}-{planned.category}-{outcome['outcome']}.gif"
+            pictures[f"{VIDEOS}/{name}"] = _film(ending.frames)
+        return pictures
 
     def _is_filmed(self, planned: Row) -> bool:
         return self._settings.machine.video == "all" or (
@@ -378,12 +348,9 @@ def torch_threads(count: int | None) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def _film(rollout: Rollout) -> tuple[str, bytes]:
-    frames = [
-        np.asarray(Image.fromarray(frame).resize(_FILM_SIZE, Image.Resampling.LANCZOS)) for frame in rollout.frames
-    ]
-    planned = rollout.planned
-    name = f"{planned.index:08d}-{planned.category}-{rollout.outcome['outcome']}.gif"
+def _film(frames: Sequence[NDArray[np.uint8]]) -> bytes:
+    """The frames as a GIF."""
+    small = [np.asarray(Image.fromarray(frame).resize(_FILM_SIZE, Image.Resampling.LANCZOS)) for frame in frames]
     with tempfile.TemporaryDirectory() as folder:  # `save_gif` writes to paths, and a run may lie in a bucket
-        save_gif(Path(folder) / name, frames)
-        return f"{VIDEOS}/{name}", (Path(folder) / name).read_bytes()
+        save_gif(Path(folder) / "film.gif", small)
+        return (Path(folder) / "film.gif").read_bytes()

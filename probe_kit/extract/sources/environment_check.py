@@ -1,9 +1,11 @@
 """The check of an environment of the user's own: what the rest of probe_kit relies on, promise by promise."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NoReturn
 
 import numpy as np
+from numpy.typing import NDArray
 
 from probe_kit.errors import MissingExtraError, ProbeKitError, UsageError
 from probe_kit.extract.sources.environment import EnvEpisode, EnvSource, OwnEnvironment, Step
@@ -38,20 +40,23 @@ class EnvironmentCheck:
 
 
 class _Trial:
-    """An environment under check, and what its first episodes showed."""
+    """An environment under check, its first episodes, and their steps: each is there once its check passed."""
+
+    environment: OwnEnvironment
+    episodes: list[EnvEpisode]
+    steps: list[list[Step]]
 
     def __init__(self, source: EnvSource) -> None:
         self.source = source
-        self.environment: OwnEnvironment | None = None
-        self.episodes: list[EnvEpisode] = []
-        self.shown: list[list[Step]] = []
+
+    def __getattr__(self, name: str) -> NoReturn:
+        raise _BrokenError(f"there is no {name} to check, see above")
 
     def open(self) -> None:
         self.environment = open_environment(self.source)
 
     def list_episodes(self) -> None:
-        environment = self._opened
-        first, second = (listed_episodes(environment, self.source) for _ in range(2))
+        first, second = (listed_episodes(self.environment, self.source) for _ in range(2))
         if first != second:
             raise _BrokenError(
                 "episodes() gave another list the second time; expected the same, in the same order"
@@ -59,58 +64,40 @@ class _Trial:
         self.episodes = [episode for _, episode in first[:EPISODES]]
 
     def play(self) -> None:
-        self.shown = [self._play(self._opened, episode) for episode in self._selected_episodes]
+        self.steps = [self._play(self.environment, episode) for episode in self.episodes]
 
     def facts_are_constant(self) -> None:
-        after = [step for steps in self._played for step in steps[1:]]
+        after = [step for steps in self.steps for step in steps[1:]]
         names = sorted(after[0].facts) if after else []
-        for steps in self._played:
+        for steps in self.steps:
             for number, step in enumerate(steps):
                 if number or step.facts:
                     fact_values(step.facts, names, f"{self.source.name}, step() {number}")
 
     def repeats(self) -> None:
         """The first episode again, behind the other one."""
-        again = self._play(self._opened, self._selected_episodes[0])
-        _check_equal(self._played[0], again, "the same episode, played again behind another one")
+        again = self._play(self.environment, self.episodes[0])
+        _check_equal(self.steps[0], again, "the same episode, played again behind another one")
 
     def repeats_elsewhere(self) -> None:
         """Repeat the first episode in a new environment, as each process opens its own."""
         other = open_environment(self.source)
         try:
-            again = self._play(other, self._selected_episodes[0])
+            again = self._play(other, self.episodes[0])
         finally:
             self._close(other)
-        _check_equal(self._played[0], again, "the same episode in a second environment")
+        _check_equal(self.steps[0], again, "the same episode in a second environment")
 
     def close(self) -> None:
-        if self.environment is not None:
+        if "environment" in vars(self):
             self._close(self.environment)
 
     def _close(self, environment: OwnEnvironment) -> None:
         with naming_environment(self.source.name, "close()"):
             environment.close()
 
-    @property
-    def _opened(self) -> OwnEnvironment:
-        if self.environment is None:
-            raise _BrokenError("the environment is not open, see above")
-        return self.environment
-
-    @property
-    def _selected_episodes(self) -> list[EnvEpisode]:
-        if not self.episodes:
-            raise _BrokenError("there are no episodes, see above")
-        return self.episodes
-
-    @property
-    def _played(self) -> list[list[Step]]:
-        if not self.shown:
-            raise _BrokenError("no episode was played, see above")
-        return self.shown
-
     def _play(self, environment: OwnEnvironment, episode: EnvEpisode) -> list[Step]:
-        steps = [self._begin(environment, episode)]
+        steps = [started(environment, episode, self.source.name)]
         while len(steps) <= STEPS and not steps[-1].done:
             steps.append(self._step(environment, episode, len(steps)))
             self._check_shapes(steps)
@@ -125,9 +112,6 @@ class _Trial:
                 f"{self.source.name}, step() {len(steps) - 1}: {name} has the shape {now.get(name, 'none')}, in "
                 f"reset() {before.get(name, 'none')}; expected the same at every step"
             )
-
-    def _begin(self, environment: OwnEnvironment, episode: EnvEpisode) -> Step:
-        return started(environment, episode, self.source.name)
 
     def _step(self, environment: OwnEnvironment, episode: EnvEpisode, number: int) -> Step:
         draw = np.random.default_rng([episode.seed, number])
@@ -212,8 +196,5 @@ def _check_equal(first: list[Step], again: list[Step], which: str) -> None:
             )
 
 
-def _equal_pictures(before: object, after: object) -> bool:
-    assert hasattr(before, "items")
-    assert hasattr(after, "items")
-    first, second = dict(before.items()), dict(after.items())
-    return first.keys() == second.keys() and all(np.array_equal(first[name], second[name]) for name in first)
+def _equal_pictures(before: Mapping[str, NDArray[np.uint8]], after: Mapping[str, NDArray[np.uint8]]) -> bool:
+    return before.keys() == after.keys() and all(np.array_equal(before[name], after[name]) for name in before)

@@ -27,7 +27,7 @@ from probe_kit.errors import (
     UsageError,
 )
 from probe_kit.extract.sources.environment import LEROBOT, SUCCESS, EnvEpisode, EnvSource, OwnEnvironment, Step
-from probe_kit.extract.sources.player import SIDE, Answer, Ending, InputsPlayer, Opens, Row
+from probe_kit.extract.sources.player import SIDE, Answer, Ending, InputsPlayer, Opens
 from probe_kit.extract.sources.source import (
     FIRST_EPISODES,
     Played,
@@ -40,6 +40,7 @@ from probe_kit.extract.sources.source import (
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.observation import Observation, checked_picture
 from probe_kit.runs.layout import AT_END, ENVIRONMENT, ONCE, TRUTHS
+from probe_kit.runs.plan import Row
 from probe_kit.runs.small_frames import SmallFrames, shrink
 
 if TYPE_CHECKING:

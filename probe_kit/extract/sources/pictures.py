@@ -19,7 +19,7 @@ from probe_kit._system.table_cells import group_names
 from probe_kit._system.text_tables import MOST_BYTES, TextTable, open_table
 from probe_kit._tables.label_table import LabelTable
 from probe_kit.errors import RecordingError, UsageError
-from probe_kit.extract.sources.player import SIDE, Answer, InputsPlayer, Opens, Row
+from probe_kit.extract.sources.player import SIDE, Answer, InputsPlayer, Opens
 from probe_kit.extract.sources.recording import Pixels
 from probe_kit.extract.sources.source import (
     REFUSED_WITHOUT_ACTING,
@@ -32,6 +32,7 @@ from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.observation import ARM_NUMBERS, Observation
 from probe_kit.hooks.contract.sites import CAMERA
 from probe_kit.runs.layout import CAPTURE_ONLY, CLASSES, DATASET, OTHER_ACTIONS, RECORDED_EPISODES, TRUTHS
+from probe_kit.runs.plan import Row
 from probe_kit.suite.pictures import decode_bytes
 
 if TYPE_CHECKING:

@@ -2,12 +2,12 @@
 
 import traceback
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from hashlib import blake2b
 from multiprocessing.connection import Connection
 from time import perf_counter
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,7 @@ from probe_kit.errors import (
 )
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.runs.layout import CAPTURE_ONLY
+from probe_kit.runs.plan import Row
 from probe_kit.runs.small_frames import SmallFrames
 
 # What one episode can get wrong by itself; everything else is wrong with the whole run and stops it.
@@ -83,58 +84,6 @@ def traceback_of(error: BaseException) -> str:
 
 SIDE = 32
 """Pixels along the stored pictures."""
-
-
-@dataclass(frozen=True)
-class Row:
-    """One row of a plan, whatever its source: an episode of a scene, a stretch of a recording, a picture.
-
-    index: its number in the run, where its objects lie. In a run that grew, numbers are not in the plan's order.
-    columns: the row as flat columns, of which every source has `episode_id`, `item_id`, `category`, `group_id`,
-    `instruction` and `policy_seed`. content: what the source's player plays. frames: recorded frames that the
-    inferences see; None where every inference sees what the actions before it led to.
-    """
-
-    index: int
-    columns: Mapping[str, Any]
-    content: Any = None
-    frames: Sequence[int] | None = None
-
-    @property
-    def episode_id(self) -> str:
-        """Its id, the same in every selection."""
-        return str(self.columns["episode_id"])
-
-    @property
-    def category(self) -> str:
-        """The category that tables group it by."""
-        return str(self.columns["category"])
-
-    @property
-    def instruction(self) -> str:
-        """The words that the model reads."""
-        return str(self.columns["instruction"])
-
-    @property
-    def policy_seed(self) -> int:
-        """The seed from which every inference of the row derives its own."""
-        return int(self.columns["policy_seed"])
-
-    def numbered(self, index: int) -> Self:
-        """The same row under another number."""
-        return replace(self, index=index)
-
-    def control_step(self, call: int, executed: int) -> int:
-        """The step that inference `call` sees: a recorded frame, or as many actions as were executed before."""
-        return executed if self.frames is None else self.frames[call]
-
-    def noise_of(self, call: int) -> int:
-        """The number that the seed of inference `call` is derived from, whichever other frames were chosen."""
-        return call if self.frames is None else self.frames[call]
-
-    def to_json(self) -> dict[str, Any]:
-        """The row as flat columns."""
-        return {"episode": self.index, **self.columns}
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,6 @@
 """Opened recordings: chosen frames of a LeRobotDataset that lies here, and the player that shows them."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property, partial
 from importlib.metadata import version
 from itertools import groupby
@@ -21,7 +20,7 @@ from probe_kit.extract.sources.lerobot_folder import (
     open_lerobot,
 )
 from probe_kit.extract.sources.lerobot_meta import IMAGE
-from probe_kit.extract.sources.player import SIDE, Answer, InputsPlayer, Opens, Row
+from probe_kit.extract.sources.player import SIDE, Answer, InputsPlayer, Opens
 from probe_kit.extract.sources.recording import LeRobotSource, Pairs
 from probe_kit.extract.sources.source import (
     MOST_UNUSUAL,
@@ -37,6 +36,7 @@ from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.observation import ARM_NUMBERS, Observation
 from probe_kit.hooks.families.shared.kinds import ACTION, IMAGES, STATE
 from probe_kit.runs.layout import CAPTURE_ONLY, DATASET, OTHER_ACTIONS, RECORDED_EPISODES, TRUTHS
+from probe_kit.runs.plan import Row
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
@@ -50,14 +50,6 @@ NAMED = 0.01
 _LONGEST = 12
 """Tasks and numbers that are listed."""
 _TASK = "task_index"
-
-
-@dataclass(frozen=True)
-class Stretch:
-    """Chosen frames of one recorded episode under one instruction, at most 64. content: hash of its files."""
-
-    episode: int
-    content: str
 
 
 class RecordingSource(Source[LeRobotSource]):
@@ -152,7 +144,7 @@ class RecordingSource(Source[LeRobotSource]):
                         "policy_seed": derive_seed(seed, "policy", item),
                         "content_blake2b": content,
                     }
-                    yield Row(index, columns, Stretch(episode, content), tuple(stretch))
+                    yield Row(index, columns, frames=tuple(stretch))
                     index, part = index + 1, part + 1
 
     def _texts(self, episode: int) -> list[str]:
@@ -220,12 +212,6 @@ class RecordingSource(Source[LeRobotSource]):
         Raises RecordingError for cameras, states or files that do not fit, UnitsError for states far outside the
         checkpoint's statistics, and CheckpointError for a checkpoint without statistics.
         """
-        fitted, policy = self.fitted(policy)
-        fitted.check_recorded_units(policy, accept_units)
-        return fitted, policy
-
-    def fitted(self, policy: "Policy") -> "tuple[Self, Policy]":
-        """Fit the source to a policy as `check` does, whatever the units."""
         card = policy.card
         raise_together(self.early_checks(card.cameras, policy.state_numbers, card.checkpoint))
         fitted = self.mapped(card.cameras)
@@ -240,6 +226,7 @@ class RecordingSource(Source[LeRobotSource]):
         chunk = predicted_once(policy, fitted.example(fitted.instructions[0]))
         fitted.prediction = chunk.shape[0], chunk.shape[1]
         fitted.other_actions = fitted._other_actions(policy, chunk.shape[1], numbers.get(ACTION))
+        fitted.check_recorded_units(policy, accept_units)
         return fitted, policy
 
     def check_recorded_units(self, policy: "Policy", accepted: bool) -> None:
@@ -445,7 +432,9 @@ class RecordingPlayer(InputsPlayer):
         self._check_content(row)
         recording = self._recording
         names = [name for name in (STATE, ACTION) if recording.folder.width(name) is not None]
-        self._numbers = recording.reader.numbers(row.content.episode, [*names, *recording.folder.columns])
+        self._numbers = recording.reader.numbers(
+            row.columns["source_episode"], [*names, *recording.folder.columns]
+        )
         return self._see()
 
     def advance(self, actions: NDArray[np.float32]) -> Answer:
@@ -459,12 +448,12 @@ class RecordingPlayer(InputsPlayer):
 
     def _check_content(self, row: Row) -> None:
         """Raise RecordingError unless the files of an episode are those that the plan was made of."""
-        recording = self._recording
-        now = recording.folder.content_blake2b(row.content.episode, recording.features)
-        if now != row.content.content:
+        recording, planned = self._recording, row.columns["content_blake2b"]
+        now = recording.folder.content_blake2b(row.columns["source_episode"], recording.features)
+        if now != planned:
             raise RecordingError(
                 f"{recording.folder.path.name}: the files of {row.columns['item_id']} were changed after the run "
-                f"was planned: their hash was {row.content.content}, now it is {now}. Leave the data set as it is "
+                f"was planned: their hash was {planned}, now it is {now}. Leave the data set as it is "
                 "until the run ends"
             )
 
@@ -475,7 +464,7 @@ class RecordingPlayer(InputsPlayer):
 
     def _see(self) -> Observation:
         recording, frame = self._recording, self._frame
-        by_feature = recording.reader.pictures(self.row.content.episode, frame, recording.features)
+        by_feature = recording.reader.pictures(self.row.columns["source_episode"], frame, recording.features)
         pictures = {camera: by_feature[feature] for camera, feature in recording.settings.cameras}
         for camera, degrees in recording.settings.rotations:
             pictures[camera] = np.ascontiguousarray(np.rot90(pictures[camera], degrees // 90))

@@ -15,7 +15,7 @@ from probe_kit._terminal.options import further_option, read_size, some_of
 from probe_kit.errors import UsageError
 from probe_kit.extract.parts import LARGEST, Scene, option_of
 from probe_kit.extract.sources.source import SourceSettings
-from probe_kit.runs.reader import OF_SCENE
+from probe_kit.runs.run_source import OF_SCENE
 from probe_kit.scene_names import ArmName, Rendering
 from probe_kit.suite.items import WORDINGS, Wording, check_wordings
 

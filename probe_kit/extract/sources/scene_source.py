@@ -1,7 +1,7 @@
 """The opened scene: every item of a suite in both layouts, and the player whose arm carries out actions."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property, partial
 from hashlib import sha256
 from itertools import islice
@@ -14,13 +14,14 @@ from probe_kit._system.counting import counted
 from probe_kit.env import Act2AnswerEnv, Idle, SceneSpec, ScriptedExpert
 from probe_kit.env.act2answer import Recorder
 from probe_kit.errors import SceneError, UsageError
-from probe_kit.extract.sources.player import Answer, Ending, Opens, Player, Row
+from probe_kit.extract.sources.player import Answer, Ending, Opens, Player
 from probe_kit.extract.sources.scene import SceneSettings
 from probe_kit.extract.sources.source import FIRST_EPISODES, Played, Source, check_units, unusual_shares
 from probe_kit.hashing import derive_seed, sha256_json
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.sites import CAMERA
 from probe_kit.runs.layout import CAPTURE_ONLY, FIRST_FRAME
+from probe_kit.runs.plan import Row
 from probe_kit.runs.small_frames import FILM_HEIGHT, shrink
 from probe_kit.suite import Episode, Suite, default_suite, load_suite
 from probe_kit.suite.build import ITEMS, default_folder
@@ -29,14 +30,6 @@ from probe_kit.suite.sufficiency import Smallest
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
-
-
-@dataclass(frozen=True)
-class Seen:
-    """A first frame in which nothing moves. facts: what a run records of it."""
-
-    observation: Observation
-    facts: dict[str, Any]
 
 
 class ScenePlayer(Player):
@@ -57,16 +50,16 @@ class ScenePlayer(Player):
         self._shoot()
         return self._see() if self._played.script is None else self._follow_script()
 
-    def look(self, row: Row) -> Seen:
-        """Set up an episode and show its first frame; nothing on it moves."""
+    def look(self, row: Row) -> tuple[Observation, dict[str, Any]]:
+        """Set up an episode and show its first frame, in which nothing moves, with what a run records of it."""
         answer = self.answer("begin", (row, False))
         assert isinstance(answer, Observation)
-        return Seen(answer, self._facts)
+        return answer, self._facts
 
-    def look_swapped(self) -> Seen:
-        """Show the item's other layout in the state that this episode is in; facts: its hash alone."""
+    def look_swapped(self) -> tuple[Observation, dict[str, Any]]:
+        """Show the item's other layout in the state that this episode is in, with its hash."""
         observation, frame = self._env.observe_exchanged()
-        return Seen(self._observed(observation), {FIRST_FRAME: frame_sha256(frame)})
+        return self._observed(observation), {FIRST_FRAME: frame_sha256(frame)}
 
     def _set_up(self, row: Row) -> None:
         options = {"item": row.content.item, "layout": row.content.layout}
@@ -317,7 +310,7 @@ class SceneSource(Source[SceneSettings]):
         try:
             for row in self.rows(0)[:FIRST_EPISODES]:
                 try:
-                    states.append(player.look(row).observation.state)
+                    states.append(player.look(row)[0].state)
                 except SceneError as error:
                     failed = error
         finally:

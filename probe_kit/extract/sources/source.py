@@ -22,8 +22,9 @@ from probe_kit.hooks.contract.observation import Observation
 
 if TYPE_CHECKING:
     from probe_kit.env import SceneSpec
-    from probe_kit.extract.sources.player import Opens, Row
+    from probe_kit.extract.sources.player import Opens
     from probe_kit.hooks import Policy
+    from probe_kit.runs.plan import Row
     from probe_kit.suite import Suite
 
 
@@ -340,13 +341,17 @@ def predicted_once(policy: "Policy", observation: Observation) -> NDArray[np.flo
     return chunk
 
 
-def check_predictions(chunks: Any, count: int) -> None:
-    """Raise PolicyFailedError unless these are (count, chunk, D) float32."""
-    if not (
-        isinstance(chunks, np.ndarray) and chunks.ndim == 3 and len(chunks) == count and chunks.dtype == np.float32
-    ):
-        described = f"{chunks.shape} {chunks.dtype}" if isinstance(chunks, np.ndarray) else type(chunks).__name__
+def check_predictions(chunks: Any, count: int, width: int | None = None) -> None:
+    """Raise PolicyFailedError unless these are chunks of actions (count, chunk, D) float32. width: D, if known.
+
+    Actions that are NaN cost their own episode only, so the environment is left to say that.
+    """
+    array = chunks if isinstance(chunks, np.ndarray) else None
+    shape: tuple[int, ...] = () if array is None else array.shape
+    fits = len(shape) == 3 and shape[0] == count and shape[1] >= 1 and width in (None, shape[2])
+    if array is None or not fits or array.dtype != np.float32:
+        described = type(chunks).__name__ if array is None else f"ndarray of shape {shape} and {array.dtype}"
         raise PolicyFailedError(
-            f"the policy predicted {described} for {count} observations; expected float32 "
-            f"({count}, chunk, actions)"
+            f"the policy gave a {described} for {count} observations; expected a numpy array "
+            f"({count}, chunk, {width or 'D'}) of float32 actions"
         )

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import combinations, product
-from typing import Any
+from typing import Any, cast
 
 from probe_kit.env.scoring import DEFAULT_RULE
 from probe_kit.errors import UsageError
@@ -183,7 +183,7 @@ def compare_wordings(runs: Sequence[RunReader]) -> list[Difference]:
         every_wording = run.all_wordings
         sides = {}
         for wording in run.wordings:
-            in_wording: RunReader = _InWording(every_wording, wording)
+            in_wording = cast("RunReader", _InWording(every_wording, wording))
             if len(in_wording.episodes):
                 sides[wording] = Side(
                     wording, (in_wording,), tuple(run_rows(in_wording, None, settings)), _location_of(run)

@@ -17,9 +17,10 @@ from probe_kit.extract.sources.environment_source import (
     listed_episodes,
     open_environment,
 )
-from probe_kit.extract.sources.player import Ending, Row
+from probe_kit.extract.sources.player import Ending
 from probe_kit.extract.sources.source import Played
 from probe_kit.hooks import Observation
+from probe_kit.runs.plan import Row
 from tests.support.reach_env import ReachEnv
 
 HOME = "reach_env:"

@@ -254,7 +254,7 @@ def test_where_the_folder_lies_is_no_part_of_a_run_and_what_it_holds_is(recordin
     moved = shutil.copytree(recording, tmp_path / "elsewhere")
     one, two = (prepare(settings(folder, episodes=(0,))) for folder in (recording, moved))
     assert one.identity() == two.identity()
-    assert one.plan.to_json() == two.plan.to_json()
+    assert one.plan.columns == two.plan.columns
     info = json.loads((moved / "meta" / "info.json").read_text(encoding="utf-8"))
     (moved / "meta" / "info.json").write_text(json.dumps({**info, "robot_type": "other"}), encoding="utf-8")
     assert prepare(settings(moved, episodes=(0,))).identity() != one.identity()

@@ -18,13 +18,13 @@ from probe_kit.extract import ExtractSettings, LeRobotSource, prepare
 from probe_kit.extract.config_files import read_config
 from probe_kit.extract.extraction import check_meaningless
 from probe_kit.extract.sources.lerobot_folder import open_lerobot, resolved_commit
-from probe_kit.extract.sources.player import Row
 from probe_kit.extract.sources.recording import read_episodes
 from probe_kit.extract.sources.recording_source import mapped_cameras
 from probe_kit.hooks import load_model
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.runs import verify_run
-from probe_kit.runs.reader import Origin
+from probe_kit.runs.plan import Row
+from probe_kit.runs.run_source import Origin
 from probe_kit.suite import Suite
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"

@@ -27,12 +27,12 @@ from probe_kit.extract.rollout.controllers import (
     with_rotation_vectors,
 )
 from probe_kit.extract.rollout.tasks import check_reachable, fitted
-from probe_kit.extract.sources.player import Row
 from probe_kit.extract.sources.scene import SceneSettings
 from probe_kit.extract.sources.scene_source import SceneSource
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks import ModelCard, Observation, load_policy
 from probe_kit.intervene.rollout import executed
+from probe_kit.runs.plan import Row
 from probe_kit.suite import Suite
 from tests.support.spatialvla_checkpoints import write_checkpoint
 

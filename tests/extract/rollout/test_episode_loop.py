@@ -18,14 +18,15 @@ from probe_kit.extract import ExtractSettings, prepare
 from probe_kit.extract.rollout import capturing as staging
 from probe_kit.extract.rollout.capturing import Capturer, EpisodeBuffers, copy_aside, stored_streams
 from probe_kit.extract.rollout.controllers import Inference
-from probe_kit.extract.rollout.worker import EpisodeLoop, Rollout
-from probe_kit.extract.sources.player import Ending, Failed, LocalPlayer, ProcessPlayer, Row
+from probe_kit.extract.rollout.worker import Ended, EpisodeLoop
+from probe_kit.extract.sources.player import Ending, Failed, LocalPlayer, ProcessPlayer
 from probe_kit.extract.sources.scene_source import ScenePlayer
 from probe_kit.hooks import Roles
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.roles import _matrix
 from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.runs.layout import StoredStream
+from probe_kit.runs.plan import Row
 from probe_kit.suite import Suite
 
 PICTURE = np.zeros((4, 4, 3), np.uint8)
@@ -86,14 +87,14 @@ class Thinking:
 
 def played(
     episodes: int, batch: int = 1, length: int = 1, bad: set[int] | None = None, capture_only: bool = False
-) -> tuple[list[Rollout | Failed], list[tuple[str, int]]]:
+) -> tuple[list[Ended | Failed], list[tuple[str, int]]]:
     log: list[tuple[str, int]] = []
     left = iter([Row(number, {"policy_seed": number}) for number in range(episodes)])
-    ring: Any = SimpleNamespace(take=lambda: object(), give_back=lambda _buffers: None)
+    free: Any = SimpleNamespace(get=lambda: SimpleNamespace(clear=lambda: None), put=lambda _buffers: None)
     stages: Any = [Quick(log, length, bad or set()) for _ in range(2 * batch)]
     controller: Any = Thinking(log, capture_only)
     next_episode: Callable[[], Any] = lambda: next(left, None)  # noqa: E731
-    return list(EpisodeLoop(stages, controller, ring, next_episode, lambda _planned: False)), log
+    return list(EpisodeLoop(stages, controller, free, next_episode, lambda _planned: False)), log
 
 
 @pytest.mark.parametrize("capture_only", [False, True])
@@ -103,7 +104,7 @@ def test_stages_begin_what_follows_before_their_results_are_collected(
 ) -> None:
     """So that setting up an episode never falls between two inferences."""
     results, log = played(12, batch, length, capture_only=capture_only)
-    assert sorted(result.planned.index for result in results if isinstance(result, Rollout)) == list(range(12))
+    assert sorted(result[0].planned.index for result in results if isinstance(result, tuple)) == list(range(12))
     begun = [position for position, (what, _) in enumerate(log) if what == "begun"]
     by_themselves = [position for position in begun if log[position - 1][0] == "ended"]
     assert len(begun) == 12
@@ -122,7 +123,7 @@ def test_a_stage_asks_for_nothing_between_the_inferences_of_two_episodes() -> No
 def test_what_was_to_follow_a_failed_episode_is_played_all_the_same(batch: int) -> None:
     results, _ = played(12, batch, bad={0, 3, 4, 11})
     failed = [result.number for result in results if isinstance(result, Failed)]
-    kept = [result.planned.index for result in results if isinstance(result, Rollout)]
+    kept = [result[0].planned.index for result in results if isinstance(result, tuple)]
     assert sorted(failed) == [0, 3, 4, 11]
     assert sorted(failed + kept) == list(range(12)), "every episode once"
 

@@ -1,71 +1,21 @@
-"""The plan of a run: its rows and their order, and the disk space and memory that it needs. Writes nothing."""
+"""The disk space and memory that a run needs, before it is begun. Writes nothing."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property
-from typing import TYPE_CHECKING, Any, Self
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from probe_kit.errors import ProbeKitError
 from probe_kit.extract.settings import Settings
-from probe_kit.extract.sources.player import Row
 from probe_kit.hooks.contract.sites import view_names
 from probe_kit.hooks.family import DTYPES
 from probe_kit.runs.layout import StoredStream
+from probe_kit.runs.plan import Plan
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Family, Model
     from probe_kit.hooks.outline import Outline
-
-
-@dataclass(frozen=True)
-class Plan:
-    """All rows of a run in order, and the size of what they leave.
-
-    identity: the part of a run's identity that says where observations come from. selection: what was selected, as
-    it stands among a run's settings; no part of its identity. name_parts: what the default name of a run depends
-    on beside its identity. suite_parent: of a suite that was selected of another one, the hash of that. decoder:
-    what makes pictures of stored videos here, with its version.
-    """
-
-    episodes: tuple[Row, ...]
-    streams: tuple[StoredStream, ...]
-    bytes: int
-    identity: Mapping[str, Any] = field(default_factory=dict)
-    selection: dict[str, Any] = field(default_factory=dict)
-    name_parts: Sequence[Any] = ()
-    suite_parent: Any = None
-    decoder: str | None = None
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the plan as stored in `plan/`: `episodes` as flat columns, and `suite_parent`."""
-        return {"episodes": [row.to_json() for row in self.episodes], "suite_parent": self.suite_parent}
-
-    def numbered(self, numbers: Mapping[str, int]) -> Self:
-        """The same rows, in the same order, with the numbers that a run has for their ids."""
-        return replace(self, episodes=tuple(row.numbered(numbers[row.episode_id]) for row in self.episodes))
-
-    def only(self, episodes: Iterable[Row]) -> Self:
-        """A plan of these rows alone, with their share of the bytes."""
-        rows = tuple(episodes)
-        return replace(self, episodes=rows, bytes=self.bytes * len(rows) // max(1, len(self.episodes)))
-
-    def episode(self, number: int) -> Row:
-        """The row that has this number. Raises KeyError."""
-        return self._by_number[number]
-
-    @cached_property
-    def _by_number(self) -> dict[int, Row]:
-        return {row.index: row for row in self.episodes}
-
-    @property
-    def sites(self) -> int:
-        """Number of captured sites per inference."""
-        return sum(len(stream.stream.sites()) for stream in self.streams)
-
-
-# -- disk space and memory ---------------------------------------------------------------------------------------
 
 
 EPISODE = 40_000

@@ -1,0 +1,337 @@
+"""The plan of a run: its rows and their order, the records that store it, and its growth.
+
+    plan/00000000.json    the first selection of a source: its rows, their order, and what was selected
+    plan/<n>.json         the n-th growth: the rows it adds, and the order of all of them
+
+A run grows by a further record; none is ever changed. Commits name the hash of the record that planned their
+episode. An episode keeps its number for ever; `order` is that of the same selection planned at once.
+"""
+
+import re
+from bisect import bisect_right
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import count
+from typing import Any, ClassVar, NotRequired, Self, TypedDict
+
+from pydantic import ConfigDict
+
+from probe_kit.errors import RunDamagedError, SettingsMismatchError
+from probe_kit.runs.layout import PLANS, StoredStream
+from probe_kit.runs.records import RESTORE, Record
+from probe_kit.runs.store import Location
+
+RowColumns = Mapping[str, Any]
+"""A row as flat columns."""
+_NUMBERED = re.compile(rf"{PLANS}/[0-9]{{8}}\.json")
+_NUMBER, _CONTENT = "episode", "content_blake2b"
+"""The part of a row that depends on when it was added; of recordings, the hash of the files that hold it."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row of a plan, whatever its source: an episode of a scene, a stretch of a recording, a picture.
+
+    index: its number in the run, where its objects lie. In a run that grew, numbers are not in the plan's order.
+    columns: the row as flat columns, of which every source has `episode_id`, `item_id`, `category`, `group_id`,
+    `instruction` and `policy_seed`. content: what the source's player plays. frames: recorded frames that the
+    inferences see; None where every inference sees what the actions before it led to.
+    """
+
+    index: int
+    columns: RowColumns
+    content: Any = None
+    frames: Sequence[int] | None = None
+
+    @property
+    def episode_id(self) -> str:
+        """Its id, the same in every selection."""
+        return str(self.columns["episode_id"])
+
+    @property
+    def category(self) -> str:
+        """The category that tables group it by."""
+        return str(self.columns["category"])
+
+    @property
+    def instruction(self) -> str:
+        """The words that the model reads."""
+        return str(self.columns["instruction"])
+
+    @property
+    def policy_seed(self) -> int:
+        """The seed from which every inference of the row derives its own."""
+        return int(self.columns["policy_seed"])
+
+    def control_step(self, call: int, executed: int) -> int:
+        """The step that inference `call` sees: a recorded frame, or as many actions as were executed before."""
+        return executed if self.frames is None else self.frames[call]
+
+    def noise_of(self, call: int) -> int:
+        """The number that the seed of inference `call` is derived from, whichever other frames were chosen."""
+        return call if self.frames is None else self.frames[call]
+
+    def to_json(self) -> dict[str, Any]:
+        """The row as flat columns."""
+        return {_NUMBER: self.index, **self.columns}
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All rows of a run in order, and how their streams are stored.
+
+    bytes: of their activations. identity: the part of a run's identity that says where observations come from.
+    selection: what was selected, as it stands among a run's settings; no part of its identity. name_parts: what
+    the default name of a run depends on beside its identity. suite_parent: of a suite that was selected of another
+    one, the hash of that. decoder: what makes pictures of stored videos here, with its version.
+    """
+
+    episodes: tuple[Row, ...]
+    streams: tuple[StoredStream, ...]
+    bytes: int
+    identity: Mapping[str, Any] = field(default_factory=dict)
+    selection: dict[str, Any] = field(default_factory=dict)
+    name_parts: Sequence[Any] = ()
+    suite_parent: str | None = None
+    decoder: str | None = None
+
+    @property
+    def columns(self) -> list[dict[str, Any]]:
+        """The rows as flat columns."""
+        return [row.to_json() for row in self.episodes]
+
+    def numbered(self, numbers: Mapping[str, int]) -> Self:
+        """The same rows, in the same order, with the numbers that a run has for their ids."""
+        rows = tuple(replace(row, index=numbers[row.episode_id]) for row in self.episodes)
+        return replace(self, episodes=rows)
+
+    def only(self, episodes: Iterable[Row]) -> Self:
+        """A plan of these rows alone, with their share of the bytes."""
+        rows = tuple(episodes)
+        return replace(self, episodes=rows, bytes=self.bytes * len(rows) // max(1, len(self.episodes)))
+
+    def episode(self, number: int) -> Row:
+        """The row that has this number. Raises KeyError."""
+        return self._by_number[number]
+
+    @cached_property
+    def _by_number(self) -> dict[int, Row]:
+        return {row.index: row for row in self.episodes}
+
+    @property
+    def sites(self) -> int:
+        """Number of captured sites per inference."""
+        return sum(len(stream.stream.sites()) for stream in self.streams)
+
+
+# -- records -----------------------------------------------------------------------------------------------------
+
+
+_STORED = ConfigDict(extra="allow", strict=True)
+
+
+class _Suite(TypedDict):
+    """The selected suite."""
+
+    __pydantic_config__ = _STORED  # type: ignore[misc]  # pydantic's way to configure a TypedDict
+    identity: str
+    content_sha256: str
+    seed_text: str
+
+
+class _Wordings(TypedDict):
+    """The wordings that were asked in."""
+
+    __pydantic_config__ = _STORED  # type: ignore[misc]
+    names: list[str]
+
+
+class _Rows(TypedDict):
+    """The chosen rows of recordings or of an environment."""
+
+    __pydantic_config__ = _STORED  # type: ignore[misc]
+    name: str
+    episodes: list[Any]
+
+
+class Selection(TypedDict):
+    """The selected part of a suite, of recordings, or of an environment."""
+
+    __pydantic_config__ = _STORED  # type: ignore[misc]
+    suite: NotRequired[_Suite]
+    categories: NotRequired[list[str]]
+    items: NotRequired[int]
+    wordings: NotRequired[_Wordings]
+    recording: NotRequired[_Rows]
+    played: NotRequired[_Rows]
+
+
+class StoredRow(TypedDict):
+    """A planned row: columns of every source, then those of a scene, of recordings, and of an environment."""
+
+    __pydantic_config__ = _STORED  # type: ignore[misc]
+    episode: int
+    episode_id: str
+    item_id: str
+    category: str
+    group_id: str
+    instruction: NotRequired[str]
+    layout: NotRequired[str]
+    side_correct: NotRequired[str]
+    item_content_sha256: NotRequired[str]
+    source_episode: NotRequired[int]
+    first_frame: NotRequired[int]
+    frame_step: NotRequired[int]
+    frames: NotRequired[int]
+    content_blake2b: NotRequired[str]
+    env_episode: NotRequired[int]
+    env_seed: NotRequired[int]
+
+
+class PlanRecord(Record):
+    """One selection. tokens: T by stream, where pooled views alone are stored. order: of all episodes so far."""
+
+    kind: ClassVar[str] = "plan"
+    run: str
+    record: int
+    selection: Selection
+    suite_parent: str | None
+    tokens: dict[str, int]
+    episodes: list[StoredRow]
+    order: list[int]
+
+
+@dataclass(frozen=True)
+class StoredPlan:
+    """All plan records of a run together.
+
+    rows: the episodes in order. selection, suite_parent, tokens: of the newest record, see `PlanRecord`. extents:
+    planned episodes after each record. hashes: of the records, which the commits of their episodes name.
+    """
+
+    rows: Sequence[RowColumns] = ()
+    selection: Mapping[str, Any] = field(default_factory=dict)
+    suite_parent: str | None = None
+    tokens: Mapping[str, int] = field(default_factory=dict)
+    extents: tuple[int, ...] = ()
+    hashes: tuple[str, ...] = ()
+
+    def hash_of(self, number: int) -> str:
+        """Hash of the record that added the episode of this number."""
+        return self.hashes[bisect_right(self.extents, number)]
+
+
+def plan_key(record: int) -> str:
+    """The key of the plan record of this number; 0 is the first selection."""
+    return f"{PLANS}/{record:08d}.json"
+
+
+def count_plans(location: Location) -> int:
+    """Return the number of plan records of a run. A run that begins right now may have none."""
+    return next(record for record in count() if not location.exists(plan_key(record)))
+
+
+def read_plans(location: Location, run: str, columns: Iterable[str]) -> StoredPlan:
+    """All plan records together; without any rows for a run that has none yet.
+
+    run: its identity. columns: those that every row has.
+    Raises RunDamagedError if a record is missing, was changed, or belongs elsewhere.
+    """
+    plan, by_number = StoredPlan(), dict[int, RowColumns]()
+    for number in count():
+        name = f"{location}/{plan_key(number)}"
+        try:
+            raw = location.read(plan_key(number))
+        except FileNotFoundError:
+            break
+        record = PlanRecord.parse(raw, name, RESTORE, run=run, record=number)
+        by_number |= {row["episode"]: row for row in record.episodes}
+        _check_rows(record, len(plan.rows), by_number, columns, name)
+        rows = [by_number[episode] for episode in record.order]
+        plan = StoredPlan(
+            rows, record.selection, record.suite_parent, record.tokens,
+            (*plan.extents, len(rows)), (*plan.hashes, record.hash),
+        )  # fmt: skip
+    missing = plan_key(len(plan.extents))
+    if later := [key for key in location.keys(PLANS) if _NUMBERED.fullmatch(key) and key > missing]:
+        raise RunDamagedError(f"{location}/{missing} is missing, though {later[0]} is there. {RESTORE}")
+    return plan
+
+
+def _check_rows(
+    record: PlanRecord, before: int, by_number: Mapping[int, RowColumns], columns: Iterable[str], name: str
+) -> None:
+    """Raise RunDamagedError unless new rows have all columns and numbers from `before` on, and all a place."""
+    if lacking := [column for row in record.episodes for column in columns if column not in row]:
+        raise RunDamagedError(f"{name} has an episode without {lacking[0]}. {RESTORE}")
+    numbers = [row["episode"] for row in record.episodes]
+    ids = {row["episode_id"] for row in by_number.values()}
+    expected = list(range(before + len(numbers)))
+    if numbers != expected[before:] or sorted(record.order) != expected or len(ids) != len(expected):
+        raise RunDamagedError(f"{name} numbers or orders its episodes in another way than plans do. {RESTORE}")
+
+
+def while_growing[Result](location: Location, read: Callable[[], Result]) -> Result:
+    """The result of `read`, called again if the run grew meanwhile: parts of two states do not fit together.
+
+    Raises what `read` raises.
+    """
+    while True:
+        before = count_plans(location)
+        try:
+            return read()
+        except RunDamagedError:
+            if count_plans(location) == before:
+                raise
+
+
+# -- growth ------------------------------------------------------------------------------------------------------
+
+
+def further_rows(
+    stored: Sequence[RowColumns], requested: Sequence[RowColumns], location: Location
+) -> list[RowColumns]:
+    """The rows of a plan that the stored one lacks; none if the stored one holds them all.
+
+    Raises SettingsMismatchError if both plan one episode differently, or if each has some that the other lacks.
+    """
+    was, now = ({row["episode_id"]: row for row in rows} for rows in (stored, requested))
+    for name in was.keys() & now.keys():
+        _check_equal(was[name], now[name], location)
+    added = [row for name, row in now.items() if name not in was]
+    lost = [row for name, row in was.items() if name not in now]
+    if added and lost:
+        raise SettingsMismatchError(
+            f"{location} has {_counted(stored)}; this command asks for {_counted(requested)}. A run grows and "
+            f"never gets smaller, and {len(lost)} of its episodes are not asked for (the first is "
+            f"{lost[0]['episode_id']}). Ask for at least what it has, or choose another --out"
+        )
+    return added
+
+
+def _check_equal(was: RowColumns, now: RowColumns, location: Location) -> None:
+    """Raise SettingsMismatchError unless an episode is planned as it is stored, but for its number."""
+    # Every part, not the id alone: an item that was edited keeps its id, and has another content.
+    for part in sorted((was.keys() | now.keys()) - {_NUMBER}):
+        if was.get(part) != now.get(part):
+            if part == _CONTENT:
+                raise SettingsMismatchError(
+                    f"the files of the data set that hold {was['episode_id']} have changed since {location} "
+                    f"began: their {part} is stored as {was.get(part)!r}, here {now.get(part)!r}. Give the data "
+                    "set as it was, or choose another --out"
+                )
+            raise SettingsMismatchError(
+                f"{location} plans {was['episode_id']} otherwise: its {part} is stored as {was.get(part)!r}, here "
+                f"{now.get(part)!r}. Use the suite, the kind of --wordings and the version of probe_kit that the "
+                "run began with, or choose another --out"
+            )
+
+
+def _counted(rows: Sequence[RowColumns]) -> str:
+    """Items by category, and the wordings they are asked in."""
+    items = {row["item_id"]: row["category"] for row in rows}
+    counts = ", ".join(f"{name} {count}" for name, count in sorted(Counter(items.values()).items()))
+    wordings = ", ".join(dict.fromkeys(row["wording"] for row in rows if "wording" in row))
+    return f"items of {counts}" + (f" in the wordings {wordings}" if wordings else "")

@@ -1,0 +1,131 @@
+"""The source of a run, the files and choices of the processes that played it, and its first items."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+from probe_kit.errors import UsageError
+from probe_kit.runs.layout import DATASET, ENVIRONMENT
+from probe_kit.suite.categories import check_categories
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+ORIGIN = "origin"
+"""Entry of a certificate."""
+SUITE = "suite"
+OF_SCENE = "scene."
+"""Beginning of the name of a file that a field of the scene gives."""
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Files and choices of one process that played episodes of a run; none is part of the run's identity.
+
+    files: absolute, by field of the source's settings, such as `suite`, `folder` or `scene.background`.
+    checkpoint: absolute folder, hub id, or a word of the family; empty if unknown. options: of the family, as they
+    were passed, files and folders absolute. random_weights: whether random weights were requested, which a file
+    that calls its weights random is not. weights_seed: of requested random weights. repositories: commits of
+    further repositories of the hub, by name, which a repetition reads again.
+    """
+
+    files: Mapping[str, str] = field(default_factory=dict)
+    checkpoint: str = ""
+    options: Mapping[str, Any] = field(default_factory=dict)
+    random_weights: bool = False
+    weights_seed: int = 0
+    repositories: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of_record(cls, record: Mapping[str, Any]) -> Self:
+        """Return the origin in the record of a process; an empty one where it has none."""
+        return cls(**record.get(ORIGIN, {}))
+
+    @property
+    def suite(self) -> str | None:
+        """The suite's folder; None for the embedded suite and for runs without one."""
+        return self.files.get(SUITE)
+
+    @property
+    def scene_files(self) -> dict[str, Path]:
+        """The files of the scene by its fields."""
+        return {
+            name.removeprefix(OF_SCENE): Path(path)
+            for name, path in self.files.items()
+            if name.startswith(OF_SCENE)
+        }
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain values."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class RunSource:
+    """The observations that a run is made of.
+
+    kind: of the source's settings, such as `scene` or `lerobot`; `arrays` for a run that probe_kit did not play.
+    name: with what identifies it, such as `NAME@VERSION#HASH` of a suite. words: what the run did with it.
+    """
+
+    kind: str
+    name: str
+    words: str
+
+    @property
+    def subject(self) -> str:
+        """The things that its model was shown, in a word; of a source of your own its kind."""
+        return {"scene": "scenes", "lerobot": "recordings", "env": "environments"}.get(self.kind, self.kind)
+
+    @classmethod
+    def of(cls, settings: Mapping[str, Any]) -> "RunSource":
+        """Return the source that the settings of a stored run name."""
+        if DATASET in settings:
+            name = f"{settings['recording']['name']}#{settings[DATASET]['meta_blake2b'][:12]}"
+            kind = str(settings[DATASET].get("kind", "lerobot"))
+            subject = "recordings" if kind == "lerobot" else kind
+            return cls(kind, name, f"it shows {subject} ({name}), and its model did not act")
+        if ENVIRONMENT in settings:
+            name = f"{settings['played']['name']}@{settings[ENVIRONMENT]['revision']}"
+            return cls("env", name, f"it plays an environment of your own ({name})")
+        name = str(settings["suite"]["identity"])
+        return cls("scene", name, f"it plays {name}")
+
+
+def select_items(
+    items: "pd.DataFrame", categories: Sequence[str] | None, per_category: int | None, where: str
+) -> list[str]:
+    """Ids of the first items of some categories, in the order of the plan.
+
+    items: as `Run.items`. categories: slugs, all by default. where: the run, for messages.
+    Raises UnknownCategoryError and UsageError, see `Run.only`.
+    """
+    categories_of_run = list(dict.fromkeys(items["category"].astype(str)))
+    selected = categories_of_run if categories is None else check_categories(categories, categories_of_run)
+    if not selected:
+        raise UsageError("no category selected. Name at least one, or leave `categories` out for all.")
+    item_ids: list[str] = []
+    for category in selected:
+        planned = items[items["category"] == category]
+        count = len(planned) if per_category is None else per_category
+        if not 0 < count <= len(planned):
+            raise UsageError(
+                f"items is {count}, but {where} plans {len(planned)} items of {category!r}; give a number from 1 "
+                f"to {len(planned)}, or play more with `probe-kit extract`"
+            )
+        _check_twins(planned, count, category)
+        item_ids += planned["item_id"].iloc[:count].tolist()
+    return item_ids
+
+
+def _check_twins(items: "pd.DataFrame", count: int, category: str) -> None:
+    """Raise UsageError if the first items hold one of two role-exchanged twins, and the others the other one."""
+    pairs = items["pair_id"]
+    separated = set(pairs.iloc[:count].dropna()) & set(pairs.iloc[count:].dropna())
+    if separated:
+        raise UsageError(
+            f"items is {count}, which would keep one of the role-exchanged twins {min(separated)!r} of "
+            f"{category!r} and drop the other. Give an even number."
+        )
