@@ -13,7 +13,6 @@ from probe_kit.hooks.contract.declared import InterventionKind
 from probe_kit.hooks.contract.sites import KV_STREAM
 from probe_kit.intervene.kinds.base import (
     Intervention,
-    Measurement,
     TableContext,
     edits_by_category,
     effect_table,
@@ -24,7 +23,7 @@ from probe_kit.intervene.kinds.base import (
 )
 from probe_kit.intervene.kinds.image_swap import share_of_swap, swap_sign
 from probe_kit.intervene.kinds.interchange import cells_at, check_sites_and_roles, patch_of
-from probe_kit.intervene.outcomes import CLEAN, FIRST_CHUNK, ConditionOutcomes
+from probe_kit.intervene.outcomes import CLEAN, FIRST_CHUNK, ConditionOutcomes, Measurement
 from probe_kit.intervene.patching.attribution import (
     AGREEMENT,
     AttributionEffect,

@@ -22,7 +22,6 @@ from probe_kit.intervene.kinds.base import (
     ConditionName,
     EffectRow,
     Intervention,
-    Measurement,
     TableContext,
     common_columns,
     count_edits,
@@ -35,7 +34,7 @@ from probe_kit.intervene.kinds.base import (
     test_against_controls,
 )
 from probe_kit.intervene.kinds.interchange import cells_at
-from probe_kit.intervene.outcomes import CLEAN, ERASE, FIRST_CHUNK, PROBE_ACCURACY, ConditionOutcomes
+from probe_kit.intervene.outcomes import CLEAN, ERASE, FIRST_CHUNK, PROBE_ACCURACY, ConditionOutcomes, Measurement
 from probe_kit.intervene.patching.attribution import LOCALISATION_SHARE
 from probe_kit.intervene.patching.patch import Cell
 from probe_kit.intervene.places import TILES, resolve_all, role_tokens

@@ -7,7 +7,6 @@ without sides one input is exchanged for a donor's, and sizes are in spreads of 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import hypot
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -17,9 +16,7 @@ from probe_kit._system.counting import counted
 from probe_kit._tables.numbers import number, percent
 from probe_kit.hooks.contract.declared import InterventionKind, Readout
 from probe_kit.intervene.kinds.base import (
-    TILES_APART,
     Intervention,
-    Measurement,
     TableContext,
     effect_table,
     interval_text,
@@ -34,8 +31,10 @@ from probe_kit.intervene.outcomes import (
     DONOR,
     FIRST_CHUNK,
     IMAGE_SWAP,
+    TILES_APART,
     ConditionOutcomes,
     Effect,
+    Measurement,
     has_sides,
     preferred_by_category,
 )
@@ -224,15 +223,6 @@ class Reach(NamedTuple):
         return cls(tiles_apart, "tiles")
 
 
-def tiles_apart(run: RunReader) -> float:
-    """Return metres between the middles of the tiles of a run's scene, or of the default one."""
-    scene: Any = run.settings.get("scene", {})
-    if "tile_left" not in scene or "tile_right" not in scene:
-        return TILES_APART
-    (left_x, left_y), (right_x, right_y) = scene["tile_left"], scene["tile_right"]
-    return hypot(left_x - right_x, left_y - right_y)
-
-
 @dataclass(frozen=True, kw_only=True)
 class ImageSwapEffect(Effect):
     """The effect of a swap on the actions, in one category.
@@ -363,10 +353,8 @@ def stored_image_swaps(run: RunReader, readout: str | None = None) -> dict[str, 
     Raises RunDamagedError if any stored intervention was changed.
     """
     preferred = preferred_by_category(run, NAME, readout)
-    apart, rows = tiles_apart(run), dict[str, dict[str, ImageSwapEffect]]()
-    for stored in {result.stored.key: result.stored for result in preferred.values()}.values():
-        measurement = Measurement(stored.outcomes(), stored.settings, {}, stored.bundle.read, stored.key, apart)
-        rows[stored.key] = {row.category: row for row in image_swap_effects(measurement)}
+    stored = {result.stored.key: result.stored for result in preferred.values()}
+    rows = {key: {row.category: row for row in image_swap_effects(measured)} for key, measured in stored.items()}
     return {category: rows[result.stored.key][category] for category, result in preferred.items()}
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from probe_kit._tables.numbers import percent
 from probe_kit.errors import UsageError
 from probe_kit.hashing import derive_seed
-from probe_kit.intervene.kinds.base import Measurement, TableContext
+from probe_kit.intervene.kinds.base import TableContext
 from probe_kit.intervene.kinds.image_swap import (
     SWAP_COLUMNS,
     ImageSwapEffect,
@@ -28,6 +28,7 @@ from probe_kit.intervene.outcomes import (
     INSTRUCTION_SWAP,
     NOISE,
     ConditionOutcomes,
+    Measurement,
     has_sides,
 )
 from probe_kit.intervene.replay import (

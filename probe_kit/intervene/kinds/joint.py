@@ -4,7 +4,7 @@ Sets of cells are patched in one inference, as an interchange patches a single o
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -13,7 +13,6 @@ from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import KV_STREAM
 from probe_kit.intervene.kinds.base import (
     Intervention,
-    Measurement,
     TableContext,
     effect_table,
     flips_seed,
@@ -24,9 +23,9 @@ from probe_kit.intervene.kinds.image_swap import share_of_swap, swap_sign
 from probe_kit.intervene.kinds.interchange import cells_at, check_sites_and_roles
 from probe_kit.intervene.outcomes import (
     CLEAN,
-    PER_STEP,
     ConditionOutcomes,
     Effect,
+    Measurement,
     StoredResult,
     stored_results,
 )
@@ -44,7 +43,7 @@ from probe_kit.intervene.patching.sweep import (
     share_fields,
 )
 from probe_kit.intervene.places import SEPARATOR, Pair, list_places, resolve_all
-from probe_kit.intervene.replay import CLEAN_RUN, SOURCE_RUN, Condition, patched_run, replay
+from probe_kit.intervene.replay import CLEAN_RUN, SOURCE_RUN, Condition, patched_run
 from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.paired_tests import max_t, paired_greater_p, smallest_flip_p
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -163,16 +162,14 @@ class JointPlaces(Intervention):
 
     def _search(self, session: "ReplaySession", cells: tuple[Cell, ...], pairs: Sequence[Pair]) -> SearchedSets:
         """Return the smallest sets of one category, searched on the choosing half of its groups."""
-        from probe_kit.intervene.rollout import evaluate_per_step
-
         choosing = choosing_half([pair.group for pair in pairs], self.seed)
         searched_pairs = [pair for pair in pairs if pair.group in choosing]
-        play, sites = evaluate_per_step if self.readout == PER_STEP else replay, sites_of_cells(cells)
+        sites = sites_of_cells(cells)
 
         def effects(sets: Sequence[tuple[Cell, ...]]) -> list[float]:
             """Return the share of the image swap's displacement that each set carries."""
             patches = [patched_run(str(number), {"": part}, sites) for number, part in enumerate(sets)]
-            played = play(session, searched_pairs, [CLEAN_RUN, SOURCE_RUN, *patches])
+            played = self.play(session, searched_pairs, [CLEAN_RUN, SOURCE_RUN, *patches])
             clean, swapped, *moved = played.displacement
             return [pooled_share(values - clean, swapped - clean) for values in moved]
 
@@ -283,10 +280,9 @@ def stored_joint_places(run: RunReader) -> dict[str, list[JointEffect]]:
     """
     rows = {}
     for category, result in _preferred(run).items():
-        stored = result.stored
-        certificate = stored.certificate()
-        measurement = Measurement(result.outcomes, stored.settings, certificate, stored.bundle.read, stored.key)
-        rows[category] = JointPlaces.effects(measurement)
+        measured = result.stored
+        of_category = _rows(result.outcomes, measured.settings, measured.certificate.get(NAME, {}))
+        rows[category] = [replace(row, key=measured.key) for row in of_category]
     return rows
 
 
