@@ -15,6 +15,8 @@ import argparse
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
@@ -70,7 +72,8 @@ def shuffled(answers: ConditionOutcomes, draw: np.random.Generator) -> Condition
 def measured(answers: ConditionOutcomes, suite: str) -> Measurement:
     """Return what effects are computed from."""
     files = {EPISODES: answers.to_bytes()}
-    return Measurement({}, files.__getitem__, seed_text=suite)
+    run: Any = SimpleNamespace(seed_text=suite, settings={})
+    return Measurement(run, {}, files.__getitem__)
 
 
 def count_outside(answers: ConditionOutcomes, suite: str, counts: dict[str, Count]) -> None:

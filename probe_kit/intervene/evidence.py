@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 from probe_kit.hooks.contract.sites import KV_STREAM, role_of_view
 from probe_kit.hooks.registry import get_family
 from probe_kit.intervene.directions import DIRECTIONS, MEAN_DIFFERENCE
+from probe_kit.intervene.exchange import NOTHING, carries_nothing
 from probe_kit.intervene.kinds.image_swap import ImageSwapEffect, stored_image_swaps
 from probe_kit.intervene.kinds.interchange import (
     BACKBONE,
@@ -30,7 +31,6 @@ from probe_kit.intervene.kinds.joint import (
 )
 from probe_kit.intervene.outcomes import FIRST_CHUNK, PER_STEP
 from probe_kit.intervene.patching.attribution import LOCALISATION_SHARE
-from probe_kit.intervene.patching.sweep import NOTHING, carries_nothing
 from probe_kit.intervene.places import ALL, PlaceName, list_places, unread_places
 from probe_kit.intervene.verdict import (
     Places,
@@ -50,7 +50,7 @@ if TYPE_CHECKING:
 class StoredEvidence:
     """All that a run's stored interventions say of the answer, by category; each part is computed once.
 
-    classified: image swaps that are classified whatever else is stored of their categories. Raises RunDamagedError.
+    classified: image swaps that count whatever else is stored of their categories. Raises RunDamagedError.
     """
 
     run: RunReader

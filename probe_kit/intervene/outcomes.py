@@ -17,17 +17,18 @@ from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from io import BytesIO
 from math import hypot
-from typing import Any, ClassVar, get_args
+from typing import Any, ClassVar, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit._system.bounded_files import open_arrays, parse_json
 from probe_kit.errors import NoInterventionsError, UnknownCategoryError, UsageError
-from probe_kit.hashing import sha256_json
+from probe_kit.hashing import derive_seed, sha256_json
 from probe_kit.hooks.contract.declared import Readout
+from probe_kit.intervene.exchange import Exchange
 from probe_kit.runs.layout import INTERVENTIONS
-from probe_kit.runs.reader import SIDE, RunReader
+from probe_kit.runs.reader import SIDE, RunReader, full_name
 from probe_kit.runs.results import HEAD, Bundle, complete_key, read_bundles
 from probe_kit.runs.run import Run
 from probe_kit.runs.store import Location
@@ -306,6 +307,14 @@ class ConditionOutcomes:
         """(E,) +1 where the correct picture lies left, −1 where it lies right, or where nothing has a side."""
         return np.where(self.sides == "left", 1.0, -1.0)
 
+    def exchange(self, source: str = IMAGE_SWAP) -> Exchange | None:
+        """Return the effect of a condition with other inputs, in one category; None if it was not played."""
+        if source not in self.conditions:
+            return None
+        flips = derive_seed("sign flips", self.seed_text, str(self.categories[0]))
+        pair = self.of(CLEAN), self.of(source)
+        return Exchange(*pair, -self.correct_sign, self.groups, self.items, self.seed_text, flips)
+
     @property
     def counts(self) -> dict[str, Any]:
         """Return category, and numbers of episodes, items and groups, as columns of a row; of one category."""
@@ -379,27 +388,26 @@ TILES_APART = 0.31
 
 @dataclass(frozen=True)
 class Measurement:
-    """One intervention as it is stored, or about to be: what effects are computed from.
+    """One intervention of a run, stored or about to be: what effects, their table and their sentences are made of.
 
     settings: what decided its numbers, see `settings_of`. read: a stored file by its name; raises RunDamagedError
     if it was changed. files: their names. key: of its folder. created: ISO time (UTC), empty before it is stored.
-    seed_text: of its run, by which random draws are made. tiles_apart: metres between the tiles of its scene.
+    explains: whether the caption of its table says what each verdict rests on, as sentences do.
     """
 
+    run: RunReader = field(repr=False)
     settings: Mapping[str, Any]
     read: Callable[[str], bytes] = field(repr=False)
     files: Collection[str] = ()
     key: str = ""
     created: str = ""
-    seed_text: str = field(default="", repr=False)
-    tiles_apart: float = TILES_APART
+    explains: bool = True
 
     @classmethod
-    def of(cls, run: RunReader, bundle: Bundle) -> "Measurement":
+    def of(cls, run: RunReader, bundle: Bundle) -> Self:
         """Return one that a run stores."""
-        times, settings = bundle.times, bundle.head["settings"]
-        created = times.get("created", "")
-        return cls(settings, bundle.read, bundle.files, bundle.key, created, run.seed_text, tiles_apart(run))
+        settings, created = bundle.head["settings"], bundle.times.get("created", "")
+        return cls(run, settings, bundle.read, bundle.files, bundle.key, created)
 
     @property
     def kind(self) -> str:
@@ -419,7 +427,7 @@ class Measurement:
     @cached_property
     def outcomes(self) -> ConditionOutcomes:
         """The numbers of its conditions. Raises RunDamagedError if they were changed."""
-        return ConditionOutcomes.from_bytes(self.read(EPISODES), self.seed_text)
+        return ConditionOutcomes.from_bytes(self.read(EPISODES), self.run.seed_text)
 
     @cached_property
     def certificate(self) -> dict[str, Any]:
@@ -433,14 +441,48 @@ class Measurement:
         key: dict[str, Any] = {"key": self.key}  # every kind's rows have it, as their last column
         return [replace(row, **key) for rows in parts for row in rows]
 
+    # -- words of tables -----------------------------------------------------------------------------------------
 
-def tiles_apart(run: RunReader) -> float:
-    """Return metres between the middles of the tiles of a run's scene, or of the default one."""
-    scene: Any = run.settings.get("scene", {})
-    if "tile_left" not in scene or "tile_right" not in scene:
-        return TILES_APART
-    (left_x, left_y), (right_x, right_y) = scene["tile_left"], scene["tile_right"]
-    return hypot(left_x - right_x, left_y - right_y)
+    @property
+    def subject(self) -> str:
+        """Return model and suite, as titles have them."""
+        label = full_name(self.run.label, self.run.random_weights)
+        # The label of a run of recordings says on what already.
+        name = self.run.suite.partition("#")[0]
+        return label if self.run.label.endswith(f" on {name}") else f"{label} on {self.run.suite}"
+
+    @property
+    def lacks_sides(self) -> bool:
+        """Whether the run has no correct picture on a side."""
+        return not self.outcomes.has_sides
+
+    @property
+    def exchange(self) -> str:
+        """Return the change of inputs that effects are shares of."""
+        return f"exchange of the {self.settings.get('vary') or ''}" if self.lacks_sides else "image swap"
+
+    def in_words(self, text: str) -> str:
+        """Return a text about the image swap, about what was exchanged in this run."""
+        return text.replace("image swap", self.exchange)
+
+    @property
+    def verdicts(self) -> Mapping[str, Any]:
+        """Return by category the `UseVerdict`; those of an `InterventionResult`, here none."""
+        return {}
+
+    @property
+    def legend(self) -> str:
+        """Return what a reader of the verdicts must know."""
+        return ""
+
+    @property
+    def tiles_apart(self) -> float:
+        """Return metres between the middles of the tiles of the run's scene, or of the default one."""
+        scene: Any = self.run.settings.get("scene", {})
+        if "tile_left" not in scene or "tile_right" not in scene:
+            return TILES_APART
+        (left_x, left_y), (right_x, right_y) = scene["tile_left"], scene["tile_right"]
+        return hypot(left_x - right_x, left_y - right_y)
 
 
 def is_stored(run: Location, key: str) -> bool:

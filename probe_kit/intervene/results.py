@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property
@@ -15,7 +16,7 @@ from probe_kit._system.escaping import csv_of_frame
 from probe_kit.errors import NoProbesError
 from probe_kit.intervene.evidence import StoredEvidence, which_layer
 from probe_kit.intervene.kinds import kind_names, kind_of
-from probe_kit.intervene.kinds.base import Intervention, TableContext, frame_of
+from probe_kit.intervene.kinds.base import Intervention, frame_of
 from probe_kit.intervene.kinds.image_swap import ImageSwapEffect
 from probe_kit.intervene.outcomes import (
     CERTIFICATE,
@@ -30,7 +31,6 @@ from probe_kit.intervene.outcomes import (
     key_of,
     read_interventions,
     stored_interventions,
-    tiles_apart,
 )
 from probe_kit.intervene.places import unread_note
 from probe_kit.intervene.verdict import UseVerdict, describe_readouts, size_of_groups
@@ -55,33 +55,13 @@ _VERDICT_COLUMNS = ("verdict", "behaviour", "reversed", "reason", "place", "tie"
 
 
 @dataclass(frozen=True)
-class InterventionResult(TableContext):
+class InterventionResult(Measurement):
     """One intervention: its settings, what it gave, and what that means with all else that its run stores."""
 
-    @property
-    def key(self) -> str:
-        """Name of its folder."""
-        return self.measurement.key
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """Return what decided its numbers, as stored."""
-        return dict(self.measurement.settings)
-
-    @property
-    def certificate(self) -> dict[str, Any]:
-        """Return what was loaded and checked, as stored."""
-        return dict(self.measurement.certificate)
-
-    @property
-    def outcomes(self) -> ConditionOutcomes:
-        """Return the numbers of its conditions."""
-        return self.measurement.outcomes
-
-    @property
-    def kind(self) -> str:
-        """Return the kind of the intervention."""
-        return self.measurement.kind
+    @classmethod
+    def of_stored(cls, stored: Measurement) -> "InterventionResult":
+        """Return what a stored intervention means."""
+        return cls(stored.run, stored.settings, stored.read, stored.files, stored.key, stored.created)
 
     @property
     def _kind(self) -> type[Intervention]:
@@ -90,7 +70,7 @@ class InterventionResult(TableContext):
     @cached_property
     def effects(self) -> list[Any]:
         """The rows of its kind, such as one `PatchEffect` per category and edit."""
-        return list(self._kind.effects(self.measurement))
+        return list(self._kind.effects(self))
 
     @property
     def table(self) -> "pd.DataFrame":
@@ -138,7 +118,7 @@ class InterventionResult(TableContext):
     def _one_step(self) -> list[str]:
         if not self.outcomes.has_sides:
             return []
-        if self.measurement.readout == PER_STEP:
+        if self.readout == PER_STEP:
             return [
                 "Per step: every condition was evaluated at every inference of the unedited episode "
                 "(teacher-forced), and the lateral displacements of its actions are summed; none was executed."
@@ -181,7 +161,10 @@ class InterventionResult(TableContext):
 
     def to_rich(self, details: bool = True) -> "Table":
         """The table for a terminal. details: split it where it is wide, else leave columns out by name."""
-        table = self._kind.table(self.effects, replace(self, explains=details))
+        _ = self.legend  # effects and verdicts are computed once, for this table and for sentences
+        context = copy(self)
+        context.__dict__["explains"] = details
+        table = self._kind.table(self.effects, context)
         return replace(table, overflow="split" if details else "leave out")
 
     @property
@@ -225,7 +208,7 @@ def load_effects(run: RunReader, key: str | None = None, kind: str | None = None
 
     Raises NoInterventionsError, UsageError for a key that is not there, RunDamagedError if it was changed.
     """
-    result = InterventionResult(run, find_stored(run, key, kind))
+    result = InterventionResult.of_stored(find_stored(run, key, kind))
     _ = result.outcomes, result.certificate  # what was changed is said now
     return result
 
@@ -261,9 +244,7 @@ def save(
         tidy_bundle(run.location, INTERVENTIONS, key)
         return key
     files = {EPISODES: outcomes.to_bytes(), CERTIFICATE: as_json(certificate), **extra_files}
-    measurement = Measurement(
-        settings, files.__getitem__, files, seed_text=run.seed_text, tiles_apart=tiles_apart(run)
-    )
+    measurement = Measurement(run, settings, files.__getitem__, files)
     rows: Sequence[Effect] = kind_of(measurement.kind).effects(measurement)
     files[EFFECTS] = csv_of_frame(frame_of(rows).drop(columns="key", errors="ignore")).encode()
     now = datetime.now(UTC).isoformat(timespec="microseconds")
@@ -351,4 +332,4 @@ def readers_of_results(run: Run) -> Iterator[Callable[[], object]]:
     for wording in run.wordings or (None,):
         reader = run if wording is None else run.in_wording(wording)
         for stored in stored_interventions(reader):
-            yield InterventionResult(reader, stored).to_json
+            yield InterventionResult.of_stored(stored).to_json

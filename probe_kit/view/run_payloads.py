@@ -417,7 +417,7 @@ def _interventions(viewed: ViewedRun) -> Iterator[dict[str, Any]]:
     used = {listed.key for listed in listed_interventions(viewed.run) if listed.state == "used"}
     for stored in stored_interventions(viewed.run):
         if stored.key in used:
-            result = InterventionResult(viewed.run, stored)
+            result = InterventionResult.of_stored(stored)
             yield _result_table(f"intervention {result.kind}", stored.key, result.to_rich(), result.findings)
 
 

@@ -80,7 +80,8 @@ def measured(
     read: Callable[[str], bytes] = str.encode,
 ) -> Measurement:
     files = {EPISODES: outcomes.to_bytes(), CERTIFICATE: as_json(dict(certificate))}
-    return Measurement(settings, lambda name: files.get(name) or read(name), seed_text=seed_text)
+    run = SimpleNamespace(label="wired", random_weights=False, suite="suite", settings={}, seed_text=seed_text)
+    return Measurement(run, settings, lambda name: files.get(name) or read(name))  # type: ignore[arg-type]
 
 
 def with_parts(
@@ -89,9 +90,9 @@ def with_parts(
     certificate: Mapping[str, Any] | None = None,
 ) -> InterventionResult:
     """The same with other outcomes, or another certificate."""
-    before = result.measurement
-    parts = before.settings, result.certificate if certificate is None else certificate, before.read
-    return replace(result, measurement=measured(outcomes or result.outcomes, before.seed_text, *parts))
+    parts = result.settings, result.certificate if certificate is None else certificate, result.read
+    changed = measured(outcomes or result.outcomes, result.run.seed_text, *parts)
+    return replace(result, read=changed.read)
 
 
 class Said(InterventionResult):
@@ -101,8 +102,8 @@ class Said(InterventionResult):
 
 
 def said_of(measurement: Measurement, verdicts: Mapping[str, UseVerdict] = MappingProxyType({})) -> Said:
-    run = SimpleNamespace(label="wired", random_weights=False, suite="suite")
-    result = Said(run, measurement)  # type: ignore[arg-type]
+    result = Said.of_stored(measurement)
+    assert isinstance(result, Said)
     result.__dict__["verdicts"] = verdicts
     return result
 

@@ -16,7 +16,7 @@ from probe_kit.errors import CaptureChangedActionError, CaptureError, EmptyRoleE
 from probe_kit.hooks.contract.declared import InterventionKind
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.sites import first_of
-from probe_kit.intervene.kinds.base import Intervention, TableContext, effect_table
+from probe_kit.intervene.kinds.base import Intervention, effect_table
 from probe_kit.intervene.outcomes import (
     ATTENTION,
     ATTENTION_FILE,
@@ -132,15 +132,15 @@ class AttentionReadout(Intervention):
         return AttentionShares.from_bytes(measurement.read(ATTENTION_FILE)).rows()
 
     @staticmethod
-    def table(rows: "Sequence[AttentionRow]", context: TableContext) -> "Table":
+    def table(rows: "Sequence[AttentionRow]", context: Measurement) -> "Table":
         """Return one line per category and block of the backbone that is read."""
         del rows
-        attention = AttentionShares.from_bytes(context.measurement.read(ATTENTION_FILE))
+        attention = AttentionShares.from_bytes(context.read(ATTENTION_FILE))
         means = attention.rows(("block",))
         roles = [role for role in dict.fromkeys(row.role for row in means) if role not in (CORRECT, OTHER)]
         lines: list[tuple[tuple[str, ...], tuple[dict[str, float], str]]] = []
         for category, part in attention.by_category():
-            apart = part.correct_minus_other(context.measurement.outcomes.seed_text)
+            apart = part.correct_minus_other(context.run.seed_text)
             for block in dict.fromkeys(row.block for row in means if row.category == category):
                 shares = {row.role: row.share for row in means if (row.category, row.block) == (category, block)}
                 lines.append(((category, f"block {block:02d}"), (shares, _difference(apart.get(block or 0)))))

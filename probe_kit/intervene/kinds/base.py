@@ -31,7 +31,7 @@ from probe_kit.intervene.outcomes import (
 from probe_kit.intervene.places import SEPARATOR, TILES, Pair
 from probe_kit.intervene.replay import Condition, replay
 from probe_kit.runs.direction_files import FileDirection, names_file, read_direction
-from probe_kit.runs.reader import RunReader, full_name
+from probe_kit.runs.reader import RunReader
 from probe_kit.runs.run import Run
 from probe_kit.statistics.bootstrap import GAINS, group_bootstrap, units_seed
 from probe_kit.statistics.paired_tests import max_t
@@ -50,52 +50,6 @@ OPTIONS = ("sites", "roles", "direction", "controls", "coefficients", "target_si
 
 
 # -- the kind -------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class TableContext:
-    """One intervention of a run: the words of a table besides its rows; `InterventionResult` is one.
-
-    measurement: what effects are computed from. explains: whether the caption says what each verdict rests on, as
-    sentences do.
-    """
-
-    run: RunReader = field(repr=False)
-    measurement: Measurement
-    explains: bool = True
-
-    @property
-    def subject(self) -> str:
-        """Return model and suite, as titles have them."""
-        label = full_name(self.run.label, self.run.random_weights)
-        # The label of a run of recordings says on what already.
-        name = self.run.suite.partition("#")[0]
-        return label if self.run.label.endswith(f" on {name}") else f"{label} on {self.run.suite}"
-
-    @property
-    def lacks_sides(self) -> bool:
-        """Whether the run has no correct picture on a side."""
-        return not self.measurement.outcomes.has_sides
-
-    @property
-    def exchange(self) -> str:
-        """Return the change of inputs that effects are shares of."""
-        vary = self.measurement.settings.get("vary") or ""
-        return f"exchange of the {vary}" if self.lacks_sides else "image swap"
-
-    def in_words(self, text: str) -> str:
-        """Return a text about the image swap, about what was exchanged in this run."""
-        return text.replace("image swap", self.exchange)
-
-    @property
-    def verdicts(self) -> Mapping[str, Any]:
-        """Return by category the `UseVerdict`."""
-        return {}
-
-    @property
-    def legend(self) -> str:
-        """Return what a reader of the verdicts must know."""
-        return ""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -209,17 +163,17 @@ class Intervention(Choice, ABC):
 
     @staticmethod
     @abstractmethod
-    def table(rows: Sequence[Any], context: TableContext) -> "Table":
+    def table(rows: Sequence[Any], context: Measurement) -> "Table":
         """Return the rows as a table for a terminal."""
 
     @classmethod
-    def sentences(cls, rows: Sequence[Any], context: TableContext) -> list[str]:
+    def sentences(cls, rows: Sequence[Any], context: Measurement) -> list[str]:
         """Return what was found with its numbers, a sentence per category; none of a kind that only describes."""
         parts = [(name, cls.sentence(part)) for name, part in edits_by_category(rows).items()]
         return [f"{category_of(name).title}: {context.in_words(text)}." for name, text in parts if text]
 
     @classmethod
-    def findings(cls, rows: Sequence[Any], context: TableContext) -> list[str]:
+    def findings(cls, rows: Sequence[Any], context: Measurement) -> list[str]:
         """Return the last lines of a command, `CATEGORY  verdict: what was found.`: short, one per category."""
         parts = [
             (category_of(name).title, cls.finding(part, context)) for name, part in edits_by_category(rows).items()
@@ -234,7 +188,7 @@ class Intervention(Choice, ABC):
         return ""
 
     @staticmethod
-    def finding(rows: Sequence[Any], context: TableContext) -> str:
+    def finding(rows: Sequence[Any], context: Measurement) -> str:
         """Return a verdict, a colon and what was found, in few words without brackets. rows: as of `sentence`."""
         del rows, context
         return ""
@@ -417,15 +371,11 @@ def test_against_controls(
     beyond = np.array(
         [values[at] - values[controls[at]].mean(axis=0) if controls[at] else values[at] for at in tested]
     )
-    numbers = max_t(beyond, outcomes.items, outcomes.groups, flips_seed(outcomes))
+    flips = derive_seed("sign flips", outcomes.seed_text, str(outcomes.categories[0]))
+    numbers = max_t(beyond, outcomes.items, outcomes.groups, flips)
     for at, excess, *statistics in zip(tested, beyond, *numbers, strict=True):
         tests[at] = ControlTest(controls[at], excess, *map(float, statistics))
     return tests
-
-
-def flips_seed(outcomes: ConditionOutcomes) -> int:
-    """Return the seed of the sign flips of one category."""
-    return derive_seed("sign flips", outcomes.seed_text, str(outcomes.categories[0]))
 
 
 def mean_of(values: Values) -> float | None:

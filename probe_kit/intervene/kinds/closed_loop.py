@@ -24,7 +24,6 @@ from probe_kit.intervene.kinds.base import (
     AlongDirection,
     ConditionName,
     EffectRow,
-    TableContext,
     common_columns,
     count_edits,
     edit_of,
@@ -191,7 +190,7 @@ class ClosedLoop(AlongDirection):
         return measurement.rows(closed_loop_effects)
 
     @staticmethod
-    def table(rows: "Sequence[ClosedLoopEffect]", context: TableContext) -> "Table":
+    def table(rows: "Sequence[ClosedLoopEffect]", context: Measurement) -> "Table":
         """Return one line per category and condition, the identity patch first."""
         return effect_table(
             f"Is it so in closed loop? {context.subject}",
@@ -215,7 +214,7 @@ class ClosedLoop(AlongDirection):
         return turned + (f"; that disrupt the task: {count_edits(disrupted, len(edits))}" if disrupted else "")
 
     @staticmethod
-    def finding(rows: "Sequence[ClosedLoopEffect]", context: TableContext) -> str:
+    def finding(rows: "Sequence[ClosedLoopEffect]", context: Measurement) -> str:
         """Return whether an edit turns the cube to the other picture, and where."""
         del context
         edits = [row for row in rows if row.place != CLEAN]

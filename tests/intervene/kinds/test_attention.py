@@ -59,7 +59,7 @@ def attention_records(copy: Run, source: ReplaySource, twin: "Policy") -> Interv
 
 @pytest.fixture
 def weighed(attention_records: InterventionResult) -> AttentionShares:
-    return AttentionShares.from_bytes(attention_records.measurement.read(ATTENTION_FILE))
+    return AttentionShares.from_bytes(attention_records.read(ATTENTION_FILE))
 
 
 @pytest.mark.slow
@@ -261,7 +261,7 @@ def test_the_command_shows_a_table_json_and_csv(copy: Run, attention_records: In
 def test_along_the_whole_episode_every_call_is_noted(copy: Run, source: ReplaySource, twin: "Policy") -> None:
     intervention = AttentionReadout(categories=("shape",), items=1, roles=("language",), readout="per-step")
     effects = run_intervention(copy, intervention, source, load=lambda *_: twin)
-    attended = AttentionShares.from_bytes(effects.measurement.read(ATTENTION_FILE))
+    attended = AttentionShares.from_bytes(effects.read(ATTENTION_FILE))
     assert attended.roles == ("all", "language")
     calls = attended.calls
     assert calls.tolist() == 2 * list(range(ceil(STEPS / int(copy.settings["execute"]))))

@@ -138,8 +138,7 @@ def test_edits_of_sites_are_counted_and_the_largest_are_named(rows: Sequence[Pat
     ("category", "title"), [("color", "Color"), ("red · or blue", "Red · or blue"), (" · ", " · ")]
 )
 def test_a_category_of_any_name_stays_in_its_own_column(category: str, title: str) -> None:
-    described = context(None)
-    described = replace(described, measurement=replace(described.measurement, settings={"kind": "interchange"}))
+    described = replace(context(None), settings={"kind": "interchange"})
     table = Interchange.table([replace(patch("kv.01", 0.9, 0.001), category=category)], described)
     (line,) = table.rows
     assert [cell.text for cell in line.cells[: table.names]] == [title, "kv.01 image"]

@@ -259,7 +259,7 @@ def test_the_verdict_says_first_chunk_and_whole_episode_whichever_is_asked_for(r
     """Color follows in the first chunk; the stored episodes along which each step was evaluated do not move."""
     for name, readout in (("image-swap", "first-chunk"), ("follow, shadow", "per-step")):
         key = key_of(settings_of(run, name))
-        shown = InterventionResult(run, find_stored(run, key))
+        shown = InterventionResult.of_stored(find_stored(run, key))
         found = shown.verdicts["color"]
         assert (found.readout, shown.effects[0].readout) == (readout, readout)
         assert found.verdict == "first chunk used; episode undecided"
@@ -272,7 +272,7 @@ def test_the_verdict_says_first_chunk_and_whole_episode_whichever_is_asked_for(r
 
 def test_a_follow_that_is_asked_for_by_its_key_has_its_own_verdict(run: ArrayRun) -> None:
     key = key_of(settings_of(run, "follow, few"))
-    effects = InterventionResult(run, find_stored(run, key))
+    effects = InterventionResult.of_stored(find_stored(run, key))
     assert effects.effects[0].n_episodes == FEW
     assert effects.verdicts["color"].behaviour == "undecided"
 
