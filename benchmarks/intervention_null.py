@@ -15,6 +15,8 @@ import argparse
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 
@@ -22,12 +24,11 @@ from probe_kit.env import SceneSpec
 from probe_kit.extract import ExtractSettings, extract_run
 from probe_kit.hooks import Policy, load_policy
 from probe_kit.intervene import ConditionOutcomes, ImageSwap, Interchange, ReplaySession, ReplaySource
-from probe_kit.intervene.kinds.base import Measurement
 from probe_kit.intervene.kinds.image_swap import image_swap_effects
 from probe_kit.intervene.kinds.interchange import patch_effects
+from probe_kit.intervene.outcomes import EPISODES, Measurement
 from probe_kit.intervene.places import Pair
-from probe_kit.intervene.replay import ReplayBatch, replay
-from probe_kit.intervene.runner import outcomes_of
+from probe_kit.intervene.replay import replay
 from probe_kit.intervene.sessions import open_session
 from probe_kit.intervene.verdict import classify_behaviour
 from probe_kit.runs import Run
@@ -70,7 +71,9 @@ def shuffled(answers: ConditionOutcomes, draw: np.random.Generator) -> Condition
 
 def measured(answers: ConditionOutcomes, suite: str) -> Measurement:
     """Return what effects are computed from."""
-    return Measurement(replace(answers, seed_text=suite), {}, {}, str.encode)
+    files = {EPISODES: answers.to_bytes()}
+    run: Any = SimpleNamespace(seed_text=suite, settings={})
+    return Measurement(run, {}, files.__getitem__)
 
 
 def count_outside(answers: ConditionOutcomes, suite: str, counts: dict[str, Count]) -> None:
@@ -108,7 +111,7 @@ class Frames:
             self.bench.policy = policy
             conditions = asked.conditions(self.bench)
             parts = [replay(self.bench, [question], conditions) for question in self.questions]
-            found = outcomes_of(self.run, [one.name for one in conditions], ReplayBatch.joined(parts))
+            found = ConditionOutcomes.joined(parts)
             partial = file.with_suffix(".partial")
             partial.write_bytes(found.to_bytes())
             partial.replace(file)

@@ -1,6 +1,7 @@
 """The places at which stored interventions found that the answer passes and is read. Needs no model."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import starmap
 from typing import TYPE_CHECKING, Literal
@@ -8,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 from probe_kit.hooks.contract.sites import KV_STREAM, role_of_view
 from probe_kit.hooks.registry import get_family
 from probe_kit.intervene.directions import DIRECTIONS, MEAN_DIFFERENCE
+from probe_kit.intervene.exchange import NOTHING, carries_nothing
 from probe_kit.intervene.kinds.image_swap import ImageSwapEffect, stored_image_swaps
 from probe_kit.intervene.kinds.interchange import (
     BACKBONE,
@@ -29,73 +31,91 @@ from probe_kit.intervene.kinds.joint import (
 )
 from probe_kit.intervene.outcomes import FIRST_CHUNK, PER_STEP
 from probe_kit.intervene.patching.attribution import LOCALISATION_SHARE
-from probe_kit.intervene.patching.sweep import NOTHING, carries_nothing
 from probe_kit.intervene.places import ALL, PlaceName, list_places, unread_places
-from probe_kit.intervene.verdict import Places, UseVerdict, classify_behaviour, control_for
+from probe_kit.intervene.verdict import (
+    Places,
+    UseVerdict,
+    classify_behaviour,
+    classify_use,
+    control_for,
+    encoded_in,
+)
 from probe_kit.runs.reader import RunReader
 
 if TYPE_CHECKING:
     from probe_kit.train.results.probe_results import ProbeResults
 
 
+@dataclass(frozen=True)
 class StoredEvidence:
-    """The rows of a run's stored interventions inside the network, by category; each is computed once.
+    """All that a run's stored interventions say of the answer, by category; each part is computed once.
 
-    maps: tokens patched in full. along: within directions. joint: sets of places. Raise RunDamagedError.
+    classified: image swaps that count whatever else is stored of their categories. Raises RunDamagedError.
     """
 
-    def __init__(self, run: RunReader) -> None:
-        self._run = run
+    run: RunReader
+    classified: Sequence[ImageSwapEffect] = ()
+
+    @cached_property
+    def swaps(self) -> dict[str, ImageSwapEffect]:
+        """The image swaps that are classified; empty if none is stored."""
+        return {**stored_image_swaps(self.run), **{row.category: row for row in self.classified}}
 
     @cached_property
     def maps(self) -> dict[str, list[PatchEffect]]:
-        """Return `stored_site_effects`."""
-        return stored_site_effects(self._run)
+        """The effects of tokens patched in full."""
+        return stored_site_effects(self.run)
 
     @cached_property
     def along(self) -> dict[str, list[PatchEffect]]:
-        """Return `stored_subspace_effects`."""
-        return stored_subspace_effects(self._run)
+        """The effects of patches within directions."""
+        return stored_subspace_effects(self.run)
 
     @cached_property
     def joint(self) -> dict[str, list[JointEffect]]:
-        """Return `stored_joint_places`."""
-        return stored_joint_places(self._run)
+        """The effects of sets of places."""
+        return stored_joint_places(self.run)
 
+    @cached_property
+    def places(self) -> dict[str, Places]:
+        """The places of interchanges and joint searches; without categories that were not searched."""
+        located, carried = localised_by_category(self.maps), carrying_directions(self.along)
+        searched = {}
+        for name, rows in self.joint.items():
+            (every,) = (row for row in rows if row.part == EVERY)
+            # A search of a part that carries nothing does not rule out the others.
+            if every.finding != "past it" or every.cells == KV_STREAM:
+                searched[name] = rows
+        jointly = {name: describe_joint_places(rows) for name, rows in searched.items()}
+        remainders = {name: describe_remainder(rows) for name, rows in searched.items()}
+        return {
+            name: Places(located.get(name), carried.get(name, ()), jointly.get(name, ""), remainders.get(name, ""))
+            for name in dict.fromkeys((*located, *carried, *jointly))
+        }
 
-def stored_places(evidence: StoredEvidence) -> dict[str, Places]:
-    """Return by category the places of interchanges and joint searches; without categories that were not searched.
+    @cached_property
+    def other_readouts(self) -> dict[str, UseVerdict]:
+        """The behaviour by the other readout; without categories in which that is not stored.
 
-    Raises RunDamagedError.
-    """
-    located, carried = localised_by_category(evidence.maps), carrying_directions(evidence.along)
-    searched = {}
-    for name, rows in evidence.joint.items():
-        (every,) = (row for row in rows if row.part == EVERY)
-        # A search of a part that carries nothing does not rule out the others.
-        if every.finding != "past it" or every.cells == KV_STREAM:
-            searched[name] = rows
-    jointly = {name: describe_joint_places(rows) for name, rows in searched.items()}
-    remainders = {name: describe_remainder(rows) for name, rows in searched.items()}
-    return {
-        name: Places(located.get(name), carried.get(name, ()), jointly.get(name, ""), remainders.get(name, ""))
-        for name in dict.fromkeys((*located, *carried, *jointly))
-    }
+        The positive control is of the other readout too.
+        """
+        stored = {readout: stored_image_swaps(self.run, readout) for readout in (FIRST_CHUNK, PER_STEP)}
+        verdicts: dict[str, UseVerdict] = {}
+        for category, swap in self.swaps.items():
+            same = stored[PER_STEP if swap.readout == FIRST_CHUNK else FIRST_CHUNK]
+            if category in same:
+                verdicts[category] = classify_behaviour(same[category], control_for(category, same))
+        return verdicts
 
+    def verdict(self, category: str, encoded: bool | None, tie: str = "") -> UseVerdict:
+        """Return the verdict of a category whose images were swapped. encoded, tie: see `classify_use`."""
+        control, other = control_for(category, self.swaps), self.other_readouts.get(category)
+        return classify_use(encoded, self.swaps[category], control, self.places.get(category), tie, other)
 
-def stored_other_readouts(run: RunReader, swaps: Mapping[str, ImageSwapEffect]) -> dict[str, UseVerdict]:
-    """Return by category the behaviour by the other readout; without categories in which that is not stored.
-
-    swaps: the image swaps that are shown, by category. The positive control is of the other readout too. Raises
-    RunDamagedError.
-    """
-    stored = {readout: stored_image_swaps(run, readout) for readout in (FIRST_CHUNK, PER_STEP)}
-    verdicts: dict[str, UseVerdict] = {}
-    for category, swap in swaps.items():
-        same = stored[PER_STEP if swap.readout == FIRST_CHUNK else FIRST_CHUNK]
-        if category in same:
-            verdicts[category] = classify_behaviour(same[category], control_for(category, same))
-    return verdicts
+    def verdicts(self, results: "ProbeResults | None") -> dict[str, UseVerdict]:
+        """Return every verdict, with what the first view of the newest probes says; None without probes."""
+        encoded, ties = encoded_in(results), stored_ties(self, results)
+        return {name: self.verdict(name, encoded.get(name), ties.get(name, "")) for name in self.swaps}
 
 
 TieAtSite = Literal["read", "unread", "another code", "in part", "not tested"]
@@ -221,24 +241,20 @@ _TIES: dict[TieAtSite, str] = {
 
 
 def which_layer(
-    run: RunReader,
-    evidence: StoredEvidence,
-    results: "ProbeResults | None",
-    places: Mapping[str, Places],
-    categories: Sequence[str],
+    evidence: StoredEvidence, results: "ProbeResults | None", categories: Sequence[str]
 ) -> dict[str, list[str]]:
     """Return by category where the answer passes and where to steer, and, as later parts, what else is known.
 
     The later parts say where it is read, and whether the probes' best site is read.
 
-    results: the newest probes, None without any. places: as `stored_places` gives them. Of stored interchanges and
-    joint places; what was not tested is named with the command that tests it.
+    results: the newest probes, None without any. Of stored interchanges and joint places; what was not tested is
+    named with the command that tests it.
     """
-    family = get_family(run.model)
+    family = get_family(evidence.run.model)
     has_kv = family is not None and family.interventions.supports("kv")
     lines = {}
     for name in categories:
-        rows, category_places = evidence.maps.get(name, []), places.get(name) or Places()
+        rows, category_places = evidence.maps.get(name, []), evidence.places.get(name) or Places()
         passes, cell = "--kind interchange tests where the answer passes", best_cell(rows)
         if any(row.role == ALL and is_backbone_layer(row) for row in rows):
             located = [site for site in category_places.located or () if site.partition(".")[0] == BACKBONE]
@@ -248,7 +264,7 @@ def which_layer(
             passes += f"; steer at {cell.place} {cell.role} with --direction {ALONG}"
         read = [part for part in str(category_places).split("; ") if part.startswith("read ") or KV_STREAM in part]
         reads = ("; ".join(read) or "--kind joint tests where it is read") * has_kv
-        best = _best_site(run, results, name, rows, evidence.along.get(name, []))
+        best = _best_site(evidence.run, results, name, rows, evidence.along.get(name, []))
         lines[name] = [part for part in (passes, reads, best) if part]
     return lines
 

@@ -12,24 +12,24 @@ coefficient, or a try on fewer episodes replaces nothing. Conditions that were p
 pooled, whichever intervention they came with. Needs no model.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
-from datetime import UTC, datetime
+from functools import cached_property
 from io import BytesIO
-from types import MappingProxyType
-from typing import Any, ClassVar, get_args
+from math import hypot
+from typing import Any, ClassVar, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit._system.bounded_files import open_arrays
+from probe_kit._system.bounded_files import open_arrays, parse_json
 from probe_kit.errors import NoInterventionsError, UnknownCategoryError, UsageError
-from probe_kit.hashing import sha256_json
+from probe_kit.hashing import derive_seed, sha256_json
 from probe_kit.hooks.contract.declared import Readout
+from probe_kit.intervene.exchange import Exchange
 from probe_kit.runs.layout import INTERVENTIONS
-from probe_kit.runs.reader import SIDE, RunReader
-from probe_kit.runs.records import as_json
-from probe_kit.runs.results import HEAD, Bundle, complete_key, read_bundles, tidy_bundle, write_bundle
+from probe_kit.runs.reader import SIDE, RunReader, full_name
+from probe_kit.runs.results import HEAD, Bundle, complete_key, read_bundles
 from probe_kit.runs.run import Run
 from probe_kit.runs.store import Location
 
@@ -180,40 +180,98 @@ def check_run_fits(run: Run) -> None:
 # -- outcomes ------------------------------------------------------------------------------------------------
 
 
-def arrays_to_bytes(record: object, without: Sequence[str] = ()) -> bytes:
-    """Return the attributes of an object as a `.npz`; the same numbers give the same bytes."""
-    file = BytesIO()
-    arrays = {
-        name: np.array(value) if isinstance(value, tuple) else value
+def arrays_of(record: object, without: Sequence[str] = ()) -> dict[str, NDArray[Any]]:
+    """Return the attributes of an object that are there, as arrays by name."""
+    return {
+        name: np.asarray(value)
         for name, value in vars(record).items()
         if value is not None and name not in without
     }
-    np.savez_compressed(file, allow_pickle=False, **arrays)
+
+
+def arrays_to_bytes(record: object, without: Sequence[str] = ()) -> bytes:
+    """Return the same as a `.npz`; the same numbers give the same bytes."""
+    file = BytesIO()
+    np.savez_compressed(file, allow_pickle=False, **arrays_of(record, without))
     return file.getvalue()
 
 
 def arrays_from_bytes(content: bytes, texts: str = "") -> dict[str, Any]:
     """Return the arrays of a `.npz` by name. texts: the one that becomes a tuple of strings."""
     with open_arrays(content) as arrays:
-        values: dict[str, Any] = dict(arrays)
-    return {name: tuple(map(str, value)) if name == texts else value for name, value in values.items()}
+        return with_texts(arrays, texts)
 
 
-BY_CONDITION = ("displacement", "max_action_change", "edit_log", "episode_outcomes", "toward", "size")
+def with_texts(arrays: Mapping[str, NDArray[Any]], texts: str) -> dict[str, Any]:
+    """Return arrays by name, one of them as a tuple of strings."""
+    return {name: tuple(map(str, value)) if name == texts else value for name, value in arrays.items()}
+
+
+Array = NDArray[np.float64]
+_FLAT = 1e-6
+"""Share of a number's size below which its spread is rounding."""
+
+
+def spread_of(clean: NDArray[np.float32]) -> Array:
+    """Return (N,) 1 / variance of every number of the clean actions (E, N); 0 for numbers without spread."""
+    values = np.ascontiguousarray(clean, np.float64)
+    variance = values.var(axis=0)
+    varies = np.sqrt(variance) > _FLAT * np.maximum(np.abs(values).max(axis=0, initial=0.0), _FLAT)
+    return np.where(varies, 1 / np.where(varies, variance, 1.0), 0.0)
+
+
+def directions_of(clean: Array, source: Array, weights: Array) -> tuple[Array, Array]:
+    """Return (E, N) the directions that displacements are read along, and (E,) the sources' own displacements.
+
+    clean, source: (E, N). A displacement of x is (x − clean) · direction: its component toward the source, in root
+    mean squares of spreads. Zero where the source changes nothing.
+    """
+    apart = source - clean
+    count = max(int((weights > 0).sum()), 1)
+    squares = (apart**2 * weights).sum(axis=1) / count
+    lengths = np.sqrt(squares)
+    scale = np.where(lengths > 0, 1 / np.where(lengths > 0, lengths, 1.0), 0.0)
+    return apart * weights / count * scale[:, None], lengths
+
+
+def displacements_toward(chunks: NDArray[np.float32], source: int) -> Array:
+    """Return (K, E) displacements toward the source's action of K conditions. chunks: (K, E, N), clean first."""
+    values = np.ascontiguousarray(chunks, np.float64)  # sums are rounded by how an array lies
+    directions, _ = directions_of(values[0], values[source], spread_of(chunks[0]))
+    return np.asarray(((values - values[0]) * directions).sum(axis=2))
+
+
+def sizes(chunks: NDArray[np.float32]) -> Array:
+    """Return (K, E) the distance of K conditions' actions from clean ones, in root mean squares of spreads."""
+    values = np.ascontiguousarray(chunks, np.float64)  # sums are rounded by how an array lies
+    weights = spread_of(chunks[0])
+    count = max(int((weights > 0).sum()), 1)
+    return np.asarray(np.sqrt(((values - values[0]) ** 2 * weights).sum(axis=2) / count))
+
+
+BY_CONDITION = ("displacement", "max_action_change", "edit_log", "episode_outcomes", "toward", "size", "chunks")
 """Arrays with conditions along their first axis."""
+UNSTORED = ("seed_text", "chunks", "mass", "inferences", "patches")
+"""Fields that a stored intervention does not have, or has in a file of its kind's own."""
 
 
 @dataclass(frozen=True)
 class ConditionOutcomes:
-    """The numbers of K conditions in E episodes of a run; see `replay.ReplayBatch`.
+    """The numbers of K conditions in E episodes of a run.
 
     conditions: names of the K, the clean one first. episodes, items, groups, categories, sides: (E,), `sides`
-    those of the correct picture. displacement: (K, E) metres from the middle, left positive. max_action_change:
-    (K, E) largest difference of any action from the clean one's. edit_log: (K, E, 5), see `LOG_FIELDS`.
-    replay_error: (E,) of the clean one from the stored one. toward, size: (K, E) displacement toward the source's
-    action and size of the change, in spreads of clean actions; None where whole episodes were played.
-    episode_outcomes: (K, E) correct, wrong or oob, where episodes were played to their end; else None. seed_text:
-    of the run, by which random draws are made; it is not stored.
+    those of the correct picture. displacement: (K, E) metres from the middle, left positive; without sides toward
+    the source's action. max_action_change: (K, E) largest difference of any action from the clean one's. edit_log:
+    (K, E, 5), see `LOG_FIELDS`. replay_error: (E,) of the clean inference from the stored one; NaN where the run
+    does not say. episode_outcomes: (K, E) where the cube ended, correct, wrong or oob, for episodes that were
+    played to their end; then `displacement` is the cube's, and `max_action_change` and `replay_error` are of the
+    trajectory; None where nothing was executed. toward, size: (K, E) displacement toward the source's action and
+    size of the change, in spreads of clean actions; None where whole episodes were played. seed_text: of the run,
+    by which random draws are made.
+
+    While an intervention is made: chunks: (K, E, N) all numbers of the actions of first inferences. mass: (N, B,
+    I, H, R) the attention of N inferences, inferences: (N, 2) their rows in the run's episodes and their calls;
+    None where attention was not recorded. patches: (N, B, P) of single patches; None where they are not known.
     """
 
     conditions: tuple[str, ...]
@@ -230,6 +288,10 @@ class ConditionOutcomes:
     toward: NDArray[np.float64] | None = None
     size: NDArray[np.float64] | None = None
     seed_text: str = ""
+    chunks: NDArray[np.float32] | None = None
+    mass: NDArray[np.float32] | None = None
+    inferences: NDArray[np.int64] | None = None
+    patches: NDArray[np.float32] | None = None
 
     @property
     def has_sides(self) -> bool:
@@ -244,6 +306,14 @@ class ConditionOutcomes:
     def correct_sign(self) -> NDArray[np.float64]:
         """(E,) +1 where the correct picture lies left, −1 where it lies right, or where nothing has a side."""
         return np.where(self.sides == "left", 1.0, -1.0)
+
+    def exchange(self, source: str = IMAGE_SWAP) -> Exchange | None:
+        """Return the effect of a condition with other inputs, in one category; None if it was not played."""
+        if source not in self.conditions:
+            return None
+        flips = derive_seed("sign flips", self.seed_text, str(self.categories[0]))
+        pair = self.of(CLEAN), self.of(source)
+        return Exchange(*pair, -self.correct_sign, self.groups, self.items, self.seed_text, flips)
 
     @property
     def counts(self) -> dict[str, Any]:
@@ -265,9 +335,33 @@ class ConditionOutcomes:
         names = dict.fromkeys(map(str, self.categories))
         return [(name, self.of_episodes(self.categories == name)) for name in names]
 
+    def in_spreads(self) -> "ConditionOutcomes":
+        """Return the same with displacements toward the source's action, and sizes; of first inferences."""
+        if self.chunks is None:
+            return self
+        # Toward the source's action, of all its inputs if they were played.
+        references = [name for name in (DONOR, IMAGE_SWAP) if name in self.conditions]
+        toward = displacements_toward(self.chunks, self.conditions.index(references[0])) if references else None
+        displacement = self.displacement
+        if toward is not None and not self.has_sides:
+            # Where no inference gave another action, a displacement is none, or was estimated.
+            displacement = np.where(self.max_action_change > 0, toward, displacement)
+        return replace(self, displacement=displacement, toward=toward, size=sizes(self.chunks))
+
+    @classmethod
+    def joined(cls, parts: "Sequence[ConditionOutcomes]") -> "ConditionOutcomes":
+        """Return the episodes of all parts, one after the other."""
+        parts = [part for part in parts if part.episodes.size] or parts[:1]
+        arrays = {
+            name: np.concatenate([getattr(part, name) for part in parts], axis=int(name in BY_CONDITION))
+            for name, value in vars(parts[0]).items()
+            if isinstance(value, np.ndarray)
+        }
+        return replace(parts[0], **arrays)
+
     def to_bytes(self) -> bytes:
         """Return a `.npz`; the same numbers give the same bytes."""
-        return arrays_to_bytes(self, ("seed_text",))
+        return arrays_to_bytes(self, UNSTORED)
 
     @classmethod
     def from_bytes(cls, content: bytes, seed_text: str = "") -> "ConditionOutcomes":
@@ -288,62 +382,107 @@ class Effect:
 
 # -- the store -----------------------------------------------------------------------------------------------
 
+TILES_APART = 0.31
+"""Metres between the tiles of the default scene; taken for a run that stores no scene."""
+
 
 @dataclass(frozen=True)
-class StoredIntervention:
-    """One stored intervention. seed_text: of its run."""
+class Measurement:
+    """One intervention of a run, stored or about to be: what effects, their table and their sentences are made of.
 
-    bundle: Bundle
-    seed_text: str = field(repr=False)
+    settings: what decided its numbers, see `settings_of`. read: a stored file by its name; raises RunDamagedError
+    if it was changed. files: their names. key: of its folder. created: ISO time (UTC), empty before it is stored.
+    explains: whether the caption of its table says what each verdict rests on, as sentences do.
+    """
+
+    run: RunReader = field(repr=False)
+    settings: Mapping[str, Any]
+    read: Callable[[str], bytes] = field(repr=False)
+    files: Collection[str] = ()
+    key: str = ""
+    created: str = ""
+    explains: bool = True
+
+    @classmethod
+    def of(cls, run: RunReader, bundle: Bundle) -> Self:
+        """Return one that a run stores."""
+        settings, created = bundle.head["settings"], bundle.times.get("created", "")
+        return cls(run, settings, bundle.read, bundle.files, bundle.key, created)
 
     @property
-    def key(self) -> str:
-        """Name of its folder."""
-        return self.bundle.key
-
-    @property
-    def settings(self) -> Mapping[str, Any]:
-        """Return what decided its numbers, see `settings_of`."""
-        settings: Mapping[str, Any] = self.bundle.head["settings"]
-        return settings
+    def kind(self) -> str:
+        """Return the kind of the intervention."""
+        return str(self.settings["kind"])
 
     @property
     def readout(self) -> str:
-        """`first-chunk` or `per-step`."""
+        """Return `first-chunk` or `per-step`."""
         return str(self.settings.get("readout", FIRST_CHUNK))
 
     @property
     def newest(self) -> tuple[str, str]:
-        """Return the ISO time (UTC) at which it was made, and the key, which decide between equals."""
-        return self.bundle.times.get("created", ""), self.key
+        """Return the time at which it was made, and the key, which decide between equals."""
+        return self.created, self.key
 
+    @cached_property
     def outcomes(self) -> ConditionOutcomes:
-        """Read what was measured. Raises RunDamagedError if it was changed."""
-        return ConditionOutcomes.from_bytes(self.bundle.read(EPISODES), self.seed_text)
+        """The numbers of its conditions. Raises RunDamagedError if they were changed."""
+        return ConditionOutcomes.from_bytes(self.read(EPISODES), self.run.seed_text)
 
+    @cached_property
     def certificate(self) -> dict[str, Any]:
-        """Read what was loaded and checked. Raises RunDamagedError if it was changed."""
-        return self.bundle.read_json(CERTIFICATE)
+        """The record of what was loaded and checked. Raises RunDamagedError if it was changed."""
+        certificate: dict[str, Any] = parse_json(self.read(CERTIFICATE))
+        return certificate
 
+    def rows[Row: Effect](self, of_category: Callable[[ConditionOutcomes], Iterable[Row]]) -> list[Row]:
+        """Return the rows of all categories, in the order of the episodes, each with the key."""
+        parts = (of_category(part) for _, part in self.outcomes.by_category())
+        key: dict[str, Any] = {"key": self.key}  # every kind's rows have it, as their last column
+        return [replace(row, **key) for rows in parts for row in rows]
 
-def save(
-    run: Location,
-    settings: Mapping[str, Any],
-    key: str,
-    outcomes: ConditionOutcomes,
-    effects: str,
-    certificate: Mapping[str, Any],
-    extra_files: Mapping[str, bytes] = MappingProxyType({}),
-) -> None:
-    """Write `interventions/<key>/`, all or nothing; what is there is kept. extra_files: by name."""
-    if is_stored(run, key):
-        tidy_bundle(run, INTERVENTIONS, key)
-        return
-    files = {
-        EPISODES: outcomes.to_bytes(), EFFECTS: effects.encode(), CERTIFICATE: as_json(certificate), **extra_files,
-    }  # fmt: skip
-    now = datetime.now(UTC).isoformat(timespec="microseconds")
-    write_bundle(run, INTERVENTIONS, key, {"settings": dict(settings)}, files, {"created": now})
+    # -- words of tables -----------------------------------------------------------------------------------------
+
+    @property
+    def subject(self) -> str:
+        """Return model and suite, as titles have them."""
+        label = full_name(self.run.label, self.run.random_weights)
+        # The label of a run of recordings says on what already.
+        name = self.run.suite.partition("#")[0]
+        return label if self.run.label.endswith(f" on {name}") else f"{label} on {self.run.suite}"
+
+    @property
+    def lacks_sides(self) -> bool:
+        """Whether the run has no correct picture on a side."""
+        return not self.outcomes.has_sides
+
+    @property
+    def exchange(self) -> str:
+        """Return the change of inputs that effects are shares of."""
+        return f"exchange of the {self.settings.get('vary') or ''}" if self.lacks_sides else "image swap"
+
+    def in_words(self, text: str) -> str:
+        """Return a text about the image swap, about what was exchanged in this run."""
+        return text.replace("image swap", self.exchange)
+
+    @property
+    def verdicts(self) -> Mapping[str, Any]:
+        """Return by category the `UseVerdict`; those of an `InterventionResult`, here none."""
+        return {}
+
+    @property
+    def legend(self) -> str:
+        """Return what a reader of the verdicts must know."""
+        return ""
+
+    @property
+    def tiles_apart(self) -> float:
+        """Return metres between the middles of the tiles of the run's scene, or of the default one."""
+        scene: Any = self.run.settings.get("scene", {})
+        if "tile_left" not in scene or "tile_right" not in scene:
+            return TILES_APART
+        (left_x, left_y), (right_x, right_y) = scene["tile_left"], scene["tile_right"]
+        return hypot(left_x - right_x, left_y - right_y)
 
 
 def is_stored(run: Location, key: str) -> bool:
@@ -361,7 +500,7 @@ def read_interventions(run: Location) -> dict[str, Bundle]:
     return bundles
 
 
-def stored_interventions(run: RunReader, kind: str | None = None) -> list[StoredIntervention]:
+def stored_interventions(run: RunReader, kind: str | None = None) -> list[Measurement]:
     """Return those of the episodes that the run has now, in the wording it is in, oldest first.
 
     kind: only these. Raises RunDamagedError if any of the run was changed, lost its settings or has another
@@ -372,14 +511,14 @@ def stored_interventions(run: RunReader, kind: str | None = None) -> list[Stored
         "wording": run.wording, **({} if kind is None else {"kind": kind}),
     }  # fmt: skip
     fitting = [
-        StoredIntervention(bundle, run.seed_text)
+        Measurement.of(run, bundle)
         for bundle in read_interventions(run.location).values()
         if all(bundle.head["settings"].get(name) == value for name, value in required.items())
     ]
     return sorted(fitting, key=lambda intervention: intervention.newest)
 
 
-def find_stored(run: RunReader, key: str | None = None, kind: str | None = None) -> StoredIntervention:
+def find_stored(run: RunReader, key: str | None = None, kind: str | None = None) -> Measurement:
     """The one whose key begins with `key`, or the newest of `kind`.
 
     Raises NoInterventionsError if there is none, UsageError for a key that is not there or not the only one.
@@ -410,7 +549,7 @@ Wrongly read is the first inference of a family in which that says little (`per-
 class StoredResult:
     """The part of one stored intervention that is of one category. outcomes: of its episodes alone."""
 
-    stored: StoredIntervention
+    stored: Measurement
     category: str
     outcomes: ConditionOutcomes
     rank: Rank
@@ -424,9 +563,9 @@ def stored_results(run: RunReader, kind: str) -> list[StoredResult]:
     order = {name: at for at, name in enumerate(dict.fromkeys(run.episodes["category"].astype(str)))}
     results = []
     for stored in stored_interventions(run, kind):
-        family = stored.certificate().get("supported", {}).get("readout", FIRST_CHUNK)
+        family = stored.certificate.get("supported", {}).get("readout", FIRST_CHUNK)
         is_wrong = family == PER_STEP != stored.readout
-        for category, outcomes in stored.outcomes().by_category():
+        for category, outcomes in stored.outcomes.by_category():
             rank = not is_wrong, outcomes.episodes.size, stored.readout == family
             results.append(StoredResult(stored, category, outcomes, rank))
     return sorted(

@@ -325,24 +325,6 @@ def roles_of(policy: "Policy", stream: str, roles: Sequence[str]) -> list[str]:
     return [role for role in roles if role == ALL or role in tiles or any(plays(name, role) for name in declared)]
 
 
-def check_roles_have_tokens(
-    policy: "Policy", streams: Sequence[str], roles: Sequence[str], usual: Sequence[str]
-) -> None:
-    """Raise UsageError for a wanted role that no token of these streams plays.
-
-    usual: the roles that are tried if nothing is said, of which one that is there will do.
-    """
-    present = {role for stream in streams for role in roles_of(policy, stream, roles)}
-    missing = [role for role in roles if role not in present]
-    if not missing or (present and tuple(roles) == tuple(usual)):
-        return
-    declared = [name for stream in streams for name in policy.role_names.get(policy.tokens_of(stream), ())]
-    raise UsageError(
-        f"no token of {', '.join(streams)} has the role {missing[0]!r}; expected one of "
-        f"{', '.join(dict.fromkeys((ALL, *declared)))}"
-    )
-
-
 FINAL_NORM = "final_norm"
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from probe_kit.hooks.capturing.edits import LOG_FIELDS, EditLog
 from probe_kit.hooks.contract.sites import Site
-from probe_kit.intervene.outcomes import BY_CONDITION, CLEAN, CONTROL_INPUT, DONOR, IMAGE_SWAP
+from probe_kit.intervene.outcomes import CLEAN, CONTROL_INPUT, DONOR, IMAGE_SWAP, ConditionOutcomes
 from probe_kit.intervene.patching.patch import Cell, patched
 from probe_kit.intervene.places import Chunk, Given, Pair
 
@@ -128,86 +128,57 @@ AttentionRecord = tuple[int, int, NDArray[np.float32], NDArray[np.float32] | Non
 """The attention of one inference: row in the run's episodes, call, (B, I, H, R) shares, (B, P) of patches."""
 
 
-@dataclass(frozen=True)
-class ReplayBatch:
-    """The numbers of K conditions in E episodes.
-
-    rows: (E,) in the run's episodes. steps: (E,) of their inferences. displacement: (K, E) see
-    `ReplaySession.displacement`. max_action_change: (K, E) the largest difference of any action from the clean
-    one's. edit_log: (K, E, 5) see `LOG_FIELDS`. replay_error: (E,) of the clean inference from the stored one; NaN
-    where the run does not say. episode_outcomes: (K, E) where the cube ended, correct, wrong or oob, for episodes
-    that were played to their end; then `displacement` is the cube's, and `max_action_change` and `replay_error`
-    are of the trajectory; None where nothing was executed. mass: (N, B, I, H, R) the attention of N inferences,
-    inferences: (N, 2) their rows and calls; None where attention was not recorded. patches: (N, B, P) of single
-    patches; None where they are not known. chunks: (K, E, N) all numbers of the actions of first inferences.
-    """
-
-    rows: NDArray[np.int64]
-    steps: NDArray[np.int64]
-    displacement: NDArray[np.float64]
-    max_action_change: NDArray[np.float64]
-    edit_log: NDArray[np.float64]
-    replay_error: NDArray[np.float64]
-    episode_outcomes: NDArray[np.str_] | None = None
-    mass: NDArray[np.float32] | None = None
-    inferences: NDArray[np.int64] | None = None
-    patches: NDArray[np.float32] | None = None
-    chunks: NDArray[np.float32] | None = None
-
-    def with_mass(self, attention_records: Sequence[AttentionRecord]) -> "ReplayBatch":
-        """Return the same with the attention of its inferences, if any was recorded."""
-        if not attention_records:
-            return self
-        rows, calls, masses, patches = zip(*attention_records, strict=True)
-        return replace(
-            self,
-            mass=np.stack(masses),
-            inferences=np.stack([rows, calls], axis=1).astype(np.int64),
-            patches=None if patches[0] is None else np.stack(patches),
+def room_for(pairs: Sequence[Pair], conditions: Sequence[Condition]) -> ConditionOutcomes:
+    """Return room for the numbers of these conditions in these pairs."""
+    shape = len(conditions), len(pairs)
+    columns: dict[str, Any] = {
+        name: np.array([getattr(pair, field) or "" for pair in pairs], str)
+        for name, field in (
+            ("episodes", "episode"), ("items", "item"), ("groups", "group"), ("categories", "category"),
+            ("sides", "side"),
         )
-
-    @classmethod
-    def empty(cls, pairs: Sequence[Pair], conditions: Sequence[Condition]) -> "ReplayBatch":
-        """Return room for the numbers of these conditions in these pairs."""
-        shape = len(conditions), len(pairs)
-        log = np.zeros((*shape, len(LOG_FIELDS)))
-        rows, steps = (np.array([getattr(pair, name) for pair in pairs], np.int64) for name in ("row", "step"))
-        return cls(rows, steps, np.empty(shape), np.zeros(shape), log, np.empty(len(pairs)))
-
-    @property
-    def arrays(self) -> dict[str, NDArray[Any]]:
-        """Return those that are there, by name."""
-        return {name: value for name, value in vars(self).items() if value is not None}
-
-    @classmethod
-    def joined(cls, parts: Sequence["ReplayBatch"]) -> "ReplayBatch":
-        """Return one after the other."""
-        by_condition = (*BY_CONDITION, "chunks")
-        joined = {
-            name: np.concatenate([getattr(part, name) for part in parts], axis=int(name in by_condition))
-            for name in parts[0].arrays
-        }
-        return cls(**joined)
+    }  # fmt: skip
+    return ConditionOutcomes(
+        conditions=tuple(condition.name for condition in conditions),
+        **columns,
+        displacement=np.empty(shape),
+        max_action_change=np.zeros(shape),
+        edit_log=np.zeros((*shape, len(LOG_FIELDS))),
+        replay_error=np.empty(len(pairs)),
+    )
 
 
-def replay(session: "ReplaySession", pairs: Sequence[Pair], conditions: Sequence[Condition]) -> ReplayBatch:
+def with_attention(outcomes: ConditionOutcomes, records: Sequence[AttentionRecord]) -> ConditionOutcomes:
+    """Return outcomes with the attention of their inferences, if any was recorded."""
+    if not records:
+        return outcomes
+    rows, calls, masses, patches = zip(*records, strict=True)
+    return replace(
+        outcomes,
+        mass=np.stack(masses),
+        inferences=np.stack([rows, calls], axis=1).astype(np.int64),
+        patches=None if patches[0] is None else np.stack(patches),
+    )
+
+
+def replay(session: "ReplaySession", pairs: Sequence[Pair], conditions: Sequence[Condition]) -> ConditionOutcomes:
     """Play every condition on every pair; the first one is the clean one."""
-    batch = ReplayBatch.empty(pairs, conditions)
+    outcomes = room_for(pairs, conditions)
     attention_records: list[AttentionRecord] = []
     chunks: list[list[Chunk]] = []
     for column, pair in enumerate(pairs):
         context = ConditionContext(session, pair)
         clean = context.clean = conditions[0].play(context).chunk
-        batch.replay_error[column] = session.replay_error(pair, clean)
+        outcomes.replay_error[column] = session.replay_error(pair, clean)
         chunks.append([])
         for number, condition in enumerate(conditions):
             played = condition.play(context) if number else ConditionResult(clean)
-            batch.displacement[number, column] = session.displacement(played.chunk, pair) + played.estimated
-            batch.max_action_change[number, column] = float(np.abs(played.chunk - clean).max())
+            outcomes.displacement[number, column] = session.displacement(played.chunk, pair) + played.estimated
+            outcomes.max_action_change[number, column] = float(np.abs(played.chunk - clean).max())
             chunks[-1].append(played.chunk.ravel())
             if played.edit_log is not None:
-                batch.edit_log[number, column] = played.edit_log.row()
+                outcomes.edit_log[number, column] = played.edit_log.row()
             if played.mass is not None:
                 attention_records.append((pair.row, pair.step, played.mass, played.patches))
     by_condition = np.array(chunks, np.float32).swapaxes(0, 1) if chunks else None
-    return replace(batch.with_mass(attention_records), chunks=by_condition)
+    return replace(with_attention(outcomes, attention_records), chunks=by_condition)

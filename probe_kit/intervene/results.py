@@ -2,8 +2,11 @@
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from copy import copy
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from functools import cached_property
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,35 +14,30 @@ import numpy as np
 from probe_kit._system.counting import counted
 from probe_kit._system.escaping import csv_of_frame
 from probe_kit.errors import NoProbesError
-from probe_kit.intervene.evidence import (
-    StoredEvidence,
-    stored_other_readouts,
-    stored_places,
-    stored_ties,
-    which_layer,
-)
+from probe_kit.intervene.evidence import StoredEvidence, which_layer
 from probe_kit.intervene.kinds import kind_names, kind_of
-from probe_kit.intervene.kinds.base import Intervention, Measurement, TableContext, frame_of
-from probe_kit.intervene.kinds.image_swap import ImageSwapEffect, stored_image_swaps, tiles_apart
+from probe_kit.intervene.kinds.base import Intervention, frame_of
+from probe_kit.intervene.kinds.image_swap import ImageSwapEffect
 from probe_kit.intervene.outcomes import (
+    CERTIFICATE,
+    EFFECTS,
+    EPISODES,
     PER_STEP,
     ConditionOutcomes,
     Effect,
-    StoredIntervention,
+    Measurement,
     find_stored,
+    is_stored,
+    key_of,
     read_interventions,
     stored_interventions,
 )
 from probe_kit.intervene.places import unread_note
-from probe_kit.intervene.verdict import (
-    Places,
-    UseVerdict,
-    classify_all,
-    describe_readouts,
-    encoded_in,
-    size_of_groups,
-)
-from probe_kit.runs.reader import RunReader, full_name
+from probe_kit.intervene.verdict import UseVerdict, describe_readouts, size_of_groups
+from probe_kit.runs.layout import INTERVENTIONS
+from probe_kit.runs.reader import RunReader
+from probe_kit.runs.records import as_json
+from probe_kit.runs.results import tidy_bundle, write_bundle
 from probe_kit.runs.run import Run
 from probe_kit.statistics.paired_tests import smallest_flip_p
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -57,50 +55,22 @@ _VERDICT_COLUMNS = ("verdict", "behaviour", "reversed", "reason", "place", "tie"
 
 
 @dataclass(frozen=True)
-class InterventionResult:
-    """One intervention: its settings, what it gave, and what that means.
+class InterventionResult(Measurement):
+    """One intervention: its settings, what it gave, and what that means with all else that its run stores."""
 
-    label: of the run. suite: its identity. measurement: what effects are computed from. verdicts: by
-    category, from this and what else is stored with the run. layers: by category what is known of the layer, of a
-    kind that edits places; see `which_layer`.
-    """
-
-    label: str
-    random_weights: bool
-    suite: str
-    measurement: Measurement = field(repr=False)
-    verdicts: dict[str, UseVerdict] = field(default_factory=dict)
-    layers: dict[str, list[str]] = field(default_factory=dict)
+    @classmethod
+    def of_stored(cls, stored: Measurement) -> "InterventionResult":
+        """Return what a stored intervention means."""
+        return cls(stored.run, stored.settings, stored.read, stored.files, stored.key, stored.created)
 
     @property
-    def key(self) -> str:
-        """Name of its folder."""
-        return self.measurement.key
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        """Return what decided its numbers, as stored."""
-        return dict(self.measurement.settings)
-
-    @property
-    def certificate(self) -> dict[str, Any]:
-        """Return what was loaded and checked, as stored."""
-        return dict(self.measurement.certificate)
-
-    @property
-    def outcomes(self) -> ConditionOutcomes:
-        """Return the numbers of its conditions."""
-        return self.measurement.outcomes
-
-    @property
-    def kind(self) -> str:
-        """Return the kind of the intervention."""
-        return str(self.measurement.settings["kind"])
+    def _kind(self) -> type[Intervention]:
+        return kind_of(self.kind)
 
     @cached_property
     def effects(self) -> list[Any]:
         """The rows of its kind, such as one `PatchEffect` per category and edit."""
-        return list(self._kind.effects(self.measurement))
+        return list(self._kind.effects(self))
 
     @property
     def table(self) -> "pd.DataFrame":
@@ -136,10 +106,6 @@ class InterventionResult:
         tests = () if self._kind.is_descriptive else (*self._few_groups(), *self._one_step())
         return *notes, *tests, *self._kind.notes(self.effects)
 
-    @property
-    def _kind(self) -> type[Intervention]:
-        return kind_of(self.kind)
-
     def _few_groups(self) -> list[str]:
         counts = {category: np.unique(part.groups).size for category, part in self.outcomes.by_category()}
         return [
@@ -152,7 +118,7 @@ class InterventionResult:
     def _one_step(self) -> list[str]:
         if not self.outcomes.has_sides:
             return []
-        if self.measurement.readout == PER_STEP:
+        if self.readout == PER_STEP:
             return [
                 "Per step: every condition was evaluated at every inference of the unedited episode "
                 "(teacher-forced), and the lateral displacements of its actions are summed; none was executed."
@@ -169,7 +135,7 @@ class InterventionResult:
         """Key, settings, certificate and the table as JSON."""
         content = {
             "key": self.key,
-            "label": self.label,
+            "label": self.run.label,
             "settings": self.settings,
             "certificate": self.certificate,
             "effects": json.loads(self.table.to_json(orient="records", double_precision=15)),
@@ -186,12 +152,49 @@ class InterventionResult:
     @property
     def findings(self) -> tuple[str, ...]:
         """The last lines of the command: a short sentence per category, and one that says which layer matters."""
-        return *self._kind.findings(self.effects, self._context), *self._which_layer(1)
+        return *self._kind.findings(self.effects, self), *self._which_layer(1)
 
     @property
     def sentences(self) -> tuple[str, ...]:
         """The same with numbers, reasons, and all that is known of the layer."""
-        return *self._kind.sentences(self.effects, self._context), *self._which_layer(None)
+        return *self._kind.sentences(self.effects, self), *self._which_layer(None)
+
+    def to_rich(self, details: bool = True) -> "Table":
+        """The table for a terminal. details: split it where it is wide, else leave columns out by name."""
+        _ = self.legend  # effects and verdicts are computed once, for this table and for sentences
+        context = copy(self)
+        context.__dict__["explains"] = details
+        table = self._kind.table(self.effects, context)
+        return replace(table, overflow="split" if details else "leave out")
+
+    @property
+    def legend(self) -> str:
+        """Return what a reader of its verdicts must know."""
+        uses = (self.verdicts.get(row.category) for row in self.effects)
+        swaps = [row for row in self.effects if isinstance(row, ImageSwapEffect)]
+        reasons = (verdict.explanation for verdict in self.verdicts.values())
+        size = size_of_groups(reasons, [(row.n_items, row.n_groups) for row in swaps])
+        return "; ".join(filter(None, (describe_readouts(uses), size)))
+
+    # -- with what else is stored --------------------------------------------------------------------------------
+
+    @cached_property
+    def verdicts(self) -> dict[str, UseVerdict]:
+        """The verdicts by category, from this and what else is stored when they are first asked for.
+
+        Empty without sides. Raises RunDamagedError.
+        """
+        if self.lacks_sides:
+            return {}
+        evidence = StoredEvidence(self.run, self.effects if self._kind.has_verdict else ())
+        return evidence.verdicts(_newest_probes(self.run))
+
+    @cached_property
+    def layers(self) -> dict[str, list[str]]:
+        """The knowledge of the layer by category, of a kind that edits places; see `which_layer`."""
+        if self.lacks_sides or not self._kind.asks_where:
+            return {}
+        return which_layer(StoredEvidence(self.run), _newest_probes(self.run), self.settings["categories"])
 
     def _which_layer(self, most: int | None) -> list[str]:
         return [
@@ -199,69 +202,20 @@ class InterventionResult:
             for name, parts in self.layers.items()
         ]
 
-    def to_rich(self, details: bool = True) -> "Table":
-        """The table for a terminal. details: split it where it is wide, else leave columns out by name."""
-        context = replace(self._context, explains=details)
-        return replace(self._kind.table(self.effects, context), overflow="split" if details else "leave out")
-
-    @property
-    def _context(self) -> TableContext:
-        label = full_name(self.label, self.random_weights)
-        # The label of a run of recordings says on what already.
-        name = self.suite.partition("#")[0]
-        subject = label if self.label.endswith(f" on {name}") else f"{label} on {self.suite}"
-        uses = (self.verdicts.get(row.category) for row in self.effects)
-        vary = str(self.settings.get("vary") or "")
-        exchange = "image swap" if self.outcomes.has_sides else f"exchange of the {vary}"
-        swaps = [row for row in self.effects if isinstance(row, ImageSwapEffect)]
-        reasons = (verdict.explanation for verdict in self.verdicts.values())
-        size = size_of_groups(reasons, [(row.n_items, row.n_groups) for row in swaps])
-        legend = "; ".join(filter(None, (describe_readouts(uses), size)))
-        return TableContext(self.measurement, subject, self.verdicts, legend, exchange=exchange)
-
 
 def load_effects(run: RunReader, key: str | None = None, kind: str | None = None) -> InterventionResult:
-    """The stored intervention whose key begins with `key`, or the newest (of `kind`), with verdicts as of now.
+    """The stored intervention whose key begins with `key`, or the newest (of `kind`).
 
     Raises NoInterventionsError, UsageError for a key that is not there, RunDamagedError if it was changed.
     """
-    return effects_of(run, find_stored(run, key, kind))
-
-
-def effects_of(run: RunReader, stored: StoredIntervention) -> InterventionResult:
-    """Read one stored intervention."""
-    measurement = Measurement(
-        stored.outcomes(), stored.settings, stored.certificate(), stored.bundle.read, stored.key, tiles_apart(run),
-    )  # fmt: skip
-    result = InterventionResult(run.label, run.random_weights, run.suite, measurement)
-    if not result.outcomes.has_sides:
-        return result
-    swaps = result.effects if kind_of(result.kind).has_verdict else ()
-    results, evidence = _newest_probes(run), StoredEvidence(run)
-    places = stored_places(evidence)
-    result.verdicts.update(_verdicts(run, evidence, results, places, swaps))
-    if kind_of(result.kind).asks_where:
-        result.layers.update(which_layer(run, evidence, results, places, list(stored.settings["categories"])))
+    result = InterventionResult.of_stored(find_stored(run, key, kind))
+    _ = result.outcomes, result.certificate  # what was changed is said now
     return result
 
 
 def verdicts_of(run: RunReader) -> dict[str, UseVerdict]:
     """Return verdicts by category, from all interventions and the newest probes that are stored with a run."""
-    evidence = StoredEvidence(run)
-    return _verdicts(run, evidence, _newest_probes(run), stored_places(evidence), ())
-
-
-def _verdicts(
-    run: RunReader,
-    evidence: StoredEvidence,
-    results: "ProbeResults | None",
-    places: Mapping[str, Places],
-    swaps: Sequence[ImageSwapEffect],
-) -> dict[str, UseVerdict]:
-    """Classify the stored image swaps. swaps: classified whatever else is stored of their categories."""
-    effects = {**stored_image_swaps(run), **{row.category: row for row in swaps}}
-    other_readouts = stored_other_readouts(run, effects)
-    return classify_all(effects, encoded_in(results), places, stored_ties(evidence, results), other_readouts)
+    return StoredEvidence(run).verdicts(_newest_probes(run))
 
 
 def _newest_probes(run: RunReader) -> "ProbeResults | None":
@@ -271,10 +225,31 @@ def _newest_probes(run: RunReader) -> "ProbeResults | None":
         return None
 
 
-def effects_csv(measurement: Measurement) -> str:
-    """Return the effects as they are stored with the outcomes, without verdicts, which later probes may change."""
-    rows: Sequence[Effect] = kind_of(str(measurement.settings["kind"])).effects(measurement)
-    return csv_of_frame(frame_of(rows).drop(columns="key", errors="ignore"))
+# -- the store -----------------------------------------------------------------------------------------------
+
+
+def save(
+    run: RunReader,
+    settings: Mapping[str, Any],
+    outcomes: ConditionOutcomes,
+    certificate: Mapping[str, Any],
+    extra_files: Mapping[str, bytes] = MappingProxyType({}),
+) -> str:
+    """Write `interventions/<key>/`, all or nothing; what is there is kept. Return the key.
+
+    The effects are stored without verdicts, which later probes may change. extra_files: by name.
+    """
+    key = key_of(settings)
+    if is_stored(run.location, key):
+        tidy_bundle(run.location, INTERVENTIONS, key)
+        return key
+    files = {EPISODES: outcomes.to_bytes(), CERTIFICATE: as_json(certificate), **extra_files}
+    measurement = Measurement(run, settings, files.__getitem__, files)
+    rows: Sequence[Effect] = kind_of(measurement.kind).effects(measurement)
+    files[EFFECTS] = csv_of_frame(frame_of(rows).drop(columns="key", errors="ignore")).encode()
+    now = datetime.now(UTC).isoformat(timespec="microseconds")
+    write_bundle(run.location, INTERVENTIONS, key, {"settings": dict(settings)}, files, {"created": now})
+    return key
 
 
 # -- what a run stores ---------------------------------------------------------------------------------------
@@ -357,4 +332,4 @@ def readers_of_results(run: Run) -> Iterator[Callable[[], object]]:
     for wording in run.wordings or (None,):
         reader = run if wording is None else run.in_wording(wording)
         for stored in stored_interventions(reader):
-            yield partial(lambda *result: effects_of(*result).to_json(), reader, stored)
+            yield InterventionResult.of_stored(stored).to_json

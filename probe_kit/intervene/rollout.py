@@ -20,8 +20,9 @@ from probe_kit.hashing import derive_seed
 from probe_kit.hooks.capturing.edits import EditLog
 from probe_kit.hooks.contract.declared import PLAIN
 from probe_kit.hooks.contract.observation import Observation
+from probe_kit.intervene.outcomes import ConditionOutcomes
 from probe_kit.intervene.places import Chunk, Pair
-from probe_kit.intervene.replay import AttentionRecord, Condition, ConditionContext, ReplayBatch
+from probe_kit.intervene.replay import AttentionRecord, Condition, ConditionContext, room_for, with_attention
 from probe_kit.intervene.sessions import ReplaySession, SceneSession
 
 
@@ -35,7 +36,9 @@ class RolloutResult:
     edit_log: EditLog
 
 
-def play_episodes(session: ReplaySession, pairs: Sequence[Pair], conditions: Sequence[Condition]) -> ReplayBatch:
+def play_episodes(
+    session: ReplaySession, pairs: Sequence[Pair], conditions: Sequence[Condition]
+) -> ConditionOutcomes:
     """Play every episode under every condition; the first one changes nothing and repeats the run.
 
     `max_action_change` is the largest difference of any number of the trajectory from the first condition's,
@@ -43,18 +46,18 @@ def play_episodes(session: ReplaySession, pairs: Sequence[Pair], conditions: Seq
     outcome is not the stored one.
     """
     assert isinstance(session, SceneSession), "only the scene is played again; other runs are refused before"
-    outcomes = np.zeros((len(conditions), len(pairs)), "U7")
-    batch = replace(ReplayBatch.empty(pairs, conditions), episode_outcomes=outcomes)
+    ends = np.zeros((len(conditions), len(pairs)), "U7")
+    outcomes = replace(room_for(pairs, conditions), episode_outcomes=ends)
     for column, pair in enumerate(pairs):
         clean = roll_out(session, pair, conditions[0], swapping=False)
-        batch.replay_error[column] = apart_from_stored(session, pair, clean)
+        outcomes.replay_error[column] = apart_from_stored(session, pair, clean)
         for number, condition in enumerate(conditions):
             played = roll_out(session, pair, condition) if number else clean
-            batch.displacement[number, column] = session.lateral_offset(np.array(played.cube))
-            batch.max_action_change[number, column] = _largest(played.frames, clean.frames)
-            batch.edit_log[number, column] = played.edit_log.row()
-            outcomes[number, column] = played.outcome
-    return batch
+            outcomes.displacement[number, column] = session.lateral_offset(np.array(played.cube))
+            outcomes.max_action_change[number, column] = _largest(played.frames, clean.frames)
+            outcomes.edit_log[number, column] = played.edit_log.row()
+            ends[number, column] = played.outcome
+    return outcomes
 
 
 def roll_out(session: SceneSession, pair: Pair, condition: Condition, swapping: bool = True) -> RolloutResult:
@@ -75,31 +78,31 @@ def roll_out(session: SceneSession, pair: Pair, condition: Condition, swapping: 
 
 def evaluate_per_step(
     session: ReplaySession, pairs: Sequence[Pair], conditions: Sequence[Condition]
-) -> ReplayBatch:
+) -> ConditionOutcomes:
     """Evaluate every condition along every episode; the first one, which edits nothing, is executed.
 
     `displacement` is where the hand began plus what the actions of all calls would add laterally, in metres from
     the middle, left positive. Raises CaptureChangedActionError if an outcome is not the stored one.
     """
     assert isinstance(session, SceneSession), "only the scene is played again; other runs are refused before"
-    batch = ReplayBatch.empty(pairs, conditions)
+    outcomes = room_for(pairs, conditions)
     attention_records: list[AttentionRecord] = []
     for column, pair in enumerate(pairs):
-        _evaluate(session, pair, conditions, batch, column, attention_records)
-    return batch.with_mass(attention_records)
+        _evaluate(session, pair, conditions, outcomes, column, attention_records)
+    return with_attention(outcomes, attention_records)
 
 
 def _evaluate(
     session: SceneSession,
     pair: Pair,
     conditions: Sequence[Condition],
-    batch: ReplayBatch,
+    outcomes: ConditionOutcomes,
     column: int,
     attention_records: list[AttentionRecord],
 ) -> None:
-    """Fill one column of a batch."""
+    """Fill one column of a outcomes."""
     edit_logs: list[list[EditLog]] = [[] for _ in conditions]
-    batch.displacement[:, column] = _offset(session, pair.clean)
+    outcomes.displacement[:, column] = _offset(session, pair.clean)
 
     def act(current: Pair, past: Sequence[Chunk]) -> Chunk:
         context, start = ConditionContext(session, current), _offset(session, current.clean)
@@ -107,16 +110,16 @@ def _evaluate(
         for number, condition in enumerate(conditions):
             played = condition.play(context) if number else clean
             actions = executed(session, [*past, played.chunk])
-            batch.displacement[number, column] += session.displacement(actions, current) - start
+            outcomes.displacement[number, column] += session.displacement(actions, current) - start
             change = float(np.abs(played.chunk - clean.chunk).max())
-            batch.max_action_change[number, column] = max(batch.max_action_change[number, column], change)
+            outcomes.max_action_change[number, column] = max(outcomes.max_action_change[number, column], change)
             edit_logs[number] += [] if played.edit_log is None else [played.edit_log]
             if played.mass is not None:
                 attention_records.append((current.row, current.step, played.mass, played.patches))
         return clean.chunk
 
-    batch.replay_error[column] = apart_from_stored(session, pair, _step_through(session, pair, act, True))
-    batch.edit_log[:, column] = [EditLog.sum(logs).row() for logs in edit_logs]
+    outcomes.replay_error[column] = apart_from_stored(session, pair, _step_through(session, pair, act, True))
+    outcomes.edit_log[:, column] = [EditLog.sum(logs).row() for logs in edit_logs]
 
 
 def _step_through(

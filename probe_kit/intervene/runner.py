@@ -1,47 +1,39 @@
 """Running an intervention: replay what is missing, store it, and read the result."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import fields
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from probe_kit._terminal.notebook import notebook_progress
-from probe_kit.errors import CaptureChangedActionError
+from probe_kit.errors import CaptureChangedActionError, UsageError
 from probe_kit.hooks.capturing.edits import LOG_FIELDS
 from probe_kit.hooks.registry import get_family
-from probe_kit.intervene.kinds.base import ConditionName, Intervention, Measurement
-from probe_kit.intervene.kinds.image_swap import ImageSwap, tiles_apart
-from probe_kit.intervene.kinds.interchange import Interchange
+from probe_kit.intervene.kinds.base import ConditionName, Intervention
+from probe_kit.intervene.kinds.image_swap import ImageSwap
 from probe_kit.intervene.outcomes import (
-    DONOR,
-    IMAGE_SWAP,
-    PER_STEP,
     ConditionOutcomes,
+    arrays_of,
     check_run_fits,
     has_sides,
     is_stored,
     key_of,
-    save,
     settings_of,
+    with_texts,
 )
-from probe_kit.intervene.places import check_roles_have_tokens, resolve_sites, unread_places
-from probe_kit.intervene.replay import Condition, ReplayBatch
-from probe_kit.intervene.results import InterventionResult, effects_csv, load_effects
-from probe_kit.intervene.rollout import evaluate_per_step
-from probe_kit.intervene.sessions import (
-    LoadPolicy,
-    Progress,
-    ReplaySession,
-    ReplaySource,
-    displacements_toward,
-    open_session,
-    sizes,
-)
+from probe_kit.intervene.places import ALL, resolve_all, roles_of, unread_places
+from probe_kit.intervene.replay import Condition
+from probe_kit.intervene.results import InterventionResult, load_effects, save
+from probe_kit.intervene.sessions import LoadPolicy, Progress, ReplaySession, ReplaySource, open_session
 from probe_kit.runs.layout import INTERVENTIONS
 from probe_kit.runs.provenance import provenance_here
 from probe_kit.runs.results import Pieces, tidy_bundle
 from probe_kit.runs.run import Run
 from probe_kit.statistics.sufficiency import groups_for_not_used
+
+if TYPE_CHECKING:
+    from probe_kit.hooks import Policy
 
 REDO = "the same `probe-kit intervene` then plays it again"
 
@@ -73,54 +65,52 @@ def run_intervention(
         tidy_bundle(run.location, INTERVENTIONS, key)
         return load_effects(run, key)
     pieces = Pieces.of(run.location, INTERVENTIONS, key, run.stamp, REDO)
-    requested, patterns = intervention.items_in(run), _patterns(settings)
+    requested = intervention.items_in(run)
     with open_session(run, source or ReplaySource(), load, intervention) as session, session.ready():
         policy = session.policy
         session.on_fit_progress = on_fit_progress or notebook_progress("items learnt from")
-        _check_roles(session, settings, getattr(type(intervention), "roles", Interchange.roles))
+        check_roles(intervention, policy)
         items = intervention.eligible_items(session, requested)
         conditions = intervention.conditions(session)
         progress = progress or notebook_progress("items replayed")
-        batch = _replay_items(session, intervention, items, conditions, pieces, progress)
-        extra_files = intervention.extra_files(session, conditions, batch)
+        outcomes = _replay_items(session, intervention, items, conditions, pieces, progress)
+        extra_files = intervention.extra_files(session, conditions, outcomes)
+        places = [name for pattern, _ in intervention.patterns for name in resolve_all([pattern], policy)]
         certificate = {
             "policy": policy.card.to_json(),
             "provenance": provenance_here(policy.card.device, policy.card.dtype),
-            "replay": _replay_check(batch),
+            "replay": _replay_check(outcomes),
             "items": {"asked": len(requested), "played": len(items)},
             "supported": policy.interventions.to_json(),
-            "edits": _ledgers(conditions, batch),
-            "unread": list(unread_places(patterns, policy.every_stream(), policy.interventions)),
+            "edits": _ledgers(outcomes),
+            "unread": list(unread_places(places, policy.every_stream(), policy.interventions)),
             "passed_over": session.passed_over,
             **session.certificate,
         }
-    outcomes = outcomes_of(run, [condition.name for condition in conditions], batch)
-    measurement = Measurement(
-        outcomes, settings, certificate, extra_files.__getitem__, tiles_apart=tiles_apart(run)
-    )
-    save(run.location, settings, key, outcomes, effects_csv(measurement), certificate, extra_files)
+    save(run, settings, outcomes.in_spreads(), certificate, extra_files)
     pieces.discard()
     return load_effects(run, key)
 
 
-def _check_roles(session: ReplaySession, settings: Mapping[str, Any], usual: Sequence[str]) -> None:
-    """Raise UsageError for a role that nothing at the asked sites plays: the table would be silent about it.
+def check_roles(intervention: Intervention, policy: "Policy") -> None:
+    """Raise UsageError for a role that no token at its sites plays: the table would be silent about it.
 
-    usual: the roles of the kind if none are named, of which one that is there will do.
+    Of the roles that are tried if none are named, one that is there will do.
     """
-    roles, sites = settings.get("roles"), settings.get("sites")
-    sites_and_roles = [(sites, roles)] if roles and sites else []
-    targets = map(ConditionName.parse, settings.get("targets", ()))
-    sites_and_roles += [([target.site], [target.role]) for target in targets]
-    for patterns, requested in sites_and_roles:
-        streams = [group.stream for pattern in patterns for group in resolve_sites(pattern, session.policy)]
-        check_roles_have_tokens(session.policy, tuple(dict.fromkeys(streams)), requested, usual)
-
-
-def _patterns(settings: Mapping[str, Any]) -> list[str]:
-    """The patterns of places that an intervention changes."""
-    targets = [ConditionName.parse(target).site for target in settings.get("targets", ())]
-    return [*settings.get("sites", ()), *targets]
+    usual = next((field.default for field in fields(intervention) if field.name == "roles"), ())
+    patterns_of: dict[tuple[str, ...], list[str]] = {}
+    for pattern, roles in intervention.patterns:
+        patterns_of.setdefault(roles, []).append(pattern)
+    for roles, patterns in patterns_of.items():
+        streams = list(dict.fromkeys(group.stream for group in resolve_all(patterns, policy).values()))
+        present = {role for stream in streams for role in roles_of(policy, stream, roles)}
+        missing = [role for role in roles if role not in present]
+        if missing and not (present and roles == usual):
+            declared = [name for stream in streams for name in policy.role_names.get(policy.tokens_of(stream), ())]
+            raise UsageError(
+                f"no token of {', '.join(streams)} has the role {missing[0]!r}; expected one of "
+                f"{', '.join(dict.fromkeys((ALL, *declared)))}"
+            )
 
 
 def unread_sites(run: Run, intervention: Intervention) -> tuple[str, ...]:
@@ -128,7 +118,7 @@ def unread_sites(run: Run, intervention: Intervention) -> tuple[str, ...]:
     family = get_family(run.model)
     if family is None:
         return ()
-    return unread_places(_patterns(settings_of(intervention, run)), run.streams, family.interventions)
+    return unread_places([pattern for pattern, _ in intervention.patterns], run.streams, family.interventions)
 
 
 def check_supported(run: Run, intervention: Intervention) -> None:
@@ -157,91 +147,57 @@ def _replay_items(
     conditions: Sequence[Condition],
     pieces: Pieces,
     progress: Progress | None,
-) -> ReplayBatch:
+) -> ConditionOutcomes:
     """Replay item by item; items of an interrupted attempt are loaded."""
     parts = []
     for number, item in enumerate(items):
         name = f"{number:06d}"
         stored = pieces.read(name)
-        if stored is not None:
-            part = ReplayBatch(**stored)
-        elif intervention.readout == PER_STEP:
-            part = evaluate_per_step(session, session.pairs(item), conditions)
-        else:
-            part = intervention.play(session, item, conditions)
         if stored is None:
-            pieces.keep(name, part.arrays)
+            part = intervention.play(session, session.pairs(item), conditions)
+            pieces.keep(name, arrays_of(part, ("seed_text",)))
+        else:
+            part = ConditionOutcomes(**with_texts(stored, "conditions"))
         parts.append(part)
         if progress is not None:
             progress(number + 1, len(items), item)
-    return ReplayBatch.joined(parts)
+    return ConditionOutcomes.joined(parts)
 
 
-def outcomes_of(run: Run, conditions: Sequence[str], batch: ReplayBatch) -> ConditionOutcomes:
-    """Return the numbers of K conditions with their episodes. conditions: names of the K, the clean one first."""
-    rows = run.episodes.iloc[batch.rows]
-    columns: dict[str, Any] = {
-        field: rows[name].to_numpy(dtype=str)
-        for field, name in (
-            ("episodes", "episode_id"), ("items", "item_id"), ("groups", "group_id"), ("categories", "category"),
-        )
-    }  # fmt: skip
-    columns["sides"] = rows["side_correct"].to_numpy(dtype=str) if has_sides(run) else np.full(len(rows), "")
-    if run.recorded:
-        names = zip(columns["episodes"], batch.steps, strict=True)
-        columns["episodes"] = np.array([f"{episode}@{frame}" for episode, frame in names])
-    # Toward the source's action, of all its inputs if they were played.
-    toward, references = None, [name for name in (DONOR, IMAGE_SWAP) if name in conditions]
-    if batch.chunks is not None and references:
-        toward = displacements_toward(batch.chunks, list(conditions).index(references[0]))
-    return ConditionOutcomes(
-        conditions=tuple(conditions),
-        **columns,
-        displacement=batch.displacement if has_sides(run) or toward is None else toward,
-        toward=toward,
-        size=None if batch.chunks is None else sizes(batch.chunks),
-        max_action_change=batch.max_action_change,
-        edit_log=batch.edit_log,
-        replay_error=batch.replay_error,
-        episode_outcomes=batch.episode_outcomes,
-        seed_text=run.seed_text,
-    )
-
-
-def _replay_check(batch: ReplayBatch) -> dict[str, Any]:
+def _replay_check(outcomes: ConditionOutcomes) -> dict[str, Any]:
     """Return how many clean inferences are the run's, bit for bit."""
-    errors = batch.replay_error[~np.isnan(batch.replay_error)]
+    errors = outcomes.replay_error[~np.isnan(outcomes.replay_error)]
     return {
-        "episodes": int(batch.replay_error.size),
+        "episodes": int(outcomes.replay_error.size),
         "compared": int(errors.size),
         "equal": int((errors == 0).sum()),
         "largest_difference": float(errors.max(initial=0.0)),
         # One that differs stops an intervention before anything is stored.
-        **({} if batch.episode_outcomes is None else {"outcomes_equal": int(batch.replay_error.size)}),
+        **({} if outcomes.episode_outcomes is None else {"outcomes_equal": int(outcomes.replay_error.size)}),
     }
 
 
-def _ledgers(conditions: Sequence[Condition], batch: ReplayBatch) -> dict[str, dict[str, float]]:
+def _ledgers(outcomes: ConditionOutcomes) -> dict[str, dict[str, float]]:
     """Per condition that changed streams: fires, fires that moved nothing, and norms as means over fires.
 
     Raises CaptureChangedActionError if coefficient 0 changed an action.
     """
     ledgers = {}
-    for number, condition in enumerate(conditions):
-        rows = dict(zip(LOG_FIELDS, batch.edit_log[number].T, strict=True))
+    for number, name in enumerate(outcomes.conditions):
+        rows = dict(zip(LOG_FIELDS, outcomes.edit_log[number].T, strict=True))
         fires = float(rows["fires"].sum())
         if not fires:
             continue
-        means = {name: float((rows[name] * rows["fires"]).sum() / fires) for name in ("norm", "change")}
-        ledgers[condition.name] = {
+        means = {field: float((rows[field] * rows["fires"]).sum() / fires) for field in ("norm", "change")}
+        ledgers[name] = {
             "fires": fires, "no_op_fires": float(rows["no_op_fires"].sum()), **means,
             "largest_change": float(rows["largest_change"].max()),
-            "max_action_change": float(batch.max_action_change[number].max()),
+            "max_action_change": float(outcomes.max_action_change[number].max()),
         }  # fmt: skip
-        if ConditionName.parse(condition.name).coefficient == "0" and batch.max_action_change[number].any():
+        if ConditionName.parse(name).coefficient == "0" and outcomes.max_action_change[number].any():
             raise CaptureChangedActionError(
-                f"{condition.name} adds nothing and changed an action by "
-                f"{batch.max_action_change[number].max():.3g}; "
+                f"{name} adds nothing and changed an action by "
+                f"{outcomes.max_action_change[number].max():.3g}; "
                 "expected the same bit for bit. The adapter's tap does not write what it reads, or the model is "
                 "not deterministic"
             )

@@ -19,7 +19,7 @@ from probe_kit.env.scoring import RULES
 from probe_kit.errors import RunDamagedError
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.intervene.outcomes import stored_interventions
-from probe_kit.intervene.results import effects_of, listed_interventions
+from probe_kit.intervene.results import InterventionResult, listed_interventions
 from probe_kit.retention import RetentionRow
 from probe_kit.retention.columns.columns import (
     ACCURACY,
@@ -417,7 +417,7 @@ def _interventions(viewed: ViewedRun) -> Iterator[dict[str, Any]]:
     used = {listed.key for listed in listed_interventions(viewed.run) if listed.state == "used"}
     for stored in stored_interventions(viewed.run):
         if stored.key in used:
-            result = effects_of(viewed.run, stored)
+            result = InterventionResult.of_stored(stored)
             yield _result_table(f"intervention {result.kind}", stored.key, result.to_rich(), result.findings)
 
 

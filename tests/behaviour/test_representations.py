@@ -238,7 +238,7 @@ def look_at_everything(run: Path) -> None:
     inventory(opened)
     listed_interventions(opened)
     for one in stored_interventions(opened):
-        one.certificate()
+        _ = one.certificate
     load_results(opened)
     read_thumbnail(opened.location, 4)
 

@@ -2,19 +2,19 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from types import MappingProxyType
+from types import MappingProxyType, SimpleNamespace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.intervene import ConditionOutcomes
-from probe_kit.intervene.kinds.base import Measurement
+from probe_kit.intervene import ConditionOutcomes, InterventionResult, UseVerdict
 from probe_kit.intervene.kinds.image_swap import ImageSwapEffect, image_swap_effects
 from probe_kit.intervene.kinds.interchange import PatchEffect, patch_effects
-from probe_kit.intervene.outcomes import FIRST_CHUNK, IMAGE_SWAP, key_of, save
-from probe_kit.intervene.results import effects_csv
+from probe_kit.intervene.outcomes import CERTIFICATE, EPISODES, FIRST_CHUNK, IMAGE_SWAP, Measurement
+from probe_kit.intervene.results import save
 from probe_kit.runs import Location
+from probe_kit.runs.records import as_json
 
 Cell = NDArray[np.float64]
 
@@ -68,10 +68,8 @@ def store_outcomes(
 ) -> str:
     """Stored as if they had been measured, with the effects of their kind; gives the key."""
     check = {"replay": {"episodes": 0, "compared": 0, "equal": 0, "largest_difference": 0.0}}
-    said, files, key = certificate or check, further or {}, key_of(settings)
-    effects = effects_csv(measured(outcomes, seed_text, settings, said, files.__getitem__))
-    save(location, settings, key, outcomes, effects, said, files)
-    return key
+    run = SimpleNamespace(location=location, seed_text=seed_text, settings={})
+    return save(run, settings, outcomes, certificate or check, further or {})  # type: ignore[arg-type]
 
 
 def measured(
@@ -81,7 +79,33 @@ def measured(
     certificate: Mapping[str, Any] = MappingProxyType({}),
     read: Callable[[str], bytes] = str.encode,
 ) -> Measurement:
-    return Measurement(replace(outcomes, seed_text=seed_text), settings, certificate, read)
+    files = {EPISODES: outcomes.to_bytes(), CERTIFICATE: as_json(dict(certificate))}
+    run = SimpleNamespace(label="wired", random_weights=False, suite="suite", settings={}, seed_text=seed_text)
+    return Measurement(run, settings, lambda name: files.get(name) or read(name))  # type: ignore[arg-type]
+
+
+def with_parts(
+    result: InterventionResult,
+    outcomes: ConditionOutcomes | None = None,
+    certificate: Mapping[str, Any] | None = None,
+) -> InterventionResult:
+    """The same with other outcomes, or another certificate."""
+    parts = result.settings, result.certificate if certificate is None else certificate, result.read
+    changed = measured(outcomes or result.outcomes, result.run.seed_text, *parts)
+    return replace(result, read=changed.read)
+
+
+class Said(InterventionResult):
+    """A result with verdicts made by hand."""
+
+    verdicts: Mapping[str, UseVerdict] = {}  # type: ignore[assignment]
+
+
+def said_of(measurement: Measurement, verdicts: Mapping[str, UseVerdict] = MappingProxyType({})) -> Said:
+    result = Said.of_stored(measurement)
+    assert isinstance(result, Said)
+    result.__dict__["verdicts"] = verdicts
+    return result
 
 
 def swaps_of(outcomes: ConditionOutcomes, seed_text: str, readout: str = FIRST_CHUNK) -> list[ImageSwapEffect]:

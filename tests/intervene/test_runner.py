@@ -37,6 +37,7 @@ from probe_kit.intervene.runner import too_few_groups
 from probe_kit.intervene.sessions import ReplaySession, load_policy_of, open_session
 from probe_kit.retention import retention_table
 from probe_kit.runs import Run, open_run, verify_run
+from tests.intervene.answers import with_parts
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
@@ -72,7 +73,7 @@ def test_too_few_groups_are_said_to_show_nothing(effects: InterventionResult) ->
     assert all(min(row.follow_p, row.reversal_p) >= 0.5 for row in effects.effects)
     enough = replace(effects.outcomes, groups=np.array([f"g{number}" for number in range(8)]))
     many = replace(enough, categories=np.full(8, "color"))
-    assert replace(effects, measurement=replace(effects.measurement, outcomes=many)).notes == ()
+    assert with_parts(effects, many).notes == ()
 
 
 def test_the_other_layout_is_the_same_scene_with_its_pictures_exchanged(copy: Run, session: ReplaySession) -> None:

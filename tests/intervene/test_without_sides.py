@@ -14,18 +14,11 @@ from probe_kit.cli import app
 from probe_kit.errors import OtherFramesError, UsageError
 from probe_kit.extract import ExtractSettings, LeRobotSource, extract_run
 from probe_kit.hooks import Observation
-from probe_kit.intervene import ImageSwap, Interchange, ReplaySource, run_intervention
+from probe_kit.intervene import AttributionPatching, ImageSwap, Interchange, ReplaySource, run_intervention
+from probe_kit.intervene.outcomes import displacements_toward, sizes, spread_of
 from probe_kit.intervene.places import Pair, read_pairs
 from probe_kit.intervene.replay import replay
-from probe_kit.intervene.runner import outcomes_of
-from probe_kit.intervene.sessions import (
-    ObservedSession,
-    SceneSession,
-    displacements_toward,
-    open_session,
-    sizes,
-    spread_of,
-)
+from probe_kit.intervene.sessions import ObservedSession, SceneSession, open_session
 from probe_kit.runs import Run, open_run
 from tests.intervene.answers import patches_of
 from tests.support.lerobot_recordings import CAMERA, write_recording
@@ -89,10 +82,7 @@ def test_recordings_of_scene_frames_give_the_numbers_of_the_scene_bit_for_bit(
         replay(opened, pairs, asked.conditions(opened))
         for opened, pairs in ((session, scene_pairs), (observed, seeded))
     ]
-    names = [condition.name for condition in asked.conditions(session)]
-    scene, frames = (
-        outcomes_of(opened.run, names, batch) for opened, batch in zip((session, observed), batches, strict=True)
-    )
+    scene, frames = (batch.in_spreads() for batch in batches)
     assert batches[0].chunks is not None
     assert batches[1].chunks is not None
     np.testing.assert_array_equal(batches[0].chunks, batches[1].chunks)
@@ -216,3 +206,16 @@ def test_a_table_and_a_command_give_the_same_rows(shown: Run, table: Path, twin:
     answer = CliRunner().invoke(app, ["intervene", str(shown.path), "--pairs", str(table), "--format", "json"])
     assert answer.exit_code == 0, answer.stderr
     assert json.loads(answer.stdout)["key"] == result.key
+
+
+@pytest.mark.slow
+def test_estimates_by_gradients_are_kept_where_nothing_has_a_side(shown: Run, table: Path, twin: "Policy") -> None:
+    """An estimate adds to the clean action's displacement, which no inference shows."""
+    screen = AttributionPatching(pairs=read_pairs(table), sites=("backbone.00",), roles=("image",))
+    result = run_intervention(shown, screen, load=lambda *_: twin)
+    (estimates,) = (
+        row
+        for name, row in zip(result.outcomes.conditions, result.outcomes.displacement, strict=True)
+        if name == "estimate|backbone.00|image"
+    )
+    assert np.abs(estimates).min() > 0

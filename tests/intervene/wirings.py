@@ -7,9 +7,9 @@ property.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 import pandas as pd
@@ -24,7 +24,7 @@ from probe_kit.hooks.contract.sites import kv_stream
 from probe_kit.hooks.families.shared.taps import kv_tap
 from probe_kit.intervene import ConditionOutcomes
 from probe_kit.intervene.places import Pair
-from probe_kit.intervene.replay import CLEAN_RUN, SOURCE_RUN, Condition, ReplayBatch, replay
+from probe_kit.intervene.replay import CLEAN_RUN, SOURCE_RUN, Condition, replay
 from probe_kit.intervene.sessions import SceneSession
 from probe_kit.models.decoding import PromptKV
 
@@ -371,22 +371,8 @@ def outcomes_of(
     """
     conditions: list[Condition] = [CLEAN_RUN, SOURCE_RUN, *further]
     inputs = [one for name in names for one in replay_inputs(name)]
-    found = replay(session, inputs, conditions)
+    outcomes = replay(session, inputs, conditions)
     for _ in range(calls - 1):
         later = replay(session, [one for name in names for one in replay_inputs(name, 0.03)], conditions)
-        found.displacement[:] += later.displacement
-    return _stored(conditions, inputs, found)
-
-
-def _stored(conditions: Sequence[Condition], inputs: Sequence[Pair], found: ReplayBatch) -> ConditionOutcomes:
-    columns: dict[str, Any] = {
-        name: np.array([getattr(one, own) for one in inputs])
-        for name, own in (
-            ("episodes", "episode"), ("items", "item"), ("groups", "group"), ("categories", "category"),
-            ("sides", "side"),
-        )
-    }  # fmt: skip
-    return ConditionOutcomes(
-        conditions=tuple(condition.name for condition in conditions), **columns, displacement=found.displacement,
-        max_action_change=found.max_action_change, edit_log=found.edit_log, replay_error=found.replay_error,
-    )  # fmt: skip
+        outcomes.displacement[:] += later.displacement
+    return replace(outcomes, chunks=None)

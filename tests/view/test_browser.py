@@ -338,7 +338,7 @@ def test_a_question_shows_both_layouts_with_what_the_probes_read_and_the_arm_did
 def responses_of(run: Run) -> dict[str, str]:
     """What the page says of the action of every episode once the pictures are swapped."""
     (stored,) = stored_interventions(run, "image-swap")
-    outcomes, said = stored.outcomes(), {}
+    outcomes, said = stored.outcomes, {}
     for number, name in enumerate(outcomes.episodes):
         toward = 1 if outcomes.sides[number] == "left" else -1
         clean, swapped = toward * outcomes.displacement[:, number] > 0

@@ -19,7 +19,8 @@ from probe_kit.errors import RunDamagedError, UsageError
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.intervene.kinds.image_swap import ImageSwap, stored_image_swaps
-from probe_kit.intervene.outcomes import ConditionOutcomes, key_of, save, settings_of, stored_interventions
+from probe_kit.intervene.outcomes import ConditionOutcomes, settings_of, stored_interventions
+from probe_kit.intervene.results import save
 from probe_kit.retention import retention_table
 from probe_kit.runs import Run, open_run
 from probe_kit.runs.layout import DIAGNOSES
@@ -92,7 +93,7 @@ def test_an_episode_says_how_its_action_responds_to_the_stored_image_swap(
     catalogue: Catalogue, little: Run
 ) -> None:
     (stored,) = stored_interventions(little, "image-swap")
-    outcomes = stored.outcomes()
+    outcomes = stored.outcomes
     expected = {}
     for number, name in enumerate(outcomes.episodes):
         left = outcomes.displacement[:, number] > 0
@@ -425,8 +426,7 @@ def swap_inputs(run: Run) -> str:
         toward=sizes, size=sizes,
     )  # fmt: skip
     check = {"replay": {"compared": 1, "equal": 1}}
-    save(run.location, settings, key_of(settings), outcomes, "", check)
-    return key_of(settings)
+    return save(run, settings, outcomes, check)
 
 
 def diagnose(run: Run, version: str = FORMAT) -> str:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from difflib import get_close_matches
+from importlib import import_module
 from types import MappingProxyType
 from typing import Any, Literal, get_args
 
@@ -234,17 +235,21 @@ InterventionKind = Literal["swap", "edit", "kv", "attention", "tiles", "gradient
 Readout = Literal["first-chunk", "per-step"]
 """first-chunk: lateral displacement by the first inference's actions, none of them executed.
 per-step: its sum over every inference of the unedited episode; only the clean actions are executed."""
-ASKED_AS: Mapping[InterventionKind, tuple[str, tuple[str, ...]]] = MappingProxyType(
-    {
-        "swap": ("--kind", ("image-swap", "instruction-swap")),
-        "edit": ("--kind", ("interchange", "joint", "steer", "closed-loop", "erase")),
-        "attention": ("--kind", ("attention",)),
-        "gradients": ("--kind", ("attribution",)),
-        "kv": ("--sites", ("kv.*",)),
-        "tiles": ("--roles", ("image.left", "image.right")),
-    }
+_VALUES: Mapping[str, tuple[str, tuple[str, ...]]] = MappingProxyType(
+    {"kv": ("--sites", ("kv.*",)), "tiles": ("--roles", ("image.left", "image.right"))}
 )
-"""What a family supports, as `probe-kit intervene` asks for it: an option and its values."""
+_KINDS = "probe_kit.intervene.kinds"
+"""A package above this one, whose kinds say themselves what a family must support for them."""
+
+
+def asked_as(kind: InterventionKind) -> tuple[str, tuple[str, ...]]:
+    """Return the option of `probe-kit intervene` that asks for such an intervention, and its values."""
+    if kind in _VALUES:
+        return _VALUES[kind]
+    names: tuple[str, ...] = import_module(_KINDS).kinds_that_need(kind)
+    return "--kind", names
+
+
 _UNDECLARED = {
     "kv": "its adapter declares no `kv` stream. Patch residual sites instead, or declare `Model.prompt_kv`",
     "attention": "its adapter gives no attention. Patch `kv` or single roles instead: what a patch "
@@ -305,7 +310,8 @@ class Interventions:
     def asked_as(self) -> dict[str, list[str]]:
         """The options and values of `probe-kit intervene` that are supported."""
         values_of: dict[str, list[str]] = {}
-        for kind, (option, values) in ASKED_AS.items():
+        for kind in get_args(InterventionKind):
+            option, values = asked_as(kind)
             if self.supports(kind):
                 values_of.setdefault(option, []).extend(values)
         return values_of
@@ -314,7 +320,7 @@ class Interventions:
         """Raises UnsupportedInterventionError if `family`, whose declaration this is, does not support `kind`."""
         if not self.supports(kind):
             why = {**_UNDECLARED, **self.instead}[kind]
-            option, values = ASKED_AS[kind]
+            option, values = asked_as(kind)
             request = f"{option} {', '.join(values)}"
             raise UnsupportedInterventionError(
                 f"{family} does not support the intervention {kind!r} (`probe-kit intervene {request}`): {why}"

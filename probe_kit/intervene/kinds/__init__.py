@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from probe_kit.errors import UsageError
 
 if TYPE_CHECKING:
+    from probe_kit.hooks.contract.declared import InterventionKind
     from probe_kit.intervene.kinds.base import Intervention
 
 _HOMES = {
@@ -35,6 +36,11 @@ def kind_of(name: str) -> "type[Intervention]":
 def every_kind() -> "list[type[Intervention]]":
     """Return all kinds, in the order of help."""
     return sorted(map(kind_of, _HOMES), key=lambda kind: kind.position)
+
+
+def kinds_that_need(capability: "InterventionKind") -> tuple[str, ...]:
+    """Return the kinds that a family supports only with a capability, the last one of their `needs`."""
+    return tuple(kind.kind for kind in every_kind() if kind.needs[-1] == capability)
 
 
 def register(name: str, module: str) -> None:

@@ -16,13 +16,15 @@ from probe_kit.errors import CaptureChangedActionError, CaptureError, EmptyRoleE
 from probe_kit.hooks.contract.declared import InterventionKind
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.sites import first_of
-from probe_kit.intervene.kinds.base import Intervention, Measurement, TableContext, effect_table
+from probe_kit.intervene.kinds.base import Intervention, effect_table
 from probe_kit.intervene.outcomes import (
     ATTENTION,
     ATTENTION_FILE,
     PATCHES_FILE,
     RECORDED,
+    ConditionOutcomes,
     Effect,
+    Measurement,
     StoredResult,
     arrays_from_bytes,
     arrays_to_bytes,
@@ -38,7 +40,7 @@ from probe_kit.intervene.places import (
     shown_cameras,
     token_boxes,
 )
-from probe_kit.intervene.replay import CLEAN_RUN, Condition, ConditionContext, ConditionResult, ReplayBatch
+from probe_kit.intervene.replay import CLEAN_RUN, Condition, ConditionContext, ConditionResult
 from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.bootstrap import GAINS, student_interval, units_seed
 
@@ -90,35 +92,37 @@ class AttentionReadout(Intervention):
         return CLEAN_RUN, attention_recorded(stream, roles, boxes)
 
     def extra_files(
-        self, session: "ReplaySession", conditions: Sequence[Condition], batch: ReplayBatch
+        self, session: "ReplaySession", conditions: Sequence[Condition], outcomes: ConditionOutcomes
     ) -> dict[str, bytes]:
         """The attention of every inference; the certificate gets the axes of the array.
 
         Raises CaptureChangedActionError if recording changed an action.
         """
-        largest = float(batch.max_action_change.max(initial=0.0))
+        largest = float(outcomes.max_action_change.max(initial=0.0))
         if largest:
             raise CaptureChangedActionError(
                 f"with its attention recorded an action differs by {largest:.3g}; expected the same bit for bit. "
                 "The adapter's `record_attention` changes the inference, or the model is not deterministic"
             )
         run, entries = session.run, session.certificate[ATTENTION]
-        assert batch.mass is not None
-        assert batch.inferences is not None
-        axes = zip(("inferences", "blocks", "iterations", "heads"), batch.mass.shape, strict=False)
+        assert outcomes.mass is not None
+        assert outcomes.inferences is not None
+        axes = zip(("inferences", "blocks", "iterations", "heads"), outcomes.mass.shape, strict=False)
         entries |= {**dict(axes), "max_action_change": largest}
-        rows, calls = run.episodes.iloc[batch.inferences[:, 0]], batch.inferences[:, 1]
+        rows, calls = run.episodes.iloc[outcomes.inferences[:, 0]], outcomes.inferences[:, 1]
         episodes, groups, categories = (
             rows[name].to_numpy(dtype=str) for name in ("episode_id", "group_id", "category")
         )
         sides = rows["side_correct"].to_numpy(dtype=str) if has_sides(run) else np.full(len(rows), "")
-        shares = AttentionShares(tuple(entries["roles"]), episodes, groups, categories, sides, calls, batch.mass)
+        shares = AttentionShares(
+            tuple(entries["roles"]), episodes, groups, categories, sides, calls, outcomes.mass
+        )
         files = {ATTENTION_FILE: arrays_to_bytes(shares)}
-        if batch.patches is not None:
+        if outcomes.patches is not None:
             by_camera: Mapping[str, NDArray[np.float32]] = conditions[-1].details
             names = np.repeat(list(by_camera), [len(places) for places in by_camera.values()])
             boxes = np.concatenate(list(by_camera.values()))
-            patches = PatchAttention(episodes, calls, batch.patches.astype(np.float16), names, boxes)
+            patches = PatchAttention(episodes, calls, outcomes.patches.astype(np.float16), names, boxes)
             files[PATCHES_FILE] = arrays_to_bytes(patches)
         return files
 
@@ -128,15 +132,15 @@ class AttentionReadout(Intervention):
         return AttentionShares.from_bytes(measurement.read(ATTENTION_FILE)).rows()
 
     @staticmethod
-    def table(rows: "Sequence[AttentionRow]", context: TableContext) -> "Table":
+    def table(rows: "Sequence[AttentionRow]", context: Measurement) -> "Table":
         """Return one line per category and block of the backbone that is read."""
         del rows
-        attention = AttentionShares.from_bytes(context.measurement.read(ATTENTION_FILE))
+        attention = AttentionShares.from_bytes(context.read(ATTENTION_FILE))
         means = attention.rows(("block",))
         roles = [role for role in dict.fromkeys(row.role for row in means) if role not in (CORRECT, OTHER)]
         lines: list[tuple[tuple[str, ...], tuple[dict[str, float], str]]] = []
         for category, part in attention.by_category():
-            apart = part.correct_minus_other(context.measurement.outcomes.seed_text)
+            apart = part.correct_minus_other(context.run.seed_text)
             for block in dict.fromkeys(row.block for row in means if row.category == category):
                 shares = {row.role: row.share for row in means if (row.category, row.block) == (category, block)}
                 lines.append(((category, f"block {block:02d}"), (shares, _difference(apart.get(block or 0)))))
@@ -249,13 +253,13 @@ def stored_patch_attention(run: RunReader) -> dict[str, PatchAttention]:
 
     Raises RunDamagedError.
     """
-    bundles = {category: result.stored.bundle for category, (result, _) in preferred_attention(run).items()}
+    stored = {category: result.stored for category, (result, _) in preferred_attention(run).items()}
     read = {
-        bundle.key: PatchAttention(**arrays_from_bytes(bundle.read(PATCHES_FILE)))
-        for bundle in bundles.values()
-        if bundle.has(PATCHES_FILE)
+        measured.key: PatchAttention(**arrays_from_bytes(measured.read(PATCHES_FILE)))
+        for measured in stored.values()
+        if PATCHES_FILE in measured.files
     }
-    return {category: read[bundle.key] for category, bundle in bundles.items() if bundle.key in read}
+    return {category: read[measured.key] for category, measured in stored.items() if measured.key in read}
 
 
 def shares_by_role(mass: "AttentionMass", masks: Sequence[NDArray[np.bool_] | None]) -> NDArray[np.float32]:
@@ -435,7 +439,7 @@ def preferred_attention(run: RunReader) -> dict[str, tuple[StoredResult, Attenti
     for result in stored_results(run, ATTENTION):
         key, before = result.stored.key, preferred.get(result.category)
         if key not in read:
-            read[key] = AttentionShares.from_bytes(result.stored.bundle.read(ATTENTION_FILE))
+            read[key] = AttentionShares.from_bytes(result.stored.read(ATTENTION_FILE))
         category_shares = read[key].only(read[key].categories == result.category)
         if before is None or (before[0].rank, len(before[1].roles)) <= (result.rank, len(category_shares.roles)):
             preferred[result.category] = result, category_shares

@@ -1,6 +1,6 @@
 """Attribution patching: gradients order cells, exact patches check the order and anchor it. Enters no verdict."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Self, get_args
 
@@ -11,38 +11,34 @@ from probe_kit.errors import UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.declared import InterventionKind
 from probe_kit.hooks.contract.sites import KV_STREAM
+from probe_kit.intervene.exchange import pooled_share
 from probe_kit.intervene.kinds.base import (
     Intervention,
-    Measurement,
-    TableContext,
     edits_by_category,
     effect_table,
-    flips_seed,
     interval_text,
     lines_of,
     p_of,
 )
-from probe_kit.intervene.kinds.image_swap import share_of_swap, swap_sign
 from probe_kit.intervene.kinds.interchange import cells_at, check_sites_and_roles, patch_of
-from probe_kit.intervene.outcomes import CLEAN, FIRST_CHUNK, ConditionOutcomes
+from probe_kit.intervene.outcomes import CLEAN, FIRST_CHUNK, ConditionOutcomes, Measurement
 from probe_kit.intervene.patching.attribution import (
     AGREEMENT,
     AttributionEffect,
+    CellName,
     Ends,
     complete_cuts,
     describe_screen,
     describe_void,
     estimate_patches,
     kind_of_place,
-    order_cells,
+    screen_rows,
     worst_anchor,
 )
 from probe_kit.intervene.patching.patch import Cell, sites_of_cells
-from probe_kit.intervene.patching.sweep import pooled_share, share_fields
-from probe_kit.intervene.places import ALL, resolve_all
+from probe_kit.intervene.places import ALL, SEPARATOR, resolve_all
 from probe_kit.intervene.replay import CLEAN_RUN, SOURCE_RUN, Condition, ConditionContext, ConditionResult
 from probe_kit.runs.run import Run
-from probe_kit.statistics.paired_tests import max_t
 
 if TYPE_CHECKING:
     from probe_kit._tables.table import Table
@@ -182,10 +178,10 @@ class AttributionPatching(Intervention):
     def effects(measurement: Measurement) -> list[AttributionEffect]:
         """Return by category the anchors, then the cells of each kind: by rank, or in their order."""
         drawn = frozenset(measurement.certificate.get(NAME, {}).get("drawn", []))
-        return measurement.rows(lambda part: order_cells(_rows(part, drawn)))
+        return measurement.rows(lambda part: _rows(part, drawn))
 
     @staticmethod
-    def table(rows: Sequence[AttributionEffect], context: TableContext) -> "Table":
+    def table(rows: Sequence[AttributionEffect], context: Measurement) -> "Table":
         """Return one line per category and cell."""
         void = [
             f"{name}: {describe_void(part)}"
@@ -204,7 +200,7 @@ class AttributionPatching(Intervention):
     sentence = staticmethod(describe_screen)
 
     @staticmethod
-    def finding(rows: Sequence[AttributionEffect], context: TableContext) -> str:
+    def finding(rows: Sequence[AttributionEffect], context: Measurement) -> str:
         """Return whether the screen holds, and what it puts first."""
         del context
         worst = worst_anchor(rows)
@@ -229,32 +225,16 @@ _COLUMNS: Mapping[str, Any] = {
 }
 
 
-def _rows(outcomes: ConditionOutcomes, drawn: frozenset[str]) -> list[AttributionEffect]:
-    """Return the rows of one category, without rank and finding."""
-    names = [name.partition("|")[2] for name in outcomes.conditions if name.startswith(f"{ESTIMATE}|")]
-    exact = [name for name in outcomes.conditions if name.startswith(f"{EXACT}|")]
-    clean, leads = outcomes.of(CLEAN), -swap_sign(outcomes) * outcomes.correct_sign
-    toward = np.array([leads * (outcomes.of(name) - clean) for name in exact])
-    _, _, numbers = max_t(toward, outcomes.items, outcomes.groups, flips_seed(outcomes))
-    p_fwe = dict(zip(exact, map(float, numbers), strict=True))
-    counts = {name: value for name, value in outcomes.counts.items() if name != "n_items"}
-    rows = []
-    for name in names:
-        site, _, role = name.partition("|")
-        shares: dict[str, Any] = {}
-        for part in (ESTIMATE, EXACT):
-            has_part = f"{part}|{name}" in outcomes.conditions
-            moved = outcomes.of(f"{part}|{name}") - clean if has_part else None
-            shares |= share_fields(part, None if moved is None else share_of_swap(outcomes, moved))
-        rows.append(
-            AttributionEffect(
-                **counts,
-                place=site,
-                role=role,
-                is_anchor=role == ALL,
-                is_drawn=f"{EXACT}|{name}" in drawn,
-                **shares,
-                p_fwe=p_fwe.get(f"{EXACT}|{name}"),
-            )
-        )
-    return rows
+def _rows(outcomes: ConditionOutcomes, drawn: Collection[str]) -> list[AttributionEffect]:
+    """Return the rows of one category. drawn: names of conditions."""
+    clean, exchange = outcomes.of(CLEAN), outcomes.exchange()
+    assert exchange is not None
+    moved: dict[str, dict[CellName, NDArray[np.float64]]] = {ESTIMATE: {}, EXACT: {}}
+    for name in outcomes.conditions:
+        part, _, cell = name.partition(SEPARATOR)
+        if part in moved:
+            site, _, role = cell.partition(SEPARATOR)
+            moved[part][site, role] = outcomes.of(name) - clean
+    anchors = [cell for cell in moved[ESTIMATE] if cell[1] == ALL]
+    at_random = [cell for cell in moved[EXACT] if SEPARATOR.join((EXACT, *cell)) in drawn]
+    return screen_rows(exchange, moved[ESTIMATE], moved[EXACT], anchors, at_random, str(outcomes.categories[0]))

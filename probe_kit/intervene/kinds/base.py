@@ -5,7 +5,7 @@ Loads neither torch nor a simulator, and neither do the kinds: tables read them 
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
@@ -18,9 +18,18 @@ from probe_kit.hashing import derive_seed
 from probe_kit.hooks.capturing.edits import LOG_FIELDS
 from probe_kit.hooks.contract.declared import InterventionKind
 from probe_kit.hooks.contract.sites import KV_STREAM
-from probe_kit.intervene.outcomes import FIRST_CHUNK, Choice, ConditionOutcomes, Effect, categories_in, has_sides
-from probe_kit.intervene.places import SEPARATOR, TILES
-from probe_kit.intervene.replay import Condition, ReplayBatch, replay
+from probe_kit.intervene.outcomes import (
+    FIRST_CHUNK,
+    PER_STEP,
+    Choice,
+    ConditionOutcomes,
+    Effect,
+    Measurement,
+    categories_in,
+    has_sides,
+)
+from probe_kit.intervene.places import SEPARATOR, TILES, Pair
+from probe_kit.intervene.replay import Condition, replay
 from probe_kit.runs.direction_files import FileDirection, names_file, read_direction
 from probe_kit.runs.reader import RunReader
 from probe_kit.runs.run import Run
@@ -36,63 +45,11 @@ if TYPE_CHECKING:
 
 Values = NDArray[np.float64]
 CONTROL = "control-"
-TILES_APART = 0.31
-"""Metres between the tiles of the default scene; taken for a run that stores no scene."""
+OPTIONS = ("sites", "roles", "direction", "controls", "coefficients", "target_side", "seed")
+"""Options of the command that a kind may take."""
 
 
 # -- the kind -------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Measurement:
-    """The stored numbers that effects are computed from.
-
-    read: a further stored file by its name. key: of the intervention. tiles_apart: metres between the tiles of the
-    run's scene.
-    """
-
-    outcomes: ConditionOutcomes
-    settings: Mapping[str, Any]
-    certificate: Mapping[str, Any]
-    read: Callable[[str], bytes]
-    key: str = ""
-    tiles_apart: float = TILES_APART
-
-    @property
-    def readout(self) -> str:
-        """Return `first-chunk` or `per-step`."""
-        return str(self.settings.get("readout", FIRST_CHUNK))
-
-    def rows[Row: Effect](self, of_category: Callable[[ConditionOutcomes], Iterable[Row]]) -> list[Row]:
-        """Return the rows of all categories, in the order of the episodes, each with the key."""
-        parts = (of_category(part) for _, part in self.outcomes.by_category())
-        key: dict[str, Any] = {"key": self.key}  # every kind's rows have it, as their last column
-        return [replace(row, **key) for rows in parts for row in rows]
-
-
-@dataclass(frozen=True)
-class TableContext:
-    """The words of a table besides its rows. subject: model and suite. verdicts: by category, `UseVerdict`.
-
-    legend: of the verdicts. explains: whether the caption says what each verdict rests on, as sentences do.
-    exchange: the change of inputs that effects are shares of.
-    """
-
-    measurement: Measurement
-    subject: str
-    verdicts: Mapping[str, Any] = MappingProxyType({})
-    legend: str = ""
-    explains: bool = True
-    exchange: str = "image swap"
-
-    @property
-    def lacks_sides(self) -> bool:
-        """Whether the run has no correct picture on a side."""
-        return not self.measurement.outcomes.has_sides
-
-    def in_words(self, text: str) -> str:
-        """Return a text about the image swap, about what was exchanged in this run."""
-        return text.replace("image swap", self.exchange)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +62,7 @@ class Intervention(Choice, ABC):
     the user's own, episode and frame of the clean inference and of its donor.
 
     Of the class. kind: its name on the command line. summary: a line of help. position: in help. options: those of
-    sites, roles, direction, controls, coefficients, target_side and seed that it takes, and their meaning. needs:
+    `OPTIONS` that it takes, and their meaning; another one raises UsageError. needs:
     the interventions that a family must support, besides those of the fields `sites` and `roles`. fits_always:
     whether items are inferred beforehand. has_verdict: whether `classify_use` classifies its rows. is_descriptive:
     whether it edits and tests nothing. asks_where: whether it edits places of the network, so that a line says
@@ -122,6 +79,14 @@ class Intervention(Choice, ABC):
     asks_where: ClassVar[bool] = False
     needs_sides: ClassVar[bool] = False
 
+    def __init_subclass__(cls, **keywords: Any) -> None:
+        super().__init_subclass__(**keywords)
+        if unknown := [name for name in cls.options if name not in OPTIONS]:
+            raise UsageError(
+                f"{cls.__name__} declares the option {unknown[0]!r}, which `probe-kit intervene` does not have; "
+                f"expected some of {', '.join(OPTIONS)}"
+            )
+
     @classmethod
     def from_options(cls, run: Run, **options: Any) -> Self:
         """Return it as the command builds it. options: those that are given. Raises UsageError."""
@@ -129,11 +94,16 @@ class Intervention(Choice, ABC):
         return cls(**options)
 
     @property
+    def patterns(self) -> tuple[tuple[str, tuple[str, ...]], ...]:
+        """Return the patterns of places that it edits, each with the roles of the tokens; none by default."""
+        return tuple((site, getattr(self, "roles", ())) for site in getattr(self, "sites", ()))
+
+    @property
     def required_capabilities(self) -> tuple[InterventionKind, ...]:
         """Return the interventions that a family must support for it, at its sites and roles."""
-        reads_kv = any(str(site).partition(".")[0] == KV_STREAM for site in getattr(self, "sites", ()))
-        sees_tiles = not TILES.keys().isdisjoint(getattr(self, "roles", ()))
-        needed: dict[InterventionKind, bool] = {"kv": reads_kv, "tiles": sees_tiles}
+        roles = {*getattr(self, "roles", ()), *(role for _, roles in self.patterns for role in roles)}
+        reads_kv = any(site.partition(".")[0] == KV_STREAM for site, _ in self.patterns)
+        needed: dict[InterventionKind, bool] = {"kv": reads_kv, "tiles": not TILES.keys().isdisjoint(roles)}
         return (*self.needs, *(kind for kind, is_needed in needed.items() if is_needed))
 
     @property
@@ -169,15 +139,21 @@ class Intervention(Choice, ABC):
         What the certificate shall say of them is put in `session.certificate`.
         """
 
-    def play(self, session: "ReplaySession", item: str, conditions: Sequence[Condition]) -> ReplayBatch:
-        """Play the conditions on the pairs of one item."""
-        return replay(session, session.pairs(item), conditions)
+    def play(
+        self, session: "ReplaySession", pairs: Sequence[Pair], conditions: Sequence[Condition]
+    ) -> ConditionOutcomes:
+        """Play the conditions on some pairs, as the readout demands."""
+        if self.readout == PER_STEP:
+            from probe_kit.intervene.rollout import evaluate_per_step
+
+            return evaluate_per_step(session, pairs, conditions)
+        return replay(session, pairs, conditions)
 
     def extra_files(
-        self, session: "ReplaySession", conditions: Sequence[Condition], batch: ReplayBatch
+        self, session: "ReplaySession", conditions: Sequence[Condition], outcomes: ConditionOutcomes
     ) -> dict[str, bytes]:
         """Return further files to store, by name; further entries go into `session.certificate`."""
-        del session, conditions, batch
+        del session, conditions, outcomes
         return {}
 
     @staticmethod
@@ -187,17 +163,17 @@ class Intervention(Choice, ABC):
 
     @staticmethod
     @abstractmethod
-    def table(rows: Sequence[Any], context: TableContext) -> "Table":
+    def table(rows: Sequence[Any], context: Measurement) -> "Table":
         """Return the rows as a table for a terminal."""
 
     @classmethod
-    def sentences(cls, rows: Sequence[Any], context: TableContext) -> list[str]:
+    def sentences(cls, rows: Sequence[Any], context: Measurement) -> list[str]:
         """Return what was found with its numbers, a sentence per category; none of a kind that only describes."""
         parts = [(name, cls.sentence(part)) for name, part in edits_by_category(rows).items()]
         return [f"{category_of(name).title}: {context.in_words(text)}." for name, text in parts if text]
 
     @classmethod
-    def findings(cls, rows: Sequence[Any], context: TableContext) -> list[str]:
+    def findings(cls, rows: Sequence[Any], context: Measurement) -> list[str]:
         """Return the last lines of a command, `CATEGORY  verdict: what was found.`: short, one per category."""
         parts = [
             (category_of(name).title, cls.finding(part, context)) for name, part in edits_by_category(rows).items()
@@ -212,7 +188,7 @@ class Intervention(Choice, ABC):
         return ""
 
     @staticmethod
-    def finding(rows: Sequence[Any], context: TableContext) -> str:
+    def finding(rows: Sequence[Any], context: Measurement) -> str:
         """Return a verdict, a colon and what was found, in few words without brackets. rows: as of `sentence`."""
         del rows, context
         return ""
@@ -395,15 +371,11 @@ def test_against_controls(
     beyond = np.array(
         [values[at] - values[controls[at]].mean(axis=0) if controls[at] else values[at] for at in tested]
     )
-    numbers = max_t(beyond, outcomes.items, outcomes.groups, flips_seed(outcomes))
+    flips = derive_seed("sign flips", outcomes.seed_text, str(outcomes.categories[0]))
+    numbers = max_t(beyond, outcomes.items, outcomes.groups, flips)
     for at, excess, *statistics in zip(tested, beyond, *numbers, strict=True):
         tests[at] = ControlTest(controls[at], excess, *map(float, statistics))
     return tests
-
-
-def flips_seed(outcomes: ConditionOutcomes) -> int:
-    """Return the seed of the sign flips of one category."""
-    return derive_seed("sign flips", outcomes.seed_text, str(outcomes.categories[0]))
 
 
 def mean_of(values: Values) -> float | None:

@@ -24,8 +24,6 @@ from probe_kit.intervene.kinds.base import (
     AlongDirection,
     ConditionName,
     EffectRow,
-    Measurement,
-    TableContext,
     common_columns,
     count_edits,
     edit_of,
@@ -38,10 +36,10 @@ from probe_kit.intervene.kinds.base import (
     test_against_controls,
 )
 from probe_kit.intervene.kinds.interchange import best_patch_targets, patch_of, patches_within
-from probe_kit.intervene.outcomes import CLEAN, FIRST_CHUNK, ConditionOutcomes, categories_in
+from probe_kit.intervene.outcomes import CLEAN, FIRST_CHUNK, ConditionOutcomes, Measurement, categories_in
 from probe_kit.intervene.patching.patch import Cell, sites_of_cells
-from probe_kit.intervene.places import ALL, SEPARATOR, TILES, resolve_sites, role_tokens
-from probe_kit.intervene.replay import SOURCE_RUN, Condition, ConditionContext, ConditionResult, ReplayBatch
+from probe_kit.intervene.places import ALL, SEPARATOR, TILES, Pair, resolve_sites, role_tokens
+from probe_kit.intervene.replay import SOURCE_RUN, Condition, ConditionContext, ConditionResult
 from probe_kit.runs.run import Run
 from probe_kit.statistics.paired_tests import sign_p
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -137,14 +135,10 @@ class ClosedLoop(AlongDirection):
         return cls(**options, targets=targets)
 
     @property
-    def sites(self) -> tuple[str, ...]:
-        """Return the places of its targets."""
-        return tuple(ConditionName.parse(target).site for target in self.targets)
-
-    @property
-    def roles(self) -> tuple[str, ...]:
-        """Return the role of each."""
-        return tuple(ConditionName.parse(target).role for target in self.targets)
+    def patterns(self) -> tuple[tuple[str, tuple[str, ...]], ...]:
+        """Return place and role of every target."""
+        names = map(ConditionName.parse, self.targets)
+        return tuple((name.site, (name.role,)) for name in names)
 
     def parameters(self) -> dict[str, Any]:
         """Return where and along what; it is read where the cube ends."""
@@ -165,12 +159,16 @@ class ClosedLoop(AlongDirection):
 
         cells = [
             Cell(site_group, role)
-            for name, role in zip(self.sites, self.roles, strict=True)
-            for site_group in resolve_sites(name, session.policy)
+            for site, (role,) in self.patterns
+            for site_group in resolve_sites(site, session.policy)
         ]
         source_sites = sites_of_cells(cells)
         within = [cell for cell in cells if len(cell.site_group.sites) == 1 and cell.role not in TILES]
-        bases = {} if self.direction == NONE else fit_token_directions(session, self, within, self.sites)
+        bases = (
+            {}
+            if self.direction == NONE
+            else fit_token_directions(session, self, within, [site for site, _ in self.patterns])
+        )
         conditions = [identity_patch(source_sites), SOURCE_RUN]
         for cell in cells:
             conditions.append(patch_of(cell, source_sites))
@@ -178,11 +176,13 @@ class ClosedLoop(AlongDirection):
                 conditions += patches_within(self.direction, bases[cell], cell, source_sites)
         return conditions
 
-    def play(self, session: "ReplaySession", item: str, conditions: Sequence[Condition]) -> ReplayBatch:
-        """Play the item's episodes, each under every condition, from its first step to its last."""
+    def play(
+        self, session: "ReplaySession", pairs: Sequence[Pair], conditions: Sequence[Condition]
+    ) -> ConditionOutcomes:
+        """Play the episodes of the pairs, each under every condition, from its first step to its last."""
         from probe_kit.intervene.rollout import play_episodes
 
-        return play_episodes(session, session.pairs(item), conditions)
+        return play_episodes(session, pairs, conditions)
 
     @staticmethod
     def effects(measurement: Measurement) -> "list[ClosedLoopEffect]":
@@ -190,7 +190,7 @@ class ClosedLoop(AlongDirection):
         return measurement.rows(closed_loop_effects)
 
     @staticmethod
-    def table(rows: "Sequence[ClosedLoopEffect]", context: TableContext) -> "Table":
+    def table(rows: "Sequence[ClosedLoopEffect]", context: Measurement) -> "Table":
         """Return one line per category and condition, the identity patch first."""
         return effect_table(
             f"Is it so in closed loop? {context.subject}",
@@ -214,7 +214,7 @@ class ClosedLoop(AlongDirection):
         return turned + (f"; that disrupt the task: {count_edits(disrupted, len(edits))}" if disrupted else "")
 
     @staticmethod
-    def finding(rows: "Sequence[ClosedLoopEffect]", context: TableContext) -> str:
+    def finding(rows: "Sequence[ClosedLoopEffect]", context: Measurement) -> str:
         """Return whether an edit turns the cube to the other picture, and where."""
         del context
         edits = [row for row in rows if row.place != CLEAN]

@@ -22,8 +22,6 @@ from probe_kit.intervene.kinds.base import (
     ConditionName,
     EffectRow,
     Intervention,
-    Measurement,
-    TableContext,
     common_columns,
     count_edits,
     edit_of,
@@ -35,7 +33,7 @@ from probe_kit.intervene.kinds.base import (
     test_against_controls,
 )
 from probe_kit.intervene.kinds.interchange import cells_at
-from probe_kit.intervene.outcomes import CLEAN, ERASE, FIRST_CHUNK, PROBE_ACCURACY, ConditionOutcomes
+from probe_kit.intervene.outcomes import CLEAN, ERASE, FIRST_CHUNK, PROBE_ACCURACY, ConditionOutcomes, Measurement
 from probe_kit.intervene.patching.attribution import LOCALISATION_SHARE
 from probe_kit.intervene.patching.patch import Cell
 from probe_kit.intervene.places import TILES, resolve_all, role_tokens
@@ -162,7 +160,7 @@ class ConceptErasure(Intervention):
         return measurement.rows(lambda part: erasure_effects(part, accuracies))
 
     @staticmethod
-    def table(rows: "Sequence[ErasureEffect]", context: TableContext) -> "Table":
+    def table(rows: "Sequence[ErasureEffect]", context: Measurement) -> "Table":
         """Return one line per category and place; controls are columns of what is compared with them."""
         edits = [row for row in rows if row.finding not in ("control", "identity patch")]
         return effect_table(
@@ -185,7 +183,7 @@ class ConceptErasure(Intervention):
         return f"erasures that take the answer from the action beyond their controls: {counts}"
 
     @staticmethod
-    def finding(rows: "Sequence[ErasureEffect]", context: TableContext) -> str:
+    def finding(rows: "Sequence[ErasureEffect]", context: Measurement) -> str:
         """Return whether an erasure takes the answer from the action, and where."""
         del context
         tried, has_answer = _tried(rows)

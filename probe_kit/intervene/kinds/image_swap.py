@@ -7,7 +7,6 @@ without sides one input is exchanged for a donor's, and sizes are in spreads of 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import hypot
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -16,11 +15,15 @@ from numpy.typing import NDArray
 from probe_kit._system.counting import counted
 from probe_kit._tables.numbers import number, percent
 from probe_kit.hooks.contract.declared import InterventionKind, Readout
+from probe_kit.intervene.exchange import (
+    NOTHING,
+    SwapShare,
+    carries_nothing,
+    share_fields,
+    share_of_whole,
+)
 from probe_kit.intervene.kinds.base import (
-    TILES_APART,
     Intervention,
-    Measurement,
-    TableContext,
     effect_table,
     interval_text,
     lines_of,
@@ -34,17 +37,12 @@ from probe_kit.intervene.outcomes import (
     DONOR,
     FIRST_CHUNK,
     IMAGE_SWAP,
+    TILES_APART,
     ConditionOutcomes,
     Effect,
+    Measurement,
     has_sides,
     preferred_by_category,
-)
-from probe_kit.intervene.patching.sweep import (
-    NOTHING,
-    SwapShare,
-    carries_nothing,
-    share_fields,
-    share_of_whole,
 )
 from probe_kit.intervene.replay import CLEAN_RUN, CONTROL_RUN, DONOR_RUN, SOURCE_RUN, Condition
 from probe_kit.runs.reader import RunReader
@@ -224,15 +222,6 @@ class Reach(NamedTuple):
         return cls(tiles_apart, "tiles")
 
 
-def tiles_apart(run: RunReader) -> float:
-    """Return metres between the middles of the tiles of a run's scene, or of the default one."""
-    scene: Any = run.settings.get("scene", {})
-    if "tile_left" not in scene or "tile_right" not in scene:
-        return TILES_APART
-    (left_x, left_y), (right_x, right_y) = scene["tile_left"], scene["tile_right"]
-    return hypot(left_x - right_x, left_y - right_y)
-
-
 @dataclass(frozen=True, kw_only=True)
 class ImageSwapEffect(Effect):
     """The effect of a swap on the actions, in one category.
@@ -285,7 +274,9 @@ def swap_columns(outcomes: ConditionOutcomes, swapped: str, reach: Reach) -> dic
     net = responses.astype(float)
     displacement = clean - other
     shares = displacement / reach.metres
-    follow_p, reversal_p = swap_p_values(outcomes, swapped)
+    exchange = outcomes.exchange(swapped)
+    assert exchange is not None
+    follow_p, reversal_p = exchange.p_values
     reached = {}
     for side in ("left", "right"):
         near, far = (values[outcomes.sides == side] > REACHED * reach.metres for values in (clean, other))
@@ -328,34 +319,6 @@ def swap_responses_by_episode(run: RunReader) -> dict[str, int]:
     }
 
 
-def swap_p_values(outcomes: ConditionOutcomes, swapped: str = IMAGE_SWAP) -> tuple[float, float]:
-    """Return p that actions move toward the correct picture, and p that they move away; of one category."""
-    displacement = outcomes.correct_sign * (outcomes.of(CLEAN) - outcomes.of(swapped))
-    toward, away = (paired_greater_p(sign * displacement, outcomes.items, outcomes.groups) for sign in (1.0, -1.0))
-    return toward, away
-
-
-def swap_sign(outcomes: ConditionOutcomes) -> float:
-    """Return 1, or −1 in a category in which swapped images lead actions away from the correct picture.
-
-    Patches that carry the effect of the swap move actions where the swap does: their p are of that direction.
-    """
-    is_reversed = IMAGE_SWAP in outcomes.conditions and swap_p_values(outcomes)[1] < SIGNIFICANCE
-    return -1.0 if is_reversed else 1.0
-
-
-def share_of_swap(outcomes: ConditionOutcomes, moved: NDArray[np.float64]) -> SwapShare | None:
-    """Return `moved` (E,) as a share of the swap's displacement in the same episodes of one category.
-
-    None if images were not swapped, or if that moves the action by no more than chance: a share would be a ratio
-    of noise. Groups are drawn for both sums together.
-    """
-    if IMAGE_SWAP not in outcomes.conditions or min(swap_p_values(outcomes)) >= SIGNIFICANCE:
-        return None
-    full = outcomes.of(IMAGE_SWAP) - outcomes.of(CLEAN)
-    return share_of_whole(moved, full, outcomes.groups, outcomes.seed_text)
-
-
 def stored_image_swaps(run: RunReader, readout: str | None = None) -> dict[str, ImageSwapEffect]:
     """Return by category the effects of the image swaps that are stored for the episodes the run has now.
 
@@ -363,10 +326,8 @@ def stored_image_swaps(run: RunReader, readout: str | None = None) -> dict[str, 
     Raises RunDamagedError if any stored intervention was changed.
     """
     preferred = preferred_by_category(run, NAME, readout)
-    apart, rows = tiles_apart(run), dict[str, dict[str, ImageSwapEffect]]()
-    for stored in {result.stored.key: result.stored for result in preferred.values()}.values():
-        measurement = Measurement(stored.outcomes(), stored.settings, {}, stored.bundle.read, stored.key, apart)
-        rows[stored.key] = {row.category: row for row in image_swap_effects(measurement)}
+    stored = {result.stored.key: result.stored for result in preferred.values()}
+    rows = {key: {row.category: row for row in image_swap_effects(measured)} for key, measured in stored.items()}
     return {category: rows[result.stored.key][category] for category, result in preferred.items()}
 
 
@@ -387,7 +348,10 @@ SWAP_COLUMNS: Mapping[str, Any] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Swap(Intervention):
-    """An exchange of one input, in the condition `swapped`; without sides for that of a donor."""
+    """An exchange of one input, in the condition `swapped`; a kind says what it is in the scene.
+
+    Without sides it is exchanged for that of a donor, and one row per category says what that does.
+    """
 
     swapped: ClassVar[str]
     needs: ClassVar[tuple[InterventionKind, ...]] = ("swap",)
@@ -395,55 +359,38 @@ class Swap(Intervention):
     @classmethod
     def effects(cls, measurement: Measurement) -> Sequence[Effect]:
         """Return one row per category."""
-        if measurement.outcomes.has_sides:
-            return cls.swap_effects(measurement)
         vary = str(measurement.settings.get("vary", ""))
         return measurement.rows(lambda part: [input_effect(part, cls.swapped, vary)])
 
     @classmethod
-    def table(cls, rows: Sequence[Any], context: TableContext) -> "Table":
-        """Return one line per category, with its verdict; without sides per category and input."""
-        if not context.lacks_sides:
-            title, caption, parts = cls.swap_table(rows, context)
-            return effect_table(title, caption, ("category",), [((row.category,), row) for row in rows], parts)
+    def table(cls, rows: Sequence[Any], context: Measurement) -> "Table":
+        """Return one line per category and input."""
         title = f"Does the input decide? {context.subject}, {context.exchange}"
         lines = lines_of(rows, lambda row: str(row.vary))
         parts = {"Does the action follow it?": _INPUT_COLUMNS}
         return effect_table(title, _INPUT_LEGEND, ("category", "input"), lines, parts)
 
     @classmethod
-    def sentences(cls, rows: Sequence[Any], context: TableContext) -> list[str]:
+    def sentences(cls, rows: Sequence[Any], context: Measurement) -> list[str]:
         """Return one per category."""
         if context.lacks_sides:
             return [f"{row.n_episodes} frames of {row.n_items} episodes: {_describe_input(row)}." for row in rows]
-        names = [f"{category_of(row.category).title} ({counted(row.n_items, 'item')})" for row in rows]
-        return [f"{name}: {cls.swap_sentence(row, context)}" for name, row in zip(names, rows, strict=True)]
+        return [
+            f"{category_of(row.category).title} ({counted(row.n_items, 'item')}): {cls.describe(row, context)}"
+            for row in rows
+        ]
 
     @classmethod
-    def finding(cls, rows: Sequence[Any], context: TableContext) -> str:
+    @abstractmethod
+    def describe(cls, row: Any, context: Measurement) -> str:
+        """Return the end of the sentence about a category in the scene."""
+
+    @classmethod
+    def finding(cls, rows: Sequence[Any], context: Measurement) -> str:
         """Return the verdict of one category."""
+        del context
         (row,) = rows
-        return _find_input(row) if context.lacks_sides else cls.swap_finding(row, context)
-
-    @staticmethod
-    @abstractmethod
-    def swap_effects(measurement: Measurement) -> Sequence[ImageSwapEffect]:
-        """Return the rows of a run with sides."""
-
-    @staticmethod
-    @abstractmethod
-    def swap_table(rows: Sequence[Any], context: TableContext) -> tuple[str, str, Mapping[str, Any]]:
-        """Return title, caption and columns of their table."""
-
-    @staticmethod
-    @abstractmethod
-    def swap_sentence(row: Any, context: TableContext) -> str:
-        """Return the end of the sentence about one of them."""
-
-    @staticmethod
-    @abstractmethod
-    def swap_finding(row: Any, context: TableContext) -> str:
-        """Return a verdict, a colon and what was found."""
+        return _find_input(row)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -461,11 +408,18 @@ class ImageSwap(Swap):
         unpaired = () if has_sides(session.run) else (DONOR_RUN, CONTROL_RUN)
         return CLEAN_RUN, SOURCE_RUN, *unpaired
 
-    swap_effects = staticmethod(image_swap_effects)
+    @classmethod
+    def effects(cls, measurement: Measurement) -> Sequence[Effect]:
+        """Return one row per category."""
+        if not measurement.outcomes.has_sides:
+            return super().effects(measurement)
+        return image_swap_effects(measurement)
 
-    @staticmethod
-    def swap_table(rows: Sequence[ImageSwapEffect], context: TableContext) -> tuple[str, str, Mapping[str, Any]]:
-        """Return them with the verdict."""
+    @classmethod
+    def table(cls, rows: Sequence[Any], context: Measurement) -> "Table":
+        """Return one line per category with its verdict."""
+        if context.lacks_sides:
+            return super().table(rows, context)
         verdicts = context.verdicts
         reasons = [
             f"{category_of(name).title}: {verdict.explanation}"
@@ -480,17 +434,22 @@ class ImageSwap(Swap):
             },
             "Does the action follow the images?": SWAP_COLUMNS,
         }
-        return f"Is it used? {context.subject}, images swapped", caption, parts
+        lines = [((row.category,), row) for row in rows]
+        title = f"Is it used? {context.subject}, images swapped"
+        return effect_table(title, caption, ("category",), lines, parts)
 
-    @staticmethod
-    def swap_sentence(row: ImageSwapEffect, context: TableContext) -> str:
+    @classmethod
+    def describe(cls, row: ImageSwapEffect, context: Measurement) -> str:
         """Return the verdict with its numbers."""
         verdict = context.verdicts.get(row.category)
         return swap_rates(row, "images") if verdict is None else str(verdict.describe(row))
 
-    @staticmethod
-    def swap_finding(row: ImageSwapEffect, context: TableContext) -> str:
+    @classmethod
+    def finding(cls, rows: Sequence[Any], context: Measurement) -> str:
         """Return the verdict, and how often a swap turns the action."""
+        if context.lacks_sides:
+            return super().finding(rows, context)
+        (row,) = rows
         turned = f"a swap turns it in {100 * row.follow_rate:.0f} % of the episodes"
         use = context.verdicts.get(row.category)
         verdict, what = ("swapped", "") if use is None else use.finding

@@ -13,7 +13,7 @@ import numpy as np
 from probe_kit._tables.numbers import percent
 from probe_kit.errors import UsageError
 from probe_kit.hashing import derive_seed
-from probe_kit.intervene.kinds.base import Measurement, TableContext
+from probe_kit.intervene.kinds.base import effect_table
 from probe_kit.intervene.kinds.image_swap import (
     SWAP_COLUMNS,
     ImageSwapEffect,
@@ -28,6 +28,8 @@ from probe_kit.intervene.outcomes import (
     INSTRUCTION_SWAP,
     NOISE,
     ConditionOutcomes,
+    Effect,
+    Measurement,
     has_sides,
 )
 from probe_kit.intervene.replay import (
@@ -42,6 +44,7 @@ from probe_kit.intervene.replay import (
 from probe_kit.statistics.significance import SIGNIFICANCE
 
 if TYPE_CHECKING:
+    from probe_kit._tables.table import Table
     from probe_kit.intervene.sessions import ReplaySession
 
 _CONDITIONS = {"instruction": INSTRUCTION_SWAP, "images": IMAGE_SWAP, "noise": NOISE}
@@ -136,9 +139,11 @@ class InstructionSwap(Swap):
             return CLEAN_RUN, swapped, SOURCE_RUN, noise
         return CLEAN_RUN, swapped, DONOR_RUN, CONTROL_RUN, noise
 
-    @staticmethod
-    def swap_effects(measurement: Measurement) -> list[InstructionSwapEffect]:
-        """Return one per category, in the order of the episodes."""
+    @classmethod
+    def effects(cls, measurement: Measurement) -> Sequence[Effect]:
+        """Return one row per category, in the order of the episodes."""
+        if not measurement.outcomes.has_sides:
+            return super().effects(measurement)
         reach = Reach.of(measurement.outcomes.of(CLEAN), measurement.tiles_apart)
 
         def of_category(part: ConditionOutcomes) -> list[InstructionSwapEffect]:
@@ -148,23 +153,27 @@ class InstructionSwap(Swap):
 
         return measurement.rows(of_category)
 
-    @staticmethod
-    def swap_table(rows: Sequence[Any], context: TableContext) -> tuple[str, str, Mapping[str, Any]]:
-        """Return them with the sensitivity of one step."""
-        del rows
+    @classmethod
+    def table(cls, rows: Sequence[Any], context: Measurement) -> "Table":
+        """Return one line per category with the sensitivity of one step."""
+        if context.lacks_sides:
+            return super().table(rows, context)
         parts = {"Does the action follow the instruction?": SWAP_COLUMNS, "What one step owes to": _STEP_COLUMNS}
-        return f"Is the instruction read? {context.subject}", _LEGEND, parts
+        lines = [((row.category,), row) for row in rows]
+        return effect_table(f"Is the instruction read? {context.subject}", _LEGEND, ("category",), lines, parts)
 
-    @staticmethod
-    def swap_sentence(row: InstructionSwapEffect, context: TableContext) -> str:
+    @classmethod
+    def describe(cls, row: InstructionSwapEffect, context: Measurement) -> str:
         """Return the rates; a swap of the instruction enters no verdict."""
         del context
         return swap_rates(row, "instruction")
 
-    @staticmethod
-    def swap_finding(row: InstructionSwapEffect, context: TableContext) -> str:
+    @classmethod
+    def finding(cls, rows: Sequence[Any], context: Measurement) -> str:
         """Return whether the action follows a swap of the instruction."""
-        del context
+        if context.lacks_sides:
+            return super().finding(rows, context)
+        (row,) = rows
         follows = "followed" if row.follow_p < SIGNIFICANCE else "not shown"
         verdict = "reversed" if row.reversal_p < SIGNIFICANCE else follows
         return (

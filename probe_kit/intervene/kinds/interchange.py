@@ -19,13 +19,12 @@ import numpy as np
 from probe_kit._tables.numbers import number, signed
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import KV_STREAM, Site
+from probe_kit.intervene.exchange import share_fields, share_of_whole
 from probe_kit.intervene.kinds.base import (
     NONE,
     AlongDirection,
     ConditionName,
     EffectRow,
-    Measurement,
-    TableContext,
     Values,
     common_columns,
     count_edits,
@@ -37,12 +36,13 @@ from probe_kit.intervene.kinds.base import (
     signed_interval,
     test_against_controls,
 )
-from probe_kit.intervene.kinds.image_swap import SMALLEST_REACH, share_of_swap, swap_sign
+from probe_kit.intervene.kinds.image_swap import SMALLEST_REACH
 from probe_kit.intervene.outcomes import (
     CLEAN,
     IMAGE_SWAP,
     UNCHANGED,
     ConditionOutcomes,
+    Measurement,
     PooledConditions,
     Rank,
     pool_conditions,
@@ -50,7 +50,6 @@ from probe_kit.intervene.outcomes import (
 )
 from probe_kit.intervene.patching.attribution import LOCALISATION_SHARE
 from probe_kit.intervene.patching.patch import Cell, sites_of_cells
-from probe_kit.intervene.patching.sweep import share_fields, share_of_whole
 from probe_kit.intervene.places import ALL, RESIDUAL, TILES, PlaceName, SiteGroup, resolve_all, roles_of
 from probe_kit.intervene.replay import CLEAN_RUN, SOURCE_RUN, Condition, patched_run
 from probe_kit.runs.reader import RunReader
@@ -154,7 +153,8 @@ def patch_effects(outcomes: ConditionOutcomes, target_side: str = IMAGE_SWAP) ->
     toward = None if outcomes.toward is None or not has_swap else outcomes.toward
     names = [ConditionName.parse(outcomes.conditions[row]) for row in rows]
     displacements = push * (outcomes.displacement[rows] - clean)
-    sign = swap_sign(outcomes) if target_side == IMAGE_SWAP else 1.0
+    exchange = outcomes.exchange()
+    sign = 1.0 if exchange is None or target_side != IMAGE_SWAP else exchange.sign
     tests = test_against_controls(sign * displacements, names, outcomes, (), ())
     effects = []
     for row, name, test, moved in zip(rows, names, tests, displacements, strict=True):
@@ -162,7 +162,7 @@ def patch_effects(outcomes: ConditionOutcomes, target_side: str = IMAGE_SWAP) ->
         is_over = push * (outcomes.displacement[row] - middle) > 0
         flips = is_over.astype(float) - (push * (clean - middle) > 0)
         # The swap moves actions to the wrong side; steering to another side is compared with its size.
-        share = share_of_swap(outcomes, -outcomes.correct_sign * moved)
+        share = None if exchange is None else exchange.share(-outcomes.correct_sign * moved)
         exchanged = None
         if toward is not None:
             full = toward[outcomes.conditions.index(IMAGE_SWAP)]
@@ -425,12 +425,12 @@ class PatchKind(AlongDirection):
         return measurement.rows(lambda part: patch_effects(part, target_side))
 
     @staticmethod
-    def table(rows: Sequence[PatchEffect], context: TableContext) -> "Table":
+    def table(rows: Sequence[PatchEffect], context: Measurement) -> "Table":
         """Return one line per category and edit; controls are columns of what is compared with them."""
-        unread = context.measurement.certificate.get("unread", ())
+        unread = context.certificate.get("unread", ())
         edits = [row for row in rows if not row.is_control]
         return effect_table(
-            f"Where is it used? {context.subject}, {context.measurement.settings['kind']}",
+            f"Where is it used? {context.subject}, {context.kind}",
             context.in_words(_LEGEND),
             ("category", "edit"),
             lines_of(edits, lambda row: f"{row.name}{' (unread)' * (row.place in unread)}"),
@@ -455,7 +455,7 @@ class PatchKind(AlongDirection):
         return f"edits that {verb} half of the image swap's effect: {count}{by_construction}"
 
     @staticmethod
-    def finding(rows: Sequence[PatchEffect], context: TableContext) -> str:
+    def finding(rows: Sequence[PatchEffect], context: Measurement) -> str:
         """Return where half of the swap's effect was found, or that no edit has it."""
         del context
         edits, localised, apart = _carriers(rows)

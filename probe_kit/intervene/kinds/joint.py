@@ -4,49 +4,35 @@ Sets of cells are patched in one inference, as an interchange patches a single o
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import KV_STREAM
+from probe_kit.intervene.exchange import CARRIES, NOTHING, SwapShare, carries_nothing, pooled_share, share_fields
 from probe_kit.intervene.kinds.base import (
     Intervention,
-    Measurement,
-    TableContext,
     effect_table,
-    flips_seed,
     interval_text,
     lines_of,
 )
-from probe_kit.intervene.kinds.image_swap import share_of_swap, swap_sign
 from probe_kit.intervene.kinds.interchange import cells_at, check_sites_and_roles
 from probe_kit.intervene.outcomes import (
     CLEAN,
-    PER_STEP,
     ConditionOutcomes,
     Effect,
+    Measurement,
     StoredResult,
     stored_results,
 )
 from probe_kit.intervene.patching.patch import Cell, all_but, sites_of_cells
-from probe_kit.intervene.patching.sweep import (
-    CARRIES,
-    KEEP,
-    NOTHING,
-    SwapShare,
-    carries_nothing,
-    choosing_half,
-    find_minimal_set,
-    finding_of_cell,
-    pooled_share,
-    share_fields,
-)
+from probe_kit.intervene.patching.sweep import KEEP, choosing_half, find_minimal_set
 from probe_kit.intervene.places import SEPARATOR, Pair, list_places, resolve_all
-from probe_kit.intervene.replay import CLEAN_RUN, SOURCE_RUN, Condition, patched_run, replay
+from probe_kit.intervene.replay import CLEAN_RUN, SOURCE_RUN, Condition, patched_run
 from probe_kit.runs.reader import RunReader
-from probe_kit.statistics.paired_tests import max_t, paired_greater_p, smallest_flip_p
+from probe_kit.statistics.paired_tests import paired_greater_p, smallest_flip_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 
 if TYPE_CHECKING:
@@ -163,16 +149,14 @@ class JointPlaces(Intervention):
 
     def _search(self, session: "ReplaySession", cells: tuple[Cell, ...], pairs: Sequence[Pair]) -> SearchedSets:
         """Return the smallest sets of one category, searched on the choosing half of its groups."""
-        from probe_kit.intervene.rollout import evaluate_per_step
-
         choosing = choosing_half([pair.group for pair in pairs], self.seed)
         searched_pairs = [pair for pair in pairs if pair.group in choosing]
-        play, sites = evaluate_per_step if self.readout == PER_STEP else replay, sites_of_cells(cells)
+        sites = sites_of_cells(cells)
 
         def effects(sets: Sequence[tuple[Cell, ...]]) -> list[float]:
             """Return the share of the image swap's displacement that each set carries."""
             patches = [patched_run(str(number), {"": part}, sites) for number, part in enumerate(sets)]
-            played = play(session, searched_pairs, [CLEAN_RUN, SOURCE_RUN, *patches])
+            played = self.play(session, searched_pairs, [CLEAN_RUN, SOURCE_RUN, *patches])
             clean, swapped, *moved = played.displacement
             return [pooled_share(values - clean, swapped - clean) for values in moved]
 
@@ -192,7 +176,7 @@ class JointPlaces(Intervention):
         return measurement.rows(lambda part: _rows(part, measurement.settings, searched))
 
     @staticmethod
-    def table(rows: "Sequence[JointEffect]", context: TableContext) -> "Table":
+    def table(rows: "Sequence[JointEffect]", context: Measurement) -> "Table":
         """Return one line per category and set."""
         return effect_table(
             f"Where is it read, alone and jointly? {context.subject}, joint places",
@@ -210,7 +194,7 @@ class JointPlaces(Intervention):
         return "; ".join(filter(None, (places, describe_remainder(rows))))
 
     @staticmethod
-    def finding(rows: "Sequence[JointEffect]", context: TableContext) -> str:
+    def finding(rows: "Sequence[JointEffect]", context: Measurement) -> str:
         """Return where the answer is read, alone or jointly, in few words."""
         del context
         joint = joint_places(rows)
@@ -283,10 +267,9 @@ def stored_joint_places(run: RunReader) -> dict[str, list[JointEffect]]:
     """
     rows = {}
     for category, result in _preferred(run).items():
-        stored = result.stored
-        certificate = stored.certificate()
-        measurement = Measurement(result.outcomes, stored.settings, certificate, stored.bundle.read, stored.key)
-        rows[category] = JointPlaces.effects(measurement)
+        measured = result.stored
+        of_category = _rows(result.outcomes, measured.settings, measured.certificate.get(NAME, {}))
+        rows[category] = [replace(row, key=measured.key) for row in of_category]
     return rows
 
 
@@ -378,21 +361,19 @@ def _rows(
     outcomes: ConditionOutcomes, settings: Mapping[str, Any], searches: Mapping[str, Any]
 ) -> list[JointEffect]:
     """Return the rows of one category. searches: by category, as the certificate has them."""
-    clean, leads = outcomes.of(CLEAN), -swap_sign(outcomes) * outcomes.correct_sign
+    clean, exchange = outcomes.of(CLEAN), outcomes.exchange()
+    assert exchange is not None
     moved = {name: outcomes.of(name) - clean for name in outcomes.conditions}
     names = [name.partition("|")[2] for name in outcomes.conditions if name.startswith(f"{ALONE}|")]
-    # Metres toward the side that the image swap leads to.
-    toward = np.array([leads * moved[f"{ALONE}|{name}"] for name in names])
-    _, p, p_fwe = max_t(toward, outcomes.items, outcomes.groups, flips_seed(outcomes))
-    every = share_of_swap(outcomes, moved[EVERY])
-    rows = []
-    for at, name in enumerate(names):
-        alone = share_of_swap(outcomes, moved[f"{ALONE}|{name}"])
-        needed = share_of_swap(outcomes, moved[EVERY] - moved[f"{WITHOUT}|{name}"])
-        finding = finding_of_cell(alone, needed, every, float(p_fwe[at]))
-        rows.append(_row("cell", name, outcomes, (alone, needed), (float(p[at]), float(p_fwe[at])), finding))
-    exact = paired_greater_p(leads * moved[EVERY], outcomes.items, outcomes.groups)
-    rows.append(_row(EVERY, _all_cells(names, settings), outcomes, (every, None), (exact, None), _of_all(every)))
+    alone = np.array([moved[f"{ALONE}|{name}"] for name in names])
+    lost = np.array([moved[EVERY] - moved[f"{WITHOUT}|{name}"] for name in names])
+    rows = [
+        _row("cell", name, outcomes, *reading)
+        for name, reading in zip(names, exchange.readings(moved[EVERY], alone, lost), strict=True)
+    ]
+    every = exchange.share(moved[EVERY])
+    exact = paired_greater_p(exchange.leads * moved[EVERY], outcomes.items, outcomes.groups)
+    rows.append(_row(EVERY, _all_cells(names, settings), outcomes, every, None, exact, None, _of_all(every)))
     # The smallest sets, on the groups in which they were not searched.
     searched = searches.get(str(outcomes.categories[0]), {})
     scoring = ~np.isin(outcomes.groups, searched.get("choosing", []))
@@ -401,14 +382,16 @@ def _rows(
         cells = " + ".join(searched.get(name, []))
         if not cells:
             continue
-        alone, needed = share_of_swap(scored, moved[part][scoring]), None
+        unit = scored.exchange()
+        assert unit is not None
+        share, needed = unit.share(moved[part][scoring]), None
         if part == MINIMAL:
-            needed = share_of_swap(scored, (moved[EVERY] - moved[WITHOUT_MINIMAL])[scoring])
-        exact = paired_greater_p((leads * moved[part])[scoring], scored.items, scored.groups)
-        confirmed = alone is not None and alone.value >= CARRIES and alone.low > NOTHING and exact < SIGNIFICANCE
+            needed = unit.share((moved[EVERY] - moved[WITHOUT_MINIMAL])[scoring])
+        exact = paired_greater_p((exchange.leads * moved[part])[scoring], scored.items, scored.groups)
+        confirmed = share is not None and share.value >= CARRIES and share.low > NOTHING and exact < SIGNIFICANCE
         word = "read jointly" if "+" in cells else "read here"
         finding = word if confirmed else "not confirmed"
-        rows.append(_row(part, cells, scored, (alone, needed), (exact, None), finding))
+        rows.append(_row(part, cells, scored, share, needed, exact, None, finding))
     return rows
 
 
@@ -416,15 +399,17 @@ def _row(
     part: str,
     cells: str,
     outcomes: ConditionOutcomes,
-    shares: tuple[SwapShare | None, SwapShare | None],
-    p: tuple[float, float | None],
+    alone: SwapShare | None,
+    needed: SwapShare | None,
+    p: float,
+    p_fwe: float | None,
     finding: str,
 ) -> JointEffect:
-    """Return one row. shares: alone, and needed. p: and the same against all cells."""
+    """Return one row; see `JointEffect`."""
     counts = {name: value for name, value in outcomes.counts.items() if name != "n_items"}
-    fields: dict[str, Any] = {**share_fields("alone", shares[0]), **share_fields("needed", shares[1])}
+    fields: dict[str, Any] = {**share_fields("alone", alone), **share_fields("needed", needed)}
     return JointEffect(
-        **counts, part=part, cells=cells.replace(SEPARATOR, " "), **fields, p=p[0], p_fwe=p[1], finding=finding
+        **counts, part=part, cells=cells.replace(SEPARATOR, " "), **fields, p=p, p_fwe=p_fwe, finding=finding
     )
 
 

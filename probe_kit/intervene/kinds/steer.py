@@ -99,6 +99,11 @@ class Steering(PatchKind):
         if len(set(self.coefficients)) != len(self.coefficients):
             raise UsageError(f"coefficients are {self.coefficients}; give each once")
 
+    @property
+    def patterns(self) -> tuple[tuple[str, tuple[str, ...]], ...]:
+        """Return the patterns of places with the role."""
+        return tuple((site, (self.role,)) for site in self.sites)
+
     @classmethod
     def from_options(cls, run: Run, **options: Any) -> Self:
         """Return it as the command builds it. Raises UsageError without sites or with other than one role."""

@@ -4,7 +4,7 @@ One backward pass gives the estimates of all cells of a pair. As in attribution 
 https://arxiv.org/abs/2310.10348).
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, Literal
@@ -17,17 +17,10 @@ from probe_kit.errors import UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.sites import KV_STREAM
+from probe_kit.intervene.exchange import Exchange, SwapShare, share_columns, share_fields
 from probe_kit.intervene.outcomes import Effect
 from probe_kit.intervene.patching.patch import Cell, infer, sites_of_cells
-from probe_kit.intervene.patching.sweep import (
-    DRAWS,
-    SwapShare,
-    Sweep,
-    share_columns,
-    share_fields,
-    share_of_whole,
-    sweep_cells,
-)
+from probe_kit.intervene.patching.sweep import sweep_cells
 from probe_kit.intervene.places import (
     ALL,
     RESIDUAL,
@@ -38,7 +31,6 @@ from probe_kit.intervene.places import (
     resolve_sites,
     role_token_mask,
 )
-from probe_kit.statistics.significance import SIGNIFICANCE
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -46,6 +38,8 @@ if TYPE_CHECKING:
 
     from probe_kit.hooks import ActivationCache, Model, Policy
 
+CellName = tuple[str, str]
+"""Place and role."""
 Ends = Literal["clean", "both"]
 """Where gradients are taken: at the clean input, or as the mean of that and of the source."""
 Slope = Callable[["Tensor"], "Tensor"]
@@ -216,6 +210,39 @@ def order_cells(rows: Sequence[AttributionEffect]) -> list[AttributionEffect]:
     return ordered
 
 
+def screen_rows(
+    exchange: Exchange,
+    estimates: Mapping[CellName, NDArray[np.float64]],
+    exact: Mapping[CellName, NDArray[np.float64]],
+    anchors: Collection[CellName],
+    drawn: Collection[CellName] = (),
+    category: str = "",
+) -> list[AttributionEffect]:
+    """Return the effects of cells of one category, in the order of `order_cells`.
+
+    estimates, exact: by cell, (E,) how far its patch moves the output by gradients, and moved it. anchors, drawn:
+    cells that are a complete cut, and that were chosen at random.
+    """
+    _, _, p_fwe = exchange.test(np.array(list(exact.values())))
+    p_of = dict(zip(exact, map(float, p_fwe), strict=True))
+    rows = [
+        AttributionEffect(
+            category=category,
+            place=cell[0],
+            role=cell[1],
+            is_anchor=cell in anchors,
+            is_drawn=cell in drawn,
+            n_episodes=exchange.clean.size,
+            n_groups=np.unique(exchange.groups).size,
+            **share_fields("estimate", exchange.share(moved)),
+            **share_fields("exact", exchange.share(exact[cell]) if cell in exact else None),
+            p_fwe=p_of.get(cell),
+        )
+        for cell, moved in estimates.items()
+    ]
+    return order_cells(rows)
+
+
 def kind_of_place(name: str) -> str:
     """Return what a place can be compared with: `kv`, `backbone`, `backbone heads`, `expert iterations`."""
     parsed = PlaceName.parse(name)
@@ -347,29 +374,10 @@ def attribute_cells(model: "Policy", pairs: Sequence[Pair], cells: Sequence[Cell
     every = (*anchors, *(cell for cell in screened if cell not in anchors))
     estimates = np.array([estimate_patches(model, pair, every, metric)[2] for pair in pairs]).T
     exact = sweep_cells(model, pairs, anchors, lambda actions, _: float(metric(torch.from_numpy(actions))))
-    rows = [_row(cell, moved, exact, anchors) for cell, moved in zip(every, estimates, strict=True)]
-    return Screen(tuple(order_cells(rows)), {str(cell): cell for cell in every})
-
-
-def _row(cell: Cell, moved: NDArray[np.float64], exact: Sweep, anchors: Sequence[Cell]) -> AttributionEffect:
-    """Return estimate and exact effect of one cell, before it has a rank. moved: (E,) estimated per pair."""
-    is_anchor = cell in anchors
-    at = anchors.index(cell) if is_anchor else 0
-    is_significant = exact.source_p < SIGNIFICANCE
-    # A share of an effect that may be none would be a ratio of noise.
-    estimate = share_of_whole(moved, exact.full_effect, exact.groups, DRAWS) if is_significant else None
-    return AttributionEffect(
-        category="",
-        place=cell.site_group.name,
-        role=cell.role,
-        is_anchor=is_anchor,
-        is_drawn=False,
-        n_episodes=exact.clean.size,
-        n_groups=np.unique(exact.groups).size,
-        **share_fields("estimate", estimate),
-        **share_fields("exact", exact.shares[at] if is_anchor else None),
-        p_fwe=float(exact.table["p_fwe"][at]) if is_anchor else None,
-    )
+    by_cell = {(cell.site_group.name, cell.role): moved for cell, moved in zip(every, estimates, strict=True)}
+    of_anchors = dict(zip(by_cell, exact.patched - exact.clean, strict=False))  # anchors come first
+    rows = screen_rows(exact.exchange, by_cell, of_anchors, of_anchors)
+    return Screen(tuple(rows), {str(cell): cell for cell in every})
 
 
 def _share(value: float | None, limits: tuple[float, float] | None) -> SwapShare | None:

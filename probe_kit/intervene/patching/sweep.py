@@ -1,15 +1,16 @@
 """A sweep of sets of cells over pairs, and the smallest set that keeps the effect."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
 from probe_kit.hashing import derive_seed
+from probe_kit.intervene.exchange import Exchange, SwapShare, pooled_share, share_columns
 from probe_kit.intervene.patching.patch import (
     Basis,
     Cell,
@@ -21,51 +22,12 @@ from probe_kit.intervene.patching.patch import (
     run_with_cache,
 )
 from probe_kit.intervene.places import Given, Pair, PlaceName, groups_and_items
-from probe_kit.statistics.bootstrap import draw_groups, units_seed
-from probe_kit.statistics.paired_tests import max_t, paired_greater_p
-from probe_kit.statistics.significance import SIGNIFICANCE
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
     from probe_kit.hooks import Model
-
-
-class SwapShare(NamedTuple):
-    """A ratio of sums over episodes, with its 95 % interval by groups; 1 is the whole swap."""
-
-    value: float
-    low: float
-    high: float
-
-
-def share_of_whole(
-    moved: NDArray[np.float64], full: NDArray[np.float64], groups: NDArray[np.str_], seed_text: str
-) -> SwapShare | None:
-    """Return Σ moved · whole / Σ whole² over episodes (E,), with its interval by groups (E,); None of nothing."""
-    if not full.any():
-        return None
-    names, group_of = np.unique(groups, return_inverse=True)
-    above, below = np.bincount(group_of, moved * full), np.bincount(group_of, full**2)
-    times = draw_groups(names.size, units_seed(groups, seed_text))
-    # A draw may hold only groups in which the source moves nothing.
-    drawn = (times @ above) / np.maximum(times @ below, np.finfo(float).tiny)
-    low, high = np.percentile(drawn, [2.5, 97.5])
-    return SwapShare(float(above.sum() / below.sum()), float(low), float(high))
-
-
-def share_fields(name: str, share: SwapShare | None) -> dict[str, Any]:
-    """Return a share and its interval as fields of a row of effects."""
-    if share is None:
-        return {name: None, f"{name}_ci": None}
-    return {name: share.value, f"{name}_ci": (share.low, share.high)}
-
-
-def share_columns(name: str, share: SwapShare | None) -> dict[str, float]:
-    """Return a share and its interval as columns of a data frame."""
-    value, low, high = (np.nan,) * 3 if share is None else share
-    return {name: value, f"{name}_low": low, f"{name}_high": high}
 
 
 Metric = Callable[[Any, Given], float]
@@ -95,31 +57,26 @@ class Sweep:
         """Return the cells of every set, joined by +."""
         return tuple(" + ".join(map(str, cells)) for cells in self.cells)
 
+    @cached_property
+    def exchange(self) -> Exchange:
+        """The effect of the source."""
+        seed = derive_seed(DRAWS, "sign flips", *np.unique(self.groups).tolist())
+        return Exchange(self.clean, self.source, self.toward, self.groups, self.items, DRAWS, seed)
+
     @property
     def full_effect(self) -> NDArray[np.float64]:
         """(E,) by how much the source differs from the clean inference."""
-        return self.source - self.clean
+        return self.exchange.full
 
-    @cached_property
+    @property
     def source_p(self) -> float:
         """Return p that the source moves the metric, in the better direction: exact sign test, as of the swap."""
-        return min(self._source_p_values)
-
-    @cached_property
-    def _source_p_values(self) -> tuple[float, float]:
-        """Toward where the source should move the metric, and away from it."""
-        moved = self.toward * self.full_effect
-        toward, away = (paired_greater_p(sign * moved, self.items, self.groups) for sign in (1.0, -1.0))
-        return toward, away
+        return min(self.exchange.p_values)
 
     @cached_property
     def shares(self) -> tuple[SwapShare | None, ...]:
         """Per set its share of the source's effect with a 95 % interval by groups; see `table`."""
-        if self.source_p >= SIGNIFICANCE:
-            return (None,) * len(self.cells)
-        return tuple(
-            share_of_whole(values - self.clean, self.full_effect, self.groups, DRAWS) for values in self.patched
-        )
+        return tuple(self.exchange.share(values - self.clean) for values in self.patched)
 
     @cached_property
     def table(self) -> "pd.DataFrame":
@@ -132,17 +89,14 @@ class Sweep:
         """
         import pandas as pd
 
-        moved = self.toward * (self.patched - self.clean)
-        seed = derive_seed(DRAWS, "sign flips", *np.unique(self.groups).tolist())
-        # Where the source moves the metric the other way, a patch that follows it is tested in that direction.
-        sign = -1.0 if self._source_p_values[1] < SIGNIFICANCE else 1.0
-        _, p, p_fwe = max_t(sign * moved, self.items, self.groups, seed)
+        moved = self.patched - self.clean
+        _, p, p_fwe = self.exchange.test(moved)
         shares = [(np.nan,) * 3 if share is None else tuple(share) for share in self.shares]
         return pd.DataFrame(
             {
                 "cells": self.names,
                 **dict(zip(("share", "low", "high"), np.array(shares).T, strict=True)),
-                "moved": moved.mean(axis=1),
+                "moved": (self.toward * moved).mean(axis=1),
                 "p": p,
                 "p_fwe": p_fwe,
                 "n_pairs": self.clean.size,
@@ -220,8 +174,6 @@ MOST_SINGLY = 30
 """Cells up to which each is left out in turn; of more, halves are, then quarters and so on (delta debugging)."""
 KEEP = 0.9
 """Share of the whole set's effect that the smaller one must keep."""
-CARRIES, NOTHING = 0.5, 0.1
-"""Shares of the swap from which a set carries it, and below which, on both sides of 0, it carries nothing."""
 
 
 def find_minimal_set[C](
@@ -257,42 +209,11 @@ def find_minimal_set[C](
     return have, effect, tried
 
 
-def pooled_share(moved: NDArray[np.float64], full: NDArray[np.float64]) -> float:
-    """Return Σ moved · whole / Σ whole² over pairs (E,); 0 where the whole moves nothing."""
-    total = float((full**2).sum())
-    return float((moved * full).sum()) / total if total else 0.0
-
-
 def choosing_half(groups: Sequence[str], seed: int) -> tuple[str, ...]:
     """Return one half of the groups, by a drawn order; the larger one of an odd number stays for scoring."""
     names = sorted(set(groups))
     order = np.random.default_rng(derive_seed("joint places", seed, *names)).permutation(len(names))
     return tuple(sorted(names[at] for at in order[: len(names) // 2]))
-
-
-def carries_nothing(low: float, high: float) -> bool:
-    """Whether an interval of a share of the swap excludes, on both sides of 0, what would matter."""
-    return low > -NOTHING and high < NOTHING
-
-
-def finding_of_cell(alone: SwapShare | None, needed: SwapShare | None, every: SwapShare | None, p: float) -> str:
-    """Return a cell's finding from its shares alone and needed, all cells' share, and p of it alone."""
-    if alone is None or needed is None or every is None:
-        return "n/a"
-    carries = alone.value >= CARRIES and p < SIGNIFICANCE
-    if carries and needed.value >= CARRIES:
-        return "read here"
-    if carries and carries_nothing(needed.low, needed.high):
-        return "enough alone"
-    if carries_nothing(alone.low, alone.high) and needed.value >= CARRIES:
-        return "needed, not enough"
-    if max(alone.high, needed.high) < -NOTHING:
-        return "opposes it"
-    return (
-        "nothing alone"
-        if carries_nothing(alone.low, alone.high) and carries_nothing(needed.low, needed.high)
-        else "in part"
-    )
 
 
 @dataclass(frozen=True)
@@ -328,22 +249,19 @@ def compare_alone_and_without(
     sets = [distinct, *[(cell,) for cell in distinct], *[all_but(distinct, (cell,)) for cell in distinct]]
     swept = sweep_cells(model, pairs, sets, metric)
     # The family of max-T: cells alone. All cells together, and all but one, are no tests of a cell.
-    rows = slice(1, 1 + len(distinct))
-    alone = replace(swept, cells=swept.cells[rows], patched=swept.patched[rows])
-    lines = []
-    for at, cell in enumerate(distinct):
-        lost = swept.patched[0] - swept.patched[1 + len(distinct) + at]
-        needed = share_of_whole(lost, swept.full_effect, swept.groups, DRAWS) if alone.shares[at] else None
-        p = float(alone.table["p_fwe"][at])
-        lines.append(
-            {
-                "cells": str(cell),
-                **share_columns("alone", alone.shares[at]),
-                **share_columns("needed", needed),
-                "p_fwe": p,
-                "finding": finding_of_cell(alone.shares[at], needed, swept.shares[0], p),
-            }
-        )
+    every, alone = swept.patched[0], swept.patched[1 : 1 + len(distinct)]
+    lost = every - swept.patched[1 + len(distinct) :]
+    readings = swept.exchange.readings(every - swept.clean, alone - swept.clean, lost)
+    lines = [
+        {
+            "cells": str(cell),
+            **share_columns("alone", reading.alone),
+            **share_columns("needed", reading.needed),
+            "p_fwe": reading.p_fwe,
+            "finding": reading.finding,
+        }
+        for cell, reading in zip(distinct, readings, strict=True)
+    ]
     return pd.DataFrame(lines)
 
 

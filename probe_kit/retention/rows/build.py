@@ -11,9 +11,7 @@ import numpy as np
 
 from probe_kit.env.scoring import DEFAULT_RULE
 from probe_kit.errors import UnknownSiteError
-from probe_kit.intervene.evidence import StoredEvidence, stored_other_readouts, stored_places, stored_ties
-from probe_kit.intervene.kinds.image_swap import ImageSwapEffect, stored_image_swaps
-from probe_kit.intervene.verdict import Places, UseVerdict, classify_use, control_for
+from probe_kit.intervene.evidence import StoredEvidence, stored_ties
 from probe_kit.retention.behaviour import (
     SuccessRate,
     ask_of,
@@ -96,11 +94,8 @@ def run_rows(
         probed = ", ".join(results.settings.views)
         raise UnknownSiteError(f"{run.location} has probes of {probed}, not of {', '.join(sorted(unknown))}")
     judged = RunUnderRule.of(run, settings.rule, settings.last_steps, settings.with_behaviour)
-    effects = stored_image_swaps(run)
     evidence = StoredEvidence(run)
-    places = stored_places(evidence) if effects else {}
-    readouts = stored_other_readouts(run, effects)
-    ties = {view: stored_ties(evidence, results, view) if effects else {} for view in views}
+    ties = {view: stored_ties(evidence, results, view) if evidence.swaps else {} for view in views}
     drawn = [
         _row(judged, results, settings, group, str(category), episodes, view)
         for category, episodes in judged.run.episodes.groupby("category", sort=False)
@@ -108,16 +103,7 @@ def run_rows(
         for view in views
     ]
     return [
-        replace(
-            row,
-            row=add_image_swap(
-                row.row,
-                effects,
-                places,
-                ties[row.row.view].get(row.row.category, ""),
-                readouts.get(row.row.category),
-            ),
-        )
+        replace(row, row=add_image_swap(row.row, evidence, ties[row.row.view].get(row.row.category, "")))
         for row in drawn
     ]
 
@@ -157,25 +143,15 @@ def _row(
     return RowWithEstimates(row, rates, streams, episodes if scored else None)
 
 
-def add_image_swap(
-    row: RetentionRow,
-    effects: Mapping[str, ImageSwapEffect],
-    places: Mapping[str, Places],
-    tie: str = "",
-    other: UseVerdict | None = None,
-) -> RetentionRow:
+def add_image_swap(row: RetentionRow, evidence: StoredEvidence, tie: str = "") -> RetentionRow:
     """The row with the effect of the image swap on its category, judged by its own probes.
 
-    effects: by category; may be empty. places: by category, where it passes and is read. tie: of the row's
-    category and view, see `evidence.stored_ties`. other: the behaviour by the other readout, see
-    `evidence.stored_other_readouts`.
+    tie: of the row's category and view, see `evidence.stored_ties`.
     """
-    of_category = effects.get(row.category)
+    of_category = evidence.swaps.get(row.category)
     if of_category is None:
         return row
     encoded = row.backbone.has_signal if row.backbone.exceeds else None
-    category, control = row.category, control_for(row.category, effects)
-    use = classify_use(encoded, of_category, control, places.get(category), tie, other)
     effect = SwapEffect(
         follow_rate=of_category.follow_rate,
         reversal_rate=of_category.reversal_rate,
@@ -184,7 +160,7 @@ def add_image_swap(
         reach_share=of_category.reach_share,
         reach_share_ci=of_category.reach_share_ci if isfinite(of_category.reach_share_ci[0]) else (None, None),
         follow_p=of_category.follow_p,
-        use=use,
+        use=evidence.verdict(row.category, encoded, tie),
     )
     return replace(row, image_swap=effect)
 

@@ -35,13 +35,12 @@ from probe_kit.intervene.kinds.attention import (
     shares_by_role,
     stored_patch_attention,
 )
-from probe_kit.intervene.kinds.base import TableContext
 from probe_kit.intervene.outcomes import ATTENTION_FILE, arrays_from_bytes, arrays_to_bytes
 from probe_kit.intervene.places import BANDS, TILES, Pair, patch_embeddings, token_boxes, tokens_overlapping
-from probe_kit.intervene.replay import ConditionContext, ReplayBatch
+from probe_kit.intervene.replay import ConditionContext
 from probe_kit.intervene.sessions import ReplaySession
 from probe_kit.runs import Run, open_run, verify_run
-from tests.intervene.answers import follower, measured, outcomes_of
+from tests.intervene.answers import follower, measured, outcomes_of, said_of
 from tests.support.smolvla_checkpoints import write_smolvla
 
 if TYPE_CHECKING:
@@ -60,7 +59,7 @@ def attention_records(copy: Run, source: ReplaySource, twin: "Policy") -> Interv
 
 @pytest.fixture
 def weighed(attention_records: InterventionResult) -> AttentionShares:
-    return AttentionShares.from_bytes(attention_records.measurement.read(ATTENTION_FILE))
+    return AttentionShares.from_bytes(attention_records.read(ATTENTION_FILE))
 
 
 @pytest.mark.slow
@@ -161,13 +160,9 @@ def test_noting_changes_no_action_bit_for_bit(attention_records: InterventionRes
     )
     assert said["max_action_change"] == 0.0
     assert attention_records.certificate["replay"]["equal"] == 4
-    found = ReplayBatch(
-        np.zeros(1, int), np.zeros(1, int), np.zeros((2, 1)), np.array([[0.0], [1e-6]]), np.zeros((2, 1, 5)),
-        np.zeros(1),
-        mass=np.zeros((1, 1, 1, 1, 1), np.float32), inferences=np.zeros((1, 2), int),
-    )  # fmt: skip
+    changed = replace(outcomes_of({"color": follower(4)}), max_action_change=np.full((2, 4), 1e-6))
     with pytest.raises(CaptureChangedActionError, match="1e-06"):
-        AttentionReadout().extra_files(SimpleNamespace(), [], found)  # type: ignore[arg-type]
+        AttentionReadout().extra_files(SimpleNamespace(), [], changed)  # type: ignore[arg-type]
 
 
 def test_shares_add_up_and_tiles_are_told_by_where_the_answer_lies(weighed: AttentionShares) -> None:
@@ -217,7 +212,7 @@ def test_means_are_over_what_is_not_asked_for_and_every_episode_counts_alike() -
 
 def headings(shares: AttentionShares) -> tuple[str, ...]:
     measurement = measured(outcomes_of({"color": follower(4)}), "suite", {}, {}, lambda _: arrays_to_bytes(shares))
-    return AttentionReadout.table([], TableContext(measurement, "of", {})).columns[2:]
+    return AttentionReadout.table([], said_of(measurement)).columns[2:]
 
 
 def test_what_nobody_plays_is_left_out_and_a_hidden_tile_counts_where_it_is_seen(weighed: AttentionShares) -> None:
@@ -266,7 +261,7 @@ def test_the_command_shows_a_table_json_and_csv(copy: Run, attention_records: In
 def test_along_the_whole_episode_every_call_is_noted(copy: Run, source: ReplaySource, twin: "Policy") -> None:
     intervention = AttentionReadout(categories=("shape",), items=1, roles=("language",), readout="per-step")
     effects = run_intervention(copy, intervention, source, load=lambda *_: twin)
-    attended = AttentionShares.from_bytes(effects.measurement.read(ATTENTION_FILE))
+    attended = AttentionShares.from_bytes(effects.read(ATTENTION_FILE))
     assert attended.roles == ("all", "language")
     calls = attended.calls
     assert calls.tolist() == 2 * list(range(ceil(STEPS / int(copy.settings["execute"]))))

@@ -18,11 +18,11 @@ from probe_kit.intervene import (
     run_intervention,
 )
 from probe_kit.intervene.kinds.attribution import EXACT
-from probe_kit.intervene.kinds.base import Measurement, TableContext
+from probe_kit.intervene.outcomes import Measurement
 from probe_kit.intervene.patching.attribution import kind_of_place
 from probe_kit.intervene.results import verdicts_of
 from probe_kit.runs import Run
-from tests.intervene.answers import measured
+from tests.intervene.answers import measured, said_of
 from tests.intervene.wirings import WiredSession, outcomes_of, replay_inputs
 
 pytestmark = pytest.mark.slow  # `tests/acceptance` holds what a user sees of it
@@ -59,7 +59,7 @@ def test_what_is_read_linearly_is_ranked_first_and_its_estimate_is_the_effect(wi
     assert anchor.estimate == pytest.approx(anchor.exact, abs=0.02)
     assert rows["backbone.01 language"].estimate == pytest.approx(1.0, abs=0.02)
     assert all(abs(row.estimate or 0) < 0.02 for row in rows.values() if row.place in ("kv.00", "kv.02"))
-    (sentence,) = AttributionPatching.sentences(list(rows.values()), context(found))
+    (sentence,) = AttributionPatching.sentences(list(rows.values()), said_of(found))
     assert sentence.startswith("Copied: gradients give 1.0")
     assert "; first of kv: kv.01 language 1.0" in sentence
 
@@ -73,16 +73,16 @@ def test_a_screen_is_void_where_a_decision_has_no_slope(wired: WiredSession, nam
     assert {row.rank for row in rows} == {None}
     assert (rows[0].name, rows[0].estimate) == ("kv.* all", 0.0)
     assert rows[0].exact == pytest.approx(1.0, abs=0.02)
-    (sentence,) = AttributionPatching.sentences(rows, context(found))
+    (sentence,) = AttributionPatching.sentences(rows, said_of(found))
     said = "screen void: gradients give 0.00 where the patch gives 1.00 (kv.* all)"
     assert f"{said}; no order is shown" in sentence
-    assert said in str(AttributionPatching.table(rows, context(found)).title)
+    assert said in str(AttributionPatching.table(rows, said_of(found)).title)
 
 
 def test_nothing_is_ordered_where_the_swap_moves_nothing(wired: WiredSession) -> None:
     rows = AttributionPatching.effects(screened(wired, "noise"))
     assert {(row.finding, row.rank, row.estimate) for row in rows} == {("n/a", None, None)}
-    assert "there is no order" in AttributionPatching.sentences(rows, context(screened(wired, "noise")))[0]
+    assert "there is no order" in AttributionPatching.sentences(rows, said_of(screened(wired, "noise")))[0]
 
 
 def test_the_largest_estimates_and_drawn_cells_are_patched_exactly(wired: WiredSession) -> None:
@@ -95,7 +95,7 @@ def test_the_largest_estimates_and_drawn_cells_are_patched_exactly(wired: WiredS
     assert found.certificate["attribution"]["drawn"] == sorted(
         f"{EXACT}|{name.replace(' ', '|')}" for name in drawn
     )
-    (sentence,) = AttributionPatching.sentences(list(rows.values()), context(found))
+    (sentence,) = AttributionPatching.sentences(list(rows.values()), said_of(found))
     assert sentence.endswith("; of 2 drawn cells the largest exact effect is 0.00.")
 
 
@@ -154,7 +154,3 @@ def test_a_family_without_gradients_is_refused_before_anything_is_loaded() -> No
     assert "gradients" in asked.required_capabilities
     with pytest.raises(UnsupportedInterventionError, match=r"openvla does not support.*--kind interchange"):
         find_family("openvla").check_intervention("gradients")
-
-
-def context(found: Measurement) -> TableContext:
-    return TableContext(found, "wired", {})

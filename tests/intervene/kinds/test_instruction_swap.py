@@ -2,7 +2,7 @@
 network."""
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -22,6 +22,7 @@ from probe_kit.intervene.kinds.instruction_swap import input_sensitivity
 from probe_kit.intervene.places import resolve_sites, roles_of, token_mask
 from probe_kit.intervene.sessions import ReplaySession
 from probe_kit.runs import Run
+from tests.intervene.answers import with_parts
 
 if TYPE_CHECKING:
     from probe_kit.hooks import Policy
@@ -75,10 +76,6 @@ def test_a_policy_that_is_deaf_is_told_from_one_that_is_blind(worded: Interventi
     assert (row.instruction_changed, row.images_changed) == (0.0, 1.0)
 
 
-def with_certificate(result: InterventionResult, certificate: dict[str, Any]) -> InterventionResult:
-    return replace(result, measurement=replace(result.measurement, certificate=certificate))
-
-
 def test_items_without_a_twin_are_passed_over_and_counted(
     session: ReplaySession, worded: InterventionResult
 ) -> None:
@@ -87,14 +84,14 @@ def test_items_without_a_twin_are_passed_over_and_counted(
     assert InstructionSwap().eligible_items(session, [alone, paired]) == [paired]
     with pytest.raises(UsageError, match="has a counterpart in its suite"):
         InstructionSwap().eligible_items(session, [alone])
-    passed = with_certificate(worded, {**worded.certificate, "items": {"asked": 2, "played": 1}})
+    passed = with_parts(worded, certificate={**worded.certificate, "items": {"asked": 2, "played": 1}})
     assert passed.notes[0] == "1 of 2 items have no counterpart and were skipped."
 
 
 def test_a_family_whose_inference_is_one_action_is_marked(worded: InterventionResult) -> None:
     shadow = {**worded.certificate, "supported": {"readout": "per-step"}}
     for certificate, is_said in ((worded.certificate, False), (shadow, True)):
-        notes = with_certificate(worded, certificate).notes
+        notes = with_parts(worded, certificate=certificate).notes
         assert any("one action in greedy bins" in note for note in notes) is is_said
 
 

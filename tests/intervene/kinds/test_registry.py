@@ -12,10 +12,12 @@ import typer
 from typer.testing import CliRunner
 
 from probe_kit.cli import app
+from probe_kit.errors import UsageError
 from probe_kit.hooks import Site
-from probe_kit.hooks.contract.declared import ASKED_AS, InterventionKind
+from probe_kit.hooks.contract.declared import InterventionKind, asked_as
 from probe_kit.intervene import commands, kinds, load_effects
 from probe_kit.intervene.kinds import every_kind, kind_names, kind_of
+from probe_kit.intervene.kinds.base import Intervention
 from probe_kit.intervene.places import TILE_ROLES
 from probe_kit.intervene.results import listed_interventions
 from probe_kit.retention import retention_table
@@ -91,6 +93,16 @@ def test_an_option_of_another_kind_is_refused_with_the_kinds_that_take_it(
     assert "--target-side does not apply to --kind erase; remove it or choose another kind: steer" in said
 
 
+def test_an_option_that_the_command_lacks_is_refused_where_a_kind_is_defined() -> None:
+    with pytest.raises(UsageError, match=r"Misspelt declares the option 'site'.*expected some of sites, roles"):
+        type("Misspelt", (Intervention,), {"options": {"site": "where"}})
+
+
+def test_a_kind_of_another_package_is_listed_with_the_models_that_support_it(with_entry: ModuleType) -> None:
+    assert with_entry.kind_names()[-1] == NAME
+    assert NAME in asked_as("edit")[1]
+
+
 @pytest.mark.parametrize("name", kind_names())
 def test_every_file_holds_the_kind_that_it_is_called_after(name: str) -> None:
     kind = kind_of(name)
@@ -101,8 +113,8 @@ def test_every_file_holds_the_kind_that_it_is_called_after(name: str) -> None:
 def test_what_a_family_supports_is_listed_in_the_words_of_the_command() -> None:
     """`probe-kit models NAME` prints `--kind`, `--sites` and `--roles` as `probe-kit intervene` takes them."""
     option: dict[str, list[str]] = {"--kind": [], "--sites": [], "--roles": []}
-    for capability, (name, values) in ASKED_AS.items():
-        assert capability in get_args(InterventionKind)
+    for capability in get_args(InterventionKind):
+        name, values = asked_as(capability)
         option[name] += values
     assert sorted(option["--kind"]) == sorted(kind_names())
     assert option["--roles"] == list(TILE_ROLES)

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from probe_kit.intervene import InterventionResult
 from probe_kit.intervene.kinds import every_kind
 from probe_kit.intervene.kinds.attribution import AttributionPatching
-from probe_kit.intervene.kinds.base import Intervention, TableContext
+from probe_kit.intervene.kinds.base import Intervention
 from probe_kit.intervene.kinds.closed_loop import ClosedLoop, ClosedLoopEffect
 from probe_kit.intervene.kinds.erase import ConceptErasure, ErasureEffect
 from probe_kit.intervene.kinds.image_swap import Finding, ImageSwap, ImageSwapEffect, InputEffect
@@ -22,7 +23,7 @@ from probe_kit.intervene.outcomes import CLEAN, ConditionOutcomes
 from probe_kit.intervene.patching.attribution import AttributionEffect
 from probe_kit.intervene.verdict import UseVerdict, classify_use
 from probe_kit.retention.columns.summary import MOST_NUMBERS, MOST_WORDS, count_words
-from tests.intervene.answers import measured
+from tests.intervene.answers import measured, said_of, with_parts
 
 SWAPS = {
     "follows": (0.92, 0.02, (0.6, 1.0), 0.001, 1.0, 0.9, (0.8, 1.0)),
@@ -52,13 +53,13 @@ def swap(response: str) -> ImageSwapEffect:
     )  # fmt: skip
 
 
-def context(verdict: UseVerdict | None) -> TableContext:
+def context(verdict: UseVerdict | None) -> InterventionResult:
     verdicts = {} if verdict is None else {"public-info": verdict}
     names, numbers, moved = np.array(["one"]), np.zeros((1, 1)), np.zeros((1, 1, 5))
     outcomes = ConditionOutcomes(
         (CLEAN,), names, names, names, names, np.array(["left"]), numbers, numbers, moved, numbers[0]
     )
-    return TableContext(measured(outcomes, "", {}, {}, str.encode), "", verdicts)
+    return said_of(measured(outcomes, ""), verdicts)
 
 
 @pytest.mark.parametrize("response", SWAPS)
@@ -137,8 +138,7 @@ def test_edits_of_sites_are_counted_and_the_largest_are_named(rows: Sequence[Pat
     ("category", "title"), [("color", "Color"), ("red · or blue", "Red · or blue"), (" · ", " · ")]
 )
 def test_a_category_of_any_name_stays_in_its_own_column(category: str, title: str) -> None:
-    described = context(None)
-    described = replace(described, measurement=replace(described.measurement, settings={"kind": "interchange"}))
+    described = replace(context(None), settings={"kind": "interchange"})
     table = Interchange.table([replace(patch("kv.01", 0.9, 0.001), category=category)], described)
     (line,) = table.rows
     assert [cell.text for cell in line.cells[: table.names]] == [title, "kv.01 image"]
@@ -370,10 +370,8 @@ def test_the_last_line_about_an_input_of_a_run_without_sides_is_short(
     kind: type[Intervention], row: InputEffect, said: str
 ) -> None:
     described = context(None)
-    measured = replace(
-        described.measurement, outcomes=replace(described.measurement.outcomes, sides=np.array([""]))
-    )
-    (line,) = kind.findings([row], replace(described, measurement=measured))
+    without_sides = with_parts(described, replace(described.outcomes, sides=np.array([""])))
+    (line,) = kind.findings([row], without_sides)
     assert line == f"Public Info  {said}"
     check_short(line)
 

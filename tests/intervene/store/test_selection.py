@@ -19,17 +19,17 @@ from probe_kit.intervene import (
     stored_attention,
     stored_image_swaps,
 )
-from probe_kit.intervene.evidence import StoredEvidence, stored_places
+from probe_kit.intervene.evidence import StoredEvidence
 from probe_kit.intervene.kinds.interchange import (
     localised_by_category,
     stored_site_effects,
     stored_steering,
     stored_subspace_effects,
 )
-from probe_kit.intervene.outcomes import ATTENTION_FILE, FORMAT, StoredIntervention, arrays_to_bytes, key_of
-from probe_kit.intervene.results import effects_of, listed_interventions, verdicts_of
+from probe_kit.intervene.outcomes import ATTENTION_FILE, FORMAT, arrays_to_bytes, find_stored, key_of
+from probe_kit.intervene.results import InterventionResult, listed_interventions, verdicts_of
 from probe_kit.runs.layout import INTERVENTIONS
-from probe_kit.runs.results import read_bundles, write_bundle
+from probe_kit.runs.results import write_bundle
 from probe_kit.train import ArrayRun
 from tests.intervene.answers import follower, habit, outcomes_of, store_outcomes
 
@@ -188,7 +188,7 @@ def read(run: ArrayRun) -> dict[str, Any]:
         "along": stored_subspace_effects(run),
         "steering": stored_steering(run),
         "attention": {name: arrays_to_bytes(own) for name, own in stored_attention(run).items()},
-        "verdicts": classify_all(found, encoded, stored_places(StoredEvidence(run))),
+        "verdicts": classify_all(found, encoded, StoredEvidence(run).places),
         "targets": best_patch_targets(run, ["color"]),
     }
 
@@ -259,7 +259,7 @@ def test_the_verdict_says_first_chunk_and_whole_episode_whichever_is_asked_for(r
     """Color follows in the first chunk; the stored episodes along which each step was evaluated do not move."""
     for name, readout in (("image-swap", "first-chunk"), ("follow, shadow", "per-step")):
         key = key_of(settings_of(run, name))
-        shown = effects_of(run, StoredIntervention(read_bundles(run.location, INTERVENTIONS)[key], run.seed_text))
+        shown = InterventionResult.of_stored(find_stored(run, key))
         found = shown.verdicts["color"]
         assert (found.readout, shown.effects[0].readout) == (readout, readout)
         assert found.verdict == "first chunk used; episode undecided"
@@ -272,7 +272,7 @@ def test_the_verdict_says_first_chunk_and_whole_episode_whichever_is_asked_for(r
 
 def test_a_follow_that_is_asked_for_by_its_key_has_its_own_verdict(run: ArrayRun) -> None:
     key = key_of(settings_of(run, "follow, few"))
-    effects = effects_of(run, StoredIntervention(read_bundles(run.location, INTERVENTIONS)[key], run.seed_text))
+    effects = InterventionResult.of_stored(find_stored(run, key))
     assert effects.effects[0].n_episodes == FEW
     assert effects.verdicts["color"].behaviour == "undecided"
 

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import pytest
 
+from probe_kit.intervene.evidence import StoredEvidence
 from probe_kit.intervene.kinds.image_swap import ImageSwapEffect
 from probe_kit.intervene.verdict import Places, UseVerdict
 from probe_kit.retention.behaviour import Regime, SuccessRate
@@ -112,7 +113,10 @@ def combination(
     )  # fmt: skip
     own = SWAPS[swapped]
     found = {} if own is None else {"color": own, **(CONTROL if control else {})}
-    return add_image_swap(row, found, {} if located is None else {"color": Places(located)})
+    evidence = StoredEvidence(None)  # type: ignore[arg-type]
+    places = {} if located is None else {"color": Places(located)}
+    evidence.__dict__.update(swaps=found, other_readouts={}, places=places)
+    return add_image_swap(row, evidence)
 
 
 def every_combination() -> Iterator[tuple[str, str, str, str, RetentionRow]]:

@@ -1,0 +1,169 @@
+"""The effect of a source's input on the output: the unit in which patches are measured, and their tests."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.statistics.bootstrap import draw_groups, units_seed
+from probe_kit.statistics.paired_tests import max_t, paired_greater_p
+from probe_kit.statistics.significance import SIGNIFICANCE
+
+Values = NDArray[np.float64]
+CARRIES, NOTHING = 0.5, 0.1
+"""Shares of the swap from which a set carries it, and below which, on both sides of 0, it carries nothing."""
+
+
+class SwapShare(NamedTuple):
+    """A ratio of sums over episodes, with its 95 % interval by groups; 1 is the whole swap."""
+
+    value: float
+    low: float
+    high: float
+
+
+def share_of_whole(
+    moved: NDArray[np.float64], full: NDArray[np.float64], groups: NDArray[np.str_], seed_text: str
+) -> SwapShare | None:
+    """Return Σ moved · whole / Σ whole² over episodes (E,), with its interval by groups (E,); None of nothing."""
+    if not full.any():
+        return None
+    names, group_of = np.unique(groups, return_inverse=True)
+    above, below = np.bincount(group_of, moved * full), np.bincount(group_of, full**2)
+    times = draw_groups(names.size, units_seed(groups, seed_text))
+    # A draw may hold only groups in which the source moves nothing.
+    drawn = (times @ above) / np.maximum(times @ below, np.finfo(float).tiny)
+    low, high = np.percentile(drawn, [2.5, 97.5])
+    return SwapShare(float(above.sum() / below.sum()), float(low), float(high))
+
+
+def share_fields(name: str, share: SwapShare | None) -> dict[str, Any]:
+    """Return a share and its interval as fields of a row of effects."""
+    if share is None:
+        return {name: None, f"{name}_ci": None}
+    return {name: share.value, f"{name}_ci": (share.low, share.high)}
+
+
+def share_columns(name: str, share: SwapShare | None) -> dict[str, float]:
+    """Return a share and its interval as columns of a data frame."""
+    value, low, high = (np.nan,) * 3 if share is None else share
+    return {name: value, f"{name}_low": low, f"{name}_high": high}
+
+
+def pooled_share(moved: NDArray[np.float64], full: NDArray[np.float64]) -> float:
+    """Return Σ moved · whole / Σ whole² over pairs (E,); 0 where the whole moves nothing."""
+    total = float((full**2).sum())
+    return float((moved * full).sum()) / total if total else 0.0
+
+
+def carries_nothing(low: float, high: float) -> bool:
+    """Whether an interval of a share of the swap excludes, on both sides of 0, what would matter."""
+    return low > -NOTHING and high < NOTHING
+
+
+def finding_of_cell(alone: SwapShare | None, needed: SwapShare | None, every: SwapShare | None, p: float) -> str:
+    """Return a cell's finding from its shares alone and needed, all cells' share, and p of it alone."""
+    if alone is None or needed is None or every is None:
+        return "n/a"
+    carries = alone.value >= CARRIES and p < SIGNIFICANCE
+    if carries and needed.value >= CARRIES:
+        return "read here"
+    if carries and carries_nothing(needed.low, needed.high):
+        return "enough alone"
+    if carries_nothing(alone.low, alone.high) and needed.value >= CARRIES:
+        return "needed, not enough"
+    if max(alone.high, needed.high) < -NOTHING:
+        return "opposes it"
+    return (
+        "nothing alone"
+        if carries_nothing(alone.low, alone.high) and carries_nothing(needed.low, needed.high)
+        else "in part"
+    )
+
+
+class CellReading(NamedTuple):
+    """One of several cells that are read in parallel.
+
+    alone: share with this cell alone patched; needed: what all cells lose without it. p, p_fwe: that it moves the
+    output alone, p_fwe against all cells.
+    """
+
+    alone: SwapShare | None
+    needed: SwapShare | None
+    p: float
+    p_fwe: float
+    finding: str
+
+
+@dataclass(frozen=True)
+class Exchange:
+    """The outputs of E clean inferences and of their sources.
+
+    clean, source: (E,) numbers such as metres to the left. toward: (E,) ±1, where the source should move them.
+    groups, items: (E,). draws: text by which groups are drawn. flips: the seed of sign flips.
+    """
+
+    clean: Values
+    source: Values
+    toward: Values
+    groups: NDArray[np.str_]
+    items: NDArray[np.str_]
+    draws: str
+    flips: int
+
+    @property
+    def full(self) -> Values:
+        """(E,) by how much the source differs from the clean inference."""
+        return self.source - self.clean
+
+    @cached_property
+    def p_values(self) -> tuple[float, float]:
+        """(p, p) that the source moves the output where it should, and that it moves it away; exact sign tests."""
+        moved = self.toward * self.full
+        toward, away = (paired_greater_p(sign * moved, self.items, self.groups) for sign in (1.0, -1.0))
+        return toward, away
+
+    @property
+    def sign(self) -> float:
+        """Return −1 where it is shown that the source moves the output away from where it should, else 1.
+
+        Patches that carry the effect of the source move the output where it does: their p are of that direction.
+        """
+        return -1.0 if self.p_values[1] < SIGNIFICANCE else 1.0
+
+    @property
+    def leads(self) -> Values:
+        """(E,) ±1, where the source moves the output."""
+        return self.sign * self.toward
+
+    def share(self, moved: Values) -> SwapShare | None:
+        """Return `moved` (E,) as a share of the source's effect. Groups are drawn for both sums together.
+
+        None if the source moves the output by no more than chance: a share would be a ratio of noise.
+        """
+        if min(self.p_values) >= SIGNIFICANCE:
+            return None
+        return share_of_whole(moved, self.full, self.groups, self.draws)
+
+    def test(self, moved: Values) -> tuple[Values, Values, Values]:
+        """Return t, p and p_fwe (K,) that each of `moved` (K, E) is where the source leads.
+
+        One-sided, by sign flips of whole groups; p_fwe against the largest t of all K.
+        """
+        return max_t(self.leads * moved, self.items, self.groups, self.flips)
+
+    def readings(self, every: Values, alone: Values, lost: Values) -> Iterator[CellReading]:
+        """Yield what C cells do.
+
+        every: (E,) how far all cells together move the output. alone: (C, E) how far each does. lost: (C, E) what
+        all of them lose without it.
+        """
+        share_of_every = self.share(every)
+        _, p, p_fwe = self.test(alone)
+        for at in range(len(alone)):
+            single, needed = self.share(alone[at]), self.share(lost[at])
+            finding = finding_of_cell(single, needed, share_of_every, float(p_fwe[at]))
+            yield CellReading(single, needed, float(p[at]), float(p_fwe[at]), finding)
