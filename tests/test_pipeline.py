@@ -24,7 +24,7 @@ def planted_run(recorded_run: Run, tmp_path: Path) -> Run:
     answer = np.where(recorded_run.episodes["side_correct"] == "left", 1.0, -1.0)
     direction = np.random.default_rng(0).normal(size=pooled.shape[-1])
     view = recorded_run.views("backbone").index("mean")
-    values = pooled[:]
+    values = pooled[: answer.size]  # the array has room for a million episodes
     values[:, 0, PLANTED.layer, view] += answer[:, None] * direction
     for row, content in enumerate(values):
         pooled[row] = content

@@ -66,7 +66,7 @@ def places(tmp_path_factory: pytest.TempPathFactory, small_suite: Suite) -> Iter
 
 def option(parameter: Any) -> st.SearchStrategy[list[str]]:
     """One way to give a parameter, mostly a wrong one."""
-    name = [] if parameter.param_type_name == "argument" else [parameter.opts[0]]
+    name = [] if parameter.param_type_name == "argument" else [[*parameter.opts, *parameter.secondary_opts][0]]
     if getattr(parameter, "is_flag", False):
         return st.just(name)
     return st.sampled_from(HOSTILE).map(lambda value: [*name, value])

@@ -116,7 +116,7 @@ def test_the_viewers_folder_needs_no_server_and_no_address(hostile: Path, tmp_pa
 def test_figures_are_written_as_png_and_pdf_that_open(runs: StoredRuns, tmp_path: Path) -> None:
     from PIL import Image
 
-    probe_kit("retention", runs.trained, runs.untrained, "--figures", tmp_path)
+    probe_kit("retention", runs.trained, runs.untrained, "--figures", tmp_path, "--details", "all")
     names = {path.stem for path in tmp_path.glob("*.png")}
     assert len(names) > 8
     assert names == {path.stem for path in tmp_path.glob("*.pdf")}
