@@ -56,8 +56,6 @@ STORED = {
     ("probe_kit/intervene/kinds/erase.py", "kept"),
     ("probe_kit/intervene/patching/attribution.py", "place"),
     ("probe_kit/intervene/verdict.py", "place"),
-    ("probe_kit/retention/behaviour.py", "one"),
-    ("probe_kit/retention/compare/known_used.py", "asked"),
 }
 """Keys of tables and of stored results, which the fence holds."""
 PRONOUNS = re.compile(

@@ -115,13 +115,13 @@ class Regime(StrEnum):
 class PairedItems:
     """Items that ran in both layouts, by how many of the two were right.
 
-    both, one, none: numbers of items. both_wrong: items that chose the wrong picture twice, part of `none`.
+    both, exactly_one, none: numbers of items. both_wrong: items wrong twice, part of `none`.
     p: exact one-sided p of groups with more of `both` against groups with more of `both_wrong`. A side bias of any
     strength makes them equally likely, and items that share a picture count once.
     """
 
     both: int
-    one: int
+    exactly_one: int
     none: int
     both_wrong: int
     p: float
@@ -328,7 +328,7 @@ def paired_items(episodes: "pd.DataFrame") -> PairedItems:
     both, both_wrong = int((right == 2).sum()), int((wrong == 2).sum())
     return PairedItems(
         both=both,
-        one=int((right == 1).sum()),
+        exactly_one=int((right == 1).sum()),
         none=int((right == 0).sum()),
         both_wrong=both_wrong,
         p=heads_p(int((lead > 0).sum()), int((lead != 0).sum())),  # groups that favour neither are no tosses

@@ -161,7 +161,7 @@ def stages_table(joins: Sequence[KnownUsedTable]) -> Table:
 
     cells = [
         (
-            f"{join.asked} · {join.acted}",
+            f"{join.vlm} · {join.policy}",
             row.category if row.category == OVERALL else category_of(row.category).title,
             str(row.n_items),
             count(row.answered_correctly),
@@ -174,8 +174,8 @@ def stages_table(joins: Sequence[KnownUsedTable]) -> Table:
     ]
     numbers = [
         {
-            "vlm": join.asked,
-            "policy": join.acted,
+            "vlm": join.vlm,
+            "policy": join.policy,
             "view": join.view,
             "category": row.category,
             "items": row.n_items,
@@ -475,8 +475,8 @@ def _joins(study: LoadedStudy, stored: StoredRuns, partial: bool) -> list[KnownU
     joins = [
         replace(
             match_runs(scored(runs[vlm].run, "text"), runs[policy].run, probes[policy]),
-            asked=stored.labels[vlm],
-            acted=stored.labels[policy],
+            vlm=stored.labels[vlm],
+            policy=stored.labels[policy],
         )
         for vlm, policy in _sources(study, stored.runs)
     ]

@@ -11,7 +11,6 @@ import pytest
 from probe_kit._system.drafts import draft_of, write_whole
 from probe_kit.runs import open_run
 from probe_kit.runs.export import export_run
-from probe_kit.runs.store import locate
 from probe_kit.suite import build_suite
 
 DYING = """
@@ -48,11 +47,7 @@ def draw_suite(path: Path) -> None:
     build_suite(path, ["color"], 2)
 
 
-def begin_run(path: Path) -> None:
-    locate(path).begin({"run.json": b"{}", "data.zarr/zarr.json": b"{}"}, last="run.json")
-
-
-@pytest.mark.parametrize("make", [write_text, draw_suite, begin_run])
+@pytest.mark.parametrize("make", [write_text, draw_suite])
 def test_what_a_killed_process_left_is_removed_by_the_next(make: Callable[[Path], None], tmp_path: Path) -> None:
     path = tmp_path / "made"
     leave_a_draft(path)

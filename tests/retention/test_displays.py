@@ -286,7 +286,7 @@ def test_paired_layouts_count_items_and_draw_their_shares(tmp_path: Path, outcom
     run = ArrayRun(tmp_path, "pi0", "suite", outcome_table(7, 6, 3), {})
     display = PairedLayoutsDisplay.from_run(run)
     paired = display.items["color"]
-    assert (paired.both, paired.one, paired.both_wrong, paired.none) == (3, 1, 2, 4)
+    assert (paired.both, paired.exactly_one, paired.both_wrong, paired.none) == (3, 1, 2, 4)
     bars = display.plot().ax_.patches
     np.testing.assert_allclose([bar.get_width() for bar in bars], [37.5, 12.5, 25, 25])
 

@@ -293,7 +293,7 @@ GOES_LEFT = share(
 
 def _right_twice(row: RetentionRow) -> str:
     paired = row.success.paired
-    return "–" if paired is None else f"{paired.both} of {paired.both + paired.one + paired.none}"
+    return "–" if paired is None else f"{paired.both} of {paired.both + paired.exactly_one + paired.none}"
 
 
 RIGHT_TWICE = Column(

@@ -142,7 +142,7 @@ _TESTS = "p: exact McNemar over items or over whole groups, the larger; (Holm) o
 def known_used_tables(joined: KnownUsedTable) -> list[Table]:
     """Counts of items, which of them, tests, and counts of single episodes."""
     probes = f"probes in view {joined.view}" if joined.view else "no probes: answer and success only"
-    title = f"Answer, probe, success: {joined.asked} (by {joined.score}) · {joined.acted}"
+    title = f"Answer, probe, success: {joined.vlm} (by {joined.score}) · {joined.policy}"
     rows = joined.rows
     which = "Which of them: VLM · probe · success (expected of coins)"
     return [

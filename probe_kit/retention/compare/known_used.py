@@ -95,21 +95,23 @@ class CategoryCounts:
 
 @dataclass(frozen=True)
 class KnownUsedTable:
-    """A VLM run and a policy run joined, item by item. view: of the probes; None without any.
+    """A VLM run and a policy run joined, item by item.
 
-    notes: what a reader must know, a sentence each.
+    vlm, policy: labels of the runs. view: of the probes; None without any.
+    notes: remarks on the join, a sentence each.
     """
 
-    asked: str
-    acted: str
+    vlm: str
+    policy: str
     score: str
     view: str | None
     rows: tuple[CategoryCounts, ...]
     notes: tuple[str, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
-        """Plain values."""
-        return asdict(self)
+        """Return plain values; the runs are called `asked` and `acted`, as in the JSON of VLM − VLA."""
+        plain = asdict(self)
+        return {"asked": plain.pop("vlm"), "acted": plain.pop("policy"), **plain}
 
     def to_frame(self) -> "pd.DataFrame":
         """A row per category and code of the three: counts of items and episodes, and coins' share."""

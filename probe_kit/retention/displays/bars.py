@@ -126,11 +126,11 @@ class PairedLayoutsDisplay(BarDisplay):
 
 
 def _paired_bar(name: str, paired: PairedItems) -> Bar:
-    total = paired.both + paired.one + paired.none
+    total = paired.both + paired.exactly_one + paired.none
     # Hatches tell the parts apart without colour.
     counts = (
         ("right in both layouts", GREEN, "", paired.both),
-        ("right in one", SKY, "\\\\\\", paired.one),
+        ("right in one", SKY, "\\\\\\", paired.exactly_one),
         ("wrong picture in both", VERMILION, "///", paired.both_wrong),
         ("none right, otherwise", _NEITHER, "", paired.none - paired.both_wrong),
     )
@@ -278,7 +278,7 @@ def joins_of(runs: Sequence[RunReader], table: RetentionTable) -> tuple[list[Kno
             refused.append(f"Not joined: {error}.")
             continue
         vlm_name, policy_name = (names.get(str(run.location), run.label) for run in (vlm, policy))
-        joins.append(replace(joined, asked=vlm_name, acted=policy_name))
+        joins.append(replace(joined, vlm=vlm_name, policy=policy_name))
     return correct_joins(joins), refused
 
 
@@ -311,7 +311,7 @@ class KnownUsedDisplay(BarDisplay):
     @classmethod
     def from_join(cls, joined: KnownUsedTable) -> Self:
         """Read a table of `probe_kit.retention.compare.known_used.match_runs`."""
-        return cls(joined=joined, title=f"{joined.asked} (by {joined.score}) · {joined.acted}")
+        return cls(joined=joined, title=f"{joined.vlm} (by {joined.score}) · {joined.policy}")
 
     @property
     def counts(self) -> Mapping[str, Mapping[str, int]]:
@@ -327,7 +327,7 @@ class KnownUsedDisplay(BarDisplay):
         """Add the legend, and who was asked and who acted in place of one run's line."""
         super().finish(figure, grid)
         probes = f"probes in view {self.joined.view}" if self.joined.view else "no probes"
-        names = f"{self.joined.asked} · {self.joined.acted}"
+        names = f"{self.joined.vlm} · {self.joined.policy}"
         footer(figure, f"{names} · items right in both layouts, a coin: 25 % · {probes}")
 
 

@@ -59,13 +59,13 @@ def test_a_policy_that_always_goes_left_is_half_right_but_never_twice(outcome_ta
     success = success_rate(episodes)
     assert success.sr == 0.5
     assert success.side_preference == 1.0
-    assert (success.paired.both, success.paired.one, success.paired.none) == (0, 50, 0)
+    assert (success.paired.both, success.paired.exactly_one, success.paired.none) == (0, 50, 0)
     assert (success.sr_left, success.sr_right) == (1.0, 0.0)
 
 
 def test_items_right_twice_are_tested_against_items_wrong_twice(outcome_table: Outcomes) -> None:
     paired = paired_items(outcome_table(correct=28, wrong=12, oob=6))
-    assert (paired.both, paired.one, paired.none, paired.both_wrong) == (14, 0, 9, 6)
+    assert (paired.both, paired.exactly_one, paired.none, paired.both_wrong) == (14, 0, 9, 6)
     assert paired.p == pytest.approx(binomtest(14, 20, alternative="greater").pvalue)
 
 

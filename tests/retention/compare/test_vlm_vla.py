@@ -87,7 +87,7 @@ def test_the_score_is_what_the_table_shows(runs: list[SaidRun], score: str, sr: 
 
 def test_a_constant_answer_has_one_right_per_item_and_no_paired_evidence(runs: list[SaidRun]) -> None:
     row = retention_table(runs, score="logits").rows[0]
-    assert (row.success.sr, row.success.paired.one, row.success.paired.p) == (0.5, 20, 1)
+    assert (row.success.sr, row.success.paired.exactly_one, row.success.paired.p) == (0.5, 20, 1)
 
 
 def test_items_with_a_side_in_their_name_are_left_out_unless_asked_for(tmp_path: Path) -> None:

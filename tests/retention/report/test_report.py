@@ -113,7 +113,7 @@ def test_names_and_instructions_cannot_become_markup(tmp_path: Path, outcome_tab
 def test_a_run_without_probes_has_a_report_of_its_behaviour(tmp_path: Path, outcome_table: Any) -> None:
     page = report_html([plain_run(tmp_path, outcome_table(6, 4, 2))])
     assert 'id="knowledge"' not in page
-    assert "the cube ends on the correct picture in 50\u00a0%" in page
+    assert "the cube ends right in 50\u00a0%" in page
 
 
 def test_a_report_without_runs_is_an_error() -> None:
