@@ -1,17 +1,19 @@
 """Samples of a probe: one per episode (pooled views), or one per token."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import NonFiniteActivationError, UnknownSiteError
 from probe_kit.hooks.contract.sites import Site, resolve_view
-from probe_kit.runs.arrays import TokenBlock
-from probe_kit.runs.reader import RunReader
 from probe_kit.train.solver.arrays import Array, Features, RowSubset, to_device, to_numpy
+
+if TYPE_CHECKING:
+    from probe_kit.runs.arrays import TokenBlock
+    from probe_kit.runs.reader import RunReader
 
 TOKENS = "tokens"
 """View in which every valid token is a sample; `tokens:<role>` takes the tokens of one role."""
@@ -36,7 +38,7 @@ class Samples:
         return cls(column, np.ones(len(column), np.intp), column)
 
     @classmethod
-    def tokens(cls, blocks: Iterable[TokenBlock], mask: NDArray[np.bool_]) -> "Samples":
+    def tokens(cls, blocks: "Iterable[TokenBlock]", mask: NDArray[np.bool_]) -> "Samples":
         """One sample per token of `mask` (E, T), from blocks of positions; every episode has a token.
 
         Holds one block and the tokens themselves, no padding.
@@ -94,7 +96,7 @@ class Samples:
         return Samples(to_device(self.features, device), self.counts, to_device(self.means, device))
 
 
-def sites_of(run: RunReader, view: str) -> list[Site]:
+def sites_of(run: "RunReader", view: str) -> list[Site]:
     """Sites of probed streams that have `view`; a role's tokens are where its mean is. Raises UnknownSiteError."""
     probed = [name for name, stream in run.streams.items() if stream.probed]
     if view == TOKENS:
@@ -122,7 +124,7 @@ def role_of(view: str) -> str | None:
 
 
 def read_samples(
-    run: RunReader, view: str, site: Site, rows: NDArray[np.intp], inferences: NDArray[np.intp]
+    run: "RunReader", view: str, site: Site, rows: NDArray[np.intp], inferences: NDArray[np.intp]
 ) -> Samples:
     """Return the samples of one site, in order: episode `rows` (n,) of the run at captured `inferences` (n,).
 
@@ -144,7 +146,7 @@ def read_samples(
     return samples
 
 
-def _read_call(run: RunReader, view: str, site: Site, rows: NDArray[np.intp], call: int) -> Samples:
+def _read_call(run: "RunReader", view: str, site: Site, rows: NDArray[np.intp], call: int) -> Samples:
     """Return one captured inference of some episodes. A reader without several inferences is asked for none."""
     at = (call,) if call else ()
     if not is_token_view(view):
@@ -153,7 +155,7 @@ def _read_call(run: RunReader, view: str, site: Site, rows: NDArray[np.intp], ca
     blocks, mask = run.iter_token_blocks(site, role, *at), run.token_mask(site, role, *at)
     if np.array_equal(rows, np.arange(len(mask))):
         return Samples.tokens(blocks, mask)
-    some = (TokenBlock(block.start, block.values[rows], block.mask[rows]) for block in blocks)
+    some = (replace(block, values=block.values[rows], mask=block.mask[rows]) for block in blocks)
     return Samples.tokens(some, mask[rows])
 
 
