@@ -333,7 +333,7 @@ def test_it_prints_the_counts_of_match_runs_and_draws_their_figure(
         (["--rule", "box"], "--rule is not for --compare stages"),
         (["--as-paper"], "--as-paper is not for --compare stages"),
         (["--views", "mean,last"], "--compare stages reads probes of one view; --views mean,last has 2. Give one"),
-        (["--views", "mean"], "has no probes. Run `probe-kit train"),
+        (["--views", "mean"], "has no activations to probe"),
     ],
 )
 def test_options_of_other_tables_are_refused(
