@@ -15,6 +15,9 @@ from probe_kit.runs.store import Location
 _BLOCK = 2 * BLOCK_BYTES
 """Hex digits of the hash of one inner chunk, of which `Sum.blocks` is a row."""
 
+_SPARE = 1 << 20
+"""Bytes that an object may have too many and is still read: a file that was made larger never takes all memory."""
+
 
 class ArrayStore(Store):
     """The objects below `folder` that are known by their sums; whatever else lies there does not exist for it.
@@ -98,7 +101,7 @@ class ArrayStore(Store):
         stored = self.sums[key]
         try:
             if byte_range is None:
-                content = self._location.read(self._key(key))
+                content = self._location.read(self._key(key), most=stored.length + _SPARE)
                 problem = stored.problem(content)
             else:
                 part = _range_of(byte_range, stored.length)

@@ -26,9 +26,13 @@ Far above what runs have. They keep a file that was made up, such as a sparse on
 """
 
 
-def check_size(key: str, size: int, where: object) -> None:
-    """Raise RunDamagedError for an object that is larger than any that probe_kit writes, before it is read."""
-    most = MOST_RECORD_BYTES if key.endswith(".json") else MOST_OBJECT_BYTES
+def check_size(key: str, size: int, where: object, most: int | None = None) -> None:
+    """Raise RunDamagedError, before it is read, for an object that is larger than any that probe_kit writes.
+
+    most: bytes that it may have, where that is known.
+    """
+    if most is None:
+        most = MOST_RECORD_BYTES if key.endswith(".json") else MOST_OBJECT_BYTES
     if size > most:
         raise RunDamagedError(
             f"{where}/{key} has {size / 1e6:,.0f} MB; expected at most {most / 1e6:,.0f} MB. Restore it from a "
@@ -107,11 +111,11 @@ class Folder:
         """Whether there is an object of that key."""
         return _inside(key) and (self._path / key).is_file()
 
-    def read(self, key: str, part: slice | None = None) -> bytes:
-        """All of one object, or a part of its bytes. Raises FileNotFoundError."""
+    def read(self, key: str, part: slice | None = None, most: int | None = None) -> bytes:
+        """All of one object, or a part of its bytes. most: see `check_size`. Raises FileNotFoundError."""
         path = self._object(key)
         if part is None:
-            check_size(key, path.stat().st_size, self)
+            check_size(key, path.stat().st_size, self, most)
             return path.read_bytes()
         with path.open("rb") as file:
             file.seek(part.start)

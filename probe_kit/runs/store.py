@@ -169,7 +169,7 @@ class Bucket:
             return False
         return True
 
-    def read(self, key: str, part: slice | None = None) -> bytes:
+    def read(self, key: str, part: slice | None = None, most: int | None = None) -> bytes:
         """See `Folder.read`: one request."""
         import obstore
 
@@ -177,7 +177,7 @@ class Bucket:
             if part is not None:
                 return bytes(obstore.get_range(objects, key, start=part.start, end=part.stop))
             answer = obstore.get(objects, key)
-            check_size(key, answer.meta["size"], self)
+            check_size(key, answer.meta["size"], self, most)
             return bytes(answer.bytes())
 
         return self._answer(content)

@@ -345,6 +345,15 @@ def test_a_sparse_file_in_a_run_is_refused_by_its_size(name: str, run: Path) -> 
         assert verify_run(run, deep=True).problems
 
 
+@pytest.mark.parametrize("name", ["0", "zarr.json"])
+def test_an_object_that_was_made_larger_after_a_run_was_opened_is_never_read_whole(name: str, run: Path) -> None:
+    opened = open_run(run)
+    with pooled(run, name)[0].open("r+b") as file:
+        file.truncate(1 << 31)  # less than the largest object of a run
+    with pytest.raises(RunDamagedError, match="has 2,147 MB; expected at most 1 MB"):
+        opened.column(opened.sites("backbone")[0], "mean")
+
+
 @pytest.mark.slow
 def test_threads_that_open_arrays_at_once_do_not_take_each_others_codecs(run: Path) -> None:
     opened = open_run(run)
