@@ -231,6 +231,14 @@ def test_black_text_is_readable_on_every_heat_colour(value: float) -> None:
 # -- behaviour -------------------------------------------------------------------------------------------------
 
 
+def test_a_name_stands_once_beside_its_point_on_its_own_figure_and_on_given_axes(probed_run: ProbedRun) -> None:
+    display = KnowledgeActionDisplay.from_table(retention_table([probed_run({"color": SIGNAL, "shape": NOISE})]))
+    for axes in (display.plot().ax_, display.plot(Figure().subplots()).ax_):
+        assert axes is not None
+        texts = [text.get_text() for text in axes.texts]
+        assert [texts.count(name) for name in ("Color", "Shape")] == [1, 1]
+
+
 @pytest.mark.slow
 def test_the_gap_has_a_point_per_category_and_marks_those_without_signal(probed_run: ProbedRun) -> None:
     table = retention_table([probed_run({"color": SIGNAL, "shape": NOISE})])

@@ -68,13 +68,21 @@ class Display(ABC):
         """Draw on `ax`, or on a figure of its own with legend and caption."""
         if ax is None:
             in_panels([self], self.figure_size, in_pyplot=True)
-            return self
-        self.draw(ax)
-        if not self.is_framed:
-            plain(ax)
-        ax.set_title(self.title, fontsize=self.title_size, loc="left")
-        self.ax_ = ax
+        else:
+            self.draw_panel(ax)
+            self.annotate()
         return self
+
+    def draw_panel(self, axes: "Axes") -> None:
+        """Draw on `axes`, with the title above."""
+        self.draw(axes)
+        if not self.is_framed:
+            plain(axes)
+        axes.set_title(self.title, fontsize=self.title_size, loc="left")
+        self.ax_ = axes
+
+    def annotate(self) -> None:  # noqa: B027 - most displays have nothing to write
+        """Write what needs the marks' final places: after the layout of a figure of its own, else at once."""
 
     def _repr_png_(self) -> "Picture | None":
         """Return the figure, whatever pyplot's backend is."""
@@ -110,7 +118,7 @@ def in_panels(
         if display is None:
             axes.set_visible(False)
         else:
-            display.plot(axes)
+            display.draw_panel(axes)
     grid = [axes for axes in places if axes.get_visible()]
     if first.is_level:
         ranges = [axes.get_ylim() for axes in grid]
@@ -119,6 +127,8 @@ def in_panels(
     figure.supylabel(first.measure, fontsize=9)
     caption(figure, *(line for display in present for line in display.certificates))
     first.finish(figure, grid)
+    for display in present:
+        display.annotate()
     return figure
 
 

@@ -375,12 +375,14 @@ class KnowledgeActionDisplay(Display):
         where = "in the backbone" if self.stream == "backbone" else f"where the {output} is made"
         axes.set_xlabel(f"best held-out probe {where} (%)", fontsize=9)
 
-    def plot(self, ax: "Axes | None" = None) -> Self:
-        """Draw on `ax`, or on a figure of its own with legend and captions; then write names near their points."""
-        super().plot(ax)
+    def finish(self, figure: "Figure", grid: "Sequence[Axes]") -> None:
+        """Add the legend, and settle the layout: names need the points' final places."""
+        super().finish(figure, grid)
+        figure.draw_without_rendering()
+
+    def annotate(self) -> None:
+        """Write names near their points."""
         assert self.ax_ is not None
-        if ax is None:
-            self.ax_.figure.draw_without_rendering()  # type: ignore[union-attr]  # names need the points' final places
         words = [title_of(point.category) for point in self.points]
         inks = [darker(series(self._models.index(point.model)).colour) for point in self.points]
         points = [(100 * point.accuracy, 100 * point.sr) for point in self.points]
@@ -389,7 +391,6 @@ class KnowledgeActionDisplay(Display):
         diagonal = [((step, step), (step + 1, step + 1)) for step in range(100)]
         guessing = [((0, 50), (100, 50)), ((50, 0), (50, 100))]
         place_labels(self.ax_, points, words, inks, [*bars, *diagonal, *guessing])
-        return self
 
 
 def _point(row: RetentionRow, stream: str) -> GapPoint | None:
