@@ -97,7 +97,7 @@ def maps(trial: Trial, last: int) -> Iterator[Property]:
     )  # fmt: skip
     end = f"backbone.{last:02d}"
     for category in categories:
-        rows = {(row.place, row.role): row for row in effects.effects if row.category == category}
+        rows = {(row.sites, row.role): row for row in effects.effects if row.category == category}
         unread = rows[end, "all"]
         yield Property(
             f"{category}: {end} is read by nothing",
@@ -124,7 +124,7 @@ def last_located(trial: Trial) -> tuple[str, str] | None:
     everywhere: dict[tuple[str, str], list[float]] = {}
     for row in effects.effects:
         if row.category in trial.used and row.is_localised and row.role != "all":
-            everywhere.setdefault((row.place, row.role), []).append(row.effect or 0.0)
+            everywhere.setdefault((row.sites, row.role), []).append(row.effect or 0.0)
     found = {name: min(shares) for name, shares in everywhere.items() if len(shares) == len(trial.used)}
     return max(found, key=lambda name: (name[0], found[name]), default=None)
 
@@ -133,7 +133,7 @@ def memories(trial: Trial) -> Iterator[Property]:
     """One block is read, and the others are not."""
     effects = trial.done(Interchange(categories=trial.used, sites=("kv.*",), roles=("all",)))
     for category in trial.used:
-        found = {row.place: row.effect for row in effects.effects if row.category == category}
+        found = {row.sites: row.effect for row in effects.effects if row.category == category}
         read = [place for place, effect in found.items() if effect is not None and effect >= 0.95]
         rest = [effect for place, effect in found.items() if place not in read]
         holds = len(read) == 1 and all(effect is not None and abs(effect) <= 0.05 for effect in rest)

@@ -58,7 +58,7 @@ LEFT_OUT = {
 
 ROW_KEYS = (
     "episode_id", "label", "asked", "acted", "model", "other_model", "target", "category", "view", "stream",
-    "site", "call", "place", "role", "cells", "part", "direction", "coefficient", "is_control", "is_drawn",
+    "site", "call", "sites", "role", "cells", "part", "direction", "coefficient", "is_control", "is_drawn",
     "block", "iteration", "head", "number", "source_episode", "frame", "row", "column", "name",
 )  # fmt: skip
 """Columns that say what a row is about, in this order in its key."""

@@ -173,7 +173,7 @@ def test_the_last_layer_of_the_seventh_notebook_is_read_by_nothing(
 ) -> None:
     """Its hooks fired and moved tokens; what can be read there turns nothing."""
     rows = stored_site_effects(open_run(made[0] / "work" / "runs" / "pi0-tiny"))["color"]
-    (last,) = (row for row in rows if (row.place, row.role) == ("backbone.03", "all"))
+    (last,) = (row for row in rows if (row.sites, row.role) == ("backbone.03", "all"))
     assert (last.max_action_change, last.no_op_fires) == (0.0, 0)
     assert last.fires == last.n_episodes
     assert last.relative_change > 0

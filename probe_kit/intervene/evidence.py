@@ -167,9 +167,9 @@ def _is_read_along(row: PatchEffect) -> bool:
 
 def _tie(rows: Sequence[PatchEffect], along: Sequence[PatchEffect], site: str, role: str) -> TieAtSite:
     """Return `tie_at_site` of one place and role. rows, along: of one category."""
-    full = next((row for row in rows if (row.place, row.role) == (site, role)), None)
-    within = [row for row in along if (row.place, row.role) == (site, role) and not row.is_control]
-    return tie_at_site(full, within, [row for row in rows if row.place == site])
+    full = next((row for row in rows if (row.sites, row.role) == (site, role)), None)
+    within = [row for row in along if (row.sites, row.role) == (site, role) and not row.is_control]
+    return tie_at_site(full, within, [row for row in rows if row.sites == site])
 
 
 def describe_tie(sites: Sites, is_joint: bool = False) -> str:
@@ -219,7 +219,7 @@ def stored_ties(
         significant = [f"{BACKBONE}.{int(layer):02d}" for layer in rows.loc[rows["signal"], "layer"]]
         # A direction of the mean over a role's tokens that carries the effect.
         is_pooled = [_is_read_along(row) and ":" not in row.direction and is_backbone_layer(row) for row in along]
-        pooled = [row.place for row, is_mean in zip(along, is_pooled, strict=True) if is_mean and row.role == role]
+        pooled = [row.sites for row, is_mean in zip(along, is_pooled, strict=True) if is_mean and row.role == role]
         if pooled and not significant:
             ties[name] = f"{UNPROBED} ({list_places([f'{site} {role}' for site in pooled])})"
             continue
@@ -261,7 +261,7 @@ def which_layer(
             none = "no layer of the backbone carries half of it"
             passes = f"passes at {list_places(located)}" if located else none
         if cell is not None and is_backbone_layer(cell):
-            passes += f"; steer at {cell.place} {cell.role} with --direction {ALONG}"
+            passes += f"; steer at {cell.sites} {cell.role} with --direction {ALONG}"
         read = [part for part in str(category_places).split("; ") if part.startswith("read ") or KV_STREAM in part]
         reads = ("; ".join(read) or "--kind joint tests where it is read") * has_kv
         best = _best_site(evidence.run, results, name, rows, evidence.along.get(name, []))
@@ -292,7 +292,7 @@ def _best_site(
     else:
         at_site = _tie(rows, along, site, role or "")
         tie = _TIES[at_site]
-        carries = any((row.place, row.role) == (site, role) and row.is_localised for row in rows)
+        carries = any((row.sites, row.role) == (site, role) and row.is_localised for row in rows)
         if at_site == "not tested" and carries:
             tie = "carries the effect; --direction mean-difference tests what probes read there"
     return f"the probes' best site {site}{'' if best['signal'] else ' (no signal)'} {tie}"

@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from probe_kit.train.results.probe_results import ProbeResults
 
 
-_VERDICT_COLUMNS = ("verdict", "behaviour", "reversed", "reason", "place", "tie")
+_VERDICT_COLUMNS = ("verdict", "behaviour", "reversed", "reason", "where", "tie")
 
 
 @dataclass(frozen=True)

@@ -55,8 +55,8 @@ class UseVerdict:
     """The verdict: is the answer used, where does it pass, and is what probes read what is used?
 
     behaviour: of the image swap. reason: the numbers it rests on, or why there is none. reversed: the same, away
-    from the correct picture. side: of a behaviour that is one-sided. place: where interchanges found that the
-    answer passes or is read; empty if none was stored. tie: between the readable copy and the behaviour; empty
+    from the correct picture. side: of a behaviour that is one-sided. where: the answer passes or is
+    read, by interchanges; empty if none was stored. tie: between the readable copy and the behaviour; empty
     without probes. readout: `first-chunk` or `per-step`, of all of these. lacks_control: whether *not used* is
     missing nothing but another category of the run that is used. other: the behaviour by the other readout; None
     if that is not stored.
@@ -66,7 +66,7 @@ class UseVerdict:
     reason: str
     reversed: bool = False
     side: Side | None = None
-    place: str = ""
+    where: str = ""
     tie: str = ""
     readout: str = FIRST_CHUNK
     lacks_control: bool = False
@@ -114,7 +114,7 @@ class UseVerdict:
         """Reason, place and tie."""
         first, *second = self.by_readout
         reasons = [first.reason, *(f"over the whole episode: {verdict.reason}" for verdict in second)]
-        return "; ".join(filter(None, (*reasons, self.place, self.tie)))
+        return "; ".join(filter(None, (*reasons, self.where, self.tie)))
 
     @property
     def sentence(self) -> str:
@@ -128,7 +128,7 @@ class UseVerdict:
             ]
         else:
             clauses = [first.clause("the answer"), *(verdict.clause("it") for verdict in second)]
-        text = "; ".join(filter(None, (*clauses, self.place, self.tie)))
+        text = "; ".join(filter(None, (*clauses, self.where, self.tie)))
         return f"{text[0].upper()}{text[1:]}."
 
     @property
@@ -380,7 +380,7 @@ def classify_use(
     if all(verdict.behaviour in ("not used", "undecided") for verdict in use.by_readout):
         return use
     tie_text = "" if encoded is None else tie or (NOT_TESTED if encoded else NO_COPY)
-    return replace(use, place=str(places or ""), tie=tie_text)
+    return replace(use, where=str(places or ""), tie=tie_text)
 
 
 def describe_sites(located: Sequence[str], carried: Sequence[str] = ()) -> str:

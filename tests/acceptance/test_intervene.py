@@ -82,7 +82,7 @@ def test_a_swapped_instruction_changes_the_action_too(intervened: Path, answers:
 def test_patched_keys_and_values_carry_the_answer_and_the_last_layer_is_not_read(
     intervened: Path, answers: dict[str, Answer]
 ) -> None:
-    rows = {row["place"]: row for row in effects("interchange", intervened, answers)}
+    rows = {row["sites"]: row for row in effects("interchange", intervened, answers)}
     unread, read = rows["backbone.03"], rows["kv.02"]
     assert unread["max_action_change"] == 0
     assert unread["fires"] > unread["no_op_fires"] == 0, "tokens moved all the same"
@@ -107,7 +107,7 @@ def test_attribution_screens_places_and_patches_its_anchors_exactly(
 ) -> None:
     rows = effects("attribution", intervened, answers)
     assert any(row["is_anchor"] for row in rows)
-    assert {row["place"] for row in rows if not row["is_anchor"]} >= {"kv.00", "kv.01", "kv.02"}
+    assert {row["sites"] for row in rows if not row["is_anchor"]} >= {"kv.00", "kv.01", "kv.02"}
 
 
 @pytest.mark.slow
@@ -127,7 +127,7 @@ def test_steering_without_strength_changes_nothing_and_with_it_moves_tokens_as_f
 def test_in_a_closed_loop_the_patched_policy_places_the_cube_on_the_other_side(
     intervened: Path, answers: dict[str, Answer]
 ) -> None:
-    rows = {row["place"]: row for row in effects("closed-loop", intervened, answers)}
+    rows = {row["sites"]: row for row in effects("closed-loop", intervened, answers)}
     assert rows["clean"]["correct"] == 1
     assert rows["clean"]["max_action_change"] == 0
     assert rows["image_swap"]["wrong"] == 1

@@ -60,7 +60,7 @@ def test_json_holds_settings_and_effects(run: Run) -> None:
 def test_csv_is_what_is_stored_with_the_verdict(run: Run) -> None:
     _, shown, _ = ask(run, "--format", "csv")
     header, first, *_ = shown.splitlines()
-    assert header.endswith("verdict,behaviour,reversed,reason,place,tie")
+    assert header.endswith("verdict,behaviour,reversed,reason,where,tie")
     assert first.startswith("color,24,12,12,1.0,0.0,1.0,")
 
 

@@ -224,7 +224,7 @@ def test_tables_show_it_beside_the_success_rate(copy: Run, effects: Intervention
     stored = json.loads(table.to_json())[0]["image_swap"]["use"]
     assert uses[0] is not None
     assert stored == asdict(uses[0])
-    assert set(stored) >= {"behaviour", "reversed", "place", "tie", "reason"}
+    assert set(stored) >= {"behaviour", "reversed", "where", "tie", "reason"}
 
 
 def test_tables_of_other_runs_have_no_such_column(recorded_run: Run) -> None:

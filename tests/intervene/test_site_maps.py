@@ -64,7 +64,7 @@ def test_all_tokens_of_the_first_layer_are_the_whole_exchange(whole: Interventio
 @pytest.mark.slow
 def test_a_site_that_nothing_reads_leaves_every_action_bit_for_bit(whole: InterventionResult) -> None:
     """The ledger tells it from hooks that missed: they fired, and moved what passed."""
-    (row,) = (row for row in whole.effects if (row.place, row.role) == ("backbone.03", "all"))
+    (row,) = (row for row in whole.effects if (row.sites, row.role) == ("backbone.03", "all"))
     assert row.max_action_change == 0.0
     assert (row.fires, row.no_op_fires) == (4, 0)
     assert row.relative_change > 0
@@ -113,7 +113,7 @@ def test_a_role_that_nothing_plays_there_is_refused_and_nothing_is_stored(
 @pytest.mark.slow
 def test_it_is_read_back_beside_what_else_is_stored(copy: Run, whole: InterventionResult) -> None:
     assert load_effects(copy, kind="interchange").to_csv() == whole.to_csv()
-    assert {row.place for row in stored_site_effects(copy)["color"]} == {
+    assert {row.sites for row in stored_site_effects(copy)["color"]} == {
         "backbone.00",
         "backbone.03",
         "expert.02@0-1",
@@ -418,7 +418,7 @@ def with_changes(signs: tuple[np.ndarray, np.ndarray], **changes: np.ndarray) ->
 
 
 def rows_of(outcomes: ConditionOutcomes) -> dict[str, PatchEffect]:
-    return {f"{row.place}|{row.role}|{row.direction}".rstrip("|"): row for row in patches_of(outcomes, SUITE)}
+    return {f"{row.sites}|{row.role}|{row.direction}".rstrip("|"): row for row in patches_of(outcomes, SUITE)}
 
 
 def test_what_carries_all_has_the_effect_one_and_is_located() -> None:
@@ -520,7 +520,7 @@ def test_the_place_is_said_beside_the_behaviour_and_does_not_change_it() -> None
     }
     for located, expected in places.items():
         use = classify_use(True, found, None, Places(located))
-        assert (use.behaviour, use.place) == ("used", expected)
+        assert (use.behaviour, use.where) == ("used", expected)
     jointly = "no single place: read jointly at kv.01 language + kv.02 language"
     assert str(Places((), jointly=jointly)) == jointly
     assert str(Places(("backbone.01",), jointly=jointly)) == f"passes at backbone.01; {jointly}"

@@ -153,7 +153,7 @@ def test_a_place_is_named_where_the_answer_is_read(
 ) -> None:
     outcomes = patched(wired, name, "backbone.01", "backbone.02", "kv.*", "expert.01")
     rows = patches_of(outcomes, SUITE)
-    assert next(row for row in rows if row.place == "expert.01").is_localised
+    assert next(row for row in rows if row.sites == "expert.01").is_localised
     assert localised_sites(rows) == located
 
 

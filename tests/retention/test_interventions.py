@@ -116,7 +116,7 @@ def test_where_nothing_carries_it_inside_the_place_is_open_and_the_behaviour_is_
     store(run, "interchange", inside(answers, backbone__00=0.0, backbone__01=0.1))
     rows = {row.category: row for row in retention_table([run]).rows}
     assert used(rows["color"]).behaviour == "used"
-    assert used(rows["color"]).place == "no place that was tried carries half of it"
+    assert used(rows["color"]).where == "no place that was tried carries half of it"
     assert used(rows["shape"]).behaviour == "not used"
 
 
@@ -132,7 +132,7 @@ def test_a_memory_and_a_map_are_read_beside_each_other(run: ArrayRun, is_memory_
     for sites in sorted(both, reverse=not is_memory_last):
         store(run, "interchange", both[sites], sites=sites)
     (row,) = (row for row in retention_table([run]).rows if row.category == "color")
-    assert (used(row).behaviour, used(row).place) == ("used", "passes at backbone.01; read at kv.00")
+    assert (used(row).behaviour, used(row).where) == ("used", "passes at backbone.01; read at kv.00")
     display = SiteEffectDisplay.from_run(run, load_results(run), "color")
     assert display.read is not None
     assert (display.passes["all"].percent.tolist(), display.read.percent.tolist()) == ([100, 100], [100, 0])
@@ -161,7 +161,7 @@ def test_a_direction_alone_is_no_search_and_no_map(run: ArrayRun) -> None:
     along = inside(answers, "|image|mean-difference", backbone__01=0.0)
     store(run, "interchange", along, direction="mean-difference")
     (row,) = (row for row in retention_table([run]).rows if row.category == "color")
-    assert (used(row).behaviour, used(row).place) == ("used", "")
+    assert (used(row).behaviour, used(row).where) == ("used", "")
     assert not any("causes" in exhibit.name for exhibit in collect_figures([run], retention_table([run])))
     with pytest.raises(NoInterventionsError, match="--kind interchange"):
         site_effect_curve(run, load_results(run))

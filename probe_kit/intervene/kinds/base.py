@@ -281,13 +281,13 @@ class ConditionName:
 class EffectRow(Effect):
     """The effect of one edit in one category, with the columns that all kinds of edits have.
 
-    place: sites that were edited. role: of the tokens. direction: empty if they were edited in full. net, net_ci:
+    sites: that were edited. role: of the tokens. direction: empty if they were edited in full. net, net_ci:
     the kind's share of episodes, with its 95 % interval by groups. max_action_change: largest difference in any
     action of any episode; 0 is bit for bit. fires, no_op_fires: of edited sites in all episodes, and those that
     changed nothing. relative_change: how far tokens were moved, in their own norms. key: of the intervention.
     """
 
-    place: str
+    sites: str
     role: str
     direction: str
     is_control: bool
@@ -304,7 +304,7 @@ class EffectRow(Effect):
     @property
     def name(self) -> str:
         """Return the edit in a few words."""
-        return " ".join(filter(None, (self.place, self.role, self.direction)))
+        return " ".join(filter(None, (self.sites, self.role, self.direction)))
 
 
 def common_columns(outcomes: ConditionOutcomes, row: int, name: ConditionName, net: Values) -> dict[str, Any]:
@@ -314,7 +314,7 @@ def common_columns(outcomes: ConditionOutcomes, row: int, name: ConditionName, n
     counts = {column: value for column, value in outcomes.counts.items() if column != "n_groups"}
     return {
         **counts,
-        "place": name.site,
+        "sites": name.site,
         "role": name.role,
         "direction": name.direction,
         "is_control": name.is_control,
@@ -482,5 +482,5 @@ def count_edits(names: Sequence[str], tried: int, most: int = 3) -> str:
 
 def share_of_edits(rows: Sequence[EffectRow], tried: int, subject: str = "edits") -> str:
     """Return `2 of 3 edits, most at backbone.01 image`. rows: with the largest effect first, at least one."""
-    first = f"{rows[0].place} {rows[0].role}".rstrip()
+    first = f"{rows[0].sites} {rows[0].role}".rstrip()
     return f"{len(rows)} of {tried} {subject}, {'most ' * (len(rows) > 1)}at {first}"

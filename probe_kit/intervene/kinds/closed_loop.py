@@ -196,7 +196,7 @@ class ClosedLoop(AlongDirection):
             f"Is it so in closed loop? {context.subject}",
             _LEGEND,
             ("category", "edit"),
-            lines_of(rows, lambda row: "identity patch" if row.place == CLEAN else row.name),
+            lines_of(rows, lambda row: "identity patch" if row.sites == CLEAN else row.name),
             {"Where the cube ends": _ENDS, "Compared with the identity patch": _COMPARED},
             lambda row: row.finding == "confirmed",
         )
@@ -204,7 +204,7 @@ class ClosedLoop(AlongDirection):
     @staticmethod
     def sentence(rows: "Sequence[ClosedLoopEffect]") -> str:
         """Return at which places the cube turns to the other picture."""
-        edits = [row for row in rows if row.place != CLEAN]
+        edits = [row for row in rows if row.sites != CLEAN]
         confirmed = [f"{row.name} {row.net:+.2f}" for row in edits if row.finding == "confirmed"]
         disrupted = [row.name for row in edits if row.finding == "task disrupted"]
         turned = (
@@ -217,7 +217,7 @@ class ClosedLoop(AlongDirection):
     def finding(rows: "Sequence[ClosedLoopEffect]", context: Measurement) -> str:
         """Return whether an edit turns the cube to the other picture, and where."""
         del context
-        edits = [row for row in rows if row.place != CLEAN]
+        edits = [row for row in rows if row.sites != CLEAN]
         confirmed = sorted((row for row in edits if row.finding == "confirmed"), key=lambda row: -row.net)
         if confirmed:
             return f"confirmed: the cube turns to the other picture after {share_of_edits(confirmed, len(edits))}"
@@ -271,7 +271,7 @@ class ClosedLoopEffect(EffectRow):
     @property
     def finding(self) -> Finding:
         """Return `confirmed` if, beyond its controls and chance, enough episodes turn to the other picture."""
-        if self.place == CLEAN:
+        if self.sites == CLEAN:
             return "identity patch"
         if self.disrupted:
             return "task disrupted"
@@ -324,7 +324,7 @@ def closed_loop_effects(outcomes: ConditionOutcomes) -> list[ClosedLoopEffect]:
 
 def _of_edits(text: Callable[[ClosedLoopEffect], str]) -> Callable[[ClosedLoopEffect], str]:
     """Return the text of a cell, but for the identity patch."""
-    return lambda row: "–" if row.place == CLEAN else text(row)
+    return lambda row: "–" if row.sites == CLEAN else text(row)
 
 
 _ENDS: Mapping[str, Any] = {

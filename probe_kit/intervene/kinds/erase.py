@@ -178,7 +178,7 @@ class ConceptErasure(Intervention):
         tried, has_answer = _tried(rows)
         if not has_answer:
             return "the unedited action does not go to the correct picture, so that nothing can be lost"
-        losses = [f"{row.name} keeps {row.kept:.2f}" for row in tried if row.finding == "effect"]
+        losses = [f"{row.name} keeps {row.share_left:.2f}" for row in tried if row.finding == "effect"]
         counts = count_edits(losses, len(tried))
         return f"erasures that take the answer from the action beyond their controls: {counts}"
 
@@ -189,7 +189,7 @@ class ConceptErasure(Intervention):
         tried, has_answer = _tried(rows)
         if not has_answer:
             return "nothing to lose: the unedited action does not go to the correct picture"
-        lost = sorted((row for row in tried if row.finding == "effect"), key=lambda row: row.kept or 0.0)
+        lost = sorted((row for row in tried if row.finding == "effect"), key=lambda row: row.share_left or 0.0)
         if not lost:
             return f"not lost: no erasure of {len(tried)} takes the answer from the action beyond its controls"
         return f"lost: the action leaves the answer after {share_of_edits(lost, len(tried), 'erasures')}"
@@ -274,10 +274,10 @@ class ErasureEffect(EffectRow):
     """The effect on the action of erasing an answer at one place, in one category; see `EffectRow`.
 
     right_before, right: share of episodes whose action goes to the correct picture's side, without and with the
-    edit. kept: of how far actions go to the correct side, the share that is left; None if they do not go there,
-    because a share of noise is noise. net: share of episodes that no longer go there minus those that do now.
-    mean_displacement: metres away from the correct side. control_kept, control_net, control_displacement: means of
-    the controls. p: exact and one-sided, that an item's action moves away from the correct picture farther than
+    edit. share_left: of how far actions go to the correct side; None if they do not go there, because a share of
+    noise is noise. net: share of episodes that no longer go there minus those that do now. mean_displacement:
+    metres away from the correct side. control_share_left, control_net, control_displacement: means of the
+    controls. p: exact and one-sided, that an item's action moves away from the correct picture farther than
     under the controls, by items and by groups, the larger one. p_fwe: of the same, by sign flips of whole groups
     against the largest t of the category. probe_accuracy_before, probe_accuracy: held-out accuracy of a fresh
     probe on the mean over tokens.
@@ -285,9 +285,9 @@ class ErasureEffect(EffectRow):
 
     right_before: float
     right: float
-    kept: float | None
+    share_left: float | None
     mean_displacement: float
-    control_kept: float | None
+    control_share_left: float | None
     control_net: float | None
     control_displacement: float | None
     p: float | None
@@ -302,19 +302,20 @@ class ErasureEffect(EffectRow):
             return "identity patch"
         if self.is_control:
             return "control"
-        if self.kept is None:
+        if self.share_left is None:
             return "no baseline effect"
-        control_share = 1.0 if self.control_kept is None else self.control_kept
+        control_share = 1.0 if self.control_share_left is None else self.control_share_left
         if control_share < LOCALISATION_SHARE:
             return "controls also disrupt"
-        beyond = self.p is not None and self.p < SIGNIFICANCE
-        return "effect" if beyond and control_share - self.kept >= SMALLEST_EFFECT_OF_INTEREST else "no effect"
+        is_significant = self.p is not None and self.p < SIGNIFICANCE
+        is_large = control_share - self.share_left >= SMALLEST_EFFECT_OF_INTEREST
+        return "effect" if is_significant and is_large else "no effect"
 
     @property
     def name(self) -> str:
         """Return the edit in a few words."""
         what = "identity patch" if self.direction == UNTOUCHED else self.direction
-        return " ".join((self.place, self.role, what))
+        return " ".join((self.sites, self.role, what))
 
     def to_json(self) -> dict[str, Any]:
         """Plain values and the finding."""
@@ -344,9 +345,9 @@ def erasure_effects(
                 **common_columns(outcomes, outcomes.conditions.index(condition), name, net[at]),
                 right_before=float((clean > 0).mean()),
                 right=float((values[at] > 0).mean()),
-                kept=None if share is None else float(share[at]),
+                share_left=None if share is None else float(share[at]),
                 mean_displacement=float(away[at].mean()),
-                control_kept=None if share is None else mean_of(share[test.controls]),
+                control_share_left=None if share is None else mean_of(share[test.controls]),
                 control_net=mean_of(net.mean(axis=1)[test.controls]),
                 control_displacement=mean_of(away.mean(axis=1)[test.controls]),
                 p=None if test.beyond is None else paired_greater_p(test.beyond, outcomes.items, outcomes.groups),
@@ -373,8 +374,8 @@ def _accuracies(row: ErasureEffect) -> str:
 _ACTION: Mapping[str, Any] = {
     "goes there %": lambda row: f"{percent(row.right_before)} → {percent(row.right)}",
     "controls %": lambda row: percent(None if row.control_net is None else row.right_before - row.control_net),
-    "kept": lambda row: "n/a" if row.kept is None else number(row.kept),
-    "controls": lambda row: number(row.control_kept),
+    "kept": lambda row: "n/a" if row.share_left is None else number(row.share_left),
+    "controls": lambda row: number(row.control_share_left),
     "displacement cm": lambda row: f"{-100 * row.mean_displacement:+.2f}",
     "p": lambda row: p_of(row.p),
     "relative change": lambda row: f"{row.relative_change:.2f}",

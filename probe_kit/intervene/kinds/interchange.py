@@ -121,7 +121,7 @@ class PatchEffect(EffectRow):
 
         The first layer of the backbone holds the swapped images themselves, and the acting stream the action.
         """
-        parsed = PlaceName.parse(self.place)
+        parsed = PlaceName.parse(self.sites)
         is_first = parsed.stream == BACKBONE and parsed.layer == 0 and parsed.quantity in ("", RESIDUAL)
         return parsed.stream not in (BACKBONE, KV_STREAM) or is_first
 
@@ -230,18 +230,18 @@ def localised_sites(rows: Sequence[PatchEffect]) -> tuple[str, ...]:
     """
     localised = [row for row in rows if row.is_localised and not row.direction and not row.is_by_construction]
     read = KV_STREAM + "."
-    by_role = {row.place for row in localised if row.role != ALL and row.place.startswith(read)}
+    by_role = {row.sites for row in localised if row.role != ALL and row.sites.startswith(read)}
     names = [
-        row.name if row.place in by_role else row.place
+        row.name if row.sites in by_role else row.sites
         for row in localised
-        if row.place not in by_role or row.role != ALL
+        if row.sites not in by_role or row.role != ALL
     ]
     return tuple(dict.fromkeys(names))
 
 
 def is_backbone_layer(row: PatchEffect) -> bool:
     """Whether the backbone's stream itself was patched, not a part of a block such as one head."""
-    name = PlaceName.parse(row.place)
+    name = PlaceName.parse(row.sites)
     return name.stream == BACKBONE and name.is_whole_layer
 
 
@@ -266,7 +266,7 @@ def carrying_directions(along: Mapping[str, Sequence[PatchEffect]]) -> dict[str,
     """
     return {
         category: tuple(
-            f"{row.direction} at {row.place} {row.role}"
+            f"{row.direction} at {row.sites} {row.role}"
             for row in rows
             if row.is_localised and row.control_displacement is not None
         )
@@ -359,7 +359,7 @@ def best_patch_targets(run: RunReader, categories: Sequence[str]) -> tuple[str, 
     """
     stored = stored_site_effects(run)
     best = [best_cell(stored.get(category, [])) for category in categories]
-    cells = tuple(dict.fromkeys(str(ConditionName(cell.place, cell.role)) for cell in best if cell is not None))
+    cells = tuple(dict.fromkeys(str(ConditionName(cell.sites, cell.role)) for cell in best if cell is not None))
     if not cells:
         raise UsageError(
             f"no stored interchange of {run.location} located a place of {', '.join(categories)}: run "
@@ -374,7 +374,7 @@ def best_cell(rows: Sequence[PatchEffect]) -> PatchEffect | None:
     if not located:
         return None
     deepest = ([row for row in located if is_backbone_layer(row)] or located)[-1]
-    last = [row for row in located if row.place == deepest.place]
+    last = [row for row in located if row.sites == deepest.sites]
     return max(last, key=lambda row: (row.role != ALL, row.effect or 0.0))
 
 
@@ -433,7 +433,7 @@ class PatchKind(AlongDirection):
             f"Where is it used? {context.subject}, {context.kind}",
             context.in_words(_LEGEND),
             ("category", "edit"),
-            lines_of(edits, lambda row: f"{row.name}{' (unread)' * (row.place in unread)}"),
+            lines_of(edits, lambda row: f"{row.name}{' (unread)' * (row.sites in unread)}"),
             {"What the action does": _WITHOUT_SIDES if context.lacks_sides else _COLUMNS},
             lambda row: row.is_localised and not row.is_by_construction,
         )

@@ -58,7 +58,7 @@ FIRST = 3
 class AttributionEffect(Effect):
     """One cell in one category.
 
-    place, role: of its tokens. is_anchor: a complete cut, patched exactly to test the screen. is_drawn: patched
+    sites, role: of its tokens. is_anchor: a complete cut, patched exactly to test the screen. is_drawn: patched
     exactly although its estimate was not among the largest. estimate, exact: shares of the image swap with 95 %
     intervals by groups, None where the swap itself is not significant or no exact patch was made. p_fwe: of the
     exact patch, one-sided, max-T over those of the category. rank: by estimate among the cells of its kind, 1 for
@@ -66,7 +66,7 @@ class AttributionEffect(Effect):
     anchor carries the effect.
     """
 
-    place: str
+    sites: str
     role: str
     is_anchor: bool
     is_drawn: bool
@@ -83,13 +83,13 @@ class AttributionEffect(Effect):
 
     @property
     def name(self) -> str:
-        """Return place and role."""
-        return f"{self.place} {self.role}"
+        """Return sites and role."""
+        return f"{self.sites} {self.role}"
 
     @property
     def kind(self) -> str:
         """Return the kind of cells that it is ordered among; empty for an anchor."""
-        return "" if self.is_anchor else kind_of_place(self.place)
+        return "" if self.is_anchor else kind_of_place(self.sites)
 
 
 # -- estimates -----------------------------------------------------------------------------------------------
@@ -228,7 +228,7 @@ def screen_rows(
     rows = [
         AttributionEffect(
             category=category,
-            place=cell[0],
+            sites=cell[0],
             role=cell[1],
             is_anchor=cell in anchors,
             is_drawn=cell in drawn,

@@ -125,7 +125,7 @@ def shown_passing(run: RunReader) -> dict[str, list[PatchEffect]]:
         category: [
             row
             for row in rows
-            if PlaceName.parse(row.place).is_whole_layer
+            if PlaceName.parse(row.sites).is_whole_layer
             and (_stream(row) == BACKBONE or (_stream(row) == KV_STREAM and row.role == ALL))
         ]
         for category, rows in stored_site_effects(run).items()
@@ -142,14 +142,14 @@ def site_effect_curve(run: RunReader, results: ProbeResults, view: str = "mean")
 
 def _points(rows: Sequence[PatchEffect]) -> Points:
     return Points(
-        np.array([PlaceName.parse(row.place).layer for row in rows], np.int64),
+        np.array([PlaceName.parse(row.sites).layer for row in rows], np.int64),
         np.array([100 * row.net for row in rows]),
         np.array([row.p_fwe is not None and row.p_fwe < SIGNIFICANCE for row in rows], bool),
     )
 
 
 def _stream(row: PatchEffect) -> str:
-    return PlaceName.parse(row.place).stream
+    return PlaceName.parse(row.sites).stream
 
 
 @in_report(13)

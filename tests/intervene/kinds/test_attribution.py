@@ -58,7 +58,7 @@ def test_what_is_read_linearly_is_ranked_first_and_its_estimate_is_the_effect(wi
     assert (anchor.is_anchor, anchor.rank) == (True, None)
     assert anchor.estimate == pytest.approx(anchor.exact, abs=0.02)
     assert rows["backbone.01 language"].estimate == pytest.approx(1.0, abs=0.02)
-    assert all(abs(row.estimate or 0) < 0.02 for row in rows.values() if row.place in ("kv.00", "kv.02"))
+    assert all(abs(row.estimate or 0) < 0.02 for row in rows.values() if row.sites in ("kv.00", "kv.02"))
     (sentence,) = AttributionPatching.sentences(list(rows.values()), said_of(found))
     assert sentence.startswith("Copied: gradients give 1.0")
     assert "; first of kv: kv.01 language 1.0" in sentence
@@ -142,7 +142,7 @@ def test_a_screen_is_stored_with_the_run_and_enters_no_verdict(
     asked = AttributionPatching(categories=("color",), items=1, sites=("kv.*", "backbone.01"))
     found = run_intervention(copy, asked, source, load=lambda *_: twin)
     assert load_effects(copy, kind="attribution").to_csv() == found.to_csv()
-    assert {row.place for row in found.effects} == {"kv.*", "kv.00", "kv.01", "kv.02", "backbone.01"}
+    assert {row.sites for row in found.effects} == {"kv.*", "kv.00", "kv.01", "kv.02", "backbone.01"}
     assert verdicts_of(copy) == before
     assert found.certificate["edits"][f"{EXACT}|kv.02|image"]["fires"] > 0
 

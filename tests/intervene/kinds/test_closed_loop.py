@@ -137,7 +137,7 @@ def test_stored_answers_come_back_with_outcomes_and_without() -> None:
 
 def place(name: str, role: str, effect: float, p: float = 0.001) -> PatchEffect:
     return PatchEffect(
-        category="color", place=name, role=role, direction="", coefficient="", is_control=False,
+        category="color", sites=name, role=role, direction="", coefficient="", is_control=False,
         n_episodes=8, n_items=4,
         effect=effect, effect_ci=(effect, effect), net=0.0, net_ci=(0.0, 0.0), net_left=0.0, net_right=0.0,
         mean_displacement=0.0, control_displacement=None,
@@ -151,7 +151,7 @@ def test_the_best_cell_is_the_last_located_place_in_its_narrowest_role() -> None
         place("backbone.02", "language", 0.1), place("backbone.03", "all", 0.0, 1.0),
     ]  # fmt: skip
     cells = [best_cell(rows), best_cell(rows[:2])]
-    assert [cell and (cell.place, cell.role) for cell in cells] == [
+    assert [cell and (cell.sites, cell.role) for cell in cells] == [
         ("backbone.02", "image"),
         ("backbone.02", "all"),
     ]
@@ -192,7 +192,7 @@ def effects(run: Run, source: ReplaySource, twin: "Policy") -> InterventionResul
 
 
 def row_of(effects: InterventionResult, place: str, direction: str = "") -> dict[str, object]:
-    (row,) = (row for row in effects.effects if (row.place, row.direction) == (place, direction))
+    (row,) = (row for row in effects.effects if (row.sites, row.direction) == (place, direction))
     return row.to_json()
 
 

@@ -49,7 +49,7 @@ def effects(copy: Run, source: ReplaySource, twin: "Policy") -> InterventionResu
 
 
 def row_of(effects: InterventionResult, place: str, direction: str) -> ErasureEffect:
-    (row,) = (row for row in effects.effects if (row.place, row.direction) == (place, direction))
+    (row,) = (row for row in effects.effects if (row.sites, row.direction) == (place, direction))
     return row
 
 
@@ -98,7 +98,7 @@ def test_it_is_stored_apart_from_other_kinds_and_read_back(copy: Run, effects: I
     assert verify_run(copy.path, deep=True).ok
     assert "weaker evidence than interchange" in " ".join(effects.notes)
     stored = (copy.path / "interventions" / effects.key / "effects.csv").read_text(encoding="utf-8")
-    assert stored.splitlines()[0].split(",")[:4] == ["category", "place", "role", "direction"]
+    assert stored.splitlines()[0].split(",")[:4] == ["category", "sites", "role", "direction"]
 
 
 @pytest.mark.slow
@@ -154,10 +154,10 @@ def test_what_is_lost_is_lost_beyond_the_controls(own: float, beside: float, bas
     assert row.finding == finding
     assert [one.finding for one in controls] == ["control", "control"]
     if finding == "no baseline effect":
-        assert row.kept is None
+        assert row.share_left is None
         return
-    assert row.kept == pytest.approx(own)
-    assert row.control_kept == pytest.approx(beside)
+    assert row.share_left == pytest.approx(own)
+    assert row.control_share_left == pytest.approx(beside)
     assert row.p is not None
     # Twelve items with the same sign: the smallest possible p.
     assert row.p == 2.0**-12

@@ -106,7 +106,7 @@ def test_what_every_block_hands_over_is_a_place_and_all_of_it_is_the_exchange(
     effects = run_intervention(copy, intervention, source, load=lambda *_: twin)
     assert twin.prompt_kv is not None
     blocks = twin.prompt_kv.layers - 1
-    assert {row.place for row in effects.effects} == {f"kv.{block:02d}" for block in range(blocks)}
+    assert {row.sites for row in effects.effects} == {f"kv.{block:02d}" for block in range(blocks)}
     for name, said in effects.certificate["edits"].items():
         assert said["fires"] == 2 * 2, name  # keys and values, in two episodes
     words = effects.certificate["edits"]["kv.00|language"]

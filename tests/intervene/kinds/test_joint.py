@@ -139,11 +139,11 @@ def test_heads_of_one_block_are_cells_and_no_search_of_the_backbone(
         jointly.of("alone|backbone.01.heads.3|image"), singly.of("backbone.01.heads.3|image")
     )
     rows = stored_site_effects(copy)["color"]
-    assert [row.place for row in rows if row.role == "image" and "heads" in row.place] == [
+    assert [row.sites for row in rows if row.role == "image" and "heads" in row.sites] == [
         "backbone.01.heads.2",
         "backbone.01.heads.3",
     ]
-    assert not any(row.is_by_construction for row in rows if "heads" in row.place)
+    assert not any(row.is_by_construction for row in rows if "heads" in row.sites)
     assert "color" not in localised_by_category(stored_site_effects(copy)), (
         "heads alone are no search of the backbone"
     )

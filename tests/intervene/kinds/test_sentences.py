@@ -89,7 +89,7 @@ COMMON: dict[str, Any] = {
 
 def patch(place: str, effect: float | None, p: float, centimetres: float = 3.0) -> PatchEffect:
     return PatchEffect(
-        **COMMON, place=place, coefficient="", effect=effect, effect_ci=None, net=0.4, net_left=0.4, net_right=0.4,
+        **COMMON, sites=place, coefficient="", effect=effect, effect_ci=None, net=0.4, net_left=0.4, net_right=0.4,
         mean_displacement=centimetres / 100, control_displacement=None, t=2.0, p=p, p_fwe=p,
     )  # fmt: skip
 
@@ -147,7 +147,7 @@ def test_a_category_of_any_name_stays_in_its_own_column(category: str, title: st
 
 def closed_loop(place: str, net: float, p: float | None, disrupted: bool = False) -> ClosedLoopEffect:
     return ClosedLoopEffect(
-        **COMMON, place=place, correct=0.5, wrong=0.5, in_zone=1.0, wrong_in_zone=0.5, net=net, net_left=net,
+        **COMMON, sites=place, correct=0.5, wrong=0.5, in_zone=1.0, wrong_in_zone=0.5, net=net, net_left=net,
         net_right=net, control_net=0.0, gained=1, lost=0, p_mcnemar=0.1, t=1.0, p=p, p_fwe=p, disrupted=disrupted,
     )  # fmt: skip
 
@@ -167,9 +167,9 @@ def test_closed_loops_say_what_is_confirmed_and_what_disrupts_the_task() -> None
 def erasure(kept: float | None, p: float) -> ErasureEffect:
     common = COMMON | {"direction": "leace"}
     return ErasureEffect(
-        **common, place="backbone.02", right_before=1.0, right=0.5, kept=kept, net=0.5, mean_displacement=0.1,
-        control_kept=0.9, control_net=0.0, control_displacement=0.0, p=p, p_fwe=p, probe_accuracy_before=1.0,
-        probe_accuracy=0.5,
+        **common, sites="backbone.02", right_before=1.0, right=0.5, share_left=kept, net=0.5,
+        mean_displacement=0.1, control_share_left=0.9, control_net=0.0, control_displacement=0.0, p=p, p_fwe=p,
+        probe_accuracy_before=1.0, probe_accuracy=0.5,
     )  # fmt: skip
 
 
@@ -217,7 +217,7 @@ def input_row(changed: float, share: float | None, finding: Finding) -> InputEff
 
 def anchor(estimate: float, finding: str, exact: float = 1.0) -> AttributionEffect:
     return AttributionEffect(
-        category="public-info", place="kv.*", role="all", is_anchor=True, is_drawn=False, n_episodes=48,
+        category="public-info", sites="kv.*", role="all", is_anchor=True, is_drawn=False, n_episodes=48,
         n_groups=12, estimate=estimate, estimate_ci=None, exact=exact, exact_ci=None, p_fwe=0.01, finding=finding,
     )  # fmt: skip
 
@@ -329,7 +329,7 @@ FINDINGS: list[tuple[type[Intervention], Sequence[Any], str]] = [
     ),
     (
         AttributionPatching,
-        [anchor(0.9, "anchored"), replace(anchor(0.7, "anchored"), place="kv.01", is_anchor=False, rank=1)],
+        [anchor(0.9, "anchored"), replace(anchor(0.7, "anchored"), sites="kv.01", is_anchor=False, rank=1)],
         "ordered: gradients agree with patches; kv.01 all comes first with 0.70 of the effect.",
     ),
 ]

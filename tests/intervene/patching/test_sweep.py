@@ -43,7 +43,7 @@ def test_a_sweep_gives_the_numbers_of_the_interchange(copied: pt.Sweep, wired: W
     stored = outcomes_of(wired, ["copied"], [patch_of(own, sites) for own in cells])
     rows = copied.table.iloc[chosen].iterrows()
     for at, (effect, (row, own)) in enumerate(zip(patches_of(stored, "suite"), rows, strict=True)):
-        assert f"{effect.place} {effect.role}" == own["cells"]
+        assert f"{effect.sites} {effect.role}" == own["cells"]
         assert own["share"] == pytest.approx(effect.effect, abs=1e-9)
         assert own["moved"] == pytest.approx(effect.mean_displacement, abs=1e-9)
         np.testing.assert_array_equal(copied.patched[row], stored.displacement[2 + at])

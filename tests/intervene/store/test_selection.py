@@ -221,12 +221,12 @@ def test_every_quantity_is_of_what_it_is_about(run: ArrayRun) -> None:
     seen = read(run)
     verdict = seen["verdicts"]["color"]
     assert verdict.behaviour == "used"
-    assert verdict.place == (
+    assert verdict.where == (
         "passes at backbone.02; read at kv.02; carried by mean-difference at backbone.02 image"
     )
     assert seen["verdicts"]["shape"].behaviour == "not used"
     assert (seen["follows"]["color"].follow_rate, seen["follows"]["color"].n_episodes) == (1.0, MANY)
-    cells = [(row.place, row.role, row.net) for row in seen["maps"]["color"]]
+    cells = [(row.sites, row.role, row.net) for row in seen["maps"]["color"]]
     assert cells == [
         ("backbone.00", "all", 1.0), ("backbone.00", "image", 1.0), ("backbone.02", "all", 1.0),
         ("backbone.02", "image", 1.0), ("backbone.02", "image.left", 0.0), ("backbone.10", "all", 0.0),
