@@ -30,8 +30,8 @@ from threadpoolctl import threadpool_limits
 from probe_kit.statistics.folds import INNER_FOLDS, OUTER_FOLDS
 from probe_kit.statistics.label_permutations import flip_items
 from probe_kit.train.crossval import logistic_folds as probe
-from probe_kit.train.crossval.joint import can_be_joint, cross_validate_jointly, labels_at_once
 from probe_kit.train.crossval.joint_objective import JointProblems, JointSite, NewtonState
+from probe_kit.train.crossval.logistic_folds import can_be_joint, cross_validate_jointly, labels_at_once
 from probe_kit.train.crossval.nested_folds import (
     STRENGTHS,
     FittedFold,

@@ -24,7 +24,7 @@ from probe_kit.statistics.folds import SHARED_TRAINING, stratified_folds
 from probe_kit.statistics.paired_tests import SHARED_PROBE, better_than_best, better_than_reference
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.crossval.nested_folds import nested_folds
-from probe_kit.train.crossval.site_probe import probe_labels
+from probe_kit.train.crossval.site_probe import probe_site
 from probe_kit.train.crossval.task_scores import squared_deviations
 from probe_kit.train.samples import Samples
 
@@ -86,7 +86,7 @@ def draw(world: LabelWorld, seed: int) -> tuple[float, tuple[float, float], bool
     labels, group_of = world.labels(generator)
     folds = nested_folds(np.zeros(labels.size), group_of, seed, stratified_folds)
     here, there = (
-        probe_labels(Samples.pooled(features), labels[:, None], "continuous", folds).scores
+        probe_site(Samples.pooled(features), labels, np.empty((labels.size, 0)), folds, "continuous").scores
         for features in (world.features(labels, group_of, generator) for _ in range(2))
     )
     deviations = squared_deviations(labels, [fold.outer for fold in folds])

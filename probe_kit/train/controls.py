@@ -10,7 +10,6 @@ import numpy as np
 
 from probe_kit.errors import SuiteNotFoundError, UsageError
 from probe_kit.hashing import derive_seed
-from probe_kit.hooks.contract.sites import Site
 from probe_kit.runs.layout import DATASET
 from probe_kit.runs.reader import RunReader, full_name
 from probe_kit.statistics.intervals import Accuracy
@@ -83,7 +82,7 @@ def prepare_controls(
     left_out = {name: reasons[name] for name in ordered if name in reasons}
     missing = [name for name in ordered if name not in reasons and not stored.has(name, categories)]
     suite = None
-    if PICTURED.intersection(missing).difference(array_features) and run.inputs is None:
+    if (PICTURED & set(missing)) - set(array_features) and run.inputs is None:
         try:
             suite = suite_of(run, folder)
         except SuiteNotFoundError as error:
@@ -121,7 +120,7 @@ def add_controls(
         for category, problem in problems.items():
             if features is None:
                 references = {
-                    stream: _controlled(problem, _layer_probes(prepared.inputs, problem, width, seed))
+                    stream: problem.control_curve(_layer_probes(prepared.inputs, problem, width, seed))
                     for stream, width in widths.items()
                 }
                 # Of a side one score, as wide as the backbone.
@@ -129,7 +128,7 @@ def add_controls(
                 if problem.is_side:
                     scored = {"": references.get("backbone", next(iter(references.values())))}
             else:
-                reference = _controlled(problem, [problem.probe(features)])
+                reference = problem.control_curve([problem.probe(features)])
                 references, scored = dict.fromkeys(widths, reference), {"": reference}
             scores = [control_score(name, category, curve, stream) for stream, curve in scored.items()]
             compared: list[ControlComparison] = []
@@ -142,11 +141,6 @@ def add_controls(
                 ]
             controls = controls.with_scores(scores, compared)
     return replace(results, controls=controls)
-
-
-def _controlled(problem: Problem, probes: Sequence[SiteProbe]) -> ProbeCurve:
-    """Return the curve of the probes of a control, of sites that stand for none."""
-    return problem.curve({Site("control", number): probe for number, probe in enumerate(probes)})
 
 
 def _layer_probes(inputs: ControlInputs, problem: Problem, width: int, seed: int) -> list[SiteProbe]:

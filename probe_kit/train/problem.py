@@ -1,7 +1,7 @@
 """The probing problem of a category: samples, labels, folds, label permutations."""
 
 import warnings
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -25,7 +25,7 @@ from probe_kit.statistics.label_permutations import (
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.choices import EVERYWHERE, Task
 from probe_kit.train.crossval.nested_folds import Matrix, NestedFold, nested_folds
-from probe_kit.train.crossval.site_probe import SiteProbe, probe_labels, probe_site
+from probe_kit.train.crossval.site_probe import SiteProbe, probe_site
 from probe_kit.train.crossval.task_scores import chance_level
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeSettings
@@ -82,9 +82,7 @@ class Problem:
     def fit(self, samples: Samples, permuted_labels: NDArray[Any] | None = None) -> SiteProbe:
         """Probe the samples of this category, and again for every column of (E, P) permuted labels."""
         permuted = self.permuted_labels[:, :0] if permuted_labels is None else permuted_labels
-        if self.is_side:
-            return probe_site(samples, self.labels, permuted, self.folds)
-        return probe_labels(samples, np.column_stack([self.labels, permuted]), self.task, self.folds)
+        return probe_site(samples, self.labels, permuted, self.folds, None if self.is_side else self.task)
 
     def curve(self, probes: Mapping[Site, SiteProbe], parts: tuple[str, ...] = ()) -> ProbeCurve:
         """Return the curve of the probes of some sites, in order."""
@@ -112,6 +110,10 @@ class Problem:
             if self.is_side
             else smallest_p_of_labels(self.labels, self.permuted_labels[:, : fitted[0].null.size]),
         )
+
+    def control_curve(self, probes: Sequence[SiteProbe]) -> ProbeCurve:
+        """Return the curve of the probes of a control, at sites that stand for none."""
+        return self.curve({Site("control", number): probe for number, probe in enumerate(probes)})
 
 
 def make_problem(

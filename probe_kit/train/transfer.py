@@ -20,7 +20,7 @@ from probe_kit.statistics.label_permutations import p_value
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.train.choices import EVERYWHERE, Task
 from probe_kit.train.crossval.nested_folds import NestedFold
-from probe_kit.train.crossval.site_probe import SiteProbe, predict_once, probe_labels
+from probe_kit.train.crossval.site_probe import SiteProbe, predict_once, probe_site
 from probe_kit.train.crossval.task_scores import METRICS, balanced_scores, score_interval
 from probe_kit.train.probe_sweep import (
     TOKEN_PERMUTATIONS,
@@ -338,7 +338,7 @@ def _transfer(
     fitted, recentred = (
         _scored(predictions, truth, test.task, strength) for predictions in np.split(predicted, [other_count])
     )
-    return (fitted, recentred), probe_labels(other_samples, truth[:, :1], test.task, test.folds).scores
+    return (fitted, recentred), probe_site(other_samples, truth[:, 0], truth[:, 1:1], test.folds, test.task).scores
 
 
 def _recentred(samples_to_move: Samples, run_samples: Samples) -> Samples:

@@ -12,13 +12,16 @@ from sklearn.preprocessing import StandardScaler
 
 from probe_kit.errors import ProbeNotConvergedError
 from probe_kit.statistics.label_permutations import flip_items
-from probe_kit.train.crossval import joint as joint_probe
 from probe_kit.train.crossval import joint_objective as joint_site
 from probe_kit.train.crossval import joint_objective as mixed
 from probe_kit.train.crossval import logistic_folds as probe
-from probe_kit.train.crossval.joint import can_be_joint, cross_validate_jointly, labels_at_once
 from probe_kit.train.crossval.joint_objective import JointProblems, JointSite, NewtonState, training_sets
-from probe_kit.train.crossval.logistic_folds import cross_validate
+from probe_kit.train.crossval.logistic_folds import (
+    can_be_joint,
+    cross_validate,
+    cross_validate_jointly,
+    labels_at_once,
+)
 from probe_kit.train.crossval.nested_folds import STRENGTHS, FittedFold, nested_folds
 from probe_kit.train.samples import Samples
 from probe_kit.train.solver.arrays import Array, RowSubset
@@ -37,7 +40,7 @@ NOISE = GENERATOR.standard_normal((COUNTS.sum(), 12)) + OF_EPISODE
 @pytest.fixture(autouse=True)
 def narrow_sites_too(monkeypatch: pytest.MonkeyPatch) -> None:
     """The matrices here are tiny."""
-    monkeypatch.setattr(joint_probe, "LEAST_WIDTH", 1)
+    monkeypatch.setattr(probe, "LEAST_WIDTH", 1)
 
 
 class Evaluated(JointProblems):
@@ -118,7 +121,7 @@ def test_many_columns_are_solved_on_axes_of_their_own_where_these_fit_into_memor
     samples = tokens(np.zeros((COUNTS.sum(), 100)))
     assert can_be_joint(samples, 12)
     assert not can_be_joint(samples, 13)
-    monkeypatch.setattr(joint_probe, "IN_MEMORY", 8 * 100 * (3 * int(COUNTS.sum()) // 5) - 1)
+    monkeypatch.setattr(probe, "IN_MEMORY", 8 * 100 * (3 * int(COUNTS.sum()) // 5) - 1)
     assert can_be_joint(samples, 60)
 
 
@@ -198,7 +201,7 @@ def test_permuted_labels_are_solved_in_parts_that_fit_into_memory(monkeypatch: p
     site = JointSite.of(samples, FOLDS)
     many = np.column_stack([LABELS, flip_items(LABELS, ITEMS, 6, seed=1)])
     at_once = cross_validate_jointly(site, samples, many, FOLDS)
-    monkeypatch.setattr(joint_probe, "COLUMN_MEMORY", 20 * 7 * 3 * (12 * int(COUNTS.sum()) + 128 * 13))
+    monkeypatch.setattr(probe, "COLUMN_MEMORY", 20 * 7 * 3 * (12 * int(COUNTS.sum()) + 128 * 13))
     assert labels_at_once(site, FOLDS) == 3
     assert_same(cross_validate_jointly(site, samples, many, FOLDS), at_once)
 
@@ -213,8 +216,8 @@ def test_c_is_solved_in_parts_where_one_column_of_labels_does_not_fit(monkeypatc
         sizes.append(len(problems))
         return mixed.solve(problems, start)
 
-    monkeypatch.setattr(joint_probe, "solve", solve)
-    monkeypatch.setattr(joint_probe, "COLUMN_MEMORY", 20 * 3 * (12 * int(COUNTS.sum()) + 128 * 13))
+    monkeypatch.setattr(probe, "solve", solve)
+    monkeypatch.setattr(probe, "COLUMN_MEMORY", 20 * 3 * (12 * int(COUNTS.sum()) + 128 * 13))
     assert_same(cross_validate_jointly(site, samples, COLUMNS, FOLDS), at_once)
     assert sizes == [60, 60, 20, 5] * 3  # C by threes, then the outer folds, for every column of labels
 
@@ -226,8 +229,8 @@ def test_59_permuted_labels_of_many_tokens_stay_within_the_stated_memory(monkeyp
     features = np.random.default_rng(1).standard_normal((9000, 8), dtype=np.float32)
     samples = Samples(RowSubset.all(features), counts, features.reshape(60, 150, 8).mean(axis=1, dtype=float))
     many = np.column_stack([LABELS, flip_items(LABELS, ITEMS, 59, seed=1)])
-    monkeypatch.setattr(joint_probe, "COLUMN_MEMORY", 2**23)
-    monkeypatch.setattr(joint_probe, "STRENGTHS", np.array([1e-3]))
+    monkeypatch.setattr(probe, "COLUMN_MEMORY", 2**23)
+    monkeypatch.setattr(probe, "STRENGTHS", np.array([1e-3]))
     monkeypatch.setattr(joint_site, "ROWS_PER_BLOCK", 128)
     tracemalloc.start()
     try:

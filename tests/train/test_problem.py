@@ -17,7 +17,7 @@ from probe_kit.statistics.label_permutations import flip_groups, max_statistic_p
 from probe_kit.train import ArrayRun, Target
 from probe_kit.train.choices import TASKS, Task
 from probe_kit.train.crossval.nested_folds import STRENGTHS, nested_folds
-from probe_kit.train.crossval.site_probe import probe_labels, probe_site
+from probe_kit.train.crossval.site_probe import probe_site
 from probe_kit.train.crossval.task_scores import correctness
 from probe_kit.train.problem import Problem, make_problem
 from probe_kit.train.samples import Samples
@@ -196,12 +196,14 @@ def test_a_trend_over_the_episode_is_read_and_is_no_signal() -> None:
     draw = np.random.default_rng(1)
     problem = label_problem_of(trend_and_noise(draw), 19)
     features = FRAME[:, None] + 0.1 * draw.normal(size=(GROUP.size, 4))
-    probe = probe_labels(Samples.pooled(features), columns_of(problem), "continuous", problem.folds)
+    probe = probe_site(
+        Samples.pooled(features), problem.labels, problem.permuted_labels, problem.folds, "continuous"
+    )
     assert probe.scores.mean() > 0.2, "the label can be predicted from the step"
     assert probe.null.mean() > 0.2, "so chance is not 0"
     assert p_value(np.array([probe.scores.mean()]), probe.null[None, :])[0] > 0.05
     free = np.column_stack([problem.labels, *(draw.permutation(problem.labels) for _ in range(19))])
-    shuffled = probe_labels(Samples.pooled(features), free, "continuous", problem.folds)
+    shuffled = probe_site(Samples.pooled(features), free[:, 0], free[:, 1:], problem.folds, "continuous")
     assert p_value(np.array([shuffled.scores.mean()]), shuffled.null[None, :])[0] == 0.05, (
         "as a null of frames has it"
     )
@@ -217,8 +219,10 @@ def test_the_score_of_a_labelling_does_not_depend_on_its_place_among_the_permuta
         values = np.digitize(values, np.quantile(values, levels)).astype(np.float64)
     problem = label_problem_of(values, 5, task=task)
     features = draw.normal(size=(GROUP.size, 4))
-    probe = probe_labels(Samples.pooled(features), columns_of(problem), task, problem.folds)
-    turned = probe_labels(Samples.pooled(features), np.roll(columns_of(problem), 1, axis=1), task, problem.folds)
+    probe = problem.fit(Samples.pooled(features), problem.permuted_labels)
+    first = problem.permuted_labels[:, -1]
+    others = np.column_stack([problem.labels, problem.permuted_labels[:, :-1]])
+    turned = probe_site(Samples.pooled(features), first, others, problem.folds, task)
     expected = np.roll([probe.scores.mean(), *probe.null], 1)
     np.testing.assert_allclose([turned.scores.mean(), *turned.null], expected, rtol=0, atol=1e-12)
 
@@ -237,7 +241,9 @@ def test_labels_that_know_nothing_are_found_in_five_of_a_hundred(kind: str) -> N
         of_group = draw.normal(size=(GROUPS, 4))[GROUP]
         features = of_group + FRAME[:, None] + draw.normal(size=(GROUP.size, 4))
         problem = label_problem_of(values, 39)
-        probe = probe_labels(Samples.pooled(features), columns_of(problem), "continuous", problem.folds)
+        probe = probe_site(
+            Samples.pooled(features), problem.labels, problem.permuted_labels, problem.folds, "continuous"
+        )
         found += int(p_value(np.array([probe.scores.mean()]), probe.null[None, :])[0] <= 0.05)
     assert found <= 12, "five are expected; 13 or more have a chance of 0.0015"
 

@@ -23,7 +23,7 @@ from probe_kit.statistics.label_permutations import flip_items
 from probe_kit.train.crossval import logistic_folds as small_probe
 from probe_kit.train.crossval.logistic_folds import cross_validate
 from probe_kit.train.crossval.nested_folds import STRENGTHS, FittedFold, NestedFold, nested_folds
-from probe_kit.train.crossval.site_probe import PENALTIES, probe_labels, probe_site
+from probe_kit.train.crossval.site_probe import PENALTIES, probe_site
 from probe_kit.train.crossval.task_scores import chance_level, explained_scores, fold_auc, log_loss
 from probe_kit.train.samples import Samples
 
@@ -287,7 +287,7 @@ def study(groups: int, width: int, columns: int, seed: int) -> tuple[np.ndarray,
 
 def one_after_another(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> list[FittedFold]:
     with monkeypatch.context() as patch:
-        patch.setattr(small_probe, "FEW_COLUMNS", 0)
+        patch.setattr(small_probe, "STACKED_COLUMNS", 0)
         return cross_validate(*arguments)  # type: ignore[arg-type]
 
 
@@ -433,7 +433,7 @@ def mean_log_loss(truth: NDArray[np.float64], decisions: NDArray[np.float64]) ->
 def test_a_continuous_label_is_predicted_as_by_scikit_learn() -> None:
     x, columns = problem("continuous")
     columns = columns[:, :2]
-    probe = probe_labels(Samples.pooled(x), columns, "continuous", nested(GROUPS))
+    probe = probe_site(Samples.pooled(x), columns[:, 0], columns[:, 1:], nested(GROUPS), "continuous")
     grid = sorted(PENALTIES.tolist(), reverse=True)
     found = [by_scikit_learn(x, column, clipped_ridge, grid, squares) for column in columns.T]
     np.testing.assert_allclose(probe.decisions, found[0], atol=1e-10)
@@ -446,7 +446,7 @@ def test_a_continuous_label_is_predicted_as_by_scikit_learn() -> None:
 def test_classes_are_predicted_as_by_scikit_learn() -> None:
     x, columns = problem("classes")
     columns = columns[:, :2]
-    probe = probe_labels(Samples.pooled(x), columns, "classes", nested(GROUPS))
+    probe = probe_site(Samples.pooled(x), columns[:, 0], columns[:, 1:], nested(GROUPS), "classes")
     grid = sorted(PENALTIES.tolist(), reverse=True)
 
     def wrong(truth: NDArray[np.float64], predicted: NDArray[np.float64]) -> float:
@@ -461,7 +461,7 @@ def test_classes_are_predicted_as_by_scikit_learn() -> None:
 
 def test_a_binary_label_is_predicted_as_by_scikit_learn_without_the_prior_of_the_fold() -> None:
     x, columns = problem("binary")
-    probe = probe_labels(Samples.pooled(x), columns, "binary", nested(GROUPS))
+    probe = probe_site(Samples.pooled(x), columns[:, 0], columns[:, 1:], nested(GROUPS), "binary")
     y = columns[:, 0]
     decisions = by_scikit_learn(x, y, logistic, STRENGTHS.tolist(), mean_log_loss)
     prior = np.empty_like(y)
@@ -496,7 +496,7 @@ def test_inner_qualities_are_those_by_which_penalties_are_chosen_above_the_permu
         return found
 
     folds = nested(GROUPS)
-    probe = probe_labels(Samples.pooled(x), columns, task, folds)  # type: ignore[arg-type]
+    probe = probe_site(Samples.pooled(x), columns[:, 0], columns[:, 1:], folds, task)  # type: ignore[arg-type]
     penalties = 1 / probe.strengths if task == "binary" else probe.strengths
     for fold, penalty, inner in zip(folds, penalties, probe.inner, strict=True):
         best = [max(qualities(fold, y, one).sum() for one in grid) for y in columns.T[1:]]
@@ -519,9 +519,11 @@ def test_the_mean_of_the_scores_is_the_metric_of_scikit_learn() -> None:
 def test_one_sample_far_away_does_not_ruin_the_score() -> None:
     x, columns = problem("continuous")
     far = np.column_stack([x, 1e-5 * np.random.default_rng(1).normal(size=len(x))])
-    whole = probe_labels(Samples.pooled(far), columns[:, :1], "continuous", nested(GROUPS)).scores.mean()
+    whole = probe_site(
+        Samples.pooled(far), columns[:, 0], columns[:, 1:1], nested(GROUPS), "continuous"
+    ).scores.mean()
     far[7, -1] = 1.0  # a hundred thousand deviations where it is not trained on
-    outside = probe_labels(Samples.pooled(far), columns[:, :1], "continuous", nested(GROUPS))
+    outside = probe_site(Samples.pooled(far), columns[:, 0], columns[:, 1:1], nested(GROUPS), "continuous")
     train = np.setdiff1d(np.arange(len(x)), next(f.outer.test for f in nested(GROUPS) if 7 in f.outer.test))
     assert columns[train, 0].min() <= outside.decisions[7] <= columns[train, 0].max()
     assert outside.scores.mean() > whole - 0.2
@@ -530,7 +532,7 @@ def test_one_sample_far_away_does_not_ruin_the_score() -> None:
 def test_equal_label_permutations_are_fitted_once_and_scored_alike() -> None:
     x, columns = problem("classes")
     repeated = columns[:, [0, 1, 0, 1, 2]]
-    probe = probe_labels(Samples.pooled(x), repeated, "classes", nested(GROUPS))
-    apart = probe_labels(Samples.pooled(x), columns, "classes", nested(GROUPS))
+    probe = probe_site(Samples.pooled(x), repeated[:, 0], repeated[:, 1:], nested(GROUPS), "classes")
+    apart = probe_site(Samples.pooled(x), columns[:, 0], columns[:, 1:], nested(GROUPS), "classes")
     expected = [apart.null[0], apart.scores.mean(), apart.null[0], apart.null[1]]
     np.testing.assert_allclose(probe.null, expected, atol=1e-12)

@@ -9,8 +9,9 @@ samples Z, test samples T and centred targets Y the predictions at penalty λ ar
 factorised once, so that every relabelling is a matrix product.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from probe_kit.errors import NonFiniteActivationError
 from probe_kit.statistics.folds import Fold
 from probe_kit.train.choices import Task
 from probe_kit.train.crossval.logistic_folds import cross_validate
-from probe_kit.train.crossval.nested_folds import InnerQuality, Matrix, NestedFold
+from probe_kit.train.crossval.nested_folds import FittedFold, InnerQuality, Matrix, NestedFold
 from probe_kit.train.crossval.task_scores import balanced_scores, correctness, explained_scores
 from probe_kit.train.samples import Samples
 from probe_kit.train.solver.arrays import Standardiser, to_numpy
@@ -68,11 +69,21 @@ class RidgeFold:
                 yield mean + self.to_predictions @ (coordinates / (self.spectrum + penalty)[:, None])
 
 
-Fitted = tuple[Matrix, Matrix, list[InnerQuality]]
-"""(E, K) held-out class numbers or quantities, (F,) C or λ of the first column, and every fold's inner quality."""
+@dataclass(frozen=True)
+class Predictions:
+    """Held-out predictions of E samples for K columns of labels.
+
+    values: (E, K) decision values of a side, else class numbers or quantities. strengths: (F,) C or λ of the first
+    column. inner: every fold's inner quality. folds: the logistic probes of the folds; empty of ridge.
+    """
+
+    values: Matrix
+    strengths: Matrix
+    inner: list[InnerQuality]
+    folds: Sequence[FittedFold] = ()
 
 
-def _predict_by_ridge(samples: Samples, labels: Matrix, task: Task, folds: list[NestedFold]) -> Fitted:
+def _predict_by_ridge(samples: Samples, labels: Matrix, task: Task, folds: list[NestedFold]) -> Predictions:
     """Return quantities within the range of the training labels, or the best class by ridge on class indicators.
 
     Each column of an outer fold is predicted at the λ that is best in its inner folds: by squared error of
@@ -100,7 +111,7 @@ def _predict_by_ridge(samples: Samples, labels: Matrix, task: Task, folds: list[
             predictions[np.ix_(fold.outer.test, columns)] = predicted[:, columns]
         penalties.append(PENALTIES[best[0]])
         qualities.append(InnerQuality.of(quality, by_sample, best))
-    return predictions, np.array(penalties), qualities
+    return Predictions(predictions, np.array(penalties), qualities)
 
 
 def _along_penalties(samples: Samples, labels: Matrix, classes: int, fold: Fold) -> Iterator[Matrix]:
@@ -155,58 +166,40 @@ class SiteProbe:
 
 def probe_site(
     samples: Samples,
-    labels: NDArray[np.bool_],
-    permuted_labels: NDArray[np.bool_],
+    labels: NDArray[Any],
+    permuted_labels: NDArray[Any],
     folds: list[NestedFold],
+    task: Task | None = None,
 ) -> SiteProbe:
-    """Probe the samples of E episodes for (E,) sides, and again for every column of (E, P) label permutations.
+    """Probe the samples of E episodes for (E,) labels, and again for every column of (E, P) label permutations.
 
-    Raises ProbeNotConvergedError, and NonFiniteActivationError for NaN or infinity.
+    labels: bool of a side, else coded. task: None for a side, whose score is not balanced: its layouts are.
+    Raises ProbeNotConvergedError where the probe is logistic, and NonFiniteActivationError for NaN or infinity.
     """
     check_non_finite(samples)
     columns = np.column_stack([labels, permuted_labels])
-    fitted = cross_validate(samples, columns, folds)
-    tested = np.concatenate([fold.outer.test for fold in folds])
-    decisions = np.concatenate([fold.decisions for fold in fitted])[np.argsort(tested)]
-    right = correctness(decisions, columns)
-    return SiteProbe(
-        decisions=decisions[:, 0],
-        scores=right[:, 0].astype(np.float64),
-        strengths=np.array([fold.strengths[0] for fold in fitted]),
-        weights=np.stack([fold.weights for fold in fitted]).astype(np.float32),
-        intercepts=np.array([fold.intercept for fold in fitted]),
-        spreads=np.array([fold.spread for fold in fitted]),
-        null=right[:, 1:].mean(axis=0),
-        inner=np.stack([fold.inner.first for fold in fitted]).astype(np.float32),
-    )
-
-
-def probe_labels(samples: Samples, labels: Matrix, task: Task, folds: list[NestedFold]) -> SiteProbe:
-    """Probe samples for the first of (E, 1 + P) columns of coded labels, and for the permutations behind it.
-
-    Raises ProbeNotConvergedError for a binary label, and NonFiniteActivationError for NaN or infinity.
-    """
-    check_non_finite(samples)
-    labels, column_of = _distinct(labels)
-    predictions, strengths, inner = _predict(samples, labels, task, folds)
-    if task == "continuous":
-        scores = explained_scores(predictions, labels, [fold.outer for fold in folds])
-    else:
-        scores = balanced_scores(predictions, labels)
+    columns, column_of = (columns, np.arange(columns.shape[1])) if task is None else _distinct(columns)
+    predictions = _predict(samples, columns, task, folds)
+    scores = _scores(predictions.values, columns, task, folds)
+    inner: NDArray[np.floating] = np.stack([quality.first for quality in predictions.inner]).astype(np.float32)
+    if task is not None:
+        trained = zip(predictions.inner, folds, strict=True)
+        inner = np.stack(
+            [_above_permutations(quality, column_of[1:], fold.outer.train) for quality, fold in trained]
+        )
+    # Only directions of a side are stored; other probes are refitted where they are transferred.
+    directions = predictions.folds if task is None else ()
     none = np.zeros(len(folds))
     return SiteProbe(
-        decisions=predictions[:, 0],
+        decisions=predictions.values[:, 0],
         scores=scores[:, 0],
-        strengths=strengths,
-        weights=np.zeros((len(folds), 0), np.float32),
-        intercepts=none,
-        spreads=none,
+        strengths=predictions.strengths,
+        weights=np.array([fold.weights for fold in directions] or np.zeros((len(folds), 0)), np.float32),
+        intercepts=np.array([fold.intercept for fold in directions] or none),
+        spreads=np.array([fold.spread for fold in directions] or none),
         null=scores.mean(axis=0)[column_of[1:]],
-        inner=np.stack([
-            _above_permutations(quality, column_of[1:], fold.outer.train)
-            for quality, fold in zip(inner, folds, strict=True)
-        ]),
-    )  # fmt: skip
+        inner=inner,
+    )
 
 
 def predict_once(samples: Samples, labels: Matrix, task: Task, fold: NestedFold) -> tuple[Matrix, float]:
@@ -214,8 +207,8 @@ def predict_once(samples: Samples, labels: Matrix, task: Task, fold: NestedFold)
 
     labels: (E,); those of test samples have no effect. Raises ProbeNotConvergedError.
     """
-    predictions, strengths, _ = _predict(samples, labels[:, None], task, [fold])
-    return predictions[fold.outer.test, 0], float(strengths[0])
+    predictions = _predict(samples, labels[:, None], task, [fold])
+    return predictions.values[fold.outer.test, 0], float(predictions.strengths[0])
 
 
 def check_non_finite(samples: Samples) -> None:
@@ -228,17 +221,29 @@ def check_non_finite(samples: Samples) -> None:
         )
 
 
-def _predict(samples: Samples, labels: Matrix, task: Task, folds: list[NestedFold]) -> Fitted:
-    """Predict by ridge; of a binary label by the side probes' logistic regression, without its class shares."""
-    if task != "binary":
+def _predict(samples: Samples, labels: NDArray[Any], task: Task | None, folds: list[NestedFold]) -> Predictions:
+    """Predict by ridge; a side or a binary label by logistic regression, the label without its class shares."""
+    if task is not None and task != "binary":
         return _predict_by_ridge(samples, labels, task, folds)
     truth = labels == 1
-    predictions, fitted = np.empty_like(labels), cross_validate(samples, truth, folds)
+    values, fitted = np.empty(labels.shape), cross_validate(samples, truth, folds)
     for fold, probe in zip(folds, fitted, strict=True):
-        # Less the log-odds of the training classes: balanced accuracy takes both as equally frequent.
-        share = truth[fold.outer.train].mean(axis=0)
-        predictions[fold.outer.test] = probe.decisions > np.log(share / (1 - share))
-    return predictions, np.array([probe.strengths[0] for probe in fitted]), [probe.inner for probe in fitted]
+        values[fold.outer.test] = probe.decisions
+        if task == "binary":
+            # Less the log-odds of the training classes: balanced accuracy takes both as equally frequent.
+            share = truth[fold.outer.train].mean(axis=0)
+            values[fold.outer.test] = probe.decisions > np.log(share / (1 - share))
+    strengths = np.array([probe.strengths[0] for probe in fitted])
+    return Predictions(values, strengths, [probe.inner for probe in fitted], fitted)
+
+
+def _scores(predicted: Matrix, labels: NDArray[Any], task: Task | None, folds: list[NestedFold]) -> Matrix:
+    """(E, K) score of every sample, whose mean is the metric."""
+    if task is None:
+        return correctness(predicted, labels).astype(np.float64)
+    if task == "continuous":
+        return explained_scores(predicted, labels, [fold.outer for fold in folds])
+    return balanced_scores(predicted, labels)
 
 
 def _above_permutations(inner: InnerQuality, columns: NDArray[np.intp], train: NDArray[np.intp]) -> Matrix:
