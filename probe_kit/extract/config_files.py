@@ -15,8 +15,8 @@ from pydantic import create_model
 from probe_kit._system.bounded_files import read_json_object
 from probe_kit._terminal.field_options import FieldOption, Part
 from probe_kit.errors import UsageError
-from probe_kit.extract.parts import ModelSettings, is_here
-from probe_kit.extract.settings import Settings
+from probe_kit.extract.parts import is_here
+from probe_kit.extract.settings import CONFIG, Settings
 from probe_kit.extract.sources.kinds import SOURCES, kind_of, kinds_typed
 from probe_kit.hooks.contract.declared import read_pairs
 from probe_kit.runs.layout import RUN_FILE
@@ -28,41 +28,13 @@ if TYPE_CHECKING:
     from probe_kit.runs import Run
 
 
-CONFIG = "config"
-"""The part of a run's settings that holds them as they were requested, by part."""
-
-
-def portable(settings: Settings) -> dict[str, Any]:
-    """The settings by part as a run stores them: without machine, label and places of this machine.
-
-    Where these files lie is recorded by the process that played.
-    """
-    config = {name: part for name, part in settings.config().items() if name not in ("machine", "label")}
-    model, source = config["model"], settings.source
-    if is_here(model["checkpoint"]):
-        model["checkpoint"] = None
-    model["options"] |= {name: path.name for name, path in option_files(settings.model).items()}
-    files = {field: path.name for field, path in source.files().items()}
-    return {**config, "source": source.with_files(config["source"], files)}
-
-
-def option_files(model: ModelSettings) -> dict[str, Path]:
-    """Files and folders of this machine that options of a model name."""
-    from probe_kit.hooks.registry import get_family
-
-    family = get_family(model.family)
-    names = [option.name for option in (() if family is None else family.options) if option.is_path]
-    # The same text may be a word of the family, such as a data set's name.
-    return {name: Path(str(model.options[name])) for name in names if is_here(model.options.get(name))}
-
-
 def origin_of_process(settings: Settings, card: Mapping[str, Any]) -> Origin:
     """Return the origin of a process that plays with some settings. card: of its model; empty for a script."""
     model, checkpoint = settings.model, str(card.get("checkpoint") or "")
     return Origin(
         files={name: _absolute(path) for name, path in settings.source.files().items()},
         checkpoint=_absolute(checkpoint) if is_here(checkpoint) else checkpoint,
-        options={**model.options, **{name: _absolute(path) for name, path in option_files(model).items()}},
+        options={**model.options, **{name: _absolute(path) for name, path in model.files().items()}},
         random_weights=model.random_weights,
         weights_seed=model.weights_seed,
         repositories=dict(card.get("repositories", {})),

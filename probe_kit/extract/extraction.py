@@ -18,13 +18,12 @@ from probe_kit._system.counting import counted
 from probe_kit._system.imports import install_command
 from probe_kit._terminal.notebook import notebook_progress
 from probe_kit.errors import DiskSpaceError, EpisodesFailedError, MissingExtraError, UsageError
-from probe_kit.extract.config_files import CONFIG, portable
 from probe_kit.extract.parts import SCRIPTED
 from probe_kit.extract.rollout.calibration import Calibration
 from probe_kit.extract.rollout.controllers import Controller
 from probe_kit.extract.rollout.tasks import task_of
 from probe_kit.extract.rollout.worker import Worker
-from probe_kit.extract.settings import AskSettings, ExtractSettings, Settings, run_label
+from probe_kit.extract.settings import CONFIG, AskSettings, ExtractSettings, Settings, run_label
 from probe_kit.extract.sizes import planned_sizes, space_needed
 from probe_kit.extract.sources.player import Done, Event, Failed
 from probe_kit.extract.sources.source import Source, raise_together
@@ -344,7 +343,7 @@ def _plan(
         streams,
         size * len(rows),
         source.identity(execute),
-        {**source.selection(rows), CONFIG: portable(settings)},
+        {**source.selection(rows), CONFIG: settings.stored_config()},
         source.name_parts(),
         source.suite_parent,
         source.decoder,

@@ -97,6 +97,15 @@ class ModelSettings(Part):
     weights_seed: Annotated[common.WeightsSeed, Field(ge=0)] = 0
     dtype: WeightsDtype = None
 
+    def files(self) -> dict[str, Path]:
+        """Return the files and folders of this machine that options name, by option."""
+        from probe_kit.hooks.registry import get_family
+
+        family = get_family(self.family)
+        names = [option.name for option in (() if family is None else family.options) if option.is_path]
+        # The same text may be a word of the family, such as a data set's name.
+        return {name: Path(str(self.options[name])) for name in names if is_here(self.options.get(name))}
+
 
 # -- capture ------------------------------------------------------------------------------------------------
 

@@ -26,6 +26,7 @@ from probe_kit.extract.parts import (
     AskTask,
     Capture,
     ModelSettings,
+    is_here,
     read_options,
 )
 from probe_kit.extract.prompts import INSTRUCTION, find_template
@@ -46,6 +47,8 @@ _PARTS = ("model", "capture", "task", "machine")
 PAPER_PROMPTS = ("p1", "p2", "seen")
 DEFAULT_SIZE = (224, 224)
 SCENE = SceneSettings.model_fields["kind"].default
+CONFIG = "config"
+"""The part of a run's stored settings that holds them as they were requested, by part."""
 
 
 def _read_source(value: Any) -> Any:
@@ -238,6 +241,19 @@ class Settings(Part):
         """All settings by part as plain values, of which `--config` makes them again."""
         by_part: dict[str, Any] = json.loads(self.model_dump_json())
         return by_part
+
+    def stored_config(self) -> dict[str, Any]:
+        """All settings by part as a run stores them: without machine, label and places of this machine.
+
+        The process that plays records where these files lie.
+        """
+        config = {name: part for name, part in self.config().items() if name not in ("machine", "label")}
+        model = config["model"]
+        if is_here(model["checkpoint"]):
+            model["checkpoint"] = None
+        model["options"] |= {name: path.name for name, path in self.model.files().items()}
+        files = {field: path.name for field, path in self.source.files().items()}
+        return {**config, "source": self.source.with_files(config["source"], files)}
 
     def identity(self) -> dict[str, Any]:
         """Seed, capture and task, and what was requested of the model; neither machine nor label.
