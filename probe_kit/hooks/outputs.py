@@ -44,11 +44,11 @@ class Outputs:
 
 @dataclass(frozen=True)
 class RecordedRun:
-    """One inference on recorded inputs. tape: of every stream. calls: of watched modules, see `watch`."""
+    """One inference on recorded inputs. activations: of every stream. calls: of watched modules, see `watch`."""
 
     batch: Mapping[str, Tensor]
     recorded: Arrays
-    tape: ActivationCache
+    activations: ActivationCache
     calls: Mapping[str, list[Any]]
 
     def outputs(self, name: str) -> NDArray[Any]:
@@ -82,12 +82,12 @@ def watch[Result](
     with ExitStack() as stack:
         calls = {name: outputs_of(module, stack) for name, module in (modules or {}).items()}
         calls |= {name: _inputs_of(module, stack) for name, module in (entered or {}).items()}
-        tape = stack.enter_context(capture(model, compared_sites(model)))
+        activations = stack.enter_context(capture(model, compared_sites(model)))
         result = run()
-    return result, tape, calls
+    return result, activations, calls
 
 
-def stream_outputs(model: Model, tape: ActivationCache) -> dict[str, Produce]:
+def stream_outputs(model: Model, activations: ActivationCache) -> dict[str, Produce]:
     """Return `<stream>_resid` (S, L, B, T, D) and `<stream>_final_norm` (S, B, T, D), and `keys` and `values`.
 
     S is left out of a stream that runs once.
@@ -97,36 +97,36 @@ def stream_outputs(model: Model, tape: ActivationCache) -> dict[str, Produce]:
         for quantity in (*_COMPARED, *KV):
             if quantity in stream.quantities:
                 key = f"{name}_{_COMPARED[quantity]}" if quantity in _COMPARED else quantity
-                produced[key] = lambda stream=stream, quantity=quantity: _arranged(tape, stream, quantity)  # type: ignore[misc]
+                produced[key] = lambda stream=stream, quantity=quantity: _arranged(activations, stream, quantity)  # type: ignore[misc]
     return produced
 
 
-def _arranged(tape: ActivationCache, stream: Stream, quantity: str) -> NDArray[Any]:
-    values = stacked(tape, stream, quantity)
+def _arranged(activations: ActivationCache, stream: Stream, quantity: str) -> NDArray[Any]:
+    values = stacked(activations, stream, quantity)
     values = values[:, 0] if quantity == "final_norm" else values
     return values[0] if stream.iterations is None else values
 
 
-def stacked(tape: ActivationCache, stream: Stream, quantity: str = "residual") -> NDArray[Any]:
+def stacked(activations: ActivationCache, stream: Stream, quantity: str = "residual") -> NDArray[Any]:
     """Return (iterations or 1, layers, B, T, D) of one quantity."""
     sites = stream.sites(quantity)
-    values = torch.stack([tape[site] for site in sites])
+    values = torch.stack([activations[site] for site in sites])
     steps = stream.iterations or 1
     return numpy_of(values.reshape(steps, len(sites) // steps, *values.shape[1:]))
 
 
-def generation_outputs(model: Any, stream: str, tape: ActivationCache, decoded: Any) -> dict[str, Produce]:
+def generation_outputs(model: Any, stream: str, activations: ActivationCache, decoded: Any) -> dict[str, Produce]:
     """Return the quantities of a decoder whose prompt and output tokens are two streams of one stack.
 
-    stream: of the output tokens. tape: with `compared_sites`. decoded: ids (B, N) and logits (B, N, V).
+    stream: of the output tokens. activations: with `compared_sites`. decoded: ids (B, N) and logits (B, N, V).
     States are laid out as transformers counts them: the stream at every block, and normed at the end.
     """
 
     def column(name: str, iteration: int | None) -> Tensor:
         """(L+1, 1, positions, D)."""
         blocks = model.streams[name].layers - 1
-        layers = [tape[Site(name, layer, iteration=iteration)] for layer in range(blocks)]
-        return torch.stack([*layers, tape[Site(name, blocks, "final_norm", iteration)]])
+        layers = [activations[Site(name, layer, iteration=iteration)] for layer in range(blocks)]
+        return torch.stack([*layers, activations[Site(name, blocks, "final_norm", iteration)]])
 
     def states() -> Tensor:
         return torch.cat([column("backbone", None), column(stream, 0)], dim=2)

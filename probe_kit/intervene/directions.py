@@ -350,9 +350,9 @@ def _infer(session: ReplaySession, pair: Pair, site: Site, rows: Mapping[Cell, l
     """Add the episode's row to those of every cell."""
     from probe_kit.hooks import capture
 
-    with capture(session.policy, [site]) as tape:
+    with capture(session.policy, [site]) as activations:
         session.act(pair.clean, pair.seed)
-    tokens = tape[site][0].double().cpu().numpy()
+    tokens = activations[site][0].double().cpu().numpy()
     for cell, values in rows.items():
         values.append((pair, tokens[token_mask(session.policy, pair.clean, site.stream, cell.role)]))
 

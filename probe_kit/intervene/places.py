@@ -529,7 +529,7 @@ def patch_embeddings(policy: "Policy", observation: Observation, camera: str) ->
     # A tower that sees one picture at a time has the cameras as its iterations, in their order.
     entries = [site for site in policy.every_stream()["vision"].sites() if site.layer == 0]
     site = entries[policy.card.cameras.index(camera) if len(entries) > 1 else 0]
-    with capture(policy, [site]) as tape:
+    with capture(policy, [site]) as activations:
         policy.act([observation], [0])
-    embeddings: NDArray[np.float32] = tape[site][0].float().cpu().numpy()
+    embeddings: NDArray[np.float32] = activations[site][0].float().cpu().numpy()
     return embeddings

@@ -41,9 +41,9 @@ class ConditionContext:
         from probe_kit.hooks import capture
 
         if "source" not in self.memo:
-            with capture(self.session.policy, sites) as tape:
+            with capture(self.session.policy, sites) as activations:
                 self.session.act(self.pair.source, self.pair.seed)
-            self.memo["source"] = tape
+            self.memo["source"] = activations
         source: ActivationCache = self.memo["source"]
         return source
 

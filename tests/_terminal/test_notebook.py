@@ -89,9 +89,9 @@ def assert_short(name: str, data: dict[str, str]) -> None:
 def test_a_policy_and_a_tape_show_short_tables_and_short_lines() -> None:
     """By what a kernel asks, without the seconds in which one imports a policy's libraries."""
     policy = load_policy("pi0-tiny")
-    with capture(policy, policy.sites()) as tape:
+    with capture(policy, policy.sites()) as activations:
         policy.act(example_observations(["Put the cube on the red shape"]), [0])
-    for name, shown in {"policy": policy, "tape": tape}.items():
+    for name, shown in {"policy": policy, "activations": activations}.items():
         assert_short(name, DisplayFormatter().format(shown)[0])
 
 

@@ -22,46 +22,46 @@ from probe_kit.hooks.families.pi0.adapter import Pi0
 
 
 @pytest.fixture(scope="module")
-def tape(pi0_tiny: Pi0) -> ActivationCache:
+def activations(pi0_tiny: Pi0) -> ActivationCache:
     import numpy as np
 
     seen = Observation(np.zeros((48, 64, 3), np.uint8), np.zeros(8, np.float32), "Put the cube on the red shape")
-    with capture(pi0_tiny, pi0_tiny.sites()) as tape:
+    with capture(pi0_tiny, pi0_tiny.sites()) as activations:
         pi0_tiny.act([seen, seen], [0, 1])
-    return tape
+    return activations
 
 
-def test_a_tape_is_a_mapping_from_sites(tape: ActivationCache, pi0_tiny: Pi0) -> None:
-    assert set(tape) == set(tape.keys()) == set(pi0_tiny.sites())
-    assert len(list(tape)) == len(tape) == 44
-    assert all(torch.equal(tape[site], kept) for site, kept in tape.items())
-    assert {tape: 1}[tape] == 1  # compared by identity, as tensors are
+def test_a_cache_is_a_mapping_from_sites(activations: ActivationCache, pi0_tiny: Pi0) -> None:
+    assert set(activations) == set(activations.keys()) == set(pi0_tiny.sites())
+    assert len(list(activations)) == len(activations) == 44
+    assert all(torch.equal(activations[site], kept) for site, kept in activations.items())
+    assert {activations: 1}[activations] == 1  # compared by identity, as tensors are
 
 
-def test_the_name_of_a_site_does_as_well_as_the_site(tape: ActivationCache) -> None:
-    assert torch.equal(tape["expert.02.residual@3"], tape[Site("expert", 2, iteration=3)])
-    assert "backbone.03.residual" in tape
-    assert "backbone.09.residual" not in tape
-    assert "nonsense" not in tape
-    assert tape.get("backbone.09.residual") is None
+def test_the_name_of_a_site_does_as_well_as_the_site(activations: ActivationCache) -> None:
+    assert torch.equal(activations["expert.02.residual@3"], activations[Site("expert", 2, iteration=3)])
+    assert "backbone.03.residual" in activations
+    assert "backbone.09.residual" not in activations
+    assert "nonsense" not in activations
+    assert activations.get("backbone.09.residual") is None
 
 
-def test_a_site_that_was_not_captured_is_named_with_what_was(tape: ActivationCache) -> None:
+def test_a_site_that_was_not_captured_is_named_with_what_was(activations: ActivationCache) -> None:
     with pytest.raises(
         UnknownSiteError, match=r"backbone\.09\.residual was not captured; .*expert.residual: 4 layers x 10"
     ):
-        tape["backbone.09.residual"]
+        activations["backbone.09.residual"]
     with pytest.raises(UnknownSiteError, match="nothing yet"):
         ActivationCache()["backbone.00.residual"]
 
 
-def test_layers_and_iterations_stack_into_one_tensor(tape: ActivationCache) -> None:
-    assert tape.stack("backbone").shape == (4, 2, 52, 96)
-    expert = tape.stack("expert")
+def test_layers_and_iterations_stack_into_one_tensor(activations: ActivationCache) -> None:
+    assert activations.stack("backbone").shape == (4, 2, 52, 96)
+    expert = activations.stack("expert")
     assert expert.shape == (4, 10, 2, 17, 64)
-    assert torch.equal(expert[2, 7], tape["expert.02.residual@7"])
+    assert torch.equal(expert[2, 7], activations["expert.02.residual@7"])
     with pytest.raises(UnknownSiteError, match="mlp was captured"):
-        tape.stack("expert", "mlp")
+        activations.stack("expert", "mlp")
 
 
 def test_what_has_no_rectangular_shape_is_not_stacked(pi0_tiny: Pi0, observation: Observation) -> None:
@@ -72,12 +72,12 @@ def test_what_has_no_rectangular_shape_is_not_stacked(pi0_tiny: Pi0, observation
         whole.stack("expert")
 
 
-def test_it_says_what_it_holds(tape: ActivationCache) -> None:
+def test_it_says_what_it_holds(activations: ActivationCache) -> None:
     assert (
-        repr(tape)
+        repr(activations)
         == "<ActivationCache of 44 sites: backbone.residual: 4 layers; expert.residual: 4 layers x 10 iterations>"
     )
-    assert "2 × 17 × 64" in tape._repr_html_()
+    assert "2 × 17 × 64" in activations._repr_html_()
     assert repr(ActivationCache()) == "<ActivationCache of 0 sites>"
 
 
@@ -96,22 +96,22 @@ def test_only_the_asked_sites_are_kept_with_the_shape_of_their_stream(
     pi0_tiny: Pi0, observation: Observation
 ) -> None:
     sites = [Site("backbone", 3), Site("expert", 0, iteration=9)]
-    with capture(pi0_tiny, sites) as tape:
+    with capture(pi0_tiny, sites) as activations:
         pi0_tiny.act([observation, observation], [0, 1])
-    assert len(tape) == 2
-    assert tape[sites[0]].shape == (2, 52, 96)
-    assert tape[sites[1]].shape == (2, 17, 64)
+    assert len(activations) == 2
+    assert activations[sites[0]].shape == (2, 52, 96)
+    assert activations[sites[1]].shape == (2, 17, 64)
 
 
 def test_iterations_of_one_layer_are_different_activations(pi0_tiny: Pi0, observation: Observation) -> None:
     first, last = Site("expert", 2, iteration=0), Site("expert", 2, iteration=9)
-    with capture(pi0_tiny, [first, last]) as tape:
+    with capture(pi0_tiny, [first, last]) as activations:
         pi0_tiny.act([observation], [0])
-    assert (tape[first] - tape[last]).abs().max() > 0.01
+    assert (activations[first] - activations[last]).abs().max() > 0.01
 
 
 def test_copies_do_not_alias_what_the_model_works_on(pi0_tiny: Pi0, observation: Observation) -> None:
-    """An in-place change behind the hook must not reach the tape."""
+    """An in-place change behind the hook must not reach the cache."""
     site = Site("backbone", 1)
     norm = pi0_tiny.tap(site).module
     seen: list[torch.Tensor] = []
@@ -120,11 +120,11 @@ def test_copies_do_not_alias_what_the_model_works_on(pi0_tiny: Pi0, observation:
         seen.append(inputs[0].clone())
         inputs[0].zero_()
 
-    with capture(pi0_tiny, [site]) as tape:
+    with capture(pi0_tiny, [site]) as activations:
         handle = norm.register_forward_pre_hook(vandalise)
         pi0_tiny.act([observation], [0])
     handle.remove()
-    assert torch.equal(tape[site], seen[0])
+    assert torch.equal(activations[site], seen[0])
 
 
 def test_hooks_are_gone_after_the_context_and_after_an_exception(pi0_tiny: Pi0, observation: Observation) -> None:
@@ -177,13 +177,13 @@ def test_a_compiled_module_is_refused_with_the_remedy(pi0_tiny: Pi0, monkeypatch
 
 def test_attention_and_mlp_are_what_a_block_adds_to_the_residual(pi0_tiny: Pi0, observation: Observation) -> None:
     quantities = ("residual", "attention", "mlp")
-    with capture(pi0_tiny, [site for quantity in quantities for site in pi0_tiny.sites(quantity)]) as tape:
+    with capture(pi0_tiny, [site for quantity in quantities for site in pi0_tiny.sites(quantity)]) as activations:
         pi0_tiny.act([observation], [0])
     for stream, iteration in (("backbone", None), ("expert", 6)):
         for layer in range(3):
-            added = [tape[Site(stream, layer, quantity, iteration)] for quantity in ("attention", "mlp")]
-            expected = tape[Site(stream, layer, "residual", iteration)] + added[0] + added[1]
-            after = tape[Site(stream, layer + 1, "residual", iteration)]
+            added = [activations[Site(stream, layer, quantity, iteration)] for quantity in ("attention", "mlp")]
+            expected = activations[Site(stream, layer, "residual", iteration)] + added[0] + added[1]
+            after = activations[Site(stream, layer + 1, "residual", iteration)]
             torch.testing.assert_close(after, expected, atol=1e-5, rtol=1e-5)
 
 
@@ -241,9 +241,9 @@ SITE = Site("backbone", 2)
 
 
 def _tape(policy: Pi0, seen: list[Observation], edits: list[Edit], vectors: dict) -> tuple:
-    with apply_edits(policy, edits, seen, vectors) as edit_log, capture(policy, [SITE]) as tape:
+    with apply_edits(policy, edits, seen, vectors) as edit_log, capture(policy, [SITE]) as activations:
         actions = policy.act(seen, [0])
-    return tape[SITE][0].numpy(), actions, edit_log
+    return activations[SITE][0].numpy(), actions, edit_log
 
 
 @pytest.fixture
@@ -344,15 +344,18 @@ def test_rows_of_a_batch_are_edited_each_by_its_own_roles(pi0_tiny: Pi0, observa
     seen = [observation, replace(observation, instruction="Put the cube on the shape")]
     masks = [roles.mask("language") for roles in pi0_tiny.roles(seen)["backbone"]]
     assert masks[0].sum() != masks[1].sum()
-    with capture(pi0_tiny, [SITE]) as tape:
+    with capture(pi0_tiny, [SITE]) as activations:
         pi0_tiny.act(seen, [0, 1])
-    plain = tape[SITE].numpy()
+    plain = activations[SITE].numpy()
     source = np.random.default_rng(1).normal(size=plain.shape[1:]).astype(np.float32)
     image = Edit("replace", (SITE,), roles=("image",), vector=vector_hash(source), strength=0.5)
     edits = [Edit("zero", (SITE,), roles=("language",)), image]
-    with apply_edits(pi0_tiny, edits, seen, {image.vector: source}) as edit_log, capture(pi0_tiny, [SITE]) as tape:
+    with (
+        apply_edits(pi0_tiny, edits, seen, {image.vector: source}) as edit_log,
+        capture(pi0_tiny, [SITE]) as activations,
+    ):
         pi0_tiny.act(seen, [0, 1])
-    changed = tape[SITE].numpy()
+    changed = activations[SITE].numpy()
     for row, roles in enumerate(pi0_tiny.roles(seen)["backbone"]):
         language, pictures = roles.mask("language"), roles.mask("image")
         assert (changed[row][language] == 0).all()

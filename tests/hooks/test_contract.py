@@ -83,9 +83,9 @@ def test_another_adapter_over_the_same_network_keeps_its_memory(pi0_tiny: Pi0, o
     again.card = pi0_tiny.card
     assert again.passages is pi0_tiny.passages
     site = Site("kv", 0, "keys")
-    with capture(again, [site]) as tape:
+    with capture(again, [site]) as activations:
         again.act([observation], [0])
-    assert tape.fires == {"kv.00.keys": 1}
+    assert activations.fires == {"kv.00.keys": 1}
 
 
 def test_an_edit_of_the_memory_is_what_every_iteration_reads(pi0_tiny: Pi0, observation: Observation) -> None:
@@ -116,9 +116,9 @@ def test_a_donor_of_another_number_of_tokens_is_refused(pi0_tiny: Pi0, observati
 
 def test_the_memory_passes_in_a_random_twin_too(observation: Observation) -> None:
     twin = load_pi0_tiny(random_weights=True)
-    with capture(twin, [Site("kv", 1, "values")]) as tape:
+    with capture(twin, [Site("kv", 1, "values")]) as activations:
         twin.act([observation], [0])
-    assert len(tape) == 1
+    assert len(activations) == 1
 
 
 CARD = ModelCard("guided", "none", "0" * 64, True, 1, "float32", "cpu", "none", ("primary",), 0, 0)
@@ -154,11 +154,11 @@ def test_one_half_of_a_doubled_batch_is_the_stream() -> None:
     model = Guided()
     for index, sign in ((0, 1), (1, -1)):
         model.select = {"rows": Rows(index, 2)}
-        with capture(model, SITES) as tape:
+        with capture(model, SITES) as activations:
             model.step(ROWS)
             model.step(2 * ROWS)
-        torch.testing.assert_close(tape[SITES[0]], sign * ROWS)
-        torch.testing.assert_close(tape[SITES[1]], sign * 2 * ROWS)
+        torch.testing.assert_close(activations[SITES[0]], sign * ROWS)
+        torch.testing.assert_close(activations[SITES[1]], sign * 2 * ROWS)
 
 
 def test_an_edit_of_one_half_leaves_the_other() -> None:
@@ -180,10 +180,10 @@ def test_rows_that_do_not_divide_are_refused() -> None:
 def test_calls_before_the_first_one_are_passed_over_but_counted() -> None:
     model = Guided()
     model.select = {"first": 1}
-    with capture(model, SITES) as tape:
+    with capture(model, SITES) as activations:
         for factor in (1, 2, 3):
             model.step(factor * ROWS)
-    torch.testing.assert_close(tape[SITES[0]][:2], 2 * ROWS)
+    torch.testing.assert_close(activations[SITES[0]][:2], 2 * ROWS)
     with pytest.raises(CaptureError, match="fired 1 times in one inference; expected 3"), capture(model, SITES):
         model.step(ROWS)
 
@@ -206,10 +206,10 @@ def test_a_tensor_given_by_keyword_is_captured_and_another_keyword_is_an_error()
     model = Guided()
     model.layer = Called()  # type: ignore[assignment]
     model.select = {"argument": "hidden"}
-    with capture(model, SITES) as tape:
+    with capture(model, SITES) as activations:
         model.layer(hidden=ROWS)
         model.layer(hidden=2 * ROWS)
-    torch.testing.assert_close(tape[SITES[1]], 2 * ROWS)
+    torch.testing.assert_close(activations[SITES[1]], 2 * ROWS)
     model.select = {"argument": "states"}
     with pytest.raises(CaptureError, match="without the keyword 'states'"), capture(model, SITES):
         model.layer(hidden=ROWS)

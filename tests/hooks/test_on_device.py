@@ -43,13 +43,13 @@ def captured(family: str, place: str, device: str, options: dict[str, Any]) -> d
     picture, state = np.zeros((*scene.picture_shape, 3), np.uint8), np.zeros(8, np.float32)
     seen = Observation(picture, state, "Put the cube on the red shape", scene.intrinsics)
     roles = model.roles([seen]) if isinstance(model, Policy) else {}
-    with capture(model, model.sites()) as tape:
+    with capture(model, model.sites()) as activations:
         if isinstance(model, Policy):
             out = model.infer_without_acting([seen], [0])
         else:
             assert isinstance(model, AnswerModel)
             out = model.read([Prompt(seen, "Which of them is red?", ("a", "b"))]).option_logits
-    found = {str(site): tape[site].float().cpu().numpy() for site in model.sites()}
+    found = {str(site): activations[site].float().cpu().numpy() for site in model.sites()}
     for site in model.sites():
         if site.stream in roles:
             # What padding attends to, where a mask forbids it everything, is the kernel's choice.

@@ -275,31 +275,33 @@ def test_every_head_adds_its_columns_of_the_projection_and_all_make_the_attentio
 ) -> None:
     site = Site(stream, 1, "heads", iteration)
     attention = Site(stream, 1, "attention", iteration)
-    with capture(pi0_tiny, [site, attention]) as tape:
+    with capture(pi0_tiny, [site, attention]) as activations:
         pi0_tiny.act([observation], [0])
     projection, heads = pi0_tiny.tap(site).module, pi0_tiny.every_stream()[stream].heads
-    added = project_heads(pi0_tiny, tape, site)
-    assert added.shape == (heads, *tape[attention].shape)
+    added = project_heads(pi0_tiny, activations, site)
+    assert added.shape == (heads, *activations[attention].shape)
     weight, bias = projection.weight.detach(), projection.bias
     size = weight.shape[1] // heads
     for head in range(heads):
         own = slice(head * size, (head + 1) * size)
-        torch.testing.assert_close(added[head], tape[site][..., own] @ weight[:, own].T, rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(
+            added[head], activations[site][..., own] @ weight[:, own].T, rtol=1e-4, atol=1e-5
+        )
     whole = added.sum(dim=0) + (0 if bias is None else bias.detach())
-    torch.testing.assert_close(whole, tape[attention], rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(whole, activations[attention], rtol=1e-4, atol=1e-5)
 
 
 def test_a_site_by_name_is_the_same_and_another_quantity_is_refused(
     pi0_tiny: Pi0, observation: Observation
 ) -> None:
-    with capture(pi0_tiny, [Site("backbone", 1, "heads"), Site("backbone", 1)]) as tape:
+    with capture(pi0_tiny, [Site("backbone", 1, "heads"), Site("backbone", 1)]) as activations:
         pi0_tiny.act([observation], [0])
-    by_name = project_heads(pi0_tiny, tape, "backbone.01.heads")
-    assert torch.equal(by_name, project_heads(pi0_tiny, tape, Site("backbone", 1, "heads")))
+    by_name = project_heads(pi0_tiny, activations, "backbone.01.heads")
+    assert torch.equal(by_name, project_heads(pi0_tiny, activations, Site("backbone", 1, "heads")))
     with pytest.raises(UnknownSiteError, match=r"not of heads; expected backbone\.01\.heads"):
-        project_heads(pi0_tiny, tape, Site("backbone", 1))
+        project_heads(pi0_tiny, activations, Site("backbone", 1))
     with pytest.raises(UnknownSiteError, match="was not captured"):
-        project_heads(pi0_tiny, tape, Site("backbone", 2, "heads"))
+        project_heads(pi0_tiny, activations, Site("backbone", 2, "heads"))
 
 
 def test_an_edit_of_heads_writes_what_a_plain_torch_hook_writes(pi0_tiny: Pi0, observation: Observation) -> None:

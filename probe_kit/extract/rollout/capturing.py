@@ -206,13 +206,13 @@ class Capturer:
         # Pooled at once, so that the device never holds all tokens of all sites; with --tokens all it has to.
         reduce = None if self._with_tokens else pool_rows
         # The capture is entered last, so that it reads what edits left.
-        with around(), capture(self._model, self._model.sites(), reduce) as tape:
+        with around(), capture(self._model, self._model.sites(), reduce) as activations:
             result = infer()
         if not self.fires:
             self._prove_harmless(infer, output_of, output_of(result), around)
-        self.fires = tape.fires
+        self.fires = activations.fires
         for row, episode_buffers in buffers.items():
-            self._keep(tape, row, {name: rows[row] for name, rows in roles.items()}, episode_buffers)
+            self._keep(activations, row, {name: rows[row] for name, rows in roles.items()}, episode_buffers)
         return result
 
     def _prove_harmless[Result](
@@ -251,7 +251,7 @@ class Capturer:
             )
 
     def _keep(
-        self, tape: "ActivationCache", row: int, roles: "dict[str, Roles]", buffers: "EpisodeBuffers"
+        self, activations: "ActivationCache", row: int, roles: "dict[str, Roles]", buffers: "EpisodeBuffers"
     ) -> None:
         """Hand one episode's share of a capture to its buffers."""
         import torch
@@ -259,7 +259,7 @@ class Capturer:
         buffers.keep_roles(roles)
         for stored in self._streams:
             stream_roles = roles[stored.name]
-            values = torch.stack([tape[site][row] for site in stored.stream.sites()])
+            values = torch.stack([activations[site][row] for site in stored.stream.sites()])
             if self._with_tokens:
                 valid = torch.from_numpy(stream_roles.valid).to(values.device)
                 # Padding means nothing, and zeros compress well. NaN stays NaN there; readers go by the mask.

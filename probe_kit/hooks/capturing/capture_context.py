@@ -100,8 +100,8 @@ def same_bits(array: NDArray[np.float32], other: NDArray[np.float32]) -> bool:
 class ActivationCache(Mapping[Site, Tensor]):
     """The captured activations of one inference, a mapping from sites in the order in which they fired.
 
-    `tape[site]` is what `capture` kept of it, (B, T, D) on the model's device unless it was reduced; the name of a
-    site does as well as the site. fires: how often each tapped module was called.
+    `activations[site]` is what `capture` kept of it, (B, T, D) on the model's device unless it was reduced; the
+    name of a site does as well as the site. fires: how often each tapped module was called.
     """
 
     def __init__(self) -> None:
@@ -112,7 +112,7 @@ class ActivationCache(Mapping[Site, Tensor]):
         """Raises UnknownSiteError for a site that was not captured or a name that is none."""
         activation = self._kept.get(Site.parse(site) if isinstance(site, str) else site)
         if activation is None:
-            raise UnknownSiteError(f"{site} was not captured; the tape holds {self._contents() or 'nothing yet'}")
+            raise UnknownSiteError(f"{site} was not captured; the cache holds {self._contents() or 'nothing yet'}")
         return activation
 
     def __iter__(self) -> Iterator[Site]:
@@ -127,7 +127,7 @@ class ActivationCache(Mapping[Site, Tensor]):
         except UnknownSiteError:
             return False
 
-    # Like tensors, tapes are compared by identity.
+    # Like tensors, caches are compared by identity.
     __eq__ = object.__eq__
     __hash__ = object.__hash__
 
@@ -148,7 +148,7 @@ class ActivationCache(Mapping[Site, Tensor]):
         )
         if not sites:
             raise UnknownSiteError(
-                f"no site {stream}.….{quantity} was captured; the tape holds {self._contents() or 'nothing yet'}"
+                f"no site {stream}.….{quantity} was captured; the cache holds {self._contents() or 'nothing yet'}"
             )
         layers = [list(of_layer) for _, of_layer in groupby(sites, key=lambda site: site.layer)]
         iterations = {site.iteration for site in sites}
@@ -193,7 +193,7 @@ class ActivationCache(Mapping[Site, Tensor]):
             for stream, quantity, layers, iterations, shape, kind in self._streams()
         ]
         columns = ("stream", "quantity", "layers", "iterations", "each (B × T × D)", "")
-        note = "tape[site] or tape['backbone.03.residual'] for one of them, tape.stack(stream) for all layers"
+        note = "cache[site] or cache['backbone.03.residual'] for one of them, cache.stack(stream) for all layers"
         return rows_html(f"ActivationCache of {len(self)} sites", columns, rows, note)
 
 
@@ -333,12 +333,12 @@ class _CountingHook:
         )
 
 
-def _check_non_finite(tape: ActivationCache) -> None:
+def _check_non_finite(cache: ActivationCache) -> None:
     """One question to the device for all sites, not one each: every answer waits for what it has in hand."""
-    finite = [torch.isfinite(activation).all() for activation in tape._kept.values()]
+    finite = [torch.isfinite(activation).all() for activation in cache._kept.values()]
     if not finite or bool(torch.stack([flag.to(finite[0].device) for flag in finite]).all()):
         return
-    for site, good in zip(tape._kept, finite, strict=True):
+    for site, good in zip(cache._kept, finite, strict=True):
         if not good:
             raise NonFiniteActivationError(
                 f"{site} holds NaN or infinity; look for overflow (try --dtype float32) or damaged weights"

@@ -86,9 +86,9 @@ def sites_are_complete_ordered_and_without_doubles(subject: Subject) -> None:
 def every_site_of_every_quantity_fires_as_often_as_promised(subject: Subject) -> None:
     streams = subject.model.every_stream().values()
     sites = [site for stream in streams for quantity in stream.captured for site in stream.sites(quantity)]
-    with capture(subject.model, sites) as tape:
+    with capture(subject.model, sites) as activations:
         subject.run(subject.batch)
-    missing = [str(site) for site in sites if site not in tape]
+    missing = [str(site) for site in sites if site not in activations]
     require(not missing, f"no activation at {', '.join(missing)}", "one at every site")
 
 
@@ -99,7 +99,7 @@ def every_site_of_every_quantity_fires_as_often_as_promised(subject: Subject) ->
 def activations_have_the_shape_of_their_stream(subject: Subject) -> None:
     model, observations = subject.model, subject.batch
     roles = subject.roles_of(observations)
-    with capture(model, model.sites()) as tape:
+    with capture(model, model.sites()) as activations:
         subject.run(observations)
     require(roles.keys() == model.streams.keys(), f"roles of {list(roles)}", f"roles of {list(model.streams)}")
     for name, stream in model.streams.items():
@@ -107,7 +107,7 @@ def activations_have_the_shape_of_their_stream(subject: Subject) -> None:
         require(len(lengths) == 1, f"rows of {name} with {sorted(lengths)} positions", "equally long rows")
         expected = (len(observations), *lengths, stream.width)
         for site in stream.sites():
-            shape = tuple(tape[site].shape)
+            shape = tuple(activations[site].shape)
             require(shape == expected, f"{site} has the shape {shape}", f"{expected}")
 
 
@@ -126,14 +126,14 @@ def what_blocks_add_makes_the_next_residual(subject: Subject) -> None:
     sites = [site for stream in summing.values() for quantity in _SUM for site in stream.sites(quantity)]
     if not sites:
         return
-    with capture(subject.model, sites) as tape:
+    with capture(subject.model, sites) as activations:
         subject.run(observations)
     for name, stream in summing.items():
         # A tower has no roles: all of its positions are of pictures.
         valid = torch.from_numpy(np.stack([row.valid for row in roles[name]])) if name in roles else ...
         for site in stream.sites("attention"):
-            parts = [tape[replace(site, quantity=quantity)].double().cpu() for quantity in _SUM]
-            following = tape[replace(site, layer=site.layer + 1, quantity="residual")].double().cpu()
+            parts = [activations[replace(site, quantity=quantity)].double().cpu() for quantity in _SUM]
+            following = activations[replace(site, layer=site.layer + 1, quantity="residual")].double().cpu()
             apart = float((parts[0] + parts[1] + parts[2] - following)[valid].abs().max())
             limit = subject.tolerance * (1 + float(following[valid].abs().max()))
             require(
@@ -236,9 +236,9 @@ def _everywhere(stream: Stream, site: Site) -> list[Site]:
 )
 def an_edit_is_what_a_capture_inside_it_reads(subject: Subject) -> None:
     model, site = subject.model, subject.model.sites()[1]
-    with edit(model, {site: torch.zeros_like}), capture(model, [site]) as tape:
+    with edit(model, {site: torch.zeros_like}), capture(model, [site]) as activations:
         subject.run(subject.batch)
-    most = float(tape[site].abs().max())
+    most = float(activations[site].abs().max())
     require(most == 0, f"{site} holds values up to {most:.3g} behind an edit to zeros", "zeros")
 
 
@@ -261,13 +261,13 @@ def heads_make_what_the_output_projection_adds(subject: Subject) -> None:
     taps = {site: subject.model.tap(site) for site in sites}
     with ExitStack() as stack:
         put_out = {site: outputs_of(tap.module, stack) for site, tap in taps.items()}
-        with capture(subject.model, sites) as tape:
+        with capture(subject.model, sites) as activations:
             subject.run(subject.batch)
     for site, tap in taps.items():
         projected = tap.rows.of(put_out[site][tap.first + (site.iteration or 0)])[:, tap.tokens]
-        width, heads = tape[site].shape[-1], subject.model.stream_of(site).heads
+        width, heads = activations[site].shape[-1], subject.model.stream_of(site).heads
         require(width % heads == 0, f"{site} has {width} features", f"a multiple of its {heads} heads")
-        added, bias = project_heads(subject.model, tape, site).sum(dim=0), getattr(tap.module, "bias", None)
+        added, bias = project_heads(subject.model, activations, site).sum(dim=0), getattr(tap.module, "bias", None)
         apart = float((added + (0 if bias is None else bias.detach()) - projected).abs().max())
         limit = subject.tolerance * (1 + float(projected.abs().max()))
         require(apart <= limit, f"the heads of {site} are off by {apart:.3g}", f"at most {limit:.3g}")
@@ -451,9 +451,9 @@ def _require_moves(subject: Subject, first: Observation, second: Observation, ro
     before: Roles = subject.roles_of([first])[stream.name][0]
     site, embeddings = stream.sites()[0], []
     for observation in (first, second):
-        with capture(subject.model, [site]) as tape:
+        with capture(subject.model, [site]) as activations:
             subject.run([observation])
-        embeddings.append(tape[site][0].float().cpu())
+        embeddings.append(activations[site][0].float().cpu())
     moved = (embeddings[0] != embeddings[1]).any(dim=1).numpy() & before.valid
     require(bool(moved.any()), f"another {role} changes nothing at {site}", f"other embeddings of the {role}")
     labels = {span.role for span in before.spans if moved[span.start : span.stop].any()}

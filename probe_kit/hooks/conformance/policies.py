@@ -208,12 +208,12 @@ def what_is_not_supported_is_refused_by_name(subject: PolicySubject) -> None:
 def the_prompt_has_keys_and_values_for_every_token_of_the_backbone(subject: PolicySubject) -> None:
     kv, observations = _prompt_kv(subject), subject.batch
     sites = _all(kv)
-    tape = _captured(subject, observations, sites)
+    activations = _captured(subject, observations, sites)
     tokens = len(subject.policy.token_roles(observations)[kv.name][0])
-    require(len(tape) == len(sites), f"{len(tape)} of {len(sites)} sites fired", "all")
+    require(len(activations) == len(sites), f"{len(activations)} of {len(sites)} sites fired", "all")
     expected = (len(observations), tokens, kv.width)
     for site in sites:
-        shape = tuple(tape[site].shape)
+        shape = tuple(activations[site].shape)
         require(shape == expected, f"{site} has the shape {shape}", f"{expected}")
 
 
@@ -361,9 +361,9 @@ def _captured(
     subject: PolicySubject, observations: Sequence[Observation], sites: Sequence[Site]
 ) -> ActivationCache:
     """Return the activations of one inference at `sites`."""
-    with capture(subject.policy, sites) as tape:
+    with capture(subject.policy, sites) as activations:
         subject.run(observations)
-    return tape
+    return activations
 
 
 def _of(kv: Stream, layer: int) -> list[Site]:

@@ -57,9 +57,9 @@ def test_all_that_acts_passes_through_the_end_of_the_bridge(loaded: InternVLA, o
 def test_guidances_halves_are_told_apart(loaded: InternVLA, observation: Observation) -> None:
     """Both start from the same actions; what stands before them differs in the condition alone."""
     first = [Site(name, 0, "residual", 0) for name in ("expert", "expert_unconditional")]
-    with capture(loaded, first) as tape:
+    with capture(loaded, first) as activations:
         loaded.act([observation], [0])
-    ours, without = (tape[site][0] for site in first)
+    ours, without = (activations[site][0] for site in first)
     roles = loaded.roles([observation])["expert"][0]
     actions = torch.from_numpy(roles.mask("action"))
     torch.testing.assert_close(ours[actions], without[actions], rtol=0, atol=0)
@@ -113,10 +113,10 @@ def test_roles_follow_the_picture_and_the_chat(loaded: InternVLA, observation: O
         ("condition", 6), ("action", 4),
     ]  # fmt: skip
     vision = [Site("vision", 2), Site("vision_dino", 2)]
-    with capture(loaded, vision) as tape:
+    with capture(loaded, vision) as activations:
         loaded.act([observation], [0])
-    assert tape[vision[0]].shape == (1, 256, 32)
-    assert tape[vision[1]].shape == (1, 17, 24)
+    assert activations[vision[0]].shape == (1, 256, 32)
+    assert activations[vision[1]].shape == (1, 17, 24)
 
 
 def test_a_picture_that_is_no_whole_patches_is_resized_with_pil_for_qwen_and_not_for_dino(

@@ -105,9 +105,9 @@ def test_flags_belong_to_their_row(loaded: Magma, monkeypatch: pytest.MonkeyPatc
 
 def test_what_is_generated_behind_the_action_fires_no_tap(loaded: Magma) -> None:
     """Seven calls, though an eighth token was looked at."""
-    with capture(loaded, loaded.sites()) as tape:
+    with capture(loaded, loaded.sites()) as activations:
         loaded.act(example_observations(INSTRUCTIONS), [0, 1])
-    assert set(tape.fires.values()) == {7}
+    assert set(activations.fires.values()) == {7}
     own, twin = loaded.network.language_model, loaded.network.unhooked()
     assert all(a.data_ptr() == b.data_ptr() for a, b in zip(own.parameters(), twin.parameters(), strict=True))
 
@@ -140,10 +140,10 @@ def test_the_token_count_comes_from_the_pictures_size(folder: Path) -> None:
     for shrink in (0, 64):
         policy = load_magma(str(folder), shrink=shrink, unnorm_key="bridge_orig")
         for name, one in (("small", seen), ("wide", wide)):
-            with capture(policy, [Site("backbone", 0)]) as tape:
+            with capture(policy, [Site("backbone", 0)]) as activations:
                 policy.act([one], [0])
             roles = policy.roles([one])["backbone"][0]
-            assert len(roles) == tape[Site("backbone", 0)].shape[1]
+            assert len(roles) == activations[Site("backbone", 0)].shape[1]
             counts[shrink, name] = int(roles.mask("image").sum()), int(roles.mask("separator").sum())
     assert counts[0, "small"] == counts[64, "small"] == counts[64, "wide"] == (4, 2)
     assert counts[0, "wide"] == (12, 2)
@@ -152,9 +152,9 @@ def test_the_token_count_comes_from_the_pictures_size(folder: Path) -> None:
 def test_roles_point_at_what_they_name(loaded: Magma) -> None:
     """Compared with the embeddings themselves."""
     one = example_observations(INSTRUCTIONS[:1])[0]
-    with capture(loaded, [Site("backbone", 0)]) as tape:
+    with capture(loaded, [Site("backbone", 0)]) as activations:
         loaded.act([one], [0])
-    tokens, roles = tape[Site("backbone", 0)][0], loaded.roles([one])["backbone"][0]
+    tokens, roles = activations[Site("backbone", 0)][0], loaded.roles([one])["backbone"][0]
     separator = loaded.network.multi_modal_projector.row_seperator[0, 0]
     assert torch.equal(tokens[roles.mask("separator")], separator.expand(int(roles.mask("separator").sum()), -1))
     picture = loaded.network.look([loaded.picture(one.image)])[0]
@@ -189,15 +189,15 @@ def test_every_stage_of_the_trunk_is_a_stream_of_its_own_width(loaded: Magma) ->
     assert widths == {"vision_0": (2, 8), "vision_1": (2, 16), "vision_2": (3, 24), "vision_3": (2, 32)}
     sites = [site for stream in loaded.further_streams.values() for site in stream.sites()]
     one = example_observations(INSTRUCTIONS[:1])[0]
-    with capture(loaded, sites) as tape:
+    with capture(loaded, sites) as activations:
         loaded.act([one], [0])
     crops = loaded.picture(one.image).crops
     maps = loaded.network.vision_tower.stem(crops)
     for number, stage in enumerate(loaded.network.vision_tower.stages):
         maps = stage(maps)
         last = Site(f"vision_{number}", widths[f"vision_{number}"][0] - 1)
-        assert torch.equal(tape[last], maps.flatten(2).transpose(1, 2))
-        assert tape[last].shape[0] == len(crops)
+        assert torch.equal(activations[last], maps.flatten(2).transpose(1, 2))
+        assert activations[last].shape[0] == len(crops)
 
 
 # -- answering -------------------------------------------------------------------------------------------
@@ -240,10 +240,10 @@ def test_speaking_goes_on_greedily_and_can_be_asked_again(unsteered: Magma) -> N
 def test_being_asked_is_one_inference_and_speaking_is_none(unsteered: Magma) -> None:
     asked = questions()
     plain = unsteered.read(asked)
-    with capture(unsteered, unsteered.sites()) as tape:
+    with capture(unsteered, unsteered.sites()) as activations:
         reading = unsteered.read(asked)
         unsteered.speak(reading, 12)
-    assert set(tape.fires.values()) == {7}
+    assert set(activations.fires.values()) == {7}
     np.testing.assert_array_equal(plain.option_logits, reading.option_logits)
 
 

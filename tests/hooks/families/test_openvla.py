@@ -150,9 +150,9 @@ def test_picture_positions_cannot_know_the_instruction(fused: OpenVLA, observati
     """Attention is causal and the picture comes first; docs/token-policies.md says what that means for probes."""
     kept = []
     for text in ("Put the cube on the star", "Take it away"):
-        with capture(fused, fused.sites()) as tape:
+        with capture(fused, fused.sites()) as activations:
             fused.act([replace(observation, instruction=text)], [0])
-        kept.append(tape[Site("backbone", 2)])
+        kept.append(activations[Site("backbone", 2)])
     patches = 1 + fused.network.patches
     torch.testing.assert_close(kept[0][:, :patches], kept[1][:, :patches], rtol=0, atol=1e-5)
     assert (kept[0][:, -1] - kept[1][:, -1]).abs().max() > 1e-3

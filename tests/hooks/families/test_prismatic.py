@@ -57,7 +57,7 @@ def test_both_streams_together_are_the_hidden_states_of_one_pass(
 ) -> None:
     """Against transformers' own hidden states, for a language model whose block runs attention beside its MLP."""
     prompt, pixels = model.prompt("What is this?"), model.pixel_values([observation.image])
-    with capture(model, [*model.sites(), *model.sites("final_norm")]) as tape:
+    with capture(model, [*model.sites(), *model.sites("final_norm")]) as activations:
         decoded = model.generate(pixels, [prompt])
     fed = torch.tensor([[*prompt, *decoded.ids[0, :-1].tolist()]])
     with torch.no_grad():
@@ -65,19 +65,19 @@ def test_both_streams_together_are_the_hidden_states_of_one_pass(
     last = len(expected) - 1
     for layer, states in enumerate(expected):
         quantity = "final_norm" if layer == last else "residual"
-        parts = [tape[Site("backbone", layer, quantity)]]
-        parts += [tape[Site("answer", layer, quantity, step)] for step in range(3)]
+        parts = [activations[Site("backbone", layer, quantity)]]
+        parts += [activations[Site("answer", layer, quantity, step)] for step in range(3)]
         torch.testing.assert_close(torch.cat(parts, dim=1), states, rtol=0, atol=2e-5)
 
 
 def test_the_last_site_of_a_tower_is_what_the_projector_reads(model: Prismatic, observation: Observation) -> None:
     pixels = model.pixel_values([observation.image])
     sites = {name: stream.sites()[-1] for name, stream in model.further_streams.items()}
-    with capture(model, sites.values()) as tape:
+    with capture(model, sites.values()) as activations:
         model.generate(pixels, [model.prompt("What is this?")])
     towers = model.network.vision_backbone.towers
     patches = [
-        tape[site][:, tower.num_prefix_tokens :] for site, tower in zip(sites.values(), towers, strict=True)
+        activations[site][:, tower.num_prefix_tokens :] for site, tower in zip(sites.values(), towers, strict=True)
     ]
     with torch.no_grad():
         expected = model.network.vision_backbone(pixels)

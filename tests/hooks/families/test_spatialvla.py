@@ -88,23 +88,23 @@ def test_the_first_step_of_a_chunk_is_the_same_whether_the_rest_is_captured(
 ) -> None:
     whole = load_spatialvla(str(folder), iterations="chunk", unnorm_key="bridge_orig/1.0.0")
     assert (plain.streams["action"].iterations, whole.streams["action"].iterations) == (3, 12)
-    tapes = []
+    caches = []
     for policy in (plain, whole):
-        with capture(policy, policy.sites()) as tape:
+        with capture(policy, policy.sites()) as activations:
             policy.act(seen, [0, 1])
-        tapes.append(tape)
+        caches.append(activations)
     for site in plain.sites():
-        assert torch.equal(tapes[0][site], tapes[1][site])
-    assert (tapes[1][Site("action", 2, iteration=11)] - tapes[1][Site("action", 2, iteration=2)]).abs().max() > 0
+        assert torch.equal(caches[0][site], caches[1][site])
+    assert (caches[1][Site("action", 2, iteration=11)] - caches[1][Site("action", 2, iteration=2)]).abs().max() > 0
 
 
 def test_picture_positions_know_the_instruction(plain: SpatialVLA, seen: list[Observation]) -> None:
     """Attention goes both ways over the prompt; docs/token-policies.md says what that means for probes."""
     kept = []
     for text in ("put the cube on the star", "take it away"):
-        with capture(plain, plain.sites()) as tape:
+        with capture(plain, plain.sites()) as activations:
             plain.act([replace(seen[0], instruction=text)], [0])
-        kept.append(tape[Site("backbone", 2)][:, : plain.config.patches])
+        kept.append(activations[Site("backbone", 2)][:, : plain.config.patches])
     assert (kept[0] - kept[1]).abs().max() > 1e-3
 
 
@@ -138,9 +138,9 @@ def test_the_camera_of_the_scene_reaches_the_network_scaled_to_the_models_pictur
     np.testing.assert_allclose(plain.cameras(seen)[0].numpy(), expected, rtol=1e-6)
     residuals = []
     for matrix in (SCENE, SCENE * [[2], [2], [1]]):
-        with capture(plain, plain.sites()) as tape:
+        with capture(plain, plain.sites()) as activations:
             plain.act([replace(seen[0], intrinsics=matrix.astype(np.float32))], [0])
-        residuals.append(tape[Site("backbone", 0)])
+        residuals.append(activations[Site("backbone", 0)])
     patches = plain.config.patches
     assert (residuals[0] - residuals[1])[:, :patches].abs().max() > 1e-3
     assert torch.equal(residuals[0][:, patches:], residuals[1][:, patches:])

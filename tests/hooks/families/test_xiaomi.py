@@ -43,16 +43,16 @@ def test_only_the_last_blocks_memory_is_read(loaded: Xiaomi, observation: Observ
 def test_the_experts_quantities_are_what_its_layers_compute(loaded: Xiaomi, observation: Observation) -> None:
     """Norm of (residual + attention) is the middle; norm of (middle + mlp) enters the next layer."""
     expert = loaded.streams["expert"]
-    with capture(loaded, [site for kind in expert.quantities for site in expert.sites(kind)]) as tape:
+    with capture(loaded, [site for kind in expert.quantities for site in expert.sites(kind)]) as activations:
         loaded.act([observation], [0])
     for step in range(5):
         for number, layer in enumerate(loaded.network.dit.layers):
-            at = {kind: tape[Site("expert", number, kind, step)] for kind in expert.quantities}
+            at = {kind: activations[Site("expert", number, kind, step)] for kind in expert.quantities}
             middle = _apply(layer, "middle_layernorm", at["residual"] + at["attention"])
             torch.testing.assert_close(middle, at["middle"], rtol=0, atol=1e-6)
             after = _apply(layer, "final_layernorm", middle + at["mlp"])
             torch.testing.assert_close(
-                after, tape[Site("expert", number + 1, "residual", step)], rtol=0, atol=1e-6
+                after, activations[Site("expert", number + 1, "residual", step)], rtol=0, atol=1e-6
             )
             if number:
                 assert (at["residual"] + at["attention"] + at["mlp"] - after).abs().max() > 1e-2
@@ -70,12 +70,12 @@ def test_deepstack_reaches_the_backbone_between_layers_at_the_picture_only(
     """What enters a layer is more than the layer before put out: the vision tower's earlier blocks are added."""
     quantities = ("residual", "attention", "mlp")
     backbone = loaded.streams["backbone"]
-    with capture(loaded, [site for kind in quantities for site in backbone.sites(kind)]) as tape:
+    with capture(loaded, [site for kind in quantities for site in backbone.sites(kind)]) as activations:
         loaded.act([observation], [0])
     picture = torch.from_numpy(loaded.roles([observation])["backbone"][0].mask("image"))
     for layer in range(4):
-        put_out = sum(tape[Site("backbone", layer, kind)] for kind in quantities)
-        added = (tape[Site("backbone", layer + 1)] - put_out)[0].abs().amax(dim=-1)
+        put_out = sum(activations[Site("backbone", layer, kind)] for kind in quantities)
+        added = (activations[Site("backbone", layer + 1)] - put_out)[0].abs().amax(dim=-1)
         assert added[~picture].max() < 1e-5
         assert (added[picture].max() > 1e-2) == (layer < 2)
 

@@ -219,13 +219,13 @@ def test_further_cameras_reach_the_expert_past_the_backbone(tmp_path: Path, seen
     masked = roles["expert"][0].mask("special").sum() - roles["backbone"][0].mask("special").sum()
     assert masked == policy.tokens_per_camera
     end, first = policy.streams["backbone"].sites()[-1], Site("expert", 0, iteration=0)
-    tapes = []
+    caches = []
     for own in (one, other):
         with capture(policy, [end, first]) as cache:
             policy.act([own], [0])
-        tapes.append(cache)
-    assert torch.equal(tapes[0][end], tapes[1][end])
-    moved = (tapes[0][first] != tapes[1][first]).any(-1)[0].numpy()
+        caches.append(cache)
+    assert torch.equal(caches[0][end], caches[1][end])
+    moved = (caches[0][first] != caches[1][first]).any(-1)[0].numpy()
     np.testing.assert_array_equal(moved, roles["expert"][0].mask("image.wrist"))
 
 

@@ -107,10 +107,10 @@ def test_they_are_the_leading_differences_of_class_means_of_the_other_folds(
     replay_inputs = [replay_input for item in items for replay_input in session.pairs(item)]
     rows = []
     for replay_input in replay_inputs:
-        with capture(session.policy, [SITE]) as tape:
+        with capture(session.policy, [SITE]) as activations:
             session.act(replay_input.clean, replay_input.seed)
         mask = session.policy.token_roles([replay_input.clean])["backbone"][0].mask("image")
-        rows.append(tape[SITE][0].double().cpu().numpy()[mask])
+        rows.append(activations[SITE][0].double().cpu().numpy()[mask])
     values, left = (
         np.array(rows),
         np.array([replay_input.side == "left" for replay_input in replay_inputs]),

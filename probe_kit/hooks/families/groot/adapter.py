@@ -232,6 +232,6 @@ class Groot(PackedPolicy):
         """The end of the backbone, and velocities without the state's position."""
         end, horizon = self.streams["backbone"].sites()[-1], run.recorded["in_noise"].shape[1]
         return {
-            "backbone_end": lambda: numpy_of(run.tape[end]),
+            "backbone_end": lambda: numpy_of(run.activations[end]),
             "velocity": lambda: run.outputs("velocity")[:, :, -horizon:],
         }

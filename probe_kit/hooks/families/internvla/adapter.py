@@ -303,10 +303,10 @@ def internvla_outputs(load: Callable[..., InternVLA], folder: Path, recorded: Ar
         "condition": network.layer_qformer,
         "final": network.head.final_layer,
     }
-    actions, tape, calls = watch(
+    actions, activations, calls = watch(
         policy, lambda: policy.infer(inputs, pixels, noise), modules, {"head": network.head}
     )
-    streams, vision = stream_outputs(policy, tape), policy.further_streams["vision"]
+    streams, vision = stream_outputs(policy, activations), policy.further_streams["vision"]
     halves = [f"{stream.name}_resid" for stream in policy.streams.values() if stream.part == "action"]
     passed = [positional for positional, _ in calls["head"]]
 

@@ -429,14 +429,16 @@ class _Reference:
 
     def _run(self, image: NDArray[np.uint8]) -> tuple[Picture, Decoded, ActivationCache]:
         picture = self.model.picture(image)
-        decoded, tape, _ = watch(self.model, lambda: self.model.generate([self.prompt], [picture], self._choose))
-        return picture, decoded, tape
+        decoded, activations, _ = watch(
+            self.model, lambda: self.model.generate([self.prompt], [picture], self._choose)
+        )
+        return picture, decoded, activations
 
     @cached_property
     def second(self) -> tuple[Picture, dict[str, Produce]]:
         """The second picture, and what comes of it and the prompt."""
-        picture, decoded, tape = self._run(self.recorded["image2_uint8"])
-        return picture, generation_outputs(self.model, "action", tape, decoded)
+        picture, decoded, activations = self._run(self.recorded["image2_uint8"])
+        return picture, generation_outputs(self.model, "action", activations, decoded)
 
     @property
     def _choose(self) -> Choose:
@@ -498,8 +500,8 @@ class _Reference:
         return numpy_of(network.multi_modal_projector(maps.permute(0, 2, 3, 1)))
 
     def _streams(self) -> dict[str, Produce]:
-        _, decoded, tape = self.first
-        outputs = generation_outputs(self.model, "action", tape, decoded)
+        _, decoded, activations = self.first
+        outputs = generation_outputs(self.model, "action", activations, decoded)
         return {
             **outputs,
             "merged_embeds": lambda: outputs["hidden_states"]()[0],

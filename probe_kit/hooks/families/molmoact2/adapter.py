@@ -389,7 +389,7 @@ class MolmoAct2(PackedPolicy):
 
     def further_outputs(self, run: RecordedRun) -> dict[str, Produce]:
         """The backbone without its end, which only its final norm reads."""
-        return {"backbone_resid": lambda: stacked(run.tape, self.streams["backbone"])[0, :-1]}
+        return {"backbone_resid": lambda: stacked(run.activations, self.streams["backbone"])[0, :-1]}
 
 
 def _on_the_prompt(attention: Any, inputs: tuple[Any, ...], keywords: dict[str, Any], _: Any) -> Tensor:

@@ -60,7 +60,7 @@ class _Asked:
     def captured(self) -> list[tuple[ActivationCache, Prefill]]:
         """Every row alone, with everything that is stored of it."""
         runs = (watch(self.model, partial(self.model.prefill, [question])) for question in self.questions)
-        return [(tape, prefill) for prefill, tape, _ in runs]
+        return [(activations, prefill) for prefill, activations, _ in runs]
 
     @property
     def prompts(self) -> list[list[int]]:
@@ -106,9 +106,9 @@ class _Asked:
     def _streams(self, layers: Sequence[int], quantity: str) -> NDArray[Any]:
         """(layers, B, P + T, D)."""
         rows = []
-        for tape, _ in self.captured:
+        for activations, _ in self.captured:
             parts = [
-                torch.stack([tape[Site(stream, layer, quantity, step)][0] for layer in layers])
+                torch.stack([activations[Site(stream, layer, quantity, step)][0] for layer in layers])
                 for stream, step in (("backbone", None), (self.model.output, 0))
             ]
             rows.append(numpy_of(torch.cat(parts, dim=1)).transpose(1, 0, 2))
@@ -153,7 +153,7 @@ class Reference:
     def __init__(self, model: PrismaticModel, recorded: Arrays, prompt: list[int]) -> None:
         self.model, self.recorded, self.prompt = model, recorded, prompt
         self.pixels = model.pixel_values([recorded["image_uint8"]])
-        self.decoded, self.tape, _ = watch(model, lambda: model.generate(self.pixels, [prompt]))
+        self.decoded, self.activations, _ = watch(model, lambda: model.generate(self.pixels, [prompt]))
 
     def outputs(self, inputs: Collection[str], **family_outputs: Produce) -> Outputs:
         """Everything that the adapter can make, whether recorded or not. inputs: recorded names that went in."""
@@ -169,7 +169,7 @@ class Reference:
         forced = [*self.prompt, *self.decoded.ids[0].tolist()]
         return {
             **self._vision(),
-            **generation_outputs(self.model, self.model.output, self.tape, self.decoded),
+            **generation_outputs(self.model, self.model.output, self.activations, self.decoded),
             "input_ids": lambda: np.array([self.prompt]),
             "teacher_forced_ids": lambda: np.array([forced]),
             **pass_outputs(

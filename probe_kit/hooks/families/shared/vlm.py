@@ -448,8 +448,8 @@ class Reference:
     @cached_property
     def captured(self) -> tuple[ActivationCache, Prefill]:
         """One pass over all rows, with everything that is stored of it."""
-        prefill, tape, _ = watch(self.model, lambda: self.model.prefill(self.questions))
-        return tape, prefill
+        prefill, activations, _ = watch(self.model, lambda: self.model.prefill(self.questions))
+        return activations, prefill
 
     @cached_property
     def alone(self) -> list[Prefill]:
@@ -497,9 +497,9 @@ class Reference:
 
     def _streams(self) -> dict[str, Produce]:
         def joined(layer: int, quantity: str) -> torch.Tensor:
-            tape = self.captured[0]
+            activations = self.captured[0]
             parts = [Site("backbone", layer, quantity), Site(ANSWER, layer, quantity, 0)]
-            return torch.cat([tape[site] for site in parts], dim=1)
+            return torch.cat([activations[site] for site in parts], dim=1)
 
         layers = self.model.streams["backbone"].layers
         return {
@@ -513,9 +513,9 @@ class Reference:
     def vision(self) -> NDArray[Any]:
         """The input of every block of the tower for the first row's picture."""
         sites = self.model.further_streams["vision"].sites()[:-1]
-        with capture(self.model, sites) as tape:
+        with capture(self.model, sites) as activations:
             self.model.prefill(self.questions[:1])
-        values = numpy_of(torch.stack([tape[site] for site in sites]))
+        values = numpy_of(torch.stack([activations[site] for site in sites]))
         flat = self.recorded["vision_resid_row0"].ndim < values.ndim
         return values[:, 0] if flat else values
 

@@ -121,8 +121,10 @@ class _Reference:
 
     def _run(self, policy: SpatialVLA, fed: Tensor | None = None) -> tuple[dict[str, Produce], ActivationCache]:
         """The quantities of the prompt, and of output tokens `fed` in the place of the policy's own."""
-        decoded, tape, _ = watch(policy, lambda: policy.generate(self.pictures, self.cameras, [self.prompt], fed))
-        return generation_outputs(policy, "action", tape, decoded), tape
+        decoded, activations, _ = watch(
+            policy, lambda: policy.generate(self.pictures, self.cameras, [self.prompt], fed)
+        )
+        return generation_outputs(policy, "action", activations, decoded), activations
 
     @cached_property
     def _spoken(self) -> tuple[dict[str, Produce], ActivationCache]:

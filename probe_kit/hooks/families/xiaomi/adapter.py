@@ -298,8 +298,8 @@ def xiaomi_outputs(load: Callable[..., Xiaomi], folder: Path, recorded: Arrays) 
         "model": policy.vlm.model,
         "merger": policy.tower.merger,
     }
-    actions, tape, calls = watch(policy, lambda: policy.infer(inputs, state, mask, noise), modules)
-    streams, vision = stream_outputs(policy, tape), policy.vision.stream("vision")
+    actions, activations, calls = watch(policy, lambda: policy.infer(inputs, state, mask, noise), modules)
+    streams, vision = stream_outputs(policy, activations), policy.vision.stream("vision")
     cache = calls["model"][0].past_key_values.layers
     produced: dict[str, Produce] = {
         **streams,

@@ -134,7 +134,7 @@ class LerobotFlow(DenoisingPolicy):
             return euler_path(noise, run.calls["velocity"], lambda velocity: -velocity / steps)
 
         produced: dict[str, Produce] = {
-            "prefix_embs": lambda: numpy_of(run.tape[Site("backbone", 0)]),
+            "prefix_embs": lambda: numpy_of(run.activations[Site("backbone", 0)]),
             "prefix_pad": lambda: self.recorded_padding(run.recorded),
             "prep_images": lambda: images(0),
             "prep_image_masks": lambda: images(1),
