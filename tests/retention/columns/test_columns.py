@@ -24,7 +24,7 @@ from probe_kit.retention.displays import (
     collect_figures,
 )
 from probe_kit.retention.report import report_html
-from probe_kit.retention.report.parts import words_of
+from probe_kit.retention.report.page import words_of
 from probe_kit.train import ArrayRun, Controls, ControlScore, UntrainedScore, load_results, save_results
 from tests.retention.asked_runs import SaidRun, acted, asked, probes
 

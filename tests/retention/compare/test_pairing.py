@@ -17,7 +17,7 @@ from scipy import stats
 from probe_kit._tables.numbers import points, signed
 from probe_kit.errors import UsageError
 from probe_kit.retention import RetentionTable, retention_table
-from probe_kit.retention.behaviour import full_names
+from probe_kit.retention.behaviour import TableRun, distinct_labels
 from probe_kit.retention.columns.text import models_test
 from probe_kit.retention.compare.compare import Difference, ModelTest
 from probe_kit.train import ArrayRun, load_results, save_results
@@ -362,8 +362,9 @@ def test_no_two_runs_have_one_name(tmp_path: Path) -> None:
     same = [run(tmp_path / part / "run", right, called="pi0") for part in "abc"]
     random = replace(run(tmp_path / "d", right, called="pi0"), random_weights=True)
     disguised = run(tmp_path / "e", right, called="pi0 (random weights)")
-    names = full_names([*same, random, disguised])
-    assert len(set(names)) == 5
+    runs = [*same, random, disguised]
+    labels = distinct_labels(runs)
+    assert len({TableRun.of(run, label=labels[str(run.location)]).name for run in runs}) == 5
     models = {row.run.label for row in retention_table(same).rows}
     assert len(models) == 3
 

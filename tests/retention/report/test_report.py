@@ -27,14 +27,13 @@ from probe_kit.intervene.outcomes import FORMAT
 from probe_kit.intervene.verdict import Behaviour
 from probe_kit.retention import RetentionTable, retention_table
 from probe_kit.retention.columns.columns import all_columns
-from probe_kit.retention.columns.sentences import VERDICT_HELP, Readable
 from probe_kit.retention.columns.summary import HEADING_HELP
 from probe_kit.retention.columns.tables import retention_tables
-from probe_kit.retention.columns.text import TERMS, Modes
+from probe_kit.retention.columns.text import TERMS, VERDICT_HELP, Modes, Readable, warnings_of
 from probe_kit.retention.displays.report_figure import ReportFigure, collect_figures
-from probe_kit.retention.report import parts, report_html, write_report
+from probe_kit.retention.report import page, report_html, write_report
 from probe_kit.retention.report.episodes import BLOCK, episode_grid
-from probe_kit.retention.report.parts import citation, compact_svg, data_uri, warnings_of
+from probe_kit.retention.report.page import citation, compact_svg, data_uri
 from probe_kit.runs.store import locate
 from probe_kit.runs.thumbnails import as_thumbnail, read_thumbnail, thumbnail_key
 from probe_kit.train import ArrayRun, load_results
@@ -422,6 +421,6 @@ def test_a_figure_is_vectors_with_a_transparent_ground_and_no_path() -> None:
 
 
 def test_a_large_figure_is_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parts, "SVG_LIMIT", 1000)
+    monkeypatch.setattr(page, "SVG_LIMIT", 1000)
     source, _ = data_uri(exhibit())
     assert source.startswith("data:image/webp;base64,")
