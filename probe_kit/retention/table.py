@@ -128,13 +128,13 @@ class RetentionTable:
 
     @property
     def rule(self) -> str:
-        """The outcome rule by which episodes were judged."""
-        return self.rows[0].rules.rule if self.rows else DEFAULT_RULE
+        """The outcome rule by which episodes were judged; answers of VLM runs have none."""
+        return next((row.rules.rule for row in self.rows if row.run.mode == "acts"), DEFAULT_RULE)
 
     @property
     def last_steps(self) -> int:
         """The number of control steps at the end that it judged."""
-        return self.rows[0].rules.last_steps if self.rows else 1
+        return next((row.rules.last_steps for row in self.rows if row.run.mode == "acts"), 1)
 
     @property
     def all_rows(self) -> list[RetentionRow]:

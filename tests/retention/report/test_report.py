@@ -89,11 +89,8 @@ def test_the_page_opens_with_what_is_encoded_and_used_in_plain_words(probed_run:
     opening = page[page.index('<section id="summary"') : page.index('<details class="part"')]
     assert "Summary: pi0-tiny" in opening
     color, shape = re.findall(r"<li>(.*?)</li>", opening.replace("\u00a0", " "), re.DOTALL)
-    assert "<b>Color (100 items)</b>: the backbone holds the answer (90 %, " in color
-    assert (
-        "<b>Shape (100 items)</b>: a linear probe of so many items does not find the answer in the backbone ("
-        in shape
-    )
+    assert "<b>Color</b> encoded, use not tested: probes read the answer in the backbone and the action" in color
+    assert "<b>Shape</b> absent: probes of 100 items do not find the answer in the backbone" in shape
 
 
 def test_random_weights_are_marked_in_summary_figures_and_certificate(probed_run: ProbedRun) -> None:
@@ -350,7 +347,7 @@ def test_page_terminal_markdown_and_json_say_the_same_sentence_of_both_readouts(
         assert "is not used in the first chunk: " in sentence
         assert "; it is used over the whole episode" in sentence
     with (console := Console(width=400)).capture() as printed:
-        console.print(table.to_rich())
+        console.print(table.to_rich("all"))
     page = unescape(re.sub(r"<[^>]+>", " ", report_html([run])))
     for shown in (printed.get(), table.to_markdown(), page):
         text = " ".join(shown.replace("\u00a0", " ").split())
