@@ -17,7 +17,7 @@ from probe_kit.extract import AskSettings, ExtractSettings, ask_run, extract_run
 from probe_kit.extract.prompts import TEMPLATES
 from probe_kit.retention import RetentionRow, retention_table
 from probe_kit.retention.behaviour import ask_of
-from probe_kit.retention.columns.sentences import verdict
+from probe_kit.retention.columns.text import verdict
 from probe_kit.retention.rows.row import MEAN
 from probe_kit.runs import Run
 from probe_kit.suite import Suite, build_suite

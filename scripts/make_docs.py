@@ -29,7 +29,7 @@ from probe_kit.demo.pipeline import (
     compare_organisms,
     run_demo,
 )
-from probe_kit.retention.columns.sentences import verdict
+from probe_kit.retention.columns.text import verdict
 from probe_kit.retention.report import write_report
 
 SAMPLE = "sample-report.html"

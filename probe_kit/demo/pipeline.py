@@ -25,8 +25,7 @@ from probe_kit.extract.prompts import TEMPLATES
 from probe_kit.intervene import ImageSwap, ReplaySource, run_intervention
 from probe_kit.retention import RetentionRow, RetentionTable, retention_table
 from probe_kit.retention.columns.columns import FOLLOWS, MARGIN
-from probe_kit.retention.columns.sentences import readable, verdict
-from probe_kit.retention.columns.text import exceeds_text, retention_value
+from probe_kit.retention.columns.text import exceeds_text, readable, retention_value, verdict
 from probe_kit.retention.displays import layer_curve
 from probe_kit.retention.report import write_report
 from probe_kit.runs import Run

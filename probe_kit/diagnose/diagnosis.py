@@ -77,9 +77,12 @@ def measure_knowledge(run: "Run", target: "Target | str", seed: int = 0) -> Know
 
 
 def _retention(run: "Run", results: "ProbeResults") -> tuple[float, Limits, str]:
-    from probe_kit.retention.rows.probe_parts import target_row
+    from probe_kit.retention.behaviour import TableRun
+    from probe_kit.retention.rows.build import target_row
 
-    retained = target_row(run, results, EVERYWHERE, results.settings.views[0]).retention
+    retained = target_row(
+        TableRun.of(run, with_behaviour=False), results, EVERYWHERE, results.settings.views[0]
+    ).retention
     low, high = retained.ci or (None, None)
     return _or_nan(retained.value), (_or_nan(low), _or_nan(high)), retained.note
 

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from probe_kit.diagnose.results import diagnosis_table, sentences
-from probe_kit.retention.displays.style import footer, legend_above, panels, plain, series
+from probe_kit.retention.displays.display import footer, legend_above, panels, plain, series
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -1,18 +1,19 @@
-"""The behaviour of a run: its name, success rate and answers, and settings that rows of one table should share."""
+"""The behaviour of a run: success rate, answers and outcome rule; and its name beside other runs."""
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cached_property
 from pathlib import Path
 from statistics import fmean
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Self, cast
 
 import numpy as np
 
-from probe_kit.env.scoring import SENSITIVITY_RADII, success_at
+from probe_kit.env.scoring import DEFAULT_RULE, RULES, SENSITIVITY_RADII, rule_of, success_at
 from probe_kit.errors import UsageError
+from probe_kit.retention.estimators import Limits, limits
 from probe_kit.runs.layout import CAPTURE_ONLY
 from probe_kit.runs.reader import RunReader, check_several_wordings, full_name
 from probe_kit.statistics.intervals import Share
@@ -34,13 +35,6 @@ SCORES: Mapping[str, tuple[str, str]] = {
     "order-balanced": ("outcome_debiased", "side_debiased"),
 }
 """By score, the columns of outcome and side."""
-
-
-def ask_of(run: RunReader) -> Mapping[str, Any] | None:
-    """Return how a run was asked, None for one that acts."""
-    ask: Mapping[str, Any] | None = run.settings.get("ask")
-    return ask
-
 
 MANY_BY_CLAUSE = 0.05
 """Share of answers found among other words from which the accuracy without them is shown too."""
@@ -85,7 +79,7 @@ def scored(run: RunReader, score: str, with_side_words: bool = False) -> RunRead
     """A VLM run by a score; a policy run as it is. Raises UsageError for an unknown score."""
     if score not in SCORES:
         raise UsageError(f"score is {score!r}; expected one of {', '.join(SCORES)}")
-    if ask_of(run) is None:
+    if run.ask is None:
         return run
     return cast("RunReader", ScoredAnswers(run, score, with_side_words))
 
@@ -367,16 +361,14 @@ def distinct_labels(runs: Sequence[RunReader], names: Mapping[str, str] | None =
     return labels
 
 
-def full_names(runs: Sequence[RunReader], labels: Mapping[str, str] | None = None) -> list[str]:
-    """The full names of runs, in order; labels: by location, distinct ones by default."""
-    called = distinct_labels(runs) if labels is None else labels
-    return [full_name(called[str(run.location)], run.random_weights, capture_only(run.episodes)) for run in runs]
-
-
 def _doubles(runs: Sequence[RunReader], labels: Mapping[str, str]) -> set[str]:
-    names = full_names(runs, labels)
-    often = Counter(names)
-    return {str(run.location) for run, name in zip(runs, names, strict=True) if often[name] > 1}
+    """Return the locations of runs whose full names are equal."""
+    names = {
+        str(run.location): full_name(labels[str(run.location)], run.random_weights, capture_only(run.episodes))
+        for run in runs
+    }
+    often = Counter(names.values())
+    return {location for location, name in names.items() if often[name] > 1}
 
 
 _COMPARED: Mapping[str, Callable[[ProbeSettings], str]] = {
@@ -410,17 +402,20 @@ def chosen_wordings(runs: Sequence[RunReader]) -> list[str]:
     ]
 
 
-def mixed_settings(results: Mapping[str, ProbeResults], views: Sequence[str] | None = None) -> list[str]:
+def mixed_settings(
+    results: Mapping[tuple[str, str], ProbeResults], views: Sequence[str] | None = None
+) -> list[str]:
     """A sentence if the probes of several runs were not fitted alike, and one for labels that are not the answer.
 
-    views: those that are shown, if not all are; then it does not matter which others there are.
+    results: by the location of the run and the target. views: those that are shown, if not all are; then it does
+    not matter which others there are.
     """
     differences = []
     for name, value in _COMPARED.items():
         if name == "views" and views is not None:
             continue
         runs: dict[str, list[str]] = {}
-        for run, probes in results.items():
+        for (run, _), probes in results.items():
             runs.setdefault(value(probes.settings), []).append(Path(run).name)
         if len(runs) > 1:
             parts = (f"{setting} ({', '.join(names)})" for setting, names in runs.items())
@@ -436,3 +431,204 @@ def mixed_settings(results: Mapping[str, ProbeResults], views: Sequence[str] | N
         f"The rows mix probe settings: {'; '.join(differences)}. Compare them with care, or fit all runs alike; "
         "`probe-kit run show RUN` lists what a run has, --probes RUN=KEY chooses.",
     ]
+
+
+# -- the outcome rule -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutcomeRuleScores:
+    """The outcome rule, and what it gives away.
+
+    rule, rule_words: by which all outcomes of the row are. last_steps: control steps at the end that it judged.
+    n_answered, share_answered: episodes that ended in a zone; sr_answered: success among them. n_grasped,
+    sr_grasped: the same of episodes in which both fingers ever touched the cube. share_unmoved_answers: share of
+    answers whose cube never left its start. sr_idle: what a policy that does nothing would score; idle_side: the
+    picture in whose zone the untouched cube then lies, `none`, or `both` where it differs between episodes.
+    share_both_zones: share of episodes whose cube counts for both pictures, which is called correct. sr_by_rule:
+    by every rule, at the last step. sr_by_epsilon: by zone radius in metres, for the rule `disc`. behaviour:
+    shares of episodes by what hand and cube did. What is about answers is there for every run with a success rate;
+    the rest is None or empty where the run keeps no trajectories.
+    """
+
+    rule: str = DEFAULT_RULE
+    rule_words: str = ""
+    last_steps: int = 1
+    n_answered: int | None = None
+    share_answered: float | None = None
+    sr_answered: float | None = None
+    sr_answered_ci: Limits | None = None
+    n_grasped: int | None = None
+    sr_grasped: float | None = None
+    sr_grasped_ci: Limits | None = None
+    share_unmoved_answers: float | None = None
+    sr_idle: float | None = None
+    idle_side: str | None = None
+    share_both_zones: float | None = None
+    sr_by_rule: dict[str, float] = field(default_factory=dict)
+    sr_by_epsilon: dict[str, float] = field(default_factory=dict)
+    behaviour: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class TableRun:
+    """A run as a table reads it: by a score, by an outcome rule, and under a name that no other run has.
+
+    run: by its score, if it was asked. judged: with its outcomes by the rule; as `run` where there is nothing to
+    judge by. label: its name without marks. group: the one it belongs to, of several. words: the rule in words.
+    verdicts: by rule a row per episode; behaviour: a row per episode. Both are None without trajectories.
+    """
+
+    run: RunReader
+    judged: RunReader
+    label: str
+    group: str | None = None
+    rule: str = DEFAULT_RULE
+    words: str = ""
+    last_steps: int = 1
+    verdicts: "Mapping[str, pd.DataFrame] | None" = None
+    behaviour: "pd.DataFrame | None" = None
+
+    @classmethod
+    def of(
+        cls,
+        run: RunReader,
+        rule: str = DEFAULT_RULE,
+        last_steps: int = 1,
+        with_behaviour: bool = True,
+        *,
+        label: str | None = None,
+        group: str | None = None,
+    ) -> Self:
+        """Judge every episode by every rule, where the run keeps trajectories; answers in words have no rule.
+
+        with_behaviour: False reads no trajectory for the rule whose outcomes are stored. label: by default that of
+        the run.
+        """
+        label = run.label if label is None else label
+        if run.ask is not None:
+            return cls(run, run, label, group)
+        scene = run.settings.get("scene")
+        words = "" if scene is None else rule_of(rule, scene).words
+        is_stored = (rule, last_steps) == (DEFAULT_RULE, 1)
+        if scene is None or run.episodes.empty or (is_stored and not with_behaviour) or not run.has_trajectories:
+            return cls(run, run, label, group, rule, words, last_steps)
+        judgeable: Any = run  # a run of `probe_kit.runs`, which keeps trajectories
+        verdicts = {name: judgeable.judged(name) for name in RULES}
+        judged = judgeable.under(rule, last_steps)
+        return cls(run, judged, label, group, rule, words, last_steps, verdicts, judgeable.behaviour)
+
+    @property
+    def location(self) -> str:
+        """The folder or URL of the run."""
+        return str(self.run.location)
+
+    @property
+    def name(self) -> str:
+        """The label, marked if the weights are random or the model did not act; its group in front."""
+        name = full_name(self.label, self.run.random_weights, self.is_captured_only)
+        return name if self.group is None else f"{self.group}: {name}"
+
+    @property
+    def answers(self) -> bool:
+        """Whether its model was asked and did not act."""
+        return self.run.ask is not None
+
+    @cached_property
+    def is_captured_only(self) -> bool:
+        """Whether its model was captured and did not act."""
+        return capture_only(self.run.episodes)
+
+    @property
+    def is_judged(self) -> bool:
+        """Whether there is a success rate by this rule: by the default rule it was stored with every run."""
+        if self.is_captured_only:
+            return False
+        return self.verdicts is not None or (self.rule, self.last_steps) == (DEFAULT_RULE, 1)
+
+    def part(self, episodes: "pd.DataFrame") -> tuple[OutcomeRuleScores, dict[str, Share]]:
+        """The row part of some of the episodes, whose index is their position in the run, and shares by name.
+
+        Shares: `sr_answered` and `sr_grasped`, where they are defined.
+        """
+        identity: dict[str, Any] = {"rule": self.rule, "rule_words": self.words, "last_steps": self.last_steps}
+        if not self.is_judged:
+            return OutcomeRuleScores(**identity), {}
+        answered = 1 - shares_of(episodes, "oob")
+        shares = {"sr_answered": self._conditional(episodes, answered)}
+        facts: dict[str, Any] = {
+            "n_answered": int((episodes["outcome"] != "oob").sum()),
+            "share_answered": float(answered.mean()),
+        }
+        if self.verdicts is not None and self.behaviour is not None:
+            verdicts = {name: of_rule.loc[episodes.index] for name, of_rule in self.verdicts.items()}
+            acted, by_rule = self.behaviour.loc[episodes.index], verdicts[self.rule]
+            grasped = acted["grasped"].to_numpy(float)
+            shares["sr_grasped"] = self._conditional(episodes, grasped)
+            stayed = answered[~acted["moved"].to_numpy(bool)].sum()
+            facts |= {
+                "n_grasped": int(grasped.sum()),
+                "share_unmoved_answers": float(stayed / answered.sum()) if answered.any() else None,
+                "sr_idle": float((by_rule["idle"] == "correct").mean()),
+                "idle_side": _idle_side(by_rule["idle"], episodes["side_correct"]),
+                "share_both_zones": float(by_rule["both"].mean()),
+                "sr_by_rule": {name: float(of_rule["correct"].mean()) for name, of_rule in verdicts.items()},
+                "behaviour": _behaviour(acted),
+            }
+        defined = {name: share for name, share in shares.items() if share is not None}
+        for name, share in defined.items():
+            facts |= {name: share.value, f"{name}_ci": limits(share.interval())}
+        return OutcomeRuleScores(**identity, **facts), defined
+
+    def _conditional(self, episodes: "pd.DataFrame", weights: "NDArray[np.float64]") -> Share | None:
+        """Success where the weights are, groups of items as the unit; None where there is no weight."""
+        if not weights.any():
+            return None
+        counted = weights > 0
+        # Of an episode judged by several steps the weight is a share too, and success is its part of that.
+        right = np.divide(shares_of(episodes, "correct"), weights, out=np.zeros(weights.size), where=counted)
+        return Share.of(right.clip(0, 1), group_names(episodes, self.run.seed_text), weights)
+
+
+def _idle_side(idle: "pd.Series[str]", sides: "pd.Series[str]") -> str:
+    """Return where the untouched cube lies, by the rule."""
+    placed = {
+        "none" if zone == "oob" else side if zone == "correct" else {"left": "right", "right": "left"}[side]
+        for zone, side in zip(idle, sides, strict=True)
+    }
+    return placed.pop() if len(placed) == 1 else "both"
+
+
+def _behaviour(acted: "pd.DataFrame") -> dict[str, float]:
+    """Shares of episodes; of those that made a choice where there is one to make."""
+    shares = {name: float(acted[name].mean()) for name in ("grasped", "moved", "released")}
+    for name in ("first_choice", "closer_to", "release_near"):
+        choices = acted[name][acted[name].isin(["correct", "wrong"])]
+        shares[f"{name}_made"] = len(choices) / len(acted)
+        if len(choices):
+            shares[f"{name}_correct"] = float((choices == "correct").mean())
+    shares["correct_side_share"] = float(acted["correct_side_share"].mean())
+    return shares
+
+
+def rule_sentence(rules: OutcomeRuleScores) -> str:
+    """Return what outcomes were judged by, and what the rule gives away; for captions."""
+    steps = f", mean of the last {rules.last_steps} control steps (all, where there are fewer)" * (
+        rules.last_steps > 1
+    )
+    text = f"outcome rule {rules.rule}{f': {rules.rule_words}' if rules.rule_words else ''}{steps}"
+    if rules.sr_idle is None:
+        return text
+    where = {
+        "none": "the untouched cube lies in neither zone",
+        "both": "the untouched cube lies in a zone of some episodes",
+    }.get(
+        rules.idle_side or "none", f"the untouched cube already lies in the zone of the {rules.idle_side} picture"
+    )
+    return f"{text}; a policy that does nothing would score {100 * rules.sr_idle:.1f} %, as {where}"
+
+
+def check_epsilons(rule: str, are_set: bool) -> None:
+    """Radii are those of the rule `disc`. Raises UsageError where they are asked for with another one."""
+    if are_set and rule != DEFAULT_RULE:
+        raise UsageError(f"zone radii belong to the outcome rule disc; {rule} has none. Leave out --epsilons")

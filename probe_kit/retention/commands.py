@@ -291,8 +291,7 @@ def retention(
     values = locals()
     from probe_kit.env.scoring import SENSITIVITY_RADII
     from probe_kit.retention import retention_table as make_table
-    from probe_kit.retention.behaviour import scored
-    from probe_kit.retention.rows.outcome_rules import check_epsilons
+    from probe_kit.retention.behaviour import check_epsilons
     from probe_kit.retention.training_steps import read_steps
     from probe_kit.runs import open_run
 
@@ -345,16 +344,15 @@ def retention(
     elif kind == "steps":
         _show_steps(table, training, style, figures)
     else:
-        scored_runs = listed if target else [scored(run, score, with_side_words) for run in listed]
         if figures is not None:
             from probe_kit.retention.displays import collect_figures
 
-            save_all(collect_figures(scored_runs, table), figures, "all" in details)
+            save_all(collect_figures(listed, table), figures, "all" in details)
         if html is not None:
             from probe_kit.retention.report import write_report
 
             with err.status("drawing the report"):
-                written = write_report(scored_runs, html, table)
+                written = write_report(listed, html, table)
             say_report(written)
         _print_sections(table, style, details)
 
@@ -375,7 +373,7 @@ def _print_sections(table: "RetentionTable", style: str, details: Sequence[str])
 
 def _show_steps(table: "RetentionTable", training: Mapping[str, int], style: str, figures: Path | None) -> None:
     """Print the table over training steps, and draw its figure. training: steps by the location of a run."""
-    from probe_kit.retention.displays.style import ProvenanceLine
+    from probe_kit.retention.displays.display import ProvenanceLine
     from probe_kit.retention.training_steps import step_table, training_step_figure
 
     by_step = step_table(table, training)
@@ -486,7 +484,7 @@ def show_stages(
     Raises UsageError for other runs or views, and what `match_runs` raises.
     """
     from probe_kit.retention.behaviour import scored
-    from probe_kit.retention.columns.comparisons import known_used_tables
+    from probe_kit.retention.columns.tables import known_used_tables
     from probe_kit.retention.compare.known_used import match_runs
     from probe_kit.runs import open_run
     from probe_kit.train.results.store import load_side_results

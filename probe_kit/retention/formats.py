@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any, get_args, get_type_hints
 from probe_kit._tables.numbers import number, percent
 from probe_kit._tables.table import Table
 from probe_kit.retention.behaviour import Regime, normalised_score, regime
-from probe_kit.retention.columns.sentences import conclusion, verdict
 from probe_kit.retention.columns.summary import finding
-from probe_kit.retention.columns.text import NOT_ACTED, model_name, once_per_category
+from probe_kit.retention.columns.tables import once_per_category
+from probe_kit.retention.columns.text import NOT_ACTED, conclusion, model_name, verdict
 from probe_kit.retention.compare.compare import Difference
 from probe_kit.retention.rows.row import MEAN, RetentionPart, RetentionRow
 from probe_kit.statistics.crossfit import CHANCE

@@ -1,17 +1,18 @@
 """The retention table: several runs joined, and the ways to write it down."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal, Self, get_args
 
+from probe_kit._system.counting import counted
 from probe_kit._system.escaping import csv_of_frame, without_places
 from probe_kit._tables.formats import render
 from probe_kit._tables.table import Table
 from probe_kit.env.scoring import DEFAULT_RULE, SENSITIVITY_RADII, check_rule
 from probe_kit.errors import NoProbesError, NoTrajectoryError, UsageError
 from probe_kit.retention.behaviour import (
-    ask_of,
-    capture_only,
+    TableRun,
+    check_epsilons,
     chosen_wordings,
     distinct_labels,
     left_out,
@@ -21,27 +22,31 @@ from probe_kit.retention.behaviour import (
 )
 from probe_kit.retention.choices import Family, Iterations, Section
 from probe_kit.retention.columns.columns import averaged_fields
-from probe_kit.retention.columns.comparisons import size_table, vlm_vla_tables, wording_tables
 from probe_kit.retention.columns.summary import RunSummary, next_step, summarise_runs, summary_table
-from probe_kit.retention.columns.tables import retention_tables
+from probe_kit.retention.columns.tables import retention_tables, size_table, vlm_vla_tables, wording_tables
 from probe_kit.retention.columns.text import model_name
-from probe_kit.retention.compare.compare import Difference
-from probe_kit.retention.compare.pairing import (
+from probe_kit.retention.compare.compare import (
+    Difference,
     compare_groups,
     compare_runs,
     compare_with_vlms,
     compare_wordings,
 )
 from probe_kit.retention.formats import frame_of, paper_table, part_frame, peak_frame, table_json
-from probe_kit.retention.rows.build import RowSettings, RowWithEstimates, mean_row, run_rows
-from probe_kit.retention.rows.outcome_rules import can_be_judged, check_epsilons, under_rule
-from probe_kit.retention.rows.probe_parts import label_notes, label_rows, read_labels
+from probe_kit.retention.rows.build import (
+    RowSettings,
+    RowWithEstimates,
+    mean_row,
+    run_rows,
+    with_holm_of_targets,
+)
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.runs.reader import RunReader, check_sides
 from probe_kit.runs.store import Location
 from probe_kit.statistics.sufficiency import ABSENT_BELOW
+from probe_kit.train.choices import SIDES
 from probe_kit.train.results.probe_results import ProbeResults
-from probe_kit.train.results.store import is_current, load_side_results
+from probe_kit.train.results.store import is_current, load_results, load_side_results, stored_targets
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -58,7 +63,8 @@ class RetentionTable:
     table draw these. Rows of targets that are no side have no mean, as their metrics differ.
     wordings: of runs that were asked in several, every two against each other.
     iterations: of the expert, or action tokens, that take part. notes: what a reader must know, a sentence each:
-    which runs have no probes, and which settings the rows mix. vlm_vla: VLM − VLA, if that was requested.
+    which runs have no probes, and which settings the rows mix. vlm_vla: VLM − VLA, if that was requested. runs: as
+    the rows read them, VLM runs first.
     """
 
     rows: list[RetentionRow]
@@ -70,6 +76,7 @@ class RetentionTable:
     wordings: list[Difference] = field(default_factory=list)
     vlm_vla: list[Difference] = field(default_factory=list)
     unpaired: tuple[str, ...] = ()
+    runs: tuple[TableRun, ...] = field(default=(), repr=False, compare=False)
 
     def __repr__(self) -> str:
         categories = len({row.category for row in self.rows})
@@ -104,6 +111,16 @@ class RetentionTable:
         """Return the probes of a run, of its first target; None without any."""
         return next((results for (of_run, _), results in self.results.items() if of_run == str(location)), None)
 
+    def runs_of(self, runs: Sequence[RunReader]) -> list[TableRun]:
+        """Return runs as the table reads them, in order. Raises UsageError for one that it has no rows of."""
+        with_rows = {row.run.location for row in self.rows}
+        read = {run.location: run for run in self.runs if run.location in with_rows}
+        if strangers := [str(run.location) for run in runs if str(run.location) not in read]:
+            raise UsageError(
+                f"the table has no rows of {', '.join(strangers)}; make it of the runs that are drawn"
+            )
+        return [read[str(run.location)] for run in runs]
+
     def of_target(self, target: str) -> Self:
         """Return the table of one target; p stays as it is."""
         results = {name: probes for name, probes in self.results.items() if name[1] == target}
@@ -111,13 +128,13 @@ class RetentionTable:
 
     @property
     def rule(self) -> str:
-        """The outcome rule by which episodes were judged."""
-        return self.rows[0].rules.rule if self.rows else DEFAULT_RULE
+        """The outcome rule by which episodes were judged; answers of VLM runs have none."""
+        return next((row.rules.rule for row in self.rows if row.run.mode == "acts"), DEFAULT_RULE)
 
     @property
     def last_steps(self) -> int:
         """The number of control steps at the end that it judged."""
-        return self.rows[0].rules.last_steps if self.rows else 1
+        return next((row.rules.last_steps for row in self.rows if row.run.mode == "acts"), 1)
 
     @property
     def all_rows(self) -> list[RetentionRow]:
@@ -335,106 +352,110 @@ def retention_table(
     for `against` or `pairs` where they are none of the runs, for a side as target, and for labels that differ
     between runs; NoProbesError for a run without probes of a target; SceneError for overlapping zones.
     """
-    if target is not None:
-        if isinstance(runs, Mapping) or against or pairs or vlm_vla:
-            raise UsageError("labels are not compared between runs or groups; give runs alone, or no target")
-        return _label_table(
-            runs, [target] if isinstance(target, str) else target, views, iterations, keys, family, labels
-        )
-    # The default itself, and not radii equal to it, means that the caller named none.
-    check_epsilons(check_rule(rule), epsilons is not SENSITIVITY_RADII)
+    targets = [target] if isinstance(target, str) else target
+    if targets is not None and (isinstance(runs, Mapping) or against or pairs or vlm_vla):
+        raise UsageError("labels are not compared between runs or groups; give runs alone, or no target")
     groups = runs if isinstance(runs, Mapping) else {None: runs}
-    for run in (run for of_group in groups.values() for run in of_group):
-        check_sides(run, "a retention table")
-    listed = [(name, scored(run, score, with_side_words)) for name, of_group in groups.items() for run in of_group]
-    key_of_run = _key_of_run(keys, len(listed))
-    _check_doubles([run for _, run in listed])
-    order = sorted(range(len(listed)), key=lambda at: ask_of(listed[at][1]) is None)
-    listed, key_of_run = [listed[at] for at in order], [key_of_run[at] for at in order]
-    every = [run for _, run in listed]
-    results, notes = _read_probes(every, key_of_run)
-    unscored = [
+    members = [(group, run) for group, of_group in groups.items() for run in of_group]
+    key_of_run = _key_of_run(keys, len(members))
+    if targets is None:
+        # The default itself, and not radii equal to it, means that the caller named none.
+        check_epsilons(check_rule(rule), epsilons is not SENSITIVITY_RADII)
+        members, key_of_run = _of_sides(members, key_of_run, score, with_side_words)
+    every = [run for _, run in members]
+    names = distinct_labels(every, labels)
+    judging = (rule, last_steps, with_behaviour) if targets is None else (DEFAULT_RULE, 1, False)
+    table_runs = [
+        TableRun.of(run, *judging, label=names[str(run.location)], group=group) for group, run in members
+    ]
+    if targets is None:
+        probes_of_rows, notes = _read_sides(table_runs, key_of_run)
+    else:
+        probes_of_rows, notes = _read_labels(table_runs, targets, key_of_run), []
+    settings = RowSettings(views, iterations, epsilons, absent_below, categories)
+    rows_of_runs = [run_rows(table_run, probes, settings) for table_run, probes in probes_of_rows]
+    estimated = [row for of_run in rows_of_runs for row in of_run]
+    rows = [row.row for row in estimated]
+    results = {
+        (run.location, probes.settings.target): replace(
+            probes, label=(labels or {}).get(run.location, probes.label)
+        )
+        for run, probes in probes_of_rows
+        if probes is not None
+    }
+    if targets is not None:
+        rows = with_holm_of_targets(rows, results) if family == "table" else rows
+        notes += [*_label_notes(table_runs, rows, family), *mixed_episodes(every)]
+        return RetentionTable(
+            rows, [], results=results, iterations=iterations, notes=tuple(notes), runs=tuple(table_runs)
+        )
+    unjudged = [
         f"{run.location} keeps no trajectories, so that its success rate by the rule {rule} is n/a. Extract it "
         "again to have it."
-        for run in every
-        if not can_be_judged(run, rule, last_steps)
+        for run in table_runs
+        if not run.is_judged and not run.is_captured_only
     ]
-    if unscored and isinstance(runs, Mapping):
-        raise NoTrajectoryError(f"groups cannot be compared by the rule {rule}: {unscored[0]}")
-    settings = RowSettings(views, iterations, epsilons, rule, last_steps, absent_below, categories, with_behaviour)
-    drawn: list[RowWithEstimates] = []
-    means: list[RetentionRow] = []
-    for name, run in listed:
-        of_run = run_rows(run, results.get(str(run.location)), settings, name)
-        drawn += of_run
-        views_of = dict.fromkeys(row.row.view for row in of_run)
-        in_views = [[row for row in of_run if row.row.view == view] for view in views_of]
-        means += [mean_row(rows, averaged_fields()) for rows in in_views]
-    names = distinct_labels(every, labels)
-    results = {
-        location: replace(probes, label=(labels or {}).get(location, probes.label))
-        for location, probes in results.items()
-    }
+    if unjudged and isinstance(runs, Mapping):
+        raise NoTrajectoryError(f"groups cannot be compared by the rule {rule}: {unjudged[0]}")
     differences, unpaired = list[Difference](), tuple[str, ...]()
     if isinstance(runs, Mapping):
-        by_group = {name: [run for group, run in listed if group == name] for name in runs}
-        differences, unpaired = compare_groups(by_group, drawn, against, origins)
+        by_group = {name: [run for run in table_runs if run.group == name] for name in runs}
+        differences, unpaired = compare_groups(by_group, estimated, against, origins)
     elif len(every) > 1 or against is not None:
-        differences, unpaired = compare_runs(every, drawn, names, against, bool(vlm_vla), pairs)
-    unmoving = [run for run in every if capture_only(run.episodes)]
-    notes += [
-        *unscored,
-        *(f"{run.location} captured activations only and did not act: SR is n/a." for run in unmoving),
-        *mixed_settings(results, views),
-        *mixed_episodes(every),
-        *chosen_wordings(every),
-        *left_out(every),
-    ]
-    judged = [under_rule(run, rule, last_steps) for run in every if can_be_judged(run, rule, last_steps)]
-    gaps: list[Difference] = []
+        differences, unpaired = compare_runs(table_runs, estimated, against, bool(vlm_vla), pairs)
+    vlm_differences: list[Difference] = []
     if vlm_vla is not False:
-        gaps = compare_with_vlms(every, drawn, names, None if isinstance(vlm_vla, bool) else vlm_vla)
-    if vlm_vla is True and not gaps:
+        vlm_pairs = None if isinstance(vlm_vla, bool) else vlm_vla
+        vlm_differences = compare_with_vlms(table_runs, estimated, vlm_pairs)
+    if vlm_vla is True and not vlm_differences:
         raise UsageError(
             "--compare vlm-vla compares VLM runs with policy runs in the same categories, and these runs have no "
             "such pair. Make the missing ones with `probe-kit ask` or `probe-kit extract`"
         )
+    captured_only = [
+        f"{run.location} captured activations only and did not act: SR is n/a."
+        for run in table_runs
+        if run.is_captured_only
+    ]
+    notes += [*unjudged, *captured_only, *mixed_settings(results, views)]
+    notes += [*mixed_episodes(every), *chosen_wordings(every), *left_out(every)]
     return RetentionTable(
-        _called([row.row for row in drawn], names),
-        _called(means, names),
+        rows,
+        [mean for of_run in rows_of_runs for mean in _means(of_run)],
         differences,
-        {(location, probes.settings.target): probes for location, probes in results.items()},
+        results,
         iterations,
         tuple(notes),
-        compare_wordings([run for run in judged if not capture_only(run.episodes)]),
-        gaps,
+        compare_wordings([run.judged for run in table_runs if run.is_judged]),
+        vlm_differences,
         unpaired,
+        tuple(table_runs),
     )
 
 
-def _called(rows: Sequence[RetentionRow], names: Mapping[str, str]) -> list[RetentionRow]:
-    """Return the rows with the names of their runs by location."""
-    return [replace(row, run=replace(row.run, label=names[row.run.location])) for row in rows]
+Member = tuple[str | None, RunReader]
+"""The name of a group, of several, and a run of it."""
 
 
-def _label_table(
-    runs: Sequence[RunReader],
-    targets: Sequence[str],
-    views: Sequence[str] | None,
-    iterations: Iterations,
-    keys: Sequence[str | None] | None,
-    family: Family,
-    labels: Mapping[str, str] | None,
-) -> RetentionTable:
-    """Return the table of targets that are no side."""
-    if not runs or not targets:
-        raise UsageError("retention of a label needs at least one run and one target")
-    results = read_labels(runs, targets, _key_of_run(keys, len(runs)))
-    names = distinct_labels(runs, labels)
-    rows = _called(label_rows(runs, results, views, iterations, family), names)
-    full = {row.run.location: row.run.name for row in rows}
-    notes = [*label_notes(runs, rows, family, full), *mixed_episodes(runs)]
-    return RetentionTable(rows, [], results=results, iterations=iterations, notes=tuple(notes))
+def _of_sides(
+    members: Sequence[Member], keys: Sequence[str | None], score: str, with_side_words: bool
+) -> tuple[list[Member], list[str | None]]:
+    """Return runs, read by a score, and their keys, those of VLM runs first.
+
+    Raises UsageError for a run without sides, or one that is given twice.
+    """
+    for _, run in members:
+        check_sides(run, "a retention table")
+    _check_doubles([run for _, run in members])
+    order = sorted(range(len(members)), key=lambda at: members[at][1].ask is None)
+    read = [(group, scored(run, score, with_side_words)) for group, run in members]
+    return [read[at] for at in order], [keys[at] for at in order]
+
+
+def _means(of_run: Sequence[RowWithEstimates]) -> list[RetentionRow]:
+    """Return the mean over the categories of a run in each view."""
+    views = dict.fromkeys(row.row.view for row in of_run)
+    return [mean_row([row for row in of_run if row.row.view == view], averaged_fields()) for view in views]
 
 
 def _key_of_run(keys: Sequence[str | None] | None, runs: int) -> list[str | None]:
@@ -457,29 +478,92 @@ def _check_doubles(runs: Sequence[RunReader]) -> None:
             location_of[name] = str(run.location)
 
 
-def _read_probes(
-    runs: Sequence[RunReader], keys: Sequence[str | None]
-) -> tuple[dict[str, ProbeResults], list[str]]:
-    """Probes by run, and a sentence for every run without, but for models that were only asked."""
-    results: dict[str, ProbeResults] = {}
-    missing = []
-    for run, key in zip(runs, keys, strict=True):
+ProbesOfRows = list[tuple[TableRun, ProbeResults | None]]
+"""The runs in the order of their rows, target by target, with the probes that these are made of."""
+
+
+def _read_sides(runs: Sequence[TableRun], keys: Sequence[str | None]) -> tuple[ProbesOfRows, list[str]]:
+    """Return the probes of sides, and a sentence for every run without, but for models that were only asked."""
+    probes_of_rows: ProbesOfRows = []
+    notes = []
+    for table_run, key in zip(runs, keys, strict=True):
+        run, probes = table_run.run, None
         if key == "":
             if run.streams:
-                missing.append(f"Success rates only: no probes of {run.location} belong to this table.")
-            continue
-        try:
-            probes = load_side_results(run, key)
-        except NoProbesError as error:
-            if run.streams or ask_of(run) is None:
-                shares = "Success rates" if ask_of(run) is None else "Answers"
-                missing.append(f"{shares} only: {error}")
-            continue
-        results[str(run.location)] = probes
-        if not is_current(probes.settings, run):
-            missing.append(
+                notes.append(f"Success rates only: no probes of {run.location} belong to this table.")
+        else:
+            try:
+                probes = load_side_results(run, key)
+            except NoProbesError as error:
+                if run.streams or not table_run.answers:
+                    shares = "Answers" if table_run.answers else "Success rates"
+                    notes.append(f"{shares} only: {error}")
+        if probes is not None and not is_current(probes.settings, run):
+            notes.append(
                 f"The probes {probes.key} of {run.location} are of other episodes than the run has now: "
                 "accuracies and success rates do not belong together. "
                 f"`probe-kit train {run.location}` fits new ones."
             )
-    return results, missing
+        probes_of_rows.append((table_run, probes))
+    return probes_of_rows, notes
+
+
+def _read_labels(runs: Sequence[TableRun], targets: Sequence[str], keys: Sequence[str | None]) -> ProbesOfRows:
+    """Return the stored probes of every target in every run.
+
+    keys: which ones of each run, the newest by default; with one target only. Raises NoProbesError for a run
+    without probes of a target, UsageError for a side, a target given twice, a key of another target, and several
+    runs whose labels differ.
+    """
+    if not runs or not targets:
+        raise UsageError("retention of a label needs at least one run and one target")
+    if sides := [name for name in targets if name in SIDES]:
+        raise UsageError(
+            f"the target {sides[0]!r} is the name of a side. Leave --target out for the retention of sides"
+        )
+    if doubles := [name for at, name in enumerate(targets) if name in targets[:at]]:
+        raise UsageError(f"the target {doubles[0]!r} is given twice; leave one out")
+    if len(targets) > 1 and any(keys):
+        raise UsageError(
+            f"stored probes are chosen by key for {len(targets)} targets ({', '.join(targets)}); a key is of one. "
+            "Show one target at a time, or leave the keys out"
+        )
+    probes_of_rows: ProbesOfRows = []
+    for target in targets:
+        of_target = [load_results(run.run, key, target) for run, key in zip(runs, keys, strict=True)]
+        for table_run, probes in zip(runs, of_target, strict=True):
+            if probes.settings.label != of_target[0].settings.label:
+                raise UsageError(
+                    f"the labels {target!r} of {table_run.location} and {runs[0].location} differ (sha256 "
+                    f"{probes.settings.label[:12]} and {of_target[0].settings.label[:12]}); retention is compared "
+                    "on the same labels of the same episodes. Show the runs one by one"
+                )
+            probes_of_rows.append((table_run, probes))
+    return probes_of_rows
+
+
+_NAMED = 8
+"""Labels of a run that a sentence names."""
+
+
+def _label_notes(runs: Sequence[TableRun], rows: Sequence[RetentionRow], family: Family) -> Iterator[str]:
+    """Yield a warning where a signal was compared with no control, and how many labels were tried in each run."""
+    bare = [row for row in rows if row.backbone.peak is not None and not row.backbone.is_controlled]
+    if bare:
+        of_runs = ", ".join(dict.fromkeys(f"{row.target} of {row.run.name}" for row in bare))
+        yield f"No control was run for {of_runs}: a signal there is judged against chance only."
+    count = len({row.target for row in rows})
+    corrected = (
+        "of each label alone" if family == "label" else f"corrected for the {count} labels of this table (Holm)"
+    )
+    for table_run in runs:
+        tried = stored_targets(table_run.run)
+        if sum(tried.values()) > 1:
+            yield f"{table_run.name} has probes of {_in_words(tried)}; p is {corrected}."
+
+
+def _in_words(tried: Mapping[str, int]) -> str:
+    """Return how many labels a run has probes of; one whose values changed counts again."""
+    words = [f"{name} in {of} versions" if of > 1 else name for name, of in tried.items()]
+    first = ", ".join([*words[:_NAMED], *["…"] * (len(words) > _NAMED)])
+    return f"{counted(sum(tried.values()), 'label')} ({first})"

@@ -9,11 +9,10 @@ from probe_kit._system.counting import counted
 from probe_kit._tables.numbers import number, percent, points, with_limits
 from probe_kit._tables.table import Table
 from probe_kit.errors import UsageError
-from probe_kit.retention.behaviour import ask_of
 from probe_kit.retention.columns.text import title_of
 from probe_kit.retention.compare.models import checkpoint_of, split_checkpoint
+from probe_kit.retention.displays.display import ProvenanceLine, caption, legend_above, panels, plain, series
 from probe_kit.retention.displays.report_figure import ReportFigure
-from probe_kit.retention.displays.style import ProvenanceLine, caption, legend_above, panels, plain, series
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.retention.table import RetentionTable
 from probe_kit.runs.reader import RunReader
@@ -58,7 +57,7 @@ def read_steps(text: str | None, runs: Sequence[RunReader]) -> dict[str, int]:
     Raises UsageError for another text, a number of steps that is not that of the runs, runs of one step, or VLM
     runs, which have no retention.
     """
-    if vlms := [str(run.location) for run in runs if ask_of(run) is not None]:
+    if vlms := [str(run.location) for run in runs if run.ask is not None]:
         raise UsageError(f"--compare steps is for policy runs; {vlms[0]} is a VLM run. Leave it out")
     if text is None:
         steps = [training_step(run) for run in runs]

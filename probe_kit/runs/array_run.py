@@ -88,6 +88,11 @@ class ArrayRun:
         return locate(self.path)
 
     @property
+    def ask(self) -> Mapping[str, Any] | None:
+        """The way in which its model was asked; None for one that acts."""
+        return self.settings.get("ask")
+
+    @property
     def source(self) -> RunSource:
         """The suite that it names."""
         return RunSource("arrays", self.suite, f"it is made of arrays on {self.suite}")

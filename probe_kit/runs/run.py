@@ -214,6 +214,11 @@ class Run:
         """Whether its model was captured and did not act: it has activations and no success rate."""
         return bool(self.settings.get("capture_only"))
 
+    @property
+    def ask(self) -> Mapping[str, Any] | None:
+        """The way in which its model was asked; None for one that acts."""
+        return self.settings.get("ask")
+
     @cached_property
     def source(self) -> RunSource:
         """The observations that it is made of: their kind, and the name that identifies them."""

@@ -17,7 +17,6 @@ from probe_kit.errors import UsageError
 from probe_kit.extract.rollout.answers import side_expected
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks.contract.sites import PADDING, Site
-from probe_kit.retention.behaviour import ask_of
 from probe_kit.retention.compare.compare import Difference, common_items, wording_of
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.retention.table import retention_table
@@ -239,7 +238,7 @@ def why_alone(before: RunReader, after: RunReader, view: str = "mean") -> str:
     """
     if wording_of(before) != wording_of(after):
         return "other words"
-    if ask_of(before) != ask_of(after) and (why := _why_alone_beside_vlm(before, after, view)):
+    if before.ask != after.ask and (why := _why_alone_beside_vlm(before, after, view)):
         return why
     tables = [run.episodes for run in (before, after)]
     if not all(FIRST_FRAME in table for table in tables):
@@ -249,9 +248,9 @@ def why_alone(before: RunReader, after: RunReader, view: str = "mean") -> str:
 
 
 def _why_alone_beside_vlm(before: RunReader, after: RunReader, view: str) -> str:
-    vlm, policy = (before, after) if ask_of(before) is not None else (after, before)
-    ask = ask_of(vlm) or {}
-    if ask_of(policy) is not None or "{instruction}" not in ask.get("template", ""):
+    vlm, policy = (before, after) if before.ask is not None else (after, before)
+    ask = vlm.ask or {}
+    if policy.ask is not None or "{instruction}" not in ask.get("template", ""):
         return "other words"
     if ask["picture"] != "frame" or _picture_size(vlm) != _picture_size(policy):
         return "other pictures"
@@ -324,7 +323,7 @@ def lens_accuracy(run: RunReader, episodes: NDArray[np.str_]) -> NDArray[np.floa
     margins = stored[rows]
     if np.isnan(margins).any():
         return None
-    query = (ask_of(run) or {}).get("object", "target")
+    query = (run.ask or {}).get("object", "target")
     is_left = np.array([side_expected(query, side) == "left" for side in run.episodes["side_correct"][rows]])
     signed = np.where(is_left[:, None], margins, -margins)
     return np.asarray(((signed > 0) + 0.5 * (signed == 0)).mean(axis=0))

@@ -10,7 +10,8 @@ from probe_kit._tables.content import Heading, Number
 from probe_kit._tables.numbers import number, percent, with_limits
 from probe_kit._tables.table import Table
 from probe_kit.retention.behaviour import Regime, normalised_score
-from probe_kit.retention.columns.text import once_per_category, published_value, retention_value
+from probe_kit.retention.columns.tables import once_per_category
+from probe_kit.retention.columns.text import published_value, retention_value
 from probe_kit.retention.rows.row import MEAN, RetentionRow
 from probe_kit.retention.table import RetentionTable
 from probe_kit.suite.categories import OWN_DOMAIN, category_of, in_order

@@ -11,10 +11,10 @@ from probe_kit._tables.table import Table
 from probe_kit.errors import UsageError
 from probe_kit.intervene.kinds.interchange import stored_steering
 from probe_kit.retention.displays import curves_side_by_side, dose_response, layer_curve
+from probe_kit.retention.displays.display import BLUE, VERMILION, footer, panels, plain
 from probe_kit.retention.displays.report_figure import ONLY_FILLED, ReportFigure, figure_of
-from probe_kit.retention.displays.style import BLUE, VERMILION, footer, panels, plain
 from probe_kit.retention.displays.table_figures import SideTableDisplay
-from probe_kit.retention.report.parts import Picture, citation, data_uri, provenance, render, words_of
+from probe_kit.retention.report.page import Picture, citation, data_uri, provenance, render, words_of
 from probe_kit.retention.table import RetentionTable, retention_table
 from probe_kit.study.cells import slugs
 from probe_kit.study.plan import plan_study

@@ -15,8 +15,9 @@ from probe_kit._tables.table import Table
 from probe_kit.errors import ProbeKitError, RunDamagedError, UsageError
 from probe_kit.retention import retention_table
 from probe_kit.retention.behaviour import scored
+from probe_kit.retention.columns.tables import behaviour_once
 from probe_kit.retention.columns.text import P_DECIDES, difference_test, models_test
-from probe_kit.retention.compare.compare import MANY, Difference, behaviour_once, with_holm
+from probe_kit.retention.compare.compare import MANY, Difference, with_holm
 from probe_kit.retention.compare.known_used import (
     OVERALL,
     CategoryCounts,

@@ -17,7 +17,6 @@ from probe_kit.hooks.contract.sites import Site, resolve_view
 from probe_kit.intervene.kinds.attention import PatchAttention, stored_patch_attention
 from probe_kit.intervene.outcomes import has_sides
 from probe_kit.retention import RetentionRow, RetentionTable, retention_table
-from probe_kit.retention.behaviour import ask_of
 from probe_kit.runs import Run
 from probe_kit.runs.arrays import Rows, decode_bfloat16
 from probe_kit.runs.layout import MEAN_VIEW
@@ -231,7 +230,7 @@ class ViewedRun:
     @property
     def answers(self) -> bool:
         """Whether the model was asked and did not act."""
-        return ask_of(self.run) is not None
+        return self.run.ask is not None
 
     def outcome_word(self, outcome: Any) -> Any:
         """The outcome as the page names it: `unread` where no rule could read the answer of a VLM, not `oob`."""

@@ -29,7 +29,7 @@ from probe_kit.intervene import ImageSwap, InstructionSwap, UseVerdict, run_inte
 from probe_kit.intervene.verdict import Behaviour
 from probe_kit.retention import RetentionRow
 from probe_kit.retention.behaviour import SuccessRate, regime
-from probe_kit.retention.columns.sentences import verdict
+from probe_kit.retention.columns.text import verdict
 from probe_kit.retention.rows.row import BackbonePart, RunInfo, SwapEffect
 from probe_kit.suite import Suite
 

@@ -12,7 +12,7 @@ from probe_kit.env import SceneSpec
 from probe_kit.errors import CheckpointError, UsageError
 from probe_kit.extract import ExtractSettings, extract_run, prepare
 from probe_kit.retention import retention_table
-from probe_kit.retention.behaviour import success_rate
+from probe_kit.retention.behaviour import TableRun, success_rate
 from probe_kit.retention.compare.compare import Side, compare
 from probe_kit.retention.displays.bars import PairedLayoutsDisplay
 from probe_kit.retention.displays.report_figure import collect_figures
@@ -100,7 +100,7 @@ def test_groups_of_which_one_did_not_act_are_compared_in_what_both_have(
 ) -> None:
     both = retention_table({"capture_run": [capture_run], "acting": [recorded_run]})
     assert both.differences == []  # the acting run was not probed, and the other has no success rate
-    rows = run_rows(capture_run, load_results(capture_run), RowSettings(None, "all", ()))
+    rows = run_rows(TableRun.of(capture_run), load_results(capture_run), RowSettings(None, "all", ()))
     same = compare(Side("one", (capture_run,), rows), Side("other", (capture_run,), rows))
     assert {row.category for row in same} == {"color", "mean"}
     assert all(row.sr is None and row.paired and row.backbone == 0 for row in same)

@@ -13,7 +13,7 @@ from probe_kit.extract.protocols import check_protocol, protocol_scene
 from probe_kit.extract.settings import run_label
 from probe_kit.hooks.contract.declared import check_options
 from probe_kit.hooks.registry import own_families
-from probe_kit.retention.report.parts import provenance
+from probe_kit.retention.report.page import provenance
 from probe_kit.suite import Suite
 from tests.support.pi0_checkpoints import write_intact
 

@@ -36,7 +36,7 @@ from probe_kit.retention.displays import (
     role_curves,
     save_figures,
 )
-from probe_kit.retention.displays.style import FILLED, OPEN, ProvenanceLine, caption
+from probe_kit.retention.displays.display import FILLED, OPEN, ProvenanceLine, caption
 from probe_kit.retention.displays.table_figures import heat_colour, place_labels
 from probe_kit.train import ArrayRun, load_results
 

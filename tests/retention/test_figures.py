@@ -26,7 +26,7 @@ from probe_kit.retention.displays import (
     collect_figures,
     save_figures,
 )
-from probe_kit.retention.displays.style import FILLED, OPEN
+from probe_kit.retention.displays.display import FILLED, OPEN
 from probe_kit.train import ArrayRun, ProbeResults, load_results, save_results
 from tests.retention.conftest import runs_in
 

@@ -26,8 +26,8 @@ from probe_kit.retention.displays import (
     layer_curve,
     step_scores,
 )
+from probe_kit.retention.displays.display import PARTS
 from probe_kit.retention.displays.report_figure import file_names
-from probe_kit.retention.displays.style import PARTS
 from probe_kit.retention.report import report_html
 from probe_kit.runs import Run, open_run
 from probe_kit.train import ProbeResults, Target, load_results, train_probes

@@ -17,9 +17,9 @@ from probe_kit.env.scoring import RULES, Trajectory
 from probe_kit.errors import NoTrajectoryError, UsageError
 from probe_kit.extract import ExtractSettings, extract_run
 from probe_kit.retention import FinalPositionsDisplay, OutcomeRulesDisplay, retention_table, success_rate
+from probe_kit.retention.behaviour import rule_sentence
 from probe_kit.retention.displays import collect_figures
 from probe_kit.retention.report import report_html
-from probe_kit.retention.rows.outcome_rules import rule_sentence
 from probe_kit.runs import Run, open_run
 from probe_kit.statistics.intervals import Share
 from probe_kit.suite import build_suite

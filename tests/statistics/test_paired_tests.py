@@ -11,8 +11,7 @@ import pytest
 from scipy.stats import binomtest
 
 from probe_kit.retention import retention_table
-from probe_kit.retention.compare.known_used import OVERALL
-from probe_kit.retention.displays.bars import joins_of
+from probe_kit.retention.compare.known_used import OVERALL, join_runs
 from probe_kit.retention.rows.row import MEAN
 from probe_kit.statistics.paired_tests import (
     EXCHANGES,
@@ -292,7 +291,7 @@ def test_differences_are_one_family_and_means_another(runs: list[SaidRun]) -> No
 
 def test_joins_that_a_report_shows_together_are_one_family(runs: list[SaidRun]) -> None:
     table = retention_table(runs)
-    joins, _ = joins_of(runs, table)
+    joins = join_runs(table.runs, table.results).tables
     tests = [one for join in joins for row in join.rows if row.category != OVERALL for one in row.comparisons]
     check([(one.p, one.p_holm) for one in tests], len(list(product(range(2), range(3), SHARES))))
     summaries = [one for join in joins for row in join.rows if row.category == OVERALL for one in row.comparisons]

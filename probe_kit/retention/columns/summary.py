@@ -9,27 +9,25 @@ from probe_kit._tables.numbers import Limits, points, signed, whole_percent, wit
 from probe_kit._tables.table import Cell, Heading, Row, Table
 from probe_kit.intervene.verdict import UseVerdict, describe_readouts, more_groups, size_of_groups
 from probe_kit.retention.behaviour import Regime
-from probe_kit.retention.columns.sentences import (
-    chance_only,
-    conclusion,
-    is_probed,
-    knows,
-    label_finding,
-    more_items,
-    unprobed,
-    verdict,
-)
 from probe_kit.retention.columns.text import (
     P_DECIDES,
     above_chance,
     by_run,
+    chance_only,
+    conclusion,
     difference_test,
+    is_probed,
     is_vlm,
+    knows,
+    label_finding,
     model_name,
     models_p,
+    more_items,
     name_of,
     retention_value,
     title_of,
+    unprobed,
+    verdict,
 )
 from probe_kit.retention.compare.compare import Difference
 from probe_kit.retention.rows.row import MEAN, RetentionRow, StreamPart

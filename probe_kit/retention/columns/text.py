@@ -1,13 +1,20 @@
-"""The words of a retention table: texts of single values, of modes, and terms that are no column."""
+"""The words of a retention table: texts of single values, terms that are no column, verdicts and sentences."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Literal
+from math import ceil
+from typing import Literal, cast
 
-from probe_kit._tables.numbers import NONE, Write, number, p_text, percent, with_limits
-from probe_kit.retention.behaviour import Regime
+from probe_kit._system.counting import counted, enumerated
+from probe_kit._tables.numbers import NONE, Write, number, p_text, percent, whole_percent, with_limits
+from probe_kit.hooks.contract.sites import label_of
+from probe_kit.intervene.verdict import UNTESTED, UseVerdict
+from probe_kit.retention.behaviour import Regime, SuccessRate
 from probe_kit.retention.compare.compare import Difference
 from probe_kit.retention.compare.models import ModelTest
+from probe_kit.retention.rows.build import NO_STEP
 from probe_kit.retention.rows.row import RetentionRow, StreamPart
+from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.statistics.sufficiency import GROUPS_FOR_PROBES, items_for_absence
 from probe_kit.suite.categories import category_of
 from probe_kit.train.choices import EVERYWHERE, SIDES
 
@@ -173,12 +180,6 @@ def name_of_target(target: str, category: str) -> str:
     return target if category == EVERYWHERE else f"{target}, {title_of(category)}"
 
 
-def once_per_category(rows: Sequence[RetentionRow]) -> list[RetentionRow]:
-    """Success rates do not depend on the view: the first row of each run and category."""
-    # Twice reversed: of a key named twice a dict keeps the first place and the last value.
-    return list({(row.run.location, row.category): row for row in reversed(rows)}.values())[::-1]
-
-
 def by_run(rows: Sequence[RetentionRow]) -> list[list[RetentionRow]]:
     """Return the rows of each run, and group, in the order of their first ones."""
     runs: dict[tuple[str | None, str], list[RetentionRow]] = {}
@@ -229,3 +230,365 @@ VIEWER_WORDS = {
     "call": TERMS["call"],
 }
 """The words that the viewer explains."""
+
+
+# -- verdicts -------------------------------------------------------------------------------------------------
+
+
+def label_finding(row: RetentionRow) -> str:
+    """Return whether probes decode the label in the backbone and how much of that is left in the action."""
+    if not row.retention.defined:
+        is_open = row.backbone.p_fwe is None or row.action.peak is None
+        return f"{'open' if is_open else 'not shown'}: {_missing(row)}."
+    action = label_of(row.action.stream or "action")
+    if row.action.missed:
+        missed = enumerated(row.action.missed)
+        where = f"in the {action} not beyond {missed}"
+        return f"encoded, not shown in the action: probes read it in the backbone; {where}."
+    share_left = (
+        ""
+        if row.retention.value is None
+        else f"; {whole_percent(row.retention.value)} % of its score above chance is left"
+    )
+    return f"encoded and passed on: probes read it in the backbone and the {action}{share_left}."
+
+
+def _missing(row: RetentionRow) -> str:
+    """Return what is missing for retention to be defined."""
+    backbone = row.backbone
+    if backbone.peak is None or row.action.peak is None:
+        return f"no site of the {'backbone' if backbone.peak is None else 'action'} was probed"
+    if backbone.p_fwe is None:
+        return "no permuted labels say what chance is; train with permutations"
+    if row.retention.note == NO_STEP:
+        return "the control step was not run, and the step of the episode may say as much"
+    if backbone.missed and backbone.remedy:
+        return f"no p can fall below the level: {backbone.remedy}"
+    if backbone.missed:
+        return f"probes of the backbone do no better than {enumerated(backbone.missed)}"
+    return "the backbone holds too little of it above chance to divide by"
+
+
+def label_details(row: RetentionRow) -> str:
+    """Return the finding with its numbers, their uncertainty and sizes; to be set behind the name."""
+    where = f"(view {row.view})"
+    if not row.retention.defined:
+        return f"{where}: retention is not defined: {row.retention.reason}."
+    share_left = with_limits(row.retention.value, row.retention.ci, number)
+    missed = row.action.missed
+    reached = f"not shown to exceed {', '.join(missed)}" if missed else f"signal there (p < {SIGNIFICANCE})"
+    action = label_of(row.action.stream or "action")
+    return (
+        f"{where}: {share_left} of the backbone's score above chance is left in the {action}; {reached}. "
+        f"{counted(row.controls.n_groups or 0, 'group')}, {counted(row.controls.n_samples or 0, 'sample')}."
+    )
+
+
+def _capital(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:]}"
+
+
+Readable = Literal[
+    "known",
+    "shown",
+    "absent",
+    "not shown",
+    "success",
+    "failure",
+    "success not shown",
+    "shown, success",
+    "shown, failure",
+    "shown, success not shown",
+    "absent, success",
+    "absent, failure",
+    "not shown, success",
+    "not shown, failure",
+]
+"""The backbone's evidence, then success, where no image swap is stored: these never say *used*."""
+_EVIDENCE = {
+    "shown": "The probes find the answer in the backbone, beyond every control that was run",
+    "absent": "No linear probe of so many items reaches a stated accuracy in the backbone, 65 % by default, and "
+    "so many items would have shown it",
+    "not shown": "Neither shown nor absent: the items are too few to tell",
+}
+_SUCCESS = {
+    "success": "the policy is right more often than guessing explains",
+    "failure": "the policy is right less often than guessing",
+    "success not shown": "the success rate is one that guessing can reach",
+}
+_READABLE_HELP = {
+    "known": "The VLM answers right more often than guessing explains.",
+    **{name: f"{meaning}." for name, meaning in _EVIDENCE.items()},
+    **{name: f"{_capital(meaning)}. No probes are stored." for name, meaning in _SUCCESS.items()},
+    **{
+        f"{evidence}, {success}": f"{read}; {behaviour}. Only an intervention shows whether the answer is used."
+        for evidence, read in _EVIDENCE.items()
+        for success, behaviour in _SUCCESS.items()
+        if evidence == "shown" or success != "success not shown"
+    },
+}
+_BEHAVIOUR_HELP = {
+    "used": "A swap turns the action, in at least half of the episodes and by at least half of the reach.",
+    "partly used, one-sided": "A swap turns the action where the answer lies on the named side only.",
+    "partly used, graded": "A swap turns the action in fewer episodes, or by less, than where it is used.",
+    "moves with it, does not decide": "A swap moves the action by a tenth of the reach, and does not turn it.",
+    "not used": "A swap moves the action by less than a tenth of the reach; another category is used.",
+    "undecided": "The numbers do not decide whether the answer is used; the sentence says what is missing.",
+}
+VERDICT_HELP = _READABLE_HELP | _BEHAVIOUR_HELP
+"""What each verdict says, as an entry of the glossary."""
+
+
+def verdict(row: RetentionRow) -> str:
+    """Return what a row says: is the answer in the backbone, and does the policy act on it?
+
+    With a stored image swap the verdict is that of `probe_kit.intervene.classify_use`. Where the answer is neither
+    used nor read in the backbone, and without an image swap, it is `readable`.
+    """
+    use = row.image_swap.use
+    return readable(row) if use is None or _is_neither_used_nor_found(row, use) else use.verdict
+
+
+def _is_neither_used_nor_found(row: RetentionRow, use: UseVerdict) -> bool:
+    """Whether the image swap bounds the use, and probes did not find the answer."""
+    return use.is_bounded and is_probed(row) and not row.backbone.has_signal
+
+
+def readable(row: RetentionRow) -> Readable:
+    """Return what the row says without an intervention: the backbone's evidence, and success beside it.
+
+    *Shown*: the backbone's best site exceeds chance, family-wise, and every control that was run. *Absent*: it is
+    below a stated accuracy, else *not shown*. *Success*: SR in the regime of knowledge; *failure*: SR in that of
+    failure. Success does not say that the answer in the backbone is what the action uses. A VLM knows a category
+    in which it answers in the regime of knowledge, else that is *not shown*.
+    """
+    if is_vlm(row):
+        return "known" if knows(row) else "not shown"
+    nothing: Readable = "absent" if row.backbone.verdict == "absent" else "not shown"
+    if row.image_swap.use is not None and _is_neither_used_nor_found(row, row.image_swap.use):
+        return nothing
+    evidence: Readable = "shown" if row.backbone.has_signal else nothing
+    if row.success.sr is None:
+        return evidence
+    success = _success(row)
+    if not is_probed(row):
+        return success
+    if success == "success not shown" and evidence != "shown":
+        return evidence
+    return cast("Readable", f"{evidence}, {success}")
+
+
+def _success(row: RetentionRow) -> Literal["success", "failure", "success not shown"]:
+    """Return how a policy does against guessing."""
+    if knows(row):
+        return "success"
+    return "failure" if row.success.regime == Regime.FAILURE else "success not shown"
+
+
+def knows(row: RetentionRow) -> bool:
+    """Whether its success rate is in the regime of knowledge."""
+    return row.success.regime == Regime.KNOWLEDGE
+
+
+# -- what follows --------------------------------------------------------------------------------------------
+
+_UNTESTED = f"{UNTESTED}: run `probe-kit intervene`"
+_LATER = "Yet the policy succeeds: actions after the first inference may follow."
+"""An image swap reads the actions of the first inference."""
+
+
+def conclusion(row: RetentionRow) -> str:
+    """Return what follows from a row, and what to do next; of a label with its numbers."""
+    if not row.is_side:
+        return label_details(row)
+    if is_vlm(row):
+        return "The VLM knows the answer." if knows(row) else "Not shown that the VLM knows the answer."
+    use = row.image_swap.use
+    is_later = use is not None and use.is_bounded and use.is_of_first_chunk and knows(row)
+    parts = [_finding(row) if use is None else _used(row, use), _LATER * is_later]
+    if not is_probed(row):
+        has_activations = row.run.action_stream is not None
+        can_be_probed = has_activations and (row.success.n_groups or 0) >= GROUPS_FOR_PROBES
+        parts.append(f"{_capital(unprobed(row))}{': run `probe-kit train`' * can_be_probed}.")
+    return " ".join(filter(None, parts))
+
+
+def _used(row: RetentionRow, use: UseVerdict) -> str:
+    """Return the sentence of a row with a stored image swap: behaviour; place; tie."""
+    if _is_neither_used_nor_found(row, use):
+        return f"{_nothing_shown(row)} {use.sentence}"
+    return use.sentence
+
+
+def _finding(row: RetentionRow) -> str:
+    """Return the sentence of a row without one."""
+    reading = readable(row)
+    if not is_probed(row):
+        return _unprobed(row)
+    if reading == "shown":
+        return "Shown in the backbone."
+    if reading.startswith("shown, "):
+        return f"Shown in the backbone; {_behaviour(row)}; {_UNTESTED}."
+    if not knows(row):
+        return _nothing_shown(row)
+    return f"The policy succeeds; the answer is {_backbone(row)}; {_UNTESTED}."
+
+
+def _unprobed(row: RetentionRow) -> str:
+    """Return the sentence of behaviour alone; empty where the other one has said all."""
+    if row.success.sr is None:
+        return ""
+    return f"{_capital(_behaviour(row))}; {_UNTESTED}."
+
+
+def _nothing_shown(row: RetentionRow) -> str:
+    """Return the sentence of a backbone without signal: what is decided first, then what is open."""
+    absent = row.backbone.verdict == "absent"
+    behaviour = _behaviour(row)
+    backbone = _backbone(row)
+    parts = [backbone, behaviour] if absent or behaviour == _NOT_SHOWN else [behaviour, backbone]
+    clauses = "; ".join(filter(None, parts))
+    remedy = ""
+    if not absent:
+        remedy = f": {row.backbone.remedy or more_items(row) or _POWER}"
+    elif behaviour == _NOT_SHOWN:
+        remedy = _items_for_success(row.success)
+    return f"{_capital(clauses)}{remedy}."
+
+
+_NOT_SHOWN = "success is not shown"
+_POWER = "`probe-kit power` simulates how many items would show it"
+
+
+def more_items(row: RetentionRow) -> str:
+    """Return how many items it takes at least to call a backbone without the answer absent; empty for so many."""
+    success = row.success
+    if not success.n_items or not success.n_groups or not success.n_episodes:
+        return ""
+    needed = items_for_absence(success.n_items, success.n_groups, success.n_episodes)
+    return f"fewer than {needed} items cannot tell what the backbone lacks" if needed > success.n_items else ""
+
+
+def _items_for_success(success: SuccessRate) -> str:
+    """Return with how many items guessing would no longer explain the rate, if it stays; empty for one half."""
+    if success.sr is None or not success.chance_margin or not success.n_items or success.sr == 0.5:
+        return ""
+    # The margin shrinks with the root of the number of items.
+    needed = ceil(success.n_items * (success.chance_margin / (success.sr - 0.5)) ** 2)
+    return f": a rate of {whole_percent(success.sr)} % takes about {needed} items" * (needed > success.n_items)
+
+
+def _backbone(row: RetentionRow) -> str:
+    """Return the evidence of a backbone without signal, in words."""
+    if row.backbone.verdict == "absent":
+        return "absent from the backbone for a linear probe of so many items"
+    return "not shown in the backbone"
+
+
+def _behaviour(row: RetentionRow) -> str:
+    """Return in words how the policy does; empty if it did not act, or a swap says more."""
+    if row.image_swap.use is not None or row.success.sr is None:
+        return ""
+    words = {
+        "success": "the policy succeeds",
+        "failure": "the policy is right less often than guessing",
+        "success not shown": _NOT_SHOWN,
+    }
+    return words[_success(row)]
+
+
+def is_probed(row: RetentionRow) -> bool:
+    """Whether probes of the backbone are stored."""
+    return bool(row.backbone.exceeds)
+
+
+def unprobed(row: RetentionRow) -> str:
+    """Return why there are no numbers of the backbone: no probes are stored, or those of other categories are."""
+    return "the backbone was not probed" if row.run.probes is None else "the probes are not of this category"
+
+
+def chance_only(rows: Sequence[RetentionRow]) -> str:
+    """A warning that names the runs whose probes were compared with no control; empty where all were."""
+    probed = [row for row in rows if is_probed(row)]
+    names = list(dict.fromkeys(model_name(row) for row in probed if not row.backbone.is_controlled))
+    if not names:
+        return ""
+    several = len({model_name(row) for row in rows}) > 1
+    of_runs = f" for {', '.join(names)}" if several else ""
+    return (
+        f"No control was run{of_runs}: a signal is judged against chance only, and pictures and words alone may "
+        "give the answer away. Run `probe-kit train RUN`, with --suite FOLDER where it cannot find the suite"
+    )
+
+
+# -- warnings -------------------------------------------------------------------------------------------------
+
+_MOSTLY = 0.5  # share of episodes above which something is said first
+
+
+def warnings_of(mean: RetentionRow, rows: Sequence[RetentionRow]) -> list[str]:
+    """Return what would be misread without a word about it, of a run's categories and their mean, in a view."""
+    sentences = []
+    if mean.run.random_weights:
+        sentences.append("The weights are random: the model is untrained. Read every number as “knows nothing”.")
+    sentences += _unread(mean) if is_vlm(mean) else _unmoved(mean)
+    biased = [
+        row
+        for row in rows
+        if row.success.side_preference is not None and abs(row.success.side_preference - 0.5) > 0.25
+    ]
+    if biased:
+        habit = "The answers have a habit of naming" if is_vlm(mean) else "The policy has a habit of going to"
+        sentences.append(f"{habit} one side in {_of(biased, rows)}.")
+    if uncontrolled := chance_only(rows):
+        sentences.append(f"{uncontrolled}.")
+    if mean.controls.leaks:
+        sentences.append(
+            f"The suite gives answers away without a model ({', '.join(mean.controls.leaks)}): see the "
+            "controls before believing a probe."
+        )
+    return sentences
+
+
+def _unread(mean: RetentionRow) -> list[str]:
+    """Return warnings about a model that was asked."""
+    if (mean.success.share_outside or 0) <= _MOSTLY:
+        return []
+    unread = percent(mean.success.share_outside)
+    return [f"No answer could be read in {unread} % of episodes: it may know more than it says."]
+
+
+def _unmoved(mean: RetentionRow) -> list[str]:
+    """Return warnings about a policy."""
+    sentences = []
+    if (mean.success.share_never_moved or 0) > _MOSTLY:
+        sentences.append(
+            f"The cube never moved in {percent(mean.success.share_never_moved)} % of episodes: "
+            "the policy does not grasp, so its success rate is no measure of what it knows."
+        )
+    elif (mean.success.share_outside or 0) > _MOSTLY:
+        sentences.append(
+            f"The cube reached neither picture in {percent(mean.success.share_outside)} % of episodes."
+        )
+    if mean.success.share_invalid_action:
+        sentences.append(
+            f"In {percent(mean.success.share_invalid_action)} % of its steps the policy put out "
+            "something that is no action."
+        )
+    return sentences
+
+
+def _names(part: Sequence[RetentionRow], rows: Sequence[RetentionRow]) -> str:
+    """The shorter of the two lists: those that are in, or those that are not."""
+    absent = [row for row in rows if row not in part]
+    listed, prefix = (absent, "all but ") if len(absent) < len(part) else (part, "")
+    return prefix + ", ".join(title_of(row.category) for row in listed)
+
+
+def _of(part: Sequence[RetentionRow], rows: Sequence[RetentionRow]) -> str:
+    """Return how many of the categories, and which if not all."""
+    noun = "category" if len(rows) == 1 else "categories"
+    if len(part) == len(rows):
+        return f"all {len(rows)} {noun}" if len(rows) > 1 else "the only category"
+    names = f" ({_names(part, rows)})" if part else ""
+    return f"{len(part) or 'none'} of {len(rows)} {noun}{names}"

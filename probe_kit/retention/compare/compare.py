@@ -1,30 +1,35 @@
-"""One comparison: the first side minus the second, on the same items, with one exact test.
+"""One comparison: the first side minus the second, on the same items, with one exact test; and its sides.
 
-Two runs, two groups of models, a VLM and a policy, two wordings of a run are calls of `compare`; `pairing` says
-which sides are compared. Rows pair by item, layout and content. Groups of items are the unit of intervals and p.
+Two runs, two groups of models, a VLM and a policy, two wordings of a run are calls of `compare`. Rows pair by
+item, layout and content. Groups of items are the unit of intervals and p.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from functools import reduce
+from itertools import combinations, product
 from math import lcm
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.retention.behaviour import shares_of, success_share, units_of
+from probe_kit.errors import UsageError
+from probe_kit.retention.behaviour import TableRun, shares_of, success_share, units_of
 from probe_kit.retention.compare.models import (
     ModelTest,
     Relation,
     compare_models,
+    grew_from,
+    origins_of,
     retention_of_model,
     success_of_model,
 )
 from probe_kit.retention.estimators import ACTION, BACKBONE, Limits, PooledScores, Rate, limits
-from probe_kit.retention.rows.build import RowWithEstimates
+from probe_kit.retention.rows.build import RowSettings, RowWithEstimates, run_rows
 from probe_kit.retention.rows.row import MEAN, Mode
+from probe_kit.runs.layout import FIRST_FRAME
 from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.paired_tests import corrected, flip_gains_p
 from probe_kit.statistics.retention import Ratio, Scores, retention_difference
@@ -272,12 +277,6 @@ def compare(
     return [replace(row, **common, **_counts(row, shared)) for row in differences]
 
 
-def behaviour_once(differences: Sequence[Difference]) -> list[Difference]:
-    """Return each difference of success rates once, whatever number of views there are."""
-    once = {(row.group, row.minus, row.category): row for row in reversed(differences) if row.sr is not None}
-    return list(once.values())[::-1]
-
-
 def with_holm(rows: Sequence[Difference]) -> list[Difference]:
     """Return the rows, which are shown together, with `p_holm`.
 
@@ -328,20 +327,20 @@ def _on_common_items(
 
 Outcomes = Mapping[str, Sequence["pd.DataFrame"]]
 """Per category, a table of outcomes of each run."""
-Drawn = Mapping[str, Sequence[RowWithEstimates]]
+RowsOfRuns = Mapping[str, Sequence[RowWithEstimates]]
 """Per category, the row of each run."""
 
 
-def _outcomes(drawn: Sequence[RowWithEstimates]) -> Outcomes:
+def _outcomes(rows: Sequence[RowWithEstimates]) -> Outcomes:
     """Once per run, whatever number of views it has."""
     by_category: dict[str, dict[str, pd.DataFrame]] = {}
-    for row in drawn:
+    for row in rows:
         if row.outcomes is not None:
             by_category.setdefault(row.row.category, {})[row.row.run.location] = row.outcomes
     return {category: list(tables.values()) for category, tables in by_category.items()}
 
 
-def _behaviour(views: Mapping[str | None, Drawn]) -> dict[str | None, Drawn]:
+def _behaviour(views: Mapping[str | None, RowsOfRuns]) -> dict[str | None, RowsOfRuns]:
     """Return what does not depend on the view, under the view None."""
     first = next(iter(views.values()), {})
     return {
@@ -352,10 +351,10 @@ def _behaviour(views: Mapping[str | None, Drawn]) -> dict[str | None, Drawn]:
     }
 
 
-def _by_view(drawn: Sequence[RowWithEstimates]) -> dict[str | None, Drawn]:
+def _by_view(rows: Sequence[RowWithEstimates]) -> dict[str | None, RowsOfRuns]:
     """Rows per view and category."""
     views: dict[str | None, dict[str, list[RowWithEstimates]]] = {}
-    for row in drawn:
+    for row in rows:
         views.setdefault(row.row.view, {}).setdefault(row.row.category, []).append(row)
     return dict(views)
 
@@ -405,18 +404,21 @@ def _pooled(rows: Sequence[RowWithEstimates]) -> PooledScores | None:
 
 
 def _compare(
-    sides: tuple[Side, Side], view: str | None, drawn: tuple[Drawn, Drawn], outcomes: tuple[Outcomes, Outcomes]
+    sides: tuple[Side, Side],
+    view: str | None,
+    rows_of_sides: tuple[RowsOfRuns, RowsOfRuns],
+    outcomes: tuple[Outcomes, Outcomes],
 ) -> list[Difference]:
-    minuends, subtrahends = drawn
+    minuends, subtrahends = rows_of_sides
     gaps = {
         category: _Gap.of(minuends[category], subtrahends[category])
         for category in minuends
         if category in subtrahends
     }
     gaps = {category: gap for category, gap in gaps.items() if gap.sr is not None or gap.accuracies}
-    rows = [_row(sides, [category], view, [gap], drawn, outcomes) for category, gap in gaps.items()]
+    rows = [_row(sides, [category], view, [gap], rows_of_sides, outcomes) for category, gap in gaps.items()]
     if rows:
-        mean = _row(sides, list(gaps), view, list(gaps.values()), drawn, outcomes)
+        mean = _row(sides, list(gaps), view, list(gaps.values()), rows_of_sides, outcomes)
         rows.append(replace(mean, category=MEAN, categories=tuple(gaps)))
     return rows
 
@@ -426,11 +428,11 @@ def _row(
     categories: Sequence[str],
     view: str | None,
     gaps: Sequence[_Gap],
-    drawn: tuple[Drawn, Drawn],
+    rows_of_sides: tuple[RowsOfRuns, RowsOfRuns],
     outcomes: tuple[Outcomes, Outcomes],
 ) -> Difference:
     """Return the difference in one category, or in the mean of several."""
-    first, second = ([of_side[category] for category in categories] for of_side in drawn)
+    first, second = ([of_side[category] for category in categories] for of_side in rows_of_sides)
     estimates: dict[str, Rate | Ratio | None] = {
         "sr": _mean_rate([gap.sr for gap in gaps]),
         "backbone": _mean_rate([gap.accuracies.get(BACKBONE) for gap in gaps]),
@@ -474,3 +476,239 @@ def _retention(gaps: Sequence[_Gap]) -> Ratio | None:
     minuend, subtrahend = (Scores.mean([pair[side].scores for pair in pairs]) for side in (0, 1))
     between = np.sum([mine.covariance_with(theirs) for mine, theirs in pairs], axis=0) / len(pairs) ** 2
     return retention_difference(minuend, subtrahend, between)
+
+
+# -- which sides are compared ---------------------------------------------------------------------------------
+
+
+PairedRuns = tuple[list[Difference], tuple[str, ...]]
+"""Differences of runs or groups on the items that they have in common; and why others have none, and which items
+were left out, a sentence each."""
+
+
+def compare_runs(
+    runs: Sequence[TableRun],
+    rows: Sequence[RowWithEstimates],
+    against: str | None = None,
+    vlm_vla: bool = False,
+    pairs: Sequence[tuple[str, str]] | None = None,
+) -> PairedRuns:
+    """Return every other run minus the run `against`, by default the first; VLM runs and policy runs apart.
+
+    runs: in the order in which they were named. rows: theirs. against: a run's name in tables, its folder's name
+    or its location. vlm_vla: whether VLM runs are compared with policy runs elsewhere. pairs: by location, those
+    that are compared instead, each the first minus the second. Runs of one seed and wording are compared, on the
+    items that both have: success rates on these alone, probes where no run has other items.
+    Raises UsageError for a name that is none of the runs, or several.
+    """
+    if against is not None and len(runs) < 2:
+        raise UsageError(f"--compare {against} needs a second run to compare with it")
+    differences: list[Difference] = []
+    unpaired: list[str] = []
+    for minuend, subtrahend in _pairs(runs, against, pairs):
+        both = f"{minuend.name} and {subtrahend.name}"
+        items = common_items([minuend.run, subtrahend.run])
+        if why := _why_not(minuend.run, subtrahend.run, items):
+            unpaired.append(f"{both} are not compared: {why}.")
+            continue
+        unpaired += _left_out(both, items)
+        first, second = (Side.of(run.name, run.run, rows) for run in (minuend, subtrahend))
+        differences += compare(first, second, items=items)
+    if not vlm_vla and pairs is None and len({run.answers for run in runs}) == 2:
+        unpaired.append("VLM runs and policy runs are not compared with each other; --compare vlm-vla does that.")
+    return with_holm(differences), tuple(unpaired)
+
+
+def compare_groups(
+    groups: Mapping[str, Sequence[TableRun]],
+    rows: Sequence[RowWithEstimates],
+    against: str | None = None,
+    origins: Mapping[str, str] | None = None,
+) -> PairedRuns:
+    """Return every group of runs minus every earlier one, or minus the group `against`; see `compare_runs`.
+
+    Two groups count as pairs in categories in which all of their runs have at least 80 % of the items in common,
+    and then on these items alone. In other categories each group has its own items. origins: see `origins_of`.
+    Raises UsageError for a group that is none of them, and a declared origin of no run.
+    """
+    differences: list[Difference] = []
+    notes: list[str] = []
+    runs_of = {name: tuple(run.run for run in of_group) for name, of_group in groups.items()}
+    grown = origins_of([run for of_group in runs_of.values() for run in of_group], origins)
+    for names in group_pairs(list(groups), against):
+        in_common = common_items([run for name in names for run in runs_of[name]])
+        items = {category: common for category, common in in_common.items() if common.is_many}
+        first, second = (
+            Side(name, runs_of[name], tuple(row for row in rows if row.row.group == name), origins=grown)
+            for name in names
+        )
+        notes += _left_out(" and ".join(names), items)
+        differences += compare(first, second, items=items, others_too=True)
+    return with_holm(differences), tuple(notes)
+
+
+def group_pairs(groups: Sequence[str], against: str | None = None) -> list[tuple[str, str]]:
+    """Return every group with every earlier one, or every other group with `against`: minuend, subtrahend.
+
+    Raises UsageError for a group that is none of them.
+    """
+    if against is None:
+        return [(later, earlier) for earlier, later in combinations(groups, 2)]
+    if against not in groups:
+        raise UsageError(f"there is no group {against!r} to compare with; there are {', '.join(groups)}")
+    return [(name, against) for name in groups if name != against]
+
+
+def compare_with_vlms(
+    runs: Sequence[TableRun],
+    rows: Sequence[RowWithEstimates],
+    pairs: Sequence[tuple[str, str]] | None = None,
+) -> list[Difference]:
+    """Return every VLM run minus every acting one that it can be compared with, in answers and success alone.
+
+    A policy whose network grew from weights that were asked is not compared with VLMs of other weights. pairs:
+    locations of the VLM runs and policy runs that are compared instead.
+    """
+    vlms, policies = ([run for run in runs if run.answers == kind] for kind in (True, False))
+    related = [(vlm, policy, grew_from(policy.run, vlm.run)) for vlm, policy in product(vlms, policies)]
+    grown = {policy.location for _, policy, source in related if source == "yes"}
+    differences: list[Difference] = []
+    for vlm, policy, source in related:
+        is_left_out = source == "no" and policy.location in grown
+        if is_left_out if pairs is None else (vlm.location, policy.location) not in pairs:
+            continue
+        items = common_items([vlm.run, policy.run]) if wording_of(vlm.run) == wording_of(policy.run) else {}
+        items = {name: in_common for name, in_common in items.items() if in_common.n_items}
+        first, second = (Side.of(run.label, run.run, rows) for run in (vlm, policy))
+        differences += [
+            replace(
+                row,
+                source=source,
+                paired=row.n_items is not None,
+                same_frames=_same_frames(vlm.run, policy.run, row.categories or (row.category,), items),
+            )
+            for row in compare(first, second, "success", items=items, others_too=True)
+        ]
+    return with_holm(differences)
+
+
+def _same_frames(
+    vlm: RunReader, policy: RunReader, categories: Sequence[str], items: Mapping[str, CommonItems]
+) -> bool | None:
+    """Return whether all episodes of both began with the same frames; None where a run has no hashes."""
+    if FIRST_FRAME not in vlm.episodes or FIRST_FRAME not in policy.episodes:
+        return None
+    are_same = []
+    for category in categories:
+        first, second = (run.episodes[run.episodes["category"] == category] for run in (vlm, policy))
+        if category in items:
+            first, second = items[category].select(first), items[category].select(second)
+        both = first[["episode_id", FIRST_FRAME]].merge(second[["episode_id", FIRST_FRAME]], on="episode_id")
+        are_same.append(bool(len(both) and (both[f"{FIRST_FRAME}_x"] == both[f"{FIRST_FRAME}_y"]).all()))
+    return all(are_same)
+
+
+# -- wordings ----------------------------------------------------------------------------------------------------
+
+
+class _InWording:
+    """A run with the episodes of one wording, which are not read again; everything else is the run's own."""
+
+    def __init__(self, run: RunReader, wording: str) -> None:
+        self._run = run
+        self.episodes = run.episodes[run.episodes["wording"] == wording]
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._run, name)
+
+
+def compare_wordings(runs: Sequence[RunReader]) -> list[Difference]:
+    """Return every two wordings of each run against each other, the earlier one minus the later.
+
+    It separates not knowing from not being able: who places the cube by "the left picture" and not by what the
+    picture shows can act and does not know. runs: those that acted, judged by the rule of the table.
+    """
+    settings = RowSettings(None, "all", ())
+    differences: list[Difference] = []
+    for run in runs:
+        every_wording = run.all_wordings
+        sides = {}
+        for wording in run.wordings:
+            in_wording = cast("RunReader", _InWording(every_wording, wording))
+            if len(in_wording.episodes):
+                rows = run_rows(TableRun.of(in_wording, with_behaviour=False), None, settings)
+                sides[wording] = Side.of(wording, in_wording, rows)
+        for first, second in combinations(sides.values(), 2):
+            differences += compare(first, second, "success")
+    return with_holm(differences)
+
+
+def _left_out(both: str, items: Mapping[str, CommonItems]) -> list[str]:
+    """Return a sentence or two on what a comparison leaves out."""
+    none = [name for name, in_common in items.items() if not in_common.n_items]
+    part = {
+        name: in_common for name, in_common in items.items() if in_common.n_items and not in_common.is_complete
+    }
+    some = [f"{in_common.n_items} of {in_common.of_items} in {name}" for name, in_common in part.items()]
+    sentences = [f"{both} are not compared in {', '.join(none)}: no item in common."] if none else []
+    if some:
+        sentences.append(
+            f"{both} are compared on the items in common: {', '.join(some)}. Probes are not compared there: they "
+            "were fitted on other items."
+        )
+    return sentences
+
+
+def _pairs(
+    runs: Sequence[TableRun], name: str | None, pairs: Sequence[tuple[str, str]] | None
+) -> list[tuple[TableRun, TableRun]]:
+    if pairs is not None:
+        by_location = {run.location: run for run in runs}
+        if strange := [location for pair in pairs for location in pair if location not in by_location]:
+            raise UsageError(f"{strange[0]} is none of the runs {', '.join(by_location)}")
+        return [(by_location[minuend], by_location[subtrahend]) for minuend, subtrahend in pairs]
+    against = None if name is None else _run_called(name, runs)
+    if against is not None:
+        return [(run, against) for run in runs if run is not against and run.answers == against.answers]
+    with_first = []
+    for are_vlms in (True, False):
+        alike = [run for run in runs if run.answers == are_vlms]
+        with_first += [(subtrahend, alike[0]) for subtrahend in alike[1:]]
+    return with_first
+
+
+def _run_called(name: str, runs: Sequence[TableRun]) -> TableRun:
+    ways: tuple[Callable[[TableRun], str], ...] = (
+        lambda run: run.location,
+        lambda run: run.name,
+        lambda run: run.run.location.name,
+        lambda run: run.run.label,
+    )
+    for called in ways:
+        matches = [run for run in runs if called(run) == name.rstrip("/")]
+        if len(matches) == 1:
+            return matches[0]
+    candidates = ", ".join(f"{run.run.location.name} ({run.name})" for run in runs)
+    raise UsageError(f"--compare {name!r} is {'several' if matches else 'none'} of the runs {candidates}")
+
+
+def _why_not(minuend: RunReader, subtrahend: RunReader, items: Mapping[str, CommonItems]) -> str:
+    """Why two runs cannot be paired, in words that follow a colon; empty if they can."""
+    for what, read in _SAME.items():
+        mine, theirs = read(minuend), read(subtrahend)
+        if None not in (mine, theirs) and mine != theirs:
+            return f"other {what} ({mine} and {theirs})"
+    if any(in_common.n_items for in_common in items.values()):
+        return ""
+    if minuend.suite != subtrahend.suite:
+        hashed = has_item_content(minuend) and has_item_content(subtrahend)
+        unknown = "" if hashed else ", without item hashes in both runs to pair items by"
+        return f"other suites ({minuend.suite} and {subtrahend.suite}){unknown}"
+    return "no item in common in any category" if items else "no category in common"
+
+
+_SAME: Mapping[str, Callable[[RunReader], Any]] = {
+    "seeds": lambda run: run.settings.get("seed"),
+    "wordings": wording_of,
+}
+"""What two runs must share for the episodes of an item to be the same questions; None where unknown."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import OtherFramesError, UsageError
 from probe_kit.hashing import derive_seed
-from probe_kit.retention.behaviour import ask_of, units_of
+from probe_kit.retention.behaviour import TableRun, units_of
 from probe_kit.retention.estimators import best_site
 from probe_kit.runs.layout import FIRST_FRAME
 from probe_kit.runs.reader import RunReader, check_sides
@@ -147,7 +147,7 @@ def match_runs(
     frames differ or carry no hash.
     """
     check_sides(policy, "a comparison with answers")
-    if ask_of(vlm) is None or ask_of(policy) is not None:
+    if vlm.ask is None or policy.ask is not None:
         raise UsageError(
             f"{vlm.location} and {policy.location} are not a VLM run and a policy run, in this order; make them "
             "with `probe-kit ask` and `probe-kit extract`"
@@ -171,6 +171,32 @@ def match_runs(
     score = str(getattr(vlm, "score", "text"))
     joined = KnownUsedTable(vlm.label, policy.label, score, probed_view, tuple(rows), tuple(notes))
     return correct_joins([joined])[0]
+
+
+@dataclass(frozen=True)
+class Joins:
+    """Every VLM run of a table joined with every policy run. refused: why others are not, a sentence each."""
+
+    tables: tuple[KnownUsedTable, ...]
+    refused: tuple[str, ...]
+
+
+def join_runs(runs: Sequence[TableRun], results: Mapping[tuple[str, str], ProbeResults]) -> Joins:
+    """Return answer, probe and success of every pair of a VLM run and a policy run.
+
+    results: of the runs of the table, by location and target. Tests are corrected over all pairs.
+    """
+    probes_of = {location: probes for (location, _), probes in results.items()}
+    policies = [run for run in runs if not run.answers and run.is_judged]
+    joined, refused = [], []
+    for vlm, policy in product([run for run in runs if run.answers], policies):
+        try:
+            pair = match_runs(vlm.run, policy.judged, probes_of.get(policy.location))
+        except (UsageError, OtherFramesError) as error:
+            refused.append(f"Not joined: {error}.")
+            continue
+        joined.append(replace(pair, vlm=vlm.label, policy=policy.label))
+    return Joins(tuple(correct_joins(joined)), tuple(refused))
 
 
 def correct_joins(joins: Sequence[KnownUsedTable]) -> list[KnownUsedTable]:
@@ -386,7 +412,7 @@ def _missing(pairs: "pd.DataFrame", vlm: RunReader, policy: RunReader) -> list[s
 
 
 def _of_picture(vlm: RunReader) -> list[str]:
-    ask = ask_of(vlm) or {}
+    ask = vlm.ask or {}
     notes = []
     if ask.get("picture") != "frame":
         notes.append(f"The VLM was not shown the first frame (--picture {ask.get('picture')}).")

@@ -6,6 +6,7 @@ Without `ax` a display makes its own figure, with a legend and a caption that na
 
 from probe_kit.retention.displays.bars import KnownUsedDisplay, OutcomeRulesDisplay, PairedLayoutsDisplay
 from probe_kit.retention.displays.call_curves import CallCurveDisplay, aligned_curves, call_curves
+from probe_kit.retention.displays.display import ProvenanceLine
 from probe_kit.retention.displays.final_positions import FinalPositionsDisplay, final_positions
 from probe_kit.retention.displays.interventions import (
     AttentionDisplay,
@@ -35,7 +36,6 @@ from probe_kit.retention.displays.side_by_side import (
     model_depths,
     role_curves,
 )
-from probe_kit.retention.displays.style import ProvenanceLine
 from probe_kit.retention.displays.table_figures import (
     HeatTableDisplay,
     KnowledgeActionDisplay,

@@ -2,32 +2,29 @@
 
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
-from itertools import product
 from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 
 from probe_kit.env.scoring import DEFAULT_RULE, RULES
-from probe_kit.errors import OtherFramesError, UsageError
-from probe_kit.retention.behaviour import PairedItems, ask_of, capture_only, full_names, paired_items, shares_of
+from probe_kit.errors import UsageError
+from probe_kit.retention.behaviour import PairedItems, TableRun, distinct_labels, paired_items, shares_of
 from probe_kit.retention.columns.text import title_of
-from probe_kit.retention.compare.known_used import KnownUsedTable, correct_joins, match_runs
-from probe_kit.retention.displays.display import Display
-from probe_kit.retention.displays.report_figure import FigureSource, ReportFigure, figure_of, in_report
-from probe_kit.retention.displays.style import (
+from probe_kit.retention.compare.known_used import KnownUsedTable
+from probe_kit.retention.displays.display import (
     BLUE,
     GREEN,
     ORANGE,
     PURPLE,
     SKY,
     VERMILION,
+    Display,
     ProvenanceLine,
     footer,
 )
-from probe_kit.retention.rows.outcome_rules import RunUnderRule, can_be_judged, under_rule
-from probe_kit.retention.table import RetentionTable
+from probe_kit.retention.displays.report_figure import FigureSource, ReportFigure, figure_of, in_report
 from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.significance import SIGNIFICANCE
 
@@ -143,8 +140,7 @@ def _paired_bar(name: str, paired: PairedItems) -> Bar:
 def layout_figures(source: FigureSource) -> Iterator[ReportFigure]:
     """Yield one per run that acted."""
     for drawn in source.runs:
-        run = drawn.judged(source.table)
-        if run is not None and not capture_only(run.episodes):
+        if (run := drawn.judged) is not None:
             yield ReportFigure(
                 f"{drawn.stem}-paired-layouts", "The same question, pictures swapped", "behaviour",
                 "Every question is asked twice, with the two images swapped. Knowing the answer means right "
@@ -188,7 +184,8 @@ class OutcomeRulesDisplay(BarDisplay):
         """One that keeps no trajectories has a bar by `disc` alone. Raises UsageError without episodes."""
         if not runs or any(run.episodes.empty for run in runs):
             raise UsageError("there are no episodes to judge; give runs that have some")
-        bars = [bar for run, name in zip(runs, full_names(runs), strict=True) for bar in _bars(run, name)]
+        labels = distinct_labels(runs)
+        bars = [bar for run in runs for bar in _bars(TableRun.of(run, label=labels[str(run.location)]))]
         return cls(bars=tuple(bars), certificates=tuple(map(ProvenanceLine.of_run, runs)))
 
     @property
@@ -215,9 +212,9 @@ def _rule_bar(name: str, bar: RuleBar) -> Bar:
     return Bar(name, parts, f"{100 * bar.shares['correct']:.1f}", group=bar.run)
 
 
-def _bars(run: RunReader, name: str) -> list[RuleBar]:
-    judged = RunUnderRule.of(run, DEFAULT_RULE)
-    if judged.verdicts is None:
+def _bars(table_run: TableRun) -> list[RuleBar]:
+    run, name = table_run.run, table_run.name
+    if table_run.verdicts is None:
         stored = {part: _over_categories(run, shares_of(run.episodes, part)) for part, *_ in _VERDICTS}
         return [RuleBar(name, rule, stored if rule == DEFAULT_RULE else None, None) for rule in RULES]
     return [
@@ -227,7 +224,7 @@ def _bars(run: RunReader, name: str) -> list[RuleBar]:
             {part: _over_categories(run, verdicts[part]) for part, *_ in _VERDICTS},
             _over_categories(run, verdicts["idle"] == "correct"),
         )
-        for rule, verdicts in judged.verdicts.items()
+        for rule, verdicts in table_run.verdicts.items()
     ]
 
 
@@ -252,35 +249,6 @@ def rule_figures(source: FigureSource) -> Iterator[ReportFigure]:
 
 
 # -- answer, probe, success --------------------------------------------------------------------------------------
-
-
-def joins_of(runs: Sequence[RunReader], table: RetentionTable) -> tuple[list[KnownUsedTable], list[str]]:
-    """Return answer, probe and success of every pair of a VLM run and a policy run, and why others are not joined.
-
-    runs: those that the table is made of, as it reads them; probes, outcome rule and names are the table's. Tests
-    are corrected over all pairs.
-    """
-    names = {row.run.location: row.run.label for row in table.rows}
-    vlms = [run for run in runs if ask_of(run) is not None]
-    policies = [
-        run
-        for run in runs
-        if ask_of(run) is None
-        and not capture_only(run.episodes)
-        and can_be_judged(run, table.rule, table.last_steps)
-    ]
-    joins, refused = [], []
-    for vlm, policy in product(vlms, policies):
-        judged = under_rule(policy, table.rule, table.last_steps)
-        try:
-            joined = match_runs(vlm, judged, table.results_of(policy.location))
-        except (UsageError, OtherFramesError) as error:
-            refused.append(f"Not joined: {error}.")
-            continue
-        vlm_name, policy_name = (names.get(str(run.location), run.label) for run in (vlm, policy))
-        joins.append(replace(joined, vlm=vlm_name, policy=policy_name))
-    return correct_joins(joins), refused
-
 
 _LOOKS: Mapping[str, tuple[str, str]] = {
     "111": (GREEN, ""),
@@ -351,8 +319,7 @@ def words_of(code: str) -> str:
 @in_report(6)
 def known_used_figures(source: FigureSource) -> Iterator[ReportFigure]:
     """Yield one per pair of a VLM run and a policy run."""
-    joins, _ = joins_of([drawn.run for drawn in source.runs], source.table)
-    for number, joined in enumerate(joins, 1):
+    for number, joined in enumerate(source.joins.tables, 1):
         yield known_used_figure(joined, number)
 
 

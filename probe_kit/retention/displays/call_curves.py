@@ -12,7 +12,16 @@ from probe_kit.env.scoring import EVENTS, Events
 from probe_kit.errors import TooFewGroupsError, UsageError
 from probe_kit.hooks.contract.sites import label_of
 from probe_kit.retention.columns.text import title_of
-from probe_kit.retention.displays.display import Display, in_panels, known_view
+from probe_kit.retention.displays.display import (
+    PARTS,
+    Display,
+    ProvenanceLine,
+    accuracy_axis,
+    in_panels,
+    known_view,
+    mark_below,
+    significance_handles,
+)
 from probe_kit.retention.displays.report_figure import (
     ONLY_FILLED,
     DrawnRun,
@@ -21,13 +30,6 @@ from probe_kit.retention.displays.report_figure import (
     in_report,
     in_view,
     view_suffix,
-)
-from probe_kit.retention.displays.style import (
-    PARTS,
-    ProvenanceLine,
-    accuracy_axis,
-    mark_below,
-    significance_handles,
 )
 from probe_kit.retention.estimators import best_site, score_streams
 from probe_kit.statistics.crossfit import CHANCE

@@ -1,24 +1,23 @@
-"""The displays' base: a panel alone or beside others, its legend and caption; and the choice of what it shows."""
+"""The displays' base, a panel alone or beside others; and the look that all figures share."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from math import ceil
+from types import MappingProxyType
 from typing import TYPE_CHECKING, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from probe_kit.errors import UnknownCategoryError, UnknownSiteError, UsageError
+from probe_kit._system.counting import counted
+from probe_kit._tables.numbers import span
+from probe_kit.errors import UnknownCategoryError, UnknownSiteError
 from probe_kit.retention.choices import Iterations
-from probe_kit.retention.displays.style import (
-    Line,
-    ProvenanceLine,
-    caption,
-    legend_above,
-    legend_handles,
-    panels,
-    plain,
-)
+from probe_kit.retention.rows.row import RetentionRow
+from probe_kit.runs.reader import RunReader
+from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.train.choices import CORRECT, EVERYWHERE
 from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeResults
 
@@ -27,8 +26,299 @@ if TYPE_CHECKING:
     from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
+    from numpy.typing import ArrayLike
 
     from probe_kit.retention.displays.shown_figure import Picture
+
+
+# -- the look that all figures share --------------------------------------------------------------------------
+
+
+RANDOM = "RANDOM WEIGHTS"
+SHOWN = 12
+"""Hex digits of a hash that a caption shows."""
+
+
+@dataclass(frozen=True)
+class ProvenanceLine:
+    """The origin of the numbers of a figure.
+
+    weights: sha256 of the weights that acted, None for a scripted policy. suite: `name@version#hash`.
+    n: number of episodes, in words. settings: sha256 of the run's settings. probes: key of the probe results.
+    call: captured inference that was probed, None without probes.
+    """
+
+    model: str
+    random_weights: bool
+    weights: str | None
+    suite: str
+    n: str
+    settings: str
+    probes: str | None = None
+    target: str = CORRECT
+    call: int | None = None
+
+    @classmethod
+    def of_run(cls, run: RunReader) -> Self:
+        """Return the line of a run's behaviour."""
+        rule = run.rule
+        n = f"n = {counted(len(run.episodes), 'episode')}" + ("" if rule == "disc" else f" by the rule {rule}")
+        return cls(run.label, run.random_weights, run.weights_sha256, run.suite, n, run.settings_sha256)
+
+    @classmethod
+    def of_results(cls, results: ProbeResults, view: str, category: str | None = None) -> Self:
+        """Return the line of probes in one view: of all categories of a side, or of a label in one category."""
+        settings = results.settings
+        if category is None:
+            sizes = [curve.labels.size for (_, name), curve in results.curves.items() if name == view]
+            n = f"n = {span(sizes)} episodes per category, view {view}"
+        else:
+            curve = results.curves[category, view]
+            of = "" if category == EVERYWHERE else f", category {category}"
+            samples = f"{counted(curve.labels.size, 'sample')} in {counted(curve.n_groups, 'group')}"
+            n = f"n = {samples}, view {view}{of}"
+        return cls(
+            results.label if category is None else settings.model, settings.random_weights, settings.weights,
+            settings.suite, n, settings.run_settings, results.key, settings.target,
+            settings.call if category is None or settings.window == 1 else None,
+        )  # fmt: skip
+
+    @classmethod
+    def of_row(cls, row: RetentionRow) -> Self:
+        """Return the line of a row of the retention table, usually a mean."""
+        n = f"n = {counted(row.success.n_episodes, 'episode')}"
+        return cls(
+            row.run.label or row.run.model,
+            row.run.random_weights,
+            row.run.weights_sha256,
+            row.run.suite,
+            n,
+            row.run.settings,
+            row.run.probes,
+            call=row.run.call,
+        )
+
+    @property
+    def parts(self) -> tuple[str, str, str, str, str, str, str]:
+        """Return the parts of the line, most important first; random weights are named in capitals.
+
+        Model, suite, n, call, target, probes, weights; empty where there is nothing to say.
+        """
+        return (
+            f"{self.model} {RANDOM}" if self.random_weights else self.model,
+            self.suite,
+            self.n,
+            "" if self.call is None else f"call {self.call}",
+            f"target {self.target}" if self.target != CORRECT else "",
+            f"probes {self.probes}" if self.probes else "",
+            f"weights {self.weights[:SHOWN]}" if self.weights else "",
+        )
+
+    @property
+    def line(self) -> str:
+        """Everything in one line, for a caption."""
+        return " · ".join(filter(None, [*self.parts, f"settings {self.settings[:SHOWN]}"]))
+
+
+# Okabe and Ito's palette: apart for every kind of colour vision.
+BLUE, VERMILION, GREEN, ORANGE = "#0072B2", "#D55E00", "#009E73", "#E69F00"
+SKY, PURPLE, BLACK, GREY = "#56B4E9", "#CC79A7", "#000000", "#8C8C8C"
+
+DPI = 150
+"""On a screen; files are saved at `PRINT_DPI`."""
+ACCURACY = (20.0, 109.0)
+"""Percent along the axis of held-out accuracies, the same in every figure of every run.
+
+Held-out accuracies below 50 % occur by chance, rarely below 20 %. Carets of the best sites stand above 100 %.
+"""
+ABOVE_CHANCE = (-30.0, 51.0)
+"""The same of accuracies above chance, in points."""
+_CAPTION_SIZE = 6.5
+_LEGEND_SIZE = 8.0
+"""Both in points."""
+_LETTERS_PER_INCH = 16
+"""Letters of a legend's label on an inch, a low estimate."""
+_MARK = 8
+"""Letters that the mark and the gaps of a legend's entry take."""
+_LEGEND_ROWS, _ROW_HEIGHT = 2, 0.17
+"""Rows of a legend that figures have room for, and inches that each further one adds to their height."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """The look of one series; colour is never the only difference."""
+
+    colour: str
+    marker: str
+    dash: str = "-"
+
+
+PARTS = MappingProxyType(
+    {
+        "backbone": Line(BLUE, "o"),
+        "action": Line(VERMILION, "s"),
+        "vision": Line(GREEN, "^"),
+        "bridge": Line(PURPLE, "D"),
+    }
+)
+"""How the streams of one part of a model are drawn."""
+
+SERIES = (
+    Line(BLUE, "o"),
+    Line(VERMILION, "s", "--"),
+    Line(GREEN, "^", "-."),
+    Line(PURPLE, "D", ":"),
+    Line(ORANGE, "v", (0, (5, 1))),  # type: ignore[arg-type]  # matplotlib also takes (offset, dashes)
+    Line(BLACK, "P", (0, (3, 1, 1, 1))),  # type: ignore[arg-type]
+    Line(SKY, "X", "-"),
+)
+"""For models or roles, in order; an eighth one begins again."""
+
+
+def series(position: int) -> Line:
+    """Return the look of the series at `position`."""
+    return SERIES[position % len(SERIES)]
+
+
+def darker(colour: str) -> str:
+    """A shade of `#RRGGBB` that text can be read in."""
+    return "#" + "".join(f"{int(colour[at : at + 2], 16) * 6 // 10:02X}" for at in (1, 3, 5))
+
+
+def panels(
+    count: int,
+    width: float = 3.1,
+    height: float = 2.5,
+    columns: int | None = None,
+    *,
+    share: bool = True,
+    in_pyplot: bool = False,
+) -> "tuple[Figure, list[Axes]]":
+    """A figure of `count` panels of `width` × `height` inches, at most three or `columns` in a row.
+
+    share: whether panels share both axes. in_pyplot: whether pyplot knows the figure, so that notebooks show it.
+    """
+    from matplotlib import pyplot as plt
+
+    from probe_kit.retention.displays.shown_figure import ShownFigure
+
+    across = columns or (2 if count == 4 else min(3, count))
+    rows = ceil(count / across)
+    # 1.1 inches for legend and caption; 6.2 is the narrowest that a caption reads well in.
+    size = (max(width * across, 6.2), height * rows + 1.1)
+    figure: Figure
+    if in_pyplot:
+        figure = plt.figure(figsize=size, layout="constrained", dpi=DPI, FigureClass=ShownFigure)
+    else:
+        figure = ShownFigure(figsize=size, layout="constrained", dpi=DPI)
+    grid = list(figure.subplots(rows, across, sharex=share, sharey=share, squeeze=False).flat)
+    for position in range(count, len(grid)):
+        grid[position].set_visible(False)
+        # Of shared axes only the lowest row has numbers; above a hidden panel they would be missing.
+        grid[position - across].tick_params(labelbottom=True)
+    return figure, grid[:count]
+
+
+def layer_axis(axes: "Axes", layers: int, label: bool = True) -> None:
+    """Whole layer numbers below the axes."""
+    from matplotlib.ticker import MaxNLocator
+
+    axes.set_xlim(-0.06 * layers - 0.2, 1.06 * (layers - 1) + 0.2)
+    if layers == 1:  # a locator of whole numbers falls back on fractions where there is only one
+        axes.set_xticks([0])
+    else:
+        axes.xaxis.set_major_locator(MaxNLocator(nbins=7, integer=True, min_n_ticks=2))
+    if label:
+        axes.set_xlabel("layer", fontsize=8.5)
+
+
+def accuracy_axis(axes: "Axes") -> None:
+    """The fixed scale of accuracies; what lies below is marked at the lower edge by `mark_below`."""
+    axes.set_ylim(*ACCURACY)
+
+
+def mark_below(axes: "Axes", places: "ArrayLike", accuracy: "ArrayLike", colour: str) -> None:
+    """A mark at the lower edge, with the number, for every accuracy (percent) that the scale does not reach."""
+    for at, value in zip(np.asarray(places), np.asarray(accuracy), strict=True):
+        if value < ACCURACY[0]:
+            axes.plot([at], [ACCURACY[0] + 1.5], ls="none", marker="v", ms=5, color=colour, gid="below")
+            axes.annotate(
+                f"{value:.0f}", (at, ACCURACY[0] + 1.5), (0, 5), textcoords="offset points", fontsize=6.5,
+                ha="center", color=colour,
+            )  # fmt: skip
+
+
+def plain(axes: "Axes") -> None:
+    """No frame above and to the right, small tick labels."""
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.tick_params(labelsize=8)
+
+
+def caption(figure: "Figure", *certificates: ProvenanceLine) -> None:
+    """Write under the figure what it is about: every model once, then the parts that all have in common.
+
+    `figure.caption` has each certificate in full, with its settings.
+    """
+    certificates = tuple(dict.fromkeys(certificates))
+    groups = zip(*(certificate.parts for certificate in certificates), strict=True)
+    parts = dict.fromkeys(", ".join(filter(None, dict.fromkeys(group))) for group in groups)
+    footer(figure, " · ".join(filter(None, parts)))
+    figure.caption = "; ".join(certificate.line for certificate in certificates)  # type: ignore[attr-defined]
+
+
+def footer(figure: "Figure", text: str) -> None:
+    """Write a caption under a figure, on as many lines as its width needs."""
+    figure.caption = text  # type: ignore[attr-defined]
+    figure.supxlabel(text, fontsize=_CAPTION_SIZE, color="0.25", wrap=True)
+
+
+def legend_above(figure: "Figure", handles: "Sequence[Artist]", title: str = "") -> None:
+    """A legend along the upper side, in as many columns as the figure has room for; many rows make it higher.
+
+    matplotlib fills a legend column by column, and leaves their number to its caller. title: lines above it.
+    """
+    lengths = [len(str(handle.get_label())) + _MARK for handle in handles]
+    room = _LETTERS_PER_INCH * figure.get_figwidth()
+    fitting = [
+        columns
+        for columns in range(1, len(lengths) + 1)
+        if sum(int(column.max()) for column in np.array_split(lengths, columns)) <= room
+    ]
+    columns = max(fitting, default=1)
+    rows = ceil(len(lengths) / columns) + len(title.splitlines())
+    figure.set_figheight(figure.get_figheight() + _ROW_HEIGHT * max(0, rows - _LEGEND_ROWS))
+    figure.legend(
+        handles=handles, loc="outside upper left", ncols=columns, fontsize=_LEGEND_SIZE, frameon=False,
+        title=title or None, title_fontsize=_LEGEND_SIZE, alignment="left",
+    )  # fmt: skip
+
+
+def legend_handles(*grid: "Axes") -> "dict[str, Artist]":
+    """Return the handles of a legend by their label, each label once, in the order in which they are drawn."""
+    handles: dict[str, Artist] = {}
+    for axes in grid:
+        handles |= {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    return handles
+
+
+def significance_handles() -> "list[Line2D]":
+    """The legend's entries for filled and open markers, which mean the same in every figure."""
+    from matplotlib.lines import Line2D
+
+    return [
+        Line2D([], [], color="0.3", ls="none", marker="o", ms=4.5, label=FILLED),
+        Line2D([], [], color="0.3", ls="none", marker="o", ms=4.5, mfc="white", label=OPEN),
+    ]
+
+
+SIGNAL = f"above chance and every control run, p < {SIGNIFICANCE}"
+"""What every filled marker and every dot of a probe is; the same words in legends and captions."""
+FILLED = f"filled: shown ({SIGNAL})"
+OPEN = "open: not shown"
+
+
+# -- a panel of numbers ---------------------------------------------------------------------------------------
 
 
 @dataclass(kw_only=True)
@@ -181,21 +471,6 @@ def scores_of(results: ProbeResults, category: str, view: str, stream: str | Non
     scores = results.scores
     selected = (scores["category"] == category) & (scores["view"] == view)
     return scores[selected if stream is None else selected & (scores["stream"] == stream)]
-
-
-def of_iterations(scores: "pd.DataFrame", iterations: Iterations) -> "pd.DataFrame":
-    """The rows of one stream that take part; all of a stream that runs once.
-
-    Raises UsageError if the stream has no such iteration.
-    """
-    steps = scores["iteration"].dropna()
-    if iterations in ("all", "best") or steps.empty:
-        return scores
-    step = int(steps.max()) if iterations == "last" else iterations
-    if not (steps == step).any():
-        stream = scores["stream"].iloc[0]
-        raise UsageError(f"the stream {stream} has iterations {steps.min()} to {steps.max()}, not {step}")
-    return scores[scores["iteration"] == step]
 
 
 def best_of(iterations: Iterations) -> Iterations:

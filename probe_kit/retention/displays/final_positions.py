@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 
 from probe_kit.env.scoring import DEFAULT_RULE, Box, Disc, OutcomeRule, ReleasedOnTile, rule_of
 from probe_kit.errors import UsageError
-from probe_kit.retention.behaviour import capture_only
 from probe_kit.retention.columns.text import title_of
-from probe_kit.retention.displays.display import Display, in_panels
-from probe_kit.retention.displays.report_figure import FigureSource, ReportFigure, in_report
-from probe_kit.retention.displays.style import (
+from probe_kit.retention.displays.display import (
     GREEN,
     VERMILION,
+    Display,
     ProvenanceLine,
+    in_panels,
 )
+from probe_kit.retention.displays.report_figure import FigureSource, ReportFigure, in_report
 from probe_kit.runs.reader import RunReader
 
 if TYPE_CHECKING:
@@ -189,8 +189,8 @@ def _set_window(axes: "Axes", low: NDArray[np.float64], high: NDArray[np.float64
 def position_figures(source: FigureSource) -> Iterator[ReportFigure]:
     """The figures that a report of these runs shows."""
     for drawn in source.runs:
-        run = drawn.judged(source.table)
-        if run is None or capture_only(run.episodes):
+        run = drawn.judged
+        if run is None:
             continue
         if {"cube_x", "cube_y"} <= set(run.episodes) and run.settings.get("scene"):
             yield ReportFigure(

@@ -22,9 +22,19 @@ from probe_kit.intervene.kinds.attention import (
 from probe_kit.intervene.kinds.interchange import BACKBONE, PatchEffect, stored_site_effects, stored_steering
 from probe_kit.intervene.places import ALL, TILE_ROLES, PlaceName
 from probe_kit.retention.columns.text import title_of
-from probe_kit.retention.displays.display import Display, draw_series, in_panels, scores_of
+from probe_kit.retention.displays.display import (
+    GREY,
+    Display,
+    ProvenanceLine,
+    caption,
+    draw_series,
+    in_panels,
+    layer_axis,
+    panels,
+    scores_of,
+    series,
+)
 from probe_kit.retention.displays.report_figure import FigureSource, ReportFigure, in_report
-from probe_kit.retention.displays.style import GREY, ProvenanceLine, caption, layer_axis, panels, series
 from probe_kit.runs.reader import RunReader
 from probe_kit.runs.thumbnails import episode_frames
 from probe_kit.statistics.crossfit import CHANCE

@@ -9,19 +9,23 @@ from numpy.typing import NDArray
 
 from probe_kit.errors import UnknownSiteError, UsageError
 from probe_kit.retention.columns.text import title_of
-from probe_kit.retention.displays.display import Display, curve_of, in_panels, known_view, scores_of
+from probe_kit.retention.displays.display import (
+    FILLED,
+    PARTS,
+    Display,
+    ProvenanceLine,
+    curve_of,
+    in_panels,
+    known_view,
+    legend_above,
+    scores_of,
+)
 from probe_kit.retention.displays.report_figure import (
     DOTS,
     FigureSource,
     ReportFigure,
     in_report,
     probed_views,
-)
-from probe_kit.retention.displays.style import (
-    FILLED,
-    PARTS,
-    ProvenanceLine,
-    legend_above,
 )
 from probe_kit.statistics.crossfit import CHANCE
 from probe_kit.train.results.probe_results import ProbeResults

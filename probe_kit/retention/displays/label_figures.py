@@ -10,10 +10,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from probe_kit.errors import UsageError
-from probe_kit.retention.displays.display import Display, best_row, in_panels, probed_curve, scores_of
+from probe_kit.retention.displays.display import (
+    BLUE,
+    GREEN,
+    PARTS,
+    Display,
+    Line,
+    ProvenanceLine,
+    best_row,
+    in_panels,
+    probed_curve,
+    scores_of,
+    significance_handles,
+)
 from probe_kit.retention.displays.report_figure import FigureSource, ReportFigure, in_report, probed_views
-from probe_kit.retention.displays.style import BLUE, GREEN, PARTS, Line, ProvenanceLine, significance_handles
-from probe_kit.retention.rows.probe_parts import STEP
+from probe_kit.retention.rows.build import STEP
 from probe_kit.train.crossval.task_scores import METRICS, score_interval
 from probe_kit.train.results.control_scores import ControlScore
 from probe_kit.train.results.probe_curve import ProbeCurve

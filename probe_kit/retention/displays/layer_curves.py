@@ -8,17 +8,26 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import label_of
 from probe_kit.retention.choices import Iterations
 from probe_kit.retention.columns.text import name_of_target
 from probe_kit.retention.displays.display import (
+    PARTS,
     Display,
+    Line,
+    ProvenanceLine,
+    accuracy_axis,
     best_of,
     in_panels,
     known_view,
-    of_iterations,
+    layer_axis,
+    legend_above,
+    legend_handles,
+    mark_below,
     probed_curve,
     scores_of,
+    significance_handles,
 )
 from probe_kit.retention.displays.report_figure import (
     ONLY_FILLED,
@@ -26,17 +35,6 @@ from probe_kit.retention.displays.report_figure import (
     ReportFigure,
     in_report,
     probed_views,
-)
-from probe_kit.retention.displays.style import (
-    PARTS,
-    Line,
-    ProvenanceLine,
-    accuracy_axis,
-    layer_axis,
-    legend_above,
-    legend_handles,
-    mark_below,
-    significance_handles,
 )
 from probe_kit.statistics.sufficiency import FEWEST_PERMUTATIONS
 from probe_kit.train.choices import SIDES
@@ -53,6 +51,21 @@ if TYPE_CHECKING:
 
 
 Shares = NDArray[np.float64]
+
+
+def of_iterations(scores: "pd.DataFrame", iterations: Iterations) -> "pd.DataFrame":
+    """The rows of one stream that take part; all of a stream that runs once.
+
+    Raises UsageError if the stream has no such iteration.
+    """
+    steps = scores["iteration"].dropna()
+    if iterations in ("all", "best") or steps.empty:
+        return scores
+    step = int(steps.max()) if iterations == "last" else iterations
+    if not (steps == step).any():
+        stream = scores["stream"].iloc[0]
+        raise UsageError(f"the stream {stream} has iterations {steps.min()} to {steps.max()}, not {step}")
+    return scores[scores["iteration"] == step]
 
 
 @dataclass(frozen=True)

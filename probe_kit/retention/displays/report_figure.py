@@ -4,17 +4,16 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from importlib import import_module
 from inspect import isfunction
 from pathlib import Path
 from pkgutil import iter_modules
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Self
 
-from probe_kit.errors import UsageError
-from probe_kit.retention.columns.text import model_name
-from probe_kit.retention.displays.style import SIGNAL
-from probe_kit.retention.rows.outcome_rules import can_be_judged, under_rule
+from probe_kit.retention.behaviour import TableRun
+from probe_kit.retention.compare.known_used import Joins, join_runs
+from probe_kit.retention.displays.display import SIGNAL
 from probe_kit.retention.table import RetentionTable
 from probe_kit.runs.reader import RunReader
 from probe_kit.train.choices import EVERYWHERE
@@ -31,30 +30,71 @@ DOTS = f"Dots mark evidence: {SIGNAL}"
 
 @dataclass(frozen=True)
 class DrawnRun:
-    """A run of a table, of labels each with one. stem: beginning of its files' names. name: in legends.
+    """A run of a table, of labels each with one. stem: beginning of its files' names.
 
     position: among the runs. results: its probes, None without any.
     """
 
-    run: RunReader
+    of_table: TableRun
     stem: str
-    name: str
     position: int
     results: ProbeResults | None
 
-    def judged(self, table: RetentionTable) -> RunReader | None:
-        """The run with its outcomes by the table's rule; None where it cannot be judged by that."""
-        if not can_be_judged(self.run, table.rule, table.last_steps):
-            return None
-        return under_rule(self.run, table.rule, table.last_steps)
+    @property
+    def run(self) -> RunReader:
+        """The run with its outcomes as they were stored."""
+        return self.of_table.run
+
+    @property
+    def judged(self) -> RunReader | None:
+        """The run with its outcomes by the table's rule; None without any."""
+        return self.of_table.judged if self.of_table.is_judged else None
+
+    @property
+    def name(self) -> str:
+        """Its name in legends."""
+        return self.of_table.name
 
 
 @dataclass(frozen=True)
 class FigureSource:
-    """The table and the runs that figures of a report are made of."""
+    """The table and the runs that figures of a report are made of. table_runs: each once, runs: label by label."""
 
     table: RetentionTable
+    table_runs: tuple[TableRun, ...]
     runs: tuple[DrawnRun, ...]
+
+    @classmethod
+    def of(cls, runs: Sequence[RunReader], table: RetentionTable) -> Self:
+        """Read runs of a table, label by label. Raises UsageError for one that it has no rows of."""
+        table_runs = table.runs_of(runs)
+        numbered = list(enumerate(zip(table_runs, file_names([run.location.name for run in runs]), strict=True)))
+        if table.is_of_sides:
+            drawn = [DrawnRun(run, stem, at, table.results_of(run.location)) for at, (run, stem) in numbered]
+        else:
+            labels = dict(zip(table.targets, file_names(table.targets), strict=True))
+            drawn = [
+                DrawnRun(run, f"{stem}-{label}", at, table.results[run.location, target])
+                for target, label in labels.items()
+                for at, (run, stem) in numbered
+            ]
+        return cls(table, tuple(table_runs), tuple(drawn))
+
+    @cached_property
+    def joins(self) -> Joins:
+        """Answer, probe and success of every pair of a VLM run and a policy run."""
+        return join_runs(self.table_runs, self.table.results)
+
+    def figures(self) -> "list[ReportFigure]":
+        """Return every figure that the runs and their table allow, those of all runs first. Nothing is drawn yet.
+
+        Of labels one after the other; `subject` is the label.
+        """
+        figures = [figure for make in _makers(self.table.is_of_sides) for figure in make(self)]
+        order = {target: at for at, target in enumerate(self.table.targets)}
+        return sorted(
+            figures, key=lambda figure: (order.get(figure.subject, 0), -1 if figure.run is None else figure.run)
+        )
 
 
 @dataclass(frozen=True)
@@ -180,12 +220,12 @@ def probed_views(source: FigureSource) -> Iterator[ProbedView]:
                 yield ProbedView(drawn, results, row.view or "", row.category)
 
 
-def file_names(targets: Sequence[str]) -> list[str]:
-    """Return label columns as parts of file names, no two alike."""
+def file_names(texts: Sequence[str]) -> list[str]:
+    """Return folders of runs, or label columns, as parts of file names, no two alike."""
     names: list[str] = []
-    for target in targets:
-        name = re.sub(r"[^\w.-]+", "-", target).strip(".-") or "label"
-        tries = (name, *(f"{name}-{number}" for number in range(2, len(targets) + 1)))
+    for text in texts:
+        name = re.sub(r"[^\w.-]+", "-", text).strip(".-") or "label"
+        tries = (name, *(f"{name}-{number}" for number in range(2, len(texts) + 1)))
         used = {other.casefold() for other in names}
         names.append(next(free for free in tries if free.casefold() not in used))
     return names
@@ -195,36 +235,8 @@ SUFFIXES = (".png", ".pdf")
 
 
 def collect_figures(runs: Sequence[RunReader], table: RetentionTable) -> list[ReportFigure]:
-    """Return every figure that the runs and their table allow, those of all runs first. Nothing is drawn yet.
-
-    Of labels one after the other; `subject` is the label. Raises UsageError for a run that the table was not made
-    of.
-    """
-    called = {row.run.location: model_name(row) for row in table.rows}
-    if strangers := [str(run.location) for run in runs if str(run.location) not in called]:
-        raise UsageError(f"the table has no rows of {', '.join(strangers)}; make it of the runs that are drawn")
-    stems = run_names(runs)
-    if table.is_of_sides:
-        probes = [
-            (at, stem, table.results_of(run.location))
-            for at, (run, stem) in enumerate(zip(runs, stems, strict=True))
-        ]
-    else:
-        labels = dict(zip(table.targets, file_names(table.targets), strict=True))
-        probes = [
-            (at, f"{stem}-{label}", table.results[str(run.location), target])
-            for target, label in labels.items()
-            for at, (run, stem) in enumerate(zip(runs, stems, strict=True))
-        ]
-    drawn = tuple(
-        DrawnRun(runs[at], stem, called[str(runs[at].location)], at, results) for at, stem, results in probes
-    )
-    source = FigureSource(table, drawn)
-    figures = [figure for make in _makers(table.is_of_sides) for figure in make(source)]
-    order = {target: at for at, target in enumerate(table.targets)}
-    return sorted(
-        figures, key=lambda figure: (order.get(figure.subject, 0), -1 if figure.run is None else figure.run)
-    )
+    """Return the figures of runs, see `FigureSource.figures`. Raises UsageError for a run that has no rows."""
+    return FigureSource.of(runs, table).figures()
 
 
 def _makers(of_sides: bool) -> list[Maker]:
@@ -259,13 +271,3 @@ def _metadata(suffix: str, exhibit: ReportFigure, caption: str) -> dict[str, str
         # Without its date a figure of the same numbers has the same bytes.
         return {"Title": exhibit.title, "Subject": f"{caption}. {exhibit.reading}", "CreationDate": None}
     return {"Title": exhibit.title, "Description": f"{caption}. {exhibit.reading}"}
-
-
-def run_names(runs: Sequence[RunReader]) -> list[str]:
-    """Names of the runs; a name that comes again is numbered."""
-    names: list[str] = []
-    for run in runs:
-        name = run.location.name
-        count = sum(other == name or other.startswith(f"{name}-") for other in names)
-        names.append(f"{name}-{count + 1}" if name in names else name)
-    return names

@@ -14,16 +14,21 @@ from probe_kit.hooks.contract.sites import label_of
 from probe_kit.retention.choices import Iterations
 from probe_kit.retention.columns.text import title_of
 from probe_kit.retention.displays.display import (
+    ABOVE_CHANCE,
     Display,
+    ProvenanceLine,
+    accuracy_axis,
     best_of,
     curve_of,
     in_panels,
     known_view,
-    of_iterations,
+    layer_axis,
     scores_of,
+    series,
+    significance_handles,
 )
 from probe_kit.retention.displays.iteration_maps import IterationMapDisplay
-from probe_kit.retention.displays.layer_curves import StreamCurve, draw_line
+from probe_kit.retention.displays.layer_curves import StreamCurve, draw_line, of_iterations
 from probe_kit.retention.displays.report_figure import (
     DOTS,
     ONLY_FILLED,
@@ -32,14 +37,6 @@ from probe_kit.retention.displays.report_figure import (
     in_report,
     in_view,
     view_suffix,
-)
-from probe_kit.retention.displays.style import (
-    ABOVE_CHANCE,
-    ProvenanceLine,
-    accuracy_axis,
-    layer_axis,
-    series,
-    significance_handles,
 )
 from probe_kit.runs.reader import full_name
 from probe_kit.statistics.crossfit import CHANCE

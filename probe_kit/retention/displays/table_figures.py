@@ -10,16 +10,17 @@ from typing import TYPE_CHECKING, ClassVar, Literal, Self
 from probe_kit._tables.content import HEAT, heat_colour
 from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour import Regime
-from probe_kit.retention.columns.text import RATE, Modes, model_name, modes_of, once_per_category, title_of
-from probe_kit.retention.displays.display import Display
-from probe_kit.retention.displays.report_figure import FigureSource, ReportFigure, figure_of, in_report
-from probe_kit.retention.displays.style import (
+from probe_kit.retention.columns.tables import once_per_category
+from probe_kit.retention.columns.text import RATE, Modes, model_name, modes_of, title_of
+from probe_kit.retention.displays.display import (
+    Display,
     ProvenanceLine,
     darker,
     legend_above,
     series,
     significance_handles,
 )
+from probe_kit.retention.displays.report_figure import FigureSource, ReportFigure, figure_of, in_report
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.retention.table import RetentionTable
 

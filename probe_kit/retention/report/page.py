@@ -1,40 +1,49 @@
-"""The page put together: one HTML file with everything in it, for every target."""
+"""The page of a report: one HTML file with everything in it, for every target; and the parts of any page."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+import json
+import re
+from base64 import b64encode
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import partial
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
+from xml.etree import ElementTree
 
 from probe_kit._system.counting import enumerated
 from probe_kit._system.drafts import write_whole
 from probe_kit._system.escaping import without_places
 from probe_kit._tables.content import heat_key
+from probe_kit._tables.html import environment
 from probe_kit._tables.table import Table
 from probe_kit.errors import UsageError
-from probe_kit.retention.columns.comparisons import known_used_tables
-from probe_kit.retention.columns.sentences import conclusion
-from probe_kit.retention.columns.tables import SUBJECTS
-from probe_kit.retention.columns.text import Modes, model_name, modes_of, title_of
-from probe_kit.retention.displays.bars import joins_of
-from probe_kit.retention.displays.layer_curves import LayerCurveDisplay
-from probe_kit.retention.displays.report_figure import ONLY_FILLED, ReportFigure, collect_figures
-from probe_kit.retention.displays.style import caption, legend_above, panels
-from probe_kit.retention.report.episodes import PICTURES, EpisodeGrid, episode_grid
-from probe_kit.retention.report.parts import (
-    Picture,
-    arranged,
-    citation,
-    data_uri,
-    provenance,
-    render,
+from probe_kit.retention.choices import Iterations
+from probe_kit.retention.columns.tables import SUBJECTS, known_used_tables
+from probe_kit.retention.columns.text import (
+    TERMS,
+    VERDICT_HELP,
+    Modes,
+    conclusion,
+    model_name,
+    modes_of,
+    title_of,
     warnings_of,
-    words_of,
 )
-from probe_kit.retention.rows.outcome_rules import under_rule
+from probe_kit.retention.displays.display import ProvenanceLine, best_of, caption, legend_above, panels
+from probe_kit.retention.displays.layer_curves import LayerCurveDisplay
+from probe_kit.retention.displays.report_figure import (
+    ONLY_FILLED,
+    DrawnRun,
+    FigureSource,
+    ReportFigure,
+    caption_of,
+)
+from probe_kit.retention.report.episodes import PICTURES, EpisodeGrid, episode_grid
 from probe_kit.retention.rows.row import RetentionRow
 from probe_kit.retention.table import RetentionTable, retention_table
-from probe_kit.runs.reader import RunReader
+from probe_kit.runs.reader import SIDE, RunReader
 from probe_kit.train.choices import Task
 from probe_kit.train.crossval.task_scores import METRICS
 from probe_kit.train.results.probe_results import ProbeResults, best_sites_table
@@ -44,6 +53,7 @@ from probe_kit.version import __version__
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
 
 _ANSWERED: dict[Modes, str] = {
     "acts": "the answer is where the cube ends",
@@ -61,7 +71,25 @@ _ANSWERS = {
     "wrong": "the model answers wrong",
     "oob": "no answer could be read",
 }
+_OPENING = "opening"
+"""The subject of the figure beside the summary."""
 _TASKS: dict[Task, str] = {"binary": "binary", "classes": "categorical", "continuous": "continuous"}
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A figure in the page. run: its name, empty for a figure of all runs. caption: what it is about, in full."""
+
+    title: str
+    run: str
+    reading: str
+    source: str
+    caption: str
+    extra: bool
+
+
+PicturesBySubject = Mapping[str, Sequence[Sequence[Picture]]]
+"""By subject the figures of each kind, those of several runs side by side."""
 
 
 def write_report(
@@ -88,22 +116,25 @@ def report_html(
     """Return the page as text; the same runs and probes give the same text. See `write_report`."""
     if not runs:
         raise UsageError("a report needs at least one run")
-    table = table or retention_table(runs)
-    called = {row.run.location: model_name(row) for row in table.rows}
-    exhibits = [exhibit for exhibit in collect_figures(runs, table) if not exhibit.is_table]
-    names = [called[str(run.location)] for run in runs]
+    table = retention_table(runs) if table is None else table
+    source = FigureSource.of(runs, table)
     places = tuple(path for run in runs for path in (run.location.address, str(run.location)))
-    summary = table.summary_table
+    names = [without_places(run.name, places) for run in source.table_runs]
+    opening = opening_row(source) if table.is_of_sides else None
+    pictures_of = arranged([*source.figures(), *_opening_curves(opening, table.iterations)], names, places)
     sides: dict[str, Any] = {}
-    tables = [summary]
+    tables = [table.summary_table]
     if table.is_of_sides:
-        sides, of_sides = _sides(runs, table, exhibits, names, places, pictures)
-        tables += of_sides
+        grid = episode_grid([run.judged for run in source.table_runs], names, pictures)
+        question = None if opening is None else _question(opening[0], names[opening[1].position], grid)
+        sides = {"grid": grid, "question": question, **_sides(source, pictures_of)}
+        tables += [*(part for of_subject in sides["tables"].values() for part in of_subject)]
+        tables += [*sides["further"], *sides["joined"]]
         labels = _stored_labels(runs, names, places)
     else:
-        labels = _labels(runs, table, exhibits, names, places)
+        labels = _labels(table, runs, names, pictures_of)
     tables += [part for label in labels for part in (label["retention"], *label["probes"])]
-    sentence, bibtex = citation(runs)
+    sentence, bibtex = citation([run.run for run in source.table_runs])
     return render(
         "page.html.jinja",
         places,
@@ -112,18 +143,16 @@ def report_html(
         suites=list(dict.fromkeys(run.suite for run in runs)),
         version=__version__,
         finding=table.summary,
-        summary=summary,
+        summary=tables[0],
         notes=table.notes,
         several=len(runs) > 1,
         provenance=[
-            provenance(name, run, [probes for (at, _), probes in table.results.items() if at == str(run.location)])
-            for name, run in zip(names, runs, strict=True)
+            provenance(name, run.run, [probes for (at, _), probes in table.results.items() if at == run.location])
+            for name, run in zip(names, source.table_runs, strict=True)
         ],
-        interventions=arranged(exhibits, "interventions", names, places),
+        interventions=pictures_of.get("interventions", []),
         labels=labels,
-        words=words_of(
-            [summary, *tables, *(part for label in labels for part in (label["retention"], *label["probes"]))]
-        ),
+        words=words_of(tables),
         sentence=sentence,
         bibtex=bibtex,
         **sides,
@@ -133,18 +162,10 @@ def report_html(
 # -- sides -------------------------------------------------------------------------------------------------------
 
 
-def _sides(
-    runs: Sequence[RunReader],
-    table: RetentionTable,
-    exhibits: Sequence[ReportFigure],
-    names: Sequence[str],
-    places: tuple[str, ...],
-    pictures: int,
-) -> tuple[dict[str, Any], list[Table]]:
-    """Return what the page shows of sides alone, such as success, episodes and answers; and all tables of it."""
+def _sides(source: FigureSource, pictures_of: PicturesBySubject) -> dict[str, Any]:
+    """Return what the page shows of sides alone, such as success, episodes and answers."""
+    table = source.table
     modes = modes_of(table.all_rows)
-    shown_names = [without_places(name, places) for name in names]
-    grid = episode_grid([under_rule(run, table.rule, table.last_steps) for run in runs], shown_names, pictures)
     warnings: dict[tuple[str | None, str], list[tuple[str, str]]] = {}
     further_views = []
     for mean in table.means:
@@ -154,53 +175,42 @@ def _sides(
             further_views.append((f"{model_name(mean)}, view {mean.view}", sentences))
         else:
             warnings[mean.key] = [(model_name(mean), sentence) for sentence in warnings_of(mean, rows)]
-    opening, question, curve = opening_row(table), None, None
-    if opening is not None:
-        position = [str(run.location) for run in runs].index(opening.run.location)
-        question = _question(opening, shown_names[position], grid)
-        if (exhibit := _opening_curve(opening, table, position)) is not None:
-            source = data_uri(exhibit, places)
-            curve = Picture(exhibit.title, shown_names[position], exhibit.reading, *source, False)
-    joins, refused = joins_of(runs, table)
-    joined = [part for join in joins for part in known_used_tables(join)]
     tables: dict[str, list[Table]] = {subject: [] for subject in SUBJECTS.values()}
     for title, part in table.tables().items():
         tables[SUBJECTS[title]].append(part)
-    further_tables = table.further_tables
-    content = {
+    joins = source.joins
+    return {
         "modes": modes,
         "answered": _ANSWERED[modes],
         "did": "What it answers" if modes == "answers" else "What it does",
         "reached": "What reaches the answer" if modes == "answers" else "What reaches the action",
-        "question": question,
-        "curve": curve,
+        "curve": next((pictures[0] for pictures in pictures_of.get(_OPENING, ())), None),
         "further_views": further_views,
         "warnings": [warning for of_run in warnings.values() for warning in of_run],
         "tables": tables,
         "wordings": table.wording_tables,
-        "further": further_tables,
-        "joined": joined,
-        "join_notes": [*refused, *dict.fromkeys(note for join in joins for note in join.notes)],
+        "further": table.further_tables,
+        "joined": [part for join in joins.tables for part in known_used_tables(join)],
+        "join_notes": [*joins.refused, *dict.fromkeys(note for join in joins.tables for note in join.notes)],
         "pictures": {
-            subject: arranged(exhibits, subject, names, places)
-            for subject in ("behaviour", "probes", "retention", "join")
+            subject: pictures_of.get(subject, []) for subject in ("behaviour", "probes", "retention", "join")
         },
-        "grid": grid,
         "heat": heat_key(),
     }
-    return content, [*(part for of_subject in tables.values() for part in of_subject), *further_tables, *joined]
 
 
-def opening_row(table: RetentionTable) -> RetentionRow | None:
-    """The category to open with: one that the backbone holds and the action does not, if there is one.
+def opening_row(source: FigureSource) -> tuple[RetentionRow, DrawnRun] | None:
+    """The category to open with, and its run: one that the backbone holds and the action does not, if any.
 
     Of runs with probes the first category with signal is next, and then the first at all; None without rows.
     """
-    rows = [category.row for run in table.summary for category in run.categories]
+    drawn_of = {drawn.of_table.location: drawn for drawn in source.runs}
+    rows = [category.row for run in source.table.summary for category in run.categories]
+    rows = [row for row in rows if row.run.location in drawn_of]
     probed = [row for row in rows if row.backbone.score is not None]
     encoded = [row for row in probed if row.backbone.has_signal]
     lost = [row for row in encoded if not row.action.has_signal]
-    return next(iter((*lost, *encoded, *probed, *rows)), None)
+    return next(((row, drawn_of[row.run.location]) for row in (*lost, *encoded, *probed, *rows)), None)
 
 
 def _question(row: RetentionRow, name: str, grid: EpisodeGrid) -> Mapping[str, Any] | None:
@@ -218,19 +228,21 @@ def _question(row: RetentionRow, name: str, grid: EpisodeGrid) -> Mapping[str, A
     return None
 
 
-def _opening_curve(row: RetentionRow, table: RetentionTable, position: int) -> ReportFigure | None:
-    """Accuracy by layer of the row's category; None where it was not probed. position: of the run."""
-    results = table.results_of(row.run.location)
-    if results is None or row.backbone.score is None:
-        return None
-    output = "answer" if modes_of([row]) == "answers" else "action"
-    iterations = "best" if table.iterations == "all" else table.iterations
-    display = LayerCurveDisplay.from_results(results, row.category, row.view, iterations)
-    return ReportFigure(
-        "opening", f"Where the answer can be read: {title_of(row.category)}", "summary",
+def _opening_curves(
+    opening: tuple[RetentionRow, DrawnRun] | None, iterations: Iterations
+) -> Iterator[ReportFigure]:
+    """Yield accuracy by layer of the row's category; nothing where it was not probed."""
+    if opening is None:
+        return
+    row, drawn = opening
+    if drawn.results is None or row.backbone.score is None:
+        return
+    display = LayerCurveDisplay.from_results(drawn.results, row.category, row.view, best_of(iterations))
+    yield ReportFigure(
+        "opening", f"Where the answer can be read: {display.title}", _OPENING,
         "How often a linear probe names the side of the correct picture, by layer: in the backbone, and where the "
-        f"{output} is made. {ONLY_FILLED}.",
-        position, partial(_together, display),
+        f"{'answer' if row.run.mode == 'answers' else 'action'} is made. {ONLY_FILLED}.",
+        drawn.position, partial(_together, display),
     )  # fmt: skip
 
 
@@ -249,18 +261,16 @@ def _together(display: LayerCurveDisplay) -> "Figure":
 
 
 def _labels(
-    runs: Sequence[RunReader],
     table: RetentionTable,
-    exhibits: Sequence[ReportFigure],
+    runs: Sequence[RunReader],
     names: Sequence[str],
-    places: tuple[str, ...],
+    pictures_of: PicturesBySubject,
     of_run: str = "",
 ) -> list[dict[str, Any]]:
     """Return a section per label of the table.
 
     Its rows of the table and what they say, its figures, its best sites beside their controls, a table per run,
-    and what the probes say. exhibits: figures of the table. names: of the runs. of_run: name of the run where
-    sections are of one.
+    and what the probes say. names: of the runs. of_run: name of the run where sections are of one.
     """
     sections: list[dict[str, Any]] = []
     for target in table.targets:
@@ -273,7 +283,7 @@ def _labels(
             "measured": _measured(next(iter(probes.values()))),
             "retention": of_target.tables()["Retention"],
             "sentences": [category.details for run in of_target.summary for category in run.categories],
-            "pictures": arranged(exhibits, target, names, places),
+            "pictures": pictures_of.get(target, []),
             "probes": [
                 replace(best_sites_table([of]), title=f"Best sites and controls{f', {name}' if several else ''}")
                 for name, of in probes.items()
@@ -296,8 +306,8 @@ def _stored_labels(
     for run, name in zip(runs, names, strict=True):
         if targets := list(stored_targets(run)):
             table = retention_table([run], target=targets)
-            of_run = name if len(runs) > 1 else ""
-            sections += _labels([run], table, collect_figures([run], table), [name], places, of_run)
+            pictures_of = arranged(FigureSource.of([run], table).figures(), [name], places)
+            sections += _labels(table, [run], [name], pictures_of, name if len(runs) > 1 else "")
     return sections
 
 
@@ -305,3 +315,266 @@ def _measured(results: ProbeResults) -> str:
     settings, curve = results.settings, next(iter(results.curves.values()))
     classes = f" of {len(curve.classes)} classes" if settings.task == "classes" else ""
     return f"A {_TASKS[settings.task]} label{classes}; the score is {METRICS[settings.task]}."
+
+
+# -- pictures and the template -----------------------------------------------------------------------------------
+
+
+_HERE = Path(__file__).parent
+_ASSETS = {"css": "page.css", "js": "page.js", "episodes_js": "episodes.js"}
+
+
+def render(template: str, places: tuple[str, ...], **content: Any) -> str:
+    """The page; no text in it holds `places` or another absolute path of this machine."""
+    from markupsafe import Markup
+
+    assets = {name: Markup((_HERE / file).read_text(encoding="utf-8")) for name, file in _ASSETS.items()}
+    return environment(_HERE, places=places).get_template(template).render(**assets, **content)
+
+
+SVG_LIMIT = 150_000
+"""Bytes; a figure of more is kept as pixels."""
+PIXELS_PER_INCH = 200
+"""Of figures that are kept as pixels."""
+_SVG, _XLINK = "http://www.w3.org/2000/svg", "http://www.w3.org/1999/xlink"
+_ROUNDED = ("d", "x", "y")
+"""Attributes in points, of which a hundredth cannot be seen."""
+_FONTS = re.compile(r"'[^;]*sans-serif")
+"""The fonts of a text, the first of them matplotlib's; a page has those of the machine that shows it."""
+_IN_URI = " !$'()*+,-./:;=?@[]_`{|}~"
+"""What a URI in double quotes may hold as it is."""
+
+
+def arranged(
+    figures: Sequence[ReportFigure], names: Sequence[str], places: tuple[str, ...] = ()
+) -> PicturesBySubject:
+    """Draw figures, by subject and kind. names: of the runs. places: see `data_uri`.
+
+    Tables are left out, which the page prints as such. All but the first of a kind and run are extra, to be
+    unfolded, and so are those of single runs that another figure shows side by side.
+    """
+    subjects: dict[str, dict[str, list[Picture]]] = {}
+    together = {
+        (figure.subject, _kind(figure)) for figure in figures if figure.run is None and not figure.is_table
+    }
+    for figure in figures:
+        if figure.is_table:
+            continue
+        by_title = subjects.setdefault(figure.subject, {})
+        run = "" if figure.run is None else names[figure.run]
+        kind = _kind(figure)
+        before = [other for pictures in by_title.values() for other in pictures]
+        extra = any(other.run == run and other.title.partition(",")[0] == kind for other in before)
+        extra |= figure.run is not None and (figure.subject, f"{kind} side by side") in together
+        picture = Picture(figure.title, run, figure.reading, *data_uri(figure, places), extra)
+        by_title.setdefault(figure.title, []).append(picture)
+    return {subject: list(by_title.values()) for subject, by_title in subjects.items()}
+
+
+def _kind(exhibit: ReportFigure) -> str:
+    return exhibit.title.partition(",")[0]
+
+
+def data_uri(exhibit: ReportFigure, places: tuple[str, ...] = ()) -> tuple[str, str]:
+    """The drawn figure as SVG, or WebP if that would be large, with its caption. A figure gives the same bytes.
+
+    Its ground is transparent, so that the page's colour is behind it. Of `places` and other absolute paths in
+    its words the last part is left.
+    """
+    import matplotlib as mpl
+    from matplotlib.text import Text
+
+    with (
+        exhibit.drawn() as figure,
+        mpl.rc_context({"svg.hashsalt": "probe_kit", "svg.fonttype": "none", "savefig.transparent": True}),
+    ):
+        for words in figure.findobj(Text):
+            words.set_text(without_places(words.get_text(), places))
+        file = BytesIO()
+        figure.savefig(file, format="svg", metadata={"Date": None})
+        svg = compact_svg(file.getvalue())
+        if len(svg) <= SVG_LIMIT:
+            return f"data:image/svg+xml,{quote(svg, safe=_IN_URI)}", caption_of(figure)
+        file = BytesIO()
+        pixels = {"lossless": True, "method": 6}
+        figure.savefig(file, format="webp", dpi=PIXELS_PER_INCH, pil_kwargs=pixels)
+        return encode("image/webp", file.getvalue()), caption_of(figure)
+
+
+def encode(kind: str, content: bytes) -> str:
+    """A data URI of bytes of some media type."""
+    return f"data:{kind};base64,{b64encode(content).decode()}"
+
+
+def compact_svg(svg: bytes) -> bytes:
+    """The same drawing without metadata, comments, line breaks, names that nothing uses, and fine decimals."""
+    ElementTree.register_namespace("", _SVG)
+    ElementTree.register_namespace("xlink", _XLINK)
+    root = ElementTree.fromstring(svg)
+    for metadata in root.findall(f"{{{_SVG}}}metadata"):
+        root.remove(metadata)
+    used = set(re.findall(r"#([\w-]+)", svg.decode()))
+    for element in root.iter():
+        element.text, element.tail = ((text or "").strip() or None for text in (element.text, element.tail))
+        if element.get("id") not in used:
+            element.attrib.pop("id", None)
+        for name in _ROUNDED:
+            if name in element.attrib:
+                element.set(name, _rounded(element.attrib[name]))
+        if "style" in element.attrib:
+            element.set("style", _FONTS.sub("sans-serif", element.attrib["style"]))
+    return ElementTree.tostring(root)
+
+
+def _rounded(numbers: str) -> str:
+    """Numbers and letters of a path, of two decimals each and without needless spaces."""
+    short = re.sub(r"-?\d+\.\d+(?!e)", lambda match: f"{float(match[0]):.2f}".rstrip("0").rstrip("."), numbers)
+    return re.sub(r"\s*([A-Za-z])\s*", r"\1", re.sub(r"\s+", " ", short)).strip()
+
+
+# -- origin of numbers -------------------------------------------------------------------------------------------
+
+PAPER = "arXiv:2606.19297"
+
+
+def provenance(name: str, run: RunReader, results: Sequence[ProbeResults]) -> dict[str, Any]:
+    """Return what a run says about itself and its probes; runs that were not made by probe_kit say less.
+
+    Its name, its line, facts by name, and documents by name as pretty JSON.
+    """
+    settings, certificate = run.settings, run.certificate
+    facts = {
+        "run": run.label,
+        "model": run.model,
+        "weights": "random: untrained" if run.random_weights else "",
+        "weights sha256": run.weights_sha256 or "none (scripted)",
+        "suite": run.suite,
+        "episodes": str(len(run.episodes)),
+        "streams": "; ".join(_stream(run, stream) for stream in run.streams) or "none",
+        **_protocol(settings),
+        "run settings sha256": run.settings_sha256,
+        "hooks on equals hooks off": {True: "yes, bit for bit", None: ""}.get(
+            certificate.get("hooks_on_equals_hooks_off"), "no"
+        ),
+        "mixed": ", ".join(run.mixed),
+        **({f"probes{_of_target(probes)}": probes.key for probes in results} or {"probes": "none"}),
+    }
+    documents = {"run settings": settings, "certificate": certificate}
+    documents |= {
+        f"probe settings{_of_target(probes)}": {
+            "key": probes.key,
+            "created": probes.created,
+            **asdict(probes.settings),
+        }
+        for probes in results
+    }
+    return {
+        "name": name,
+        "line": ProvenanceLine.of_run(run).line,
+        "facts": [(key, value) for key, value in facts.items() if value],
+        "documents": [
+            (key, json.dumps(value, indent=2, ensure_ascii=False)) for key, value in documents.items() if value
+        ],
+    }
+
+
+def _protocol(settings: Mapping[str, Any]) -> dict[str, str]:
+    """The protocol that a run follows, how it differs from the default, and how the run differs from it."""
+    protocol = settings.get("protocol")
+    if not protocol:
+        return {}
+    return {
+        "protocol": protocol["name"],
+        "deviates from it in": _listed(protocol["deviations"]) or "nothing",
+        "it differs from the default in": _listed(
+            {name: pair[::-1] for name, pair in protocol["differs_from_default"].items()}
+        ),
+        "of it cannot be matched": "; ".join(protocol["unmatched"]),
+    }
+
+
+def _listed(pairs: Mapping[str, Sequence[str | None]]) -> str:
+    changes = (f"{name} {now or 'nothing'} instead of {was or 'nothing'}" for name, (was, now) in pairs.items())
+    return "; ".join(changes)
+
+
+def citation(runs: Sequence[RunReader]) -> tuple[str, str]:
+    """A sentence for a methods section, and BibTeX; of the protocol only for runs of its scene."""
+    lines = "; ".join(ProvenanceLine.of_run(run).line.replace(" · ", ", ") for run in runs)
+    of_scene = any(SIDE in run.episodes for run in runs)
+    protocol = f" under the Act2Answer protocol ({PAPER})" if of_scene else ""
+    asked_alone = all(run.ask is not None for run in runs)
+    shares = "Accuracies of answers about" if asked_alone else "Success rates from"
+    limits = f" {shares} a PyBullet scene are comparable with each other, not with those of other simulators."
+    sentence = f"Evaluated with probe_kit {__version__}{protocol}: {lines}.{limits if of_scene else ''}"
+    software = (
+        "@software{probe_kit,\n"
+        "  title   = {probe\\_kit: where a Vision-Language-Action model knows the answer, and where it is lost},\n"
+        f"  version = {{{__version__}}},\n"
+        "  license = {Apache-2.0}\n}"
+    )
+    paper = (
+        "\n\n@misc{act2answer,\n"
+        "  title         = {Does {VLA} Even Know the Basics?},\n"
+        "  eprint        = {2606.19297},\n"
+        "  archivePrefix = {arXiv}\n}"
+    )
+    return sentence, software + (paper if of_scene else "")
+
+
+def _stream(run: RunReader, name: str) -> str:
+    stream = run.streams[name]
+    steps = f" × {stream.iterations} iterations" if stream.iterations else ""
+    return f"{name} {stream.layers} layers{steps}, width {stream.width}"
+
+
+def _of_target(probes: ProbeResults) -> str:
+    return "" if probes.settings.is_side else f" of {probes.settings.target}"
+
+
+# -- glossary ----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Words:
+    """entries: name, meaning and place of each word, by what they stand in.
+
+    headings: the place of a column's word and meaning; two tables may give a word two meanings. values: the place
+    of a cell's text that is a word.
+    """
+
+    entries: Mapping[str, tuple[tuple[str, str, str], ...]]
+    headings: Mapping[tuple[str, str], str]
+    values: Mapping[str, str]
+
+
+def words_of(tables: Sequence[Table]) -> Words:
+    """The words of all columns of `tables` and of the verdicts in them, and terms that are neither."""
+    cells = {cell.value for table in tables for row in table.rows for cell in row.cells}
+    groups: dict[str, dict[tuple[str, str], None]] = {}
+    for table in tables:
+        title = re.split("[:,]", table.title)[0]
+        entries_of = {(column.text, column.help): None for column in table.headings if column.help}
+        groups.setdefault(title, {}).update({word: None for word in entries_of if word not in _all(groups)})
+    words = {_word(cell) for cell in cells}
+    groups["Verdicts"] = {(name, text): None for name, text in VERDICT_HELP.items() if name in words}
+    groups["Further terms"] = {word: None for word in TERMS.items() if word not in _all(groups)}
+    places = {word: f"word-{number}" for number, word in enumerate(_all(groups))}
+    entries = {
+        title: tuple((*word, places[word]) for word in entries_of)
+        for title, entries_of in groups.items()
+        if entries_of
+    }
+    of_values = {
+        name: anchor for (name, text), anchor in places.items() if (VERDICT_HELP | TERMS).get(name) == text
+    }
+    return Words(entries, places, {cell: of_values[_word(cell)] for cell in cells if _word(cell) in of_values})
+
+
+def _word(cell: str) -> str:
+    """A verdict without its direction, side and bound."""
+    return cell.removeprefix("against: ").partition(" (")[0]
+
+
+def _all(groups: Mapping[str, Mapping[tuple[str, str], None]]) -> list[tuple[str, str]]:
+    return [word for of_table in groups.values() for word in of_table]

@@ -1,21 +1,23 @@
-"""The rows of one run and their mean, with the estimates that averages and differences are made of."""
+"""The rows of one run and their mean, of behaviour and probes, with the estimates behind their numbers."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from math import isfinite
+from math import isfinite, isnan
 from operator import attrgetter
 from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from probe_kit._system.counting import enumerated
+from probe_kit._tables.numbers import p_text
 from probe_kit.env.scoring import DEFAULT_RULE
 from probe_kit.errors import UnknownSiteError
 from probe_kit.intervene.evidence import StoredEvidence, stored_ties
 from probe_kit.retention.behaviour import (
+    OutcomeRuleScores,
     SuccessRate,
-    ask_of,
-    capture_only,
+    TableRun,
     normalised_score,
     read_by_clause,
     sensitivity,
@@ -24,9 +26,19 @@ from probe_kit.retention.behaviour import (
     units_of,
 )
 from probe_kit.retention.choices import Iterations
-from probe_kit.retention.estimators import ACTION, BACKBONE, Limits, Rate, StreamScores, limits
-from probe_kit.retention.rows.outcome_rules import OutcomeRuleScores, RunUnderRule
-from probe_kit.retention.rows.probe_parts import number_or_none, with_probes
+from probe_kit.retention.estimators import (
+    ACTION,
+    BACKBONE,
+    Limits,
+    Peak,
+    Rate,
+    StreamScores,
+    best_site,
+    curve_scores,
+    estimate_retention,
+    limits,
+    stream_peaks,
+)
 from probe_kit.retention.rows.row import (
     MEAN,
     ActionPart,
@@ -40,9 +52,13 @@ from probe_kit.retention.rows.row import (
 )
 from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.intervals import Share
+from probe_kit.statistics.paired_tests import holm
 from probe_kit.statistics.retention import Scores, retention
-from probe_kit.statistics.sufficiency import ABSENT_BELOW
+from probe_kit.statistics.significance import SIGNIFICANCE
+from probe_kit.statistics.sufficiency import ABSENT_BELOW, verdict
 from probe_kit.train.choices import CORRECT
+from probe_kit.train.results.control_scores import has_signal
+from probe_kit.train.results.probe_curve import ProbeCurve
 from probe_kit.train.results.probe_results import ProbeResults
 
 if TYPE_CHECKING:
@@ -67,80 +83,78 @@ class RowWithEstimates:
 class RowSettings:
     """The settings of a table.
 
-    epsilons: zone radii in metres for `sr_by_epsilon`, which belong to the rule `disc`. rule, last_steps: see
-    `probe_kit.env.scoring.judge`. absent_below: accuracy below which a stream's best site counts as absent.
-    with_behaviour: see `RunUnderRule.of`.
+    epsilons: zone radii in metres for `sr_by_epsilon`, which belong to the rule `disc`. absent_below: accuracy
+    below which a stream's best site counts as absent.
     """
 
     views: Sequence[str] | None
     iterations: Iterations
     epsilons: Sequence[float]
-    rule: str = DEFAULT_RULE
-    last_steps: int = 1
     absent_below: float = ABSENT_BELOW
     categories: Sequence[str] | None = None
-    with_behaviour: bool = True
 
 
-def run_rows(
-    run: RunReader, results: ProbeResults | None, settings: RowSettings, group: str | None = None
-) -> list[RowWithEstimates]:
-    """One row per category and view of `run`, in the order of its episodes; without `results`, success rates only.
+def run_rows(table_run: TableRun, results: ProbeResults | None, settings: RowSettings) -> list[RowWithEstimates]:
+    """One row per category and view of a run, in the order of its episodes; without `results`, success rates only.
 
-    Raises UnknownSiteError for a view that was not probed.
+    Probes of a target that is no side have rows without success. Raises UnknownSiteError for a view that was not
+    probed.
     """
+    if results is not None and not results.settings.is_side:
+        return [
+            RowWithEstimates(target_row(table_run, results, category, view, settings.iterations))
+            for category in results.settings.categories
+            for view in settings.views or results.settings.views
+        ]
     views: Sequence[str | None] = (None,) if results is None else settings.views or results.settings.views
     if results is not None and (unknown := set(settings.views or ()) - set(results.settings.views)):
         probed = ", ".join(results.settings.views)
-        raise UnknownSiteError(f"{run.location} has probes of {probed}, not of {', '.join(sorted(unknown))}")
-    judged = RunUnderRule.of(run, settings.rule, settings.last_steps, settings.with_behaviour)
-    evidence = StoredEvidence(run)
+        raise UnknownSiteError(f"{table_run.location} has probes of {probed}, not of {', '.join(sorted(unknown))}")
+    evidence = StoredEvidence(table_run.run)
     ties = {view: stored_ties(evidence, results, view) if evidence.swaps else {} for view in views}
-    drawn = [
-        _row(judged, results, settings, group, str(category), episodes, view)
-        for category, episodes in judged.run.episodes.groupby("category", sort=False)
+    rows = [
+        _row(table_run, results, settings, str(category), episodes, view)
+        for category, episodes in table_run.judged.episodes.groupby("category", sort=False)
         if settings.categories is None or category in settings.categories
         for view in views
     ]
     return [
         replace(row, row=add_image_swap(row.row, evidence, ties[row.row.view].get(row.row.category, "")))
-        for row in drawn
+        for row in rows
     ]
 
 
 def _row(
-    judged: RunUnderRule,
+    table_run: TableRun,
     results: ProbeResults | None,
     settings: RowSettings,
-    group: str | None,
     category: str,
     episodes: "pd.DataFrame",
     view: str | None,
 ) -> RowWithEstimates:
-    run, heard = judged.run, capture_only(episodes)
-    scored = judged.scored and not heard
-    success = success_rate(episodes) if scored else _no_success(episodes, heard)
-    rules = OutcomeRuleScores(rule=judged.rule, rule_words=judged.words)
+    run = table_run.judged
+    success = success_rate(episodes) if table_run.is_judged else _no_success(table_run, episodes)
+    rules = OutcomeRuleScores(rule=table_run.rule, rule_words=table_run.words)
     rates, streams = dict[str, Share](), None
-    if scored:
-        radii = settings.epsilons if settings.rule == DEFAULT_RULE else ()
+    if table_run.is_judged:
+        radii = settings.epsilons if table_run.rule == DEFAULT_RULE else ()
         by_radius = {f"{radius:g}": rate for radius, rate in sensitivity(episodes, radii).items()}
-        rules, shares = judged.part(episodes)
+        rules, shares = table_run.part(episodes)
         rules = replace(rules, sr_by_epsilon=by_radius)
         rates = {"sr": success_share(episodes, run.seed_text), **shares}
     row = RetentionRow(
         category=category,
         view=view,
         target=CORRECT if results is None else results.settings.target,
-        group=group,
-        run=RunInfo.of(run, results),
+        group=table_run.group,
+        run=RunInfo.of(table_run, results),
         success=success,
         rules=rules,
         answers=_answers(run, episodes),
     )
     if results is not None and view is not None:
         row, streams = with_probes(row, results, settings.iterations, settings.absent_below, run.seed_text)
-    return RowWithEstimates(row, rates, streams, episodes if scored else None)
+    return RowWithEstimates(row, rates, streams, episodes if table_run.is_judged else None)
 
 
 def add_image_swap(row: RetentionRow, evidence: StoredEvidence, tie: str = "") -> RetentionRow:
@@ -166,7 +180,7 @@ def add_image_swap(row: RetentionRow, evidence: StoredEvidence, tie: str = "") -
 
 
 def _answers(run: RunReader, episodes: "pd.DataFrame") -> AnswerStats:
-    ask = ask_of(run)
+    ask = run.ask
     if ask is None:
         return AnswerStats()
     text = episodes["outcome_text" if "outcome_text" in episodes else "outcome"]
@@ -190,9 +204,10 @@ def _answers(run: RunReader, episodes: "pd.DataFrame") -> AnswerStats:
     )
 
 
-def _no_success(episodes: "pd.DataFrame", heard: bool) -> SuccessRate:
+def _no_success(table_run: TableRun, episodes: "pd.DataFrame") -> SuccessRate:
     """Return an empty rate, of a model that did not act or a run that keeps nothing to judge by."""
-    reason = "" if heard else "n/a: the run keeps no trajectories, which this outcome rule needs"
+    captured_only = table_run.is_captured_only
+    reason = "" if captured_only else "n/a: the run keeps no trajectories, which this outcome rule needs"
     items, groups = int(episodes["item_id"].nunique()), np.unique(units_of(episodes)).size
     return SuccessRate(n_episodes=len(episodes), n_items=items, n_groups=groups, reason=reason)
 
@@ -202,15 +217,15 @@ def _no_success(episodes: "pd.DataFrame", heard: bool) -> SuccessRate:
 _PARTS = ("success", "rules", "answers", "backbone", "action", "controls", "image_swap")
 
 
-def mean_row(drawn: Sequence[RowWithEstimates], averaged: Sequence[str]) -> RetentionRow:
+def mean_row(estimated: Sequence[RowWithEstimates], averaged: Sequence[str]) -> RetentionRow:
     """The category average of rows of one run and view; retention is the ratio of the mean scores.
 
     averaged: fields that are averaged over the categories that have them, as `part.field`; the columns declare
     them, see `probe_kit.retention.columns.columns`. Intervals: of independent categories, see
     `mean_interval` and `Scores.mean`.
     """
-    rows = [part.row for part in drawn]
-    of_streams = [part.streams for part in drawn if part.streams is not None]
+    rows = [part.row for part in estimated]
+    of_streams = [part.streams for part in estimated if part.streams is not None]
     # None where categories are of different streams
     probed = of_streams if len({streams.names for streams in of_streams}) == 1 else []
     first = rows[0]
@@ -225,8 +240,8 @@ def mean_row(drawn: Sequence[RowWithEstimates], averaged: Sequence[str]) -> Rete
         categories=tuple(row.category for row in rows),
         left_out=_left_out(rows),
         run=first.run,
-        success=_success(rows, drawn, means["success"]),
-        rules=_rules(rows, drawn, means["rules"]),
+        success=_success(rows, estimated, means["success"]),
+        rules=_rules(rows, estimated, means["rules"]),
         answers=replace(first.answers, **means["answers"]),
         backbone=BackbonePart(ci=_accuracy_limits(probed, BACKBONE), **means["backbone"]),
         action=ActionPart(ci=_accuracy_limits(probed, ACTION), **means["action"]),
@@ -250,20 +265,20 @@ def _accuracy_limits(probed: Sequence[StreamScores], name: str) -> Limits | None
 
 
 def _success(
-    rows: Sequence[RetentionRow], drawn: Sequence[RowWithEstimates], means: dict[str, Any]
+    rows: Sequence[RetentionRow], estimated: Sequence[RowWithEstimates], means: dict[str, Any]
 ) -> SuccessRate:
     rates = [row.success.sr for row in rows if row.success.sr is not None]
     return SuccessRate(
         n_episodes=sum(row.success.n_episodes for row in rows),
         n_items=sum(row.success.n_items for row in rows),
-        ci=_rate_limits(drawn, "sr"),
+        ci=_rate_limits(estimated, "sr"),
         normalised_score=normalised_score(rates) if len(rates) == len(rows) else None,
         **means,
     )
 
 
 def _rules(
-    rows: Sequence[RetentionRow], drawn: Sequence[RowWithEstimates], means: dict[str, Any]
+    rows: Sequence[RetentionRow], estimated: Sequence[RowWithEstimates], means: dict[str, Any]
 ) -> OutcomeRuleScores:
     rules = [row.rules for row in rows]
     sides = {of_category.idle_side for of_category in rules}
@@ -273,8 +288,8 @@ def _rules(
         last_steps=rules[0].last_steps,
         n_answered=_sum([of_category.n_answered for of_category in rules]),
         n_grasped=_sum([of_category.n_grasped for of_category in rules]),
-        sr_answered_ci=_rate_limits(drawn, "sr_answered"),
-        sr_grasped_ci=_rate_limits(drawn, "sr_grasped"),
+        sr_answered_ci=_rate_limits(estimated, "sr_answered"),
+        sr_grasped_ci=_rate_limits(estimated, "sr_grasped"),
         idle_side=sides.pop() if len(sides) == 1 else "both",
         sr_by_rule=_mean_by_key([of_category.sr_by_rule for of_category in rules]),
         sr_by_epsilon=_mean_by_key([of_category.sr_by_epsilon for of_category in rules]),
@@ -303,8 +318,8 @@ def _retention(rows: Sequence[RetentionRow], probed: Sequence[StreamScores]) -> 
     )
 
 
-def _rate_limits(drawn: Sequence[RowWithEstimates], name: str) -> Limits | None:
-    shares = [part.rates[name] for part in drawn if name in part.rates]
+def _rate_limits(estimated: Sequence[RowWithEstimates], name: str) -> Limits | None:
+    shares = [part.rates[name] for part in estimated if name in part.rates]
     if not shares:
         return None
     return limits(Rate.mean([Rate(share.value, share.interval()) for share in shares]).interval)
@@ -325,3 +340,256 @@ def _sum(values: Sequence[int | None]) -> int | None:
 def _mean_by_key(columns: Sequence[dict[str, float]]) -> dict[str, float]:
     """Average per key, for the keys that all have."""
     return {key: fmean(column[key] for column in columns) for key in columns[0] if all(key in c for c in columns)}
+
+
+# -- parts that probes give -----------------------------------------------------------------------------------
+
+
+LEAST_EXCESS = 0.05
+"""R² above chance that the backbone must have; a ratio of less is the ratio of two errors."""
+STEP = "step"
+"""The control that labels of several inferences need: the number of the inference alone may say as much."""
+NO_STEP = "n/a (control step was not run)"
+
+
+def with_probes(
+    row: RetentionRow,
+    results: ProbeResults,
+    iterations: Iterations = "all",
+    absent_below: float = ABSENT_BELOW,
+    seed_text: str = "",
+) -> tuple[RetentionRow, StreamScores | None]:
+    """Return the row with the parts of its category's probes, and their scores; None where there are none.
+
+    seed_text: of the run; scores on equal groups of one are paired. absent_below: see `verdict`.
+    """
+    curve = None if row.view is None else results.curves.get((row.category, row.view))
+    if row.view is None or curve is None:
+        note = f"n/a (probes {results.key} are of {', '.join(results.settings.categories)})"
+        return replace(row, retention=RetentionPart(note=note)), None
+    streams, peaks = curve_scores(curve, iterations, seed_text), stream_peaks(curve, iterations)
+    parts = {
+        name: _stream_part(row, results, curve, name, peak, streams, absent_below) for name, peak in peaks.items()
+    }
+    row = replace(
+        row,
+        backbone=BackbonePart(**parts.get(BACKBONE, {})),
+        action=ActionPart(**parts.get(ACTION, {}), **_iterations(curve, peaks.get(ACTION))),
+    )
+    estimate = RetentionPart(note="n/a (one stream only)")
+    if len(peaks) == 2:
+        ratio = estimate_retention(peaks, streams, parts[BACKBONE]["exceeds"], absent_below)
+        estimate = RetentionPart(
+            value=number_or_none(ratio.value),
+            ci=limits(ratio.interval),
+            # The paper's ratio is of accuracies above one half, which the metric of a label is not.
+            published=number_or_none(ratio.published) if curve.is_side else None,
+            defined=ratio.defined,
+            note=ratio.note,
+        )
+    row = replace(row, retention=estimate, controls=_controls(row, results, curve, peaks))
+    return row if curve.is_side else with_reason(row, results), streams
+
+
+def _stream_part(
+    row: RetentionRow,
+    results: ProbeResults,
+    curve: ProbeCurve,
+    name: str,
+    peak: Peak,
+    streams: StreamScores | None,
+    absent_below: float,
+) -> dict[str, Any]:
+    """Return the fields of `StreamPart` of one stream."""
+    view = row.view or ""
+    exceeds = results.controls.exceeds(row.category, view, str(peak.site), peak.p_fwe)
+    part: dict[str, Any] = {
+        "stream": peak.site.stream,
+        "peak": peak.score,
+        "chance": None if curve.is_side else number_or_none(peak.chance),
+        "site": str(peak.site),
+        "layer": peak.site.layer,
+        "depth": curve.depth(peak.site),
+        "ties": peak.ties,
+        "p_fwe": number_or_none(peak.p_fwe),
+        "exceeds": exceeds,
+        "remedy": results.remedy(row.category, view),
+    }
+    if not curve.is_side:
+        if streams is not None:
+            part |= {"above": streams.above(name), "above_ci": limits(streams.above_interval(name))}
+        return part
+    untrained = results.controls.untrained_peak(row.category, view, peak.site.stream)
+    # How much more accurate the best site is than on random labels, and untrained.
+    part["selectivity"] = number_or_none(peak.score - float(curve.control_accuracy[curve.sites.index(peak.site)]))
+    if untrained is not None:
+        part |= {"minus_untrained": untrained.difference, "minus_untrained_ci": untrained.ci}
+    if streams is not None:
+        most, findable = streams.at_most[name], streams.findable[name]
+        part |= {
+            "score": streams.accuracy(name),
+            "ci": limits(streams.interval(name)),
+            "peak": streams.peak(name),  # balanced between the sides too
+            "at_most": most,
+            "verdict": verdict(has_signal(exceeds), most, findable, absent_below),
+        }
+    return part
+
+
+def _iterations(curve: ProbeCurve, peak: Peak | None) -> dict[str, Any]:
+    """Return the iteration of the action's best site, and of a side the best layer of the first iteration.
+
+    The first iteration has seen nothing of the action yet. A stream that runs once has neither.
+    """
+    if peak is None:
+        return {}
+    iterations = [site.iteration for site in curve.sites if site.stream == peak.site.stream]
+    steps = [step for step in iterations if step is not None]
+    first = best_site(curve, peak.site.stream, min(steps)) if steps and curve.is_side else None
+    return {
+        "iteration": peak.site.iteration,
+        "first_peak": None if first is None else first.score,
+        "first_layer": None if first is None else first.site.layer,
+    }
+
+
+def _controls(
+    row: RetentionRow, results: ProbeResults, curve: ProbeCurve, peaks: Mapping[str, Peak]
+) -> ControlScores:
+    """Return the scores that the best sites are compared with."""
+    sizes = ControlScores(n_groups=curve.n_groups, n_samples=int(curve.labels.size))
+    if not curve.is_side:
+        return sizes
+    baselines = results.controls.of_category(row.category)
+    untrained = (
+        results.controls.untrained_peak(row.category, row.view or "", peak.site.stream) for peak in peaks.values()
+    )
+    accuracy, success = row.backbone.score, row.success.sr
+    items, sides = set(curve.items.tolist()), {"left": curve.labels, "right": ~curve.labels}
+    return replace(
+        sizes,
+        missing={
+            side: 1 - len(set(curve.items[is_side].tolist())) / len(items) for side, is_side in sides.items()
+        },
+        probe_minus_sr=None if accuracy is None or success is None else accuracy - success,
+        baselines={name: score.score for name, score in baselines.items()},
+        leaks=tuple(name for name, score in baselines.items() if score.above_chance),
+        untrained=next((peak.untrained for peak in untrained if peak is not None), None),
+    )
+
+
+def number_or_none(value: float) -> float | None:
+    """Return None in place of NaN, as rows hold a number that there is not."""
+    return None if isnan(value) else value
+
+
+# -- targets that are no side --------------------------------------------------------------------------------
+
+
+def with_reason(row: RetentionRow, results: ProbeResults, tests: int = 1) -> RetentionRow:
+    """Return a row of a label that says whether there is something to retain, and else what is missing.
+
+    tests: the number that p is corrected for.
+    """
+    note, reason = _missing(row, results, tests)
+    return replace(row, retention=replace(row.retention, defined=not note, note=note, reason=reason))
+
+
+def with_corrected_p(
+    row: RetentionRow, results: ProbeResults, backbone: float | None, action: float | None, tests: int
+) -> RetentionRow:
+    """Return a row of a label with p of both streams corrected for so many tests; None for no p."""
+    parts: dict[str, Any] = {
+        name: replace(part, p_fwe=p, exceeds=part.exceeds | {"chance": p < SIGNIFICANCE})
+        for name, part, p in ((BACKBONE, row.backbone, backbone), (ACTION, row.action, action))
+        if p is not None
+    }
+    return with_reason(replace(row, **parts), results, tests)
+
+
+def _missing(row: RetentionRow, results: ProbeResults, tests: int) -> tuple[str, str]:
+    """Return why there is nothing to retain, in few words and in full; two empty texts where there is."""
+    settings, backbone = results.settings, row.backbone
+    if backbone.peak is None or row.action.peak is None:
+        part = "backbone" if backbone.peak is None else "action"
+        probed = ", ".join(
+            dict.fromkeys(site.stream for site in results.curves[row.category, row.view or ""].sites)
+        )
+        return "n/a (one stream only)", (
+            f"no site of the {part} was probed, so there is no retention; probed: {probed}. Extract a policy "
+            "whose backbone and action stream are captured"
+        )
+    best = f"the backbone's best site {backbone.site} has {row.metric} {backbone.peak:.2f}"
+    if backbone.p_fwe is None or backbone.chance is None:
+        return "n/a (no permutations)", (
+            f"{best}, and no permuted labels say what chance is. Train with --permutations 200, on groups that "
+            "can exchange labels"
+        )
+    if settings.window > 1 and STEP not in results.controls.names:
+        return NO_STEP, (
+            f"{best}, and labels change within episodes, so their step may say as much. Train with the control "
+            f"step: `--controls {','.join([STEP, *results.controls.names])}`"
+        )
+    if missed := backbone.missed:
+        scores = {
+            control.name: control.score
+            for control in results.controls.scores
+            if control.category == row.category and control.stream in ("", backbone.stream)
+        }
+        facts = [f"chance {backbone.chance:.2f}, p {p_text(backbone.p_fwe)}"]
+        facts += [f"{name} {scores[name]:.2f}" for name in missed if name in scores]
+        advice = "Label more groups, or choose a label that these controls do not decode"
+        if remedy := results.remedy(row.category, row.view or "", tests):
+            advice = f"No p can be below it: {remedy}"
+        return f"n/a (backbone not shown to exceed {enumerated(missed)})", (
+            f"{best} ({'; '.join(facts)}). Expected p < {SIGNIFICANCE} and more than every control that was run. "
+            f"{advice}"
+        )
+    if row.backbone.above is None:
+        return row.retention.note, f"{best}, and too few groups to choose a site on others. Label more groups"
+    if row.task == "continuous" and row.backbone.above < LEAST_EXCESS:
+        return f"n/a (backbone {row.backbone.above:.2f} above chance)", (
+            f"{best}, {row.backbone.above:.2f} above chance where a site is chosen on other groups; expected "
+            f"{LEAST_EXCESS} or more to divide by. Label more groups"
+        )
+    return "", ""
+
+
+Results = Mapping[tuple[str, str], ProbeResults]
+"""By the location of a run and the target."""
+
+
+def target_row(
+    table_run: TableRun, results: ProbeResults, category: str, view: str, iterations: Iterations = "all"
+) -> RetentionRow:
+    """Return the row of a target, also of a side, in one category and view, without success.
+
+    Raises UnknownSiteError if it was not probed.
+    """
+    settings = results.settings
+    if (category, view) not in results.curves:
+        raise UnknownSiteError(f"view {view!r} was not probed; probed: {', '.join(settings.views)}")
+    curve = results.curves[category, view]
+    row = RetentionRow(
+        category=category,
+        view=view,
+        target=settings.target,
+        task=settings.task,
+        run=RunInfo.of(table_run, results),
+        success=SuccessRate(n_episodes=np.unique(curve.episodes).size, n_items=np.unique(curve.items).size),
+    )
+    return with_probes(row, results, iterations, seed_text=settings.seed_text)[0]
+
+
+def with_holm_of_targets(rows: Sequence[RetentionRow], results: Results) -> list[RetentionRow]:
+    """Return the rows with p of both streams corrected for the targets, within each run, category and view."""
+    families: dict[tuple[str, str, str | None], list[int]] = {}
+    for number, row in enumerate(rows):
+        families.setdefault((row.run.location, row.category, row.view), []).append(number)
+    corrected = list(rows)
+    for members in families.values():
+        p = [holm([getattr(rows[at], part).p_fwe for at in members]) for part in ("backbone", "action")]
+        for at, backbone, action in zip(members, *p, strict=True):
+            probes = results[rows[at].run.location, rows[at].target]
+            corrected[at] = with_corrected_p(rows[at], probes, backbone, action, len(members))
+    return corrected

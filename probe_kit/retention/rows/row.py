@@ -5,10 +5,9 @@ from typing import Literal, Self
 
 from probe_kit.hooks.contract.sites import first_of, label_of
 from probe_kit.intervene.verdict import UseVerdict
-from probe_kit.retention.behaviour import SuccessRate, ask_of, capture_only
+from probe_kit.retention.behaviour import OutcomeRuleScores, SuccessRate, TableRun
 from probe_kit.retention.estimators import Limits
-from probe_kit.retention.rows.outcome_rules import OutcomeRuleScores
-from probe_kit.runs.reader import RunReader, full_name
+from probe_kit.runs.reader import full_name
 from probe_kit.statistics.sufficiency import Verdict
 from probe_kit.train.choices import CORRECT, SIDES, Task
 from probe_kit.train.crossval.task_scores import METRICS
@@ -43,21 +42,22 @@ class RunInfo:
     capture_only: bool = False
 
     @classmethod
-    def of(cls, run: RunReader, results: ProbeResults | None) -> Self:
+    def of(cls, table_run: TableRun, results: ProbeResults | None) -> Self:
         """Return the part of a row that names its run."""
+        run = table_run.run
         return cls(
-            location=str(run.location),
+            location=table_run.location,
             model=run.model,
-            label=run.label,
+            label=table_run.label,
             random_weights=run.random_weights,
             weights_sha256=run.weights_sha256,
             suite=run.suite,
-            mode="acts" if ask_of(run) is None else "answers",
+            mode="answers" if table_run.answers else "acts",
             action_stream=first_of("action", run.streams.values()),
             settings=run.settings_sha256,
             probes=None if results is None else results.key,
             call=None if results is None else results.settings.call,
-            capture_only=capture_only(run.episodes),
+            capture_only=table_run.is_captured_only,
         )
 
     @property

@@ -8,9 +8,8 @@ import pytest
 
 from probe_kit.errors import UsageError
 from probe_kit.retention.behaviour import success_rate
-from probe_kit.retention.columns.comparisons import wording_tables
-from probe_kit.retention.compare.compare import Difference
-from probe_kit.retention.compare.pairing import compare_wordings
+from probe_kit.retention.columns.tables import wording_tables
+from probe_kit.retention.compare.compare import Difference, compare_wordings
 from probe_kit.runs.reader import check_several_wordings
 from probe_kit.train import ArrayRun
 

@@ -24,7 +24,7 @@ from probe_kit.retention.displays import (
     collect_figures,
 )
 from probe_kit.retention.report import report_html
-from probe_kit.retention.report.parts import words_of
+from probe_kit.retention.report.page import words_of
 from probe_kit.train import ArrayRun, Controls, ControlScore, UntrainedScore, load_results, save_results
 from tests.retention.asked_runs import SaidRun, acted, asked, probes
 
@@ -192,10 +192,10 @@ def test_the_summary_says_how_many_answers_are_right(shown: Mapping[str, str]) -
 def test_a_policy_is_described_as_before_and_a_mixture_as_both(tmp_path: Path) -> None:
     policy = acted(tmp_path, RIGHT)
     alone, both = formats([policy]), formats([policy, vlm(tmp_path)])
-    assert "the cube ends on the correct picture in" in alone["report"]
-    assert "the VLM answers right in" not in alone["report"]
-    assert "the cube ends on the correct picture in" in both["report"]
-    assert "the VLM answers right in" in both["report"]
+    assert "the cube ends right in" in alone["report"]
+    assert "share of its answers that are right" not in alone["report"]
+    assert "the cube ends right in" in both["report"]
+    assert "share of its answers that are right" in both["report"]
     for name in FORMATS:
         assert re.search(r"success rate", alone[name], re.I), name
         assert not re.search(r"accuracy of answers", alone[name], re.I), name

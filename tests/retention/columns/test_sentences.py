@@ -13,8 +13,8 @@ from probe_kit.intervene.evidence import StoredEvidence
 from probe_kit.intervene.kinds.image_swap import ImageSwapEffect
 from probe_kit.intervene.verdict import Places, UseVerdict
 from probe_kit.retention.behaviour import Regime, SuccessRate
-from probe_kit.retention.columns.sentences import conclusion, verdict
 from probe_kit.retention.columns.summary import MOST_NUMBERS, MOST_WORDS, count_words, finding, next_step
+from probe_kit.retention.columns.text import conclusion, verdict
 from probe_kit.retention.rows.build import add_image_swap
 from probe_kit.retention.rows.row import ActionPart, BackbonePart, RetentionRow, RunInfo, SwapEffect
 from tests.retention.columns.test_summary import answers

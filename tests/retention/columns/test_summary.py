@@ -11,7 +11,7 @@ from probe_kit.intervene import Behaviour, UseVerdict
 from probe_kit.retention import RetentionRow, RetentionTable
 from probe_kit.retention.behaviour import Regime, SuccessRate
 from probe_kit.retention.columns.summary import HEADINGS, MARK, summarise_runs, summary_table
-from probe_kit.retention.report.parts import warnings_of
+from probe_kit.retention.columns.text import warnings_of
 from probe_kit.retention.rows.row import (
     MEAN,
     ActionPart,

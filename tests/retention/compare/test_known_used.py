@@ -21,10 +21,9 @@ from probe_kit.extract import AskSettings, ExtractSettings, ask_run, extract_run
 from probe_kit.extract.prompts import TEMPLATES
 from probe_kit.retention import retention_table
 from probe_kit.retention.behaviour import scored
-from probe_kit.retention.columns.comparisons import known_used_tables
-from probe_kit.retention.compare.known_used import CategoryCounts, encoded_decisions, match_runs
+from probe_kit.retention.columns.tables import known_used_tables
+from probe_kit.retention.compare.known_used import CategoryCounts, encoded_decisions, join_runs, match_runs
 from probe_kit.retention.displays import KnownUsedDisplay, collect_figures
-from probe_kit.retention.displays.bars import joins_of
 from probe_kit.retention.report import report_html
 from probe_kit.runs import Run
 from probe_kit.suite import Suite
@@ -265,7 +264,7 @@ def test_the_report_of_an_asked_and_an_acting_run_holds_their_join(tmp_path: Pat
     vlm, policy = pair(tmp_path)
     runs = [vlm, policy]
     table = retention_table(runs)  # type: ignore[arg-type]
-    (joined,), _ = joins_of(runs, table)  # type: ignore[arg-type]
+    (joined,) = join_runs(table.runs, table.results).tables
     assert [one.name for one in collect_figures(runs, table) if one.subject == "join"] == ["known-used-1"]  # type: ignore[arg-type]
     page = report_html(runs, table)  # type: ignore[arg-type]
     section = page.split('<details class="part" id="join">')[1].split("</details>")[0]
@@ -282,9 +281,9 @@ def test_runs_that_saw_other_frames_are_not_joined_and_the_report_says_so(tmp_pa
     policy.episodes["first_frame_sha256"] = "other"
     runs = [vlm, policy]
     table = retention_table(runs)  # type: ignore[arg-type]
-    joins, refused = joins_of(runs, table)  # type: ignore[arg-type]
-    assert joins == []
-    assert "begin with another frame" in refused[0]
+    joins = join_runs(table.runs, table.results)
+    assert joins.tables == ()
+    assert "begin with another frame" in joins.refused[0]
     assert "begin with another frame" in report_html(runs, table)  # type: ignore[arg-type]
 
 

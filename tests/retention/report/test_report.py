@@ -27,14 +27,13 @@ from probe_kit.intervene.outcomes import FORMAT
 from probe_kit.intervene.verdict import Behaviour
 from probe_kit.retention import RetentionTable, retention_table
 from probe_kit.retention.columns.columns import all_columns
-from probe_kit.retention.columns.sentences import VERDICT_HELP, Readable
 from probe_kit.retention.columns.summary import HEADING_HELP
 from probe_kit.retention.columns.tables import retention_tables
-from probe_kit.retention.columns.text import TERMS, Modes
+from probe_kit.retention.columns.text import TERMS, VERDICT_HELP, Modes, Readable, warnings_of
 from probe_kit.retention.displays.report_figure import ReportFigure, collect_figures
-from probe_kit.retention.report import parts, report_html, write_report
+from probe_kit.retention.report import page, report_html, write_report
 from probe_kit.retention.report.episodes import BLOCK, episode_grid
-from probe_kit.retention.report.parts import citation, compact_svg, data_uri, warnings_of
+from probe_kit.retention.report.page import citation, compact_svg, data_uri
 from probe_kit.runs.store import locate
 from probe_kit.runs.thumbnails import as_thumbnail, read_thumbnail, thumbnail_key
 from probe_kit.train import ArrayRun, load_results
@@ -90,11 +89,8 @@ def test_the_page_opens_with_what_is_encoded_and_used_in_plain_words(probed_run:
     opening = page[page.index('<section id="summary"') : page.index('<details class="part"')]
     assert "Summary: pi0-tiny" in opening
     color, shape = re.findall(r"<li>(.*?)</li>", opening.replace("\u00a0", " "), re.DOTALL)
-    assert "<b>Color (100 items)</b>: the backbone holds the answer (90 %, " in color
-    assert (
-        "<b>Shape (100 items)</b>: a linear probe of so many items does not find the answer in the backbone ("
-        in shape
-    )
+    assert "<b>Color</b> encoded, use not tested: probes read the answer in the backbone and the action" in color
+    assert "<b>Shape</b> absent: probes of 100 items do not find the answer in the backbone" in shape
 
 
 def test_random_weights_are_marked_in_summary_figures_and_certificate(probed_run: ProbedRun) -> None:
@@ -351,7 +347,7 @@ def test_page_terminal_markdown_and_json_say_the_same_sentence_of_both_readouts(
         assert "is not used in the first chunk: " in sentence
         assert "; it is used over the whole episode" in sentence
     with (console := Console(width=400)).capture() as printed:
-        console.print(table.to_rich())
+        console.print(table.to_rich("all"))
     page = unescape(re.sub(r"<[^>]+>", " ", report_html([run])))
     for shown in (printed.get(), table.to_markdown(), page):
         text = " ".join(shown.replace("\u00a0", " ").split())
@@ -422,6 +418,6 @@ def test_a_figure_is_vectors_with_a_transparent_ground_and_no_path() -> None:
 
 
 def test_a_large_figure_is_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(parts, "SVG_LIMIT", 1000)
+    monkeypatch.setattr(page, "SVG_LIMIT", 1000)
     source, _ = data_uri(exhibit())
     assert source.startswith("data:image/webp;base64,")

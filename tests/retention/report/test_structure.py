@@ -14,9 +14,9 @@ from rich.console import Console
 
 from probe_kit._tables.table import Table
 from probe_kit.retention import RetentionTable, retention_table
-from probe_kit.retention.columns.sentences import VERDICT_HELP
 from probe_kit.retention.columns.summary import HEADINGS
 from probe_kit.retention.columns.tables import retention_tables
+from probe_kit.retention.columns.text import VERDICT_HELP
 from probe_kit.retention.compare.compare import Difference
 from probe_kit.retention.report import report_html
 from probe_kit.retention.report.episodes import episode_grid

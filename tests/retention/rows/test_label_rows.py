@@ -18,8 +18,8 @@ from probe_kit.errors import UnknownSiteError, UsageError
 from probe_kit.hooks import Site
 from probe_kit.retention import measure_retention, retention_table
 from probe_kit.retention.behaviour import SuccessRate, capture_only
-from probe_kit.retention.columns.sentences import label_finding
-from probe_kit.retention.rows.probe_parts import with_corrected_p, with_probes
+from probe_kit.retention.columns.text import label_finding
+from probe_kit.retention.rows.build import with_corrected_p, with_probes
 from probe_kit.retention.rows.row import RetentionRow, RunInfo
 from probe_kit.runs import Run, open_run
 from probe_kit.statistics.retention import OTHER_TRAINING
