@@ -34,9 +34,11 @@ from probe_kit.extract.sources.inputs import STATE, with_input
 from probe_kit.hooks.contract.card import EMBEDDED
 from probe_kit.hooks.contract.sites import KV_STREAM
 from probe_kit.hooks.family import SIZE
-from probe_kit.intervene.outcomes import PairRow, key_of
+from probe_kit.intervene.pairs import Chunk, Given, Pair, PairRow
 from probe_kit.intervene.patching.patch import Cell, patched
-from probe_kit.intervene.places import ALL, Chunk, Given, Pair, SiteGroup, resolve_sites, roles_of_tokens
+from probe_kit.intervene.places import ALL, SiteGroup, resolve_sites
+from probe_kit.intervene.settings import key_of
+from probe_kit.intervene.tokens import roles_of_tokens
 from probe_kit.runs.layout import DIAGNOSES
 from probe_kit.runs.reader import origin_of
 from probe_kit.runs.records import as_json
@@ -184,7 +186,8 @@ def diagnose_run(
     Raises UsageError for a model that does not act, a run with too few groups, an unknown input, a pair of a frame
     that the run lacks, or a base with other inputs, and of a target what `train_probes` raises.
     """
-    from probe_kit.intervene.sessions import ReplaySource, open_session
+    from probe_kit.intervene.open_session import open_session
+    from probe_kit.intervene.sessions import ReplaySource
 
     check_network(run)
     check_names(inputs, names_of(cameras_of(run)))
@@ -244,7 +247,7 @@ def load_diagnosis(run: "Run", key: str) -> Diagnosis:
 
 
 def _load_base(run: "Run", source: "ReplaySource", checkpoint: str, load: "LoadPolicy | None") -> "Policy":
-    from probe_kit.intervene.sessions import load_policy_of
+    from probe_kit.intervene.open_session import load_policy_of
 
     return (load or load_policy_of)(run, replace(source, checkpoint=checkpoint))
 

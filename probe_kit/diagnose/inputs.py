@@ -27,10 +27,10 @@ from probe_kit.extract.sources.inputs import (
 )
 from probe_kit.hooks.contract.card import shown_cameras
 from probe_kit.hooks.contract.observation import Observation
-from probe_kit.intervene.sessions import ObservedSession
+from probe_kit.intervene.frame_session import ObservedSession
 
 if TYPE_CHECKING:
-    from probe_kit.intervene.outcomes import PairRow
+    from probe_kit.intervene.pairs import PairRow
     from probe_kit.intervene.sessions import ReplaySession
     from probe_kit.runs import Run
 

@@ -202,7 +202,7 @@ def intervene(
     probe-kit intervene runs/mine --kind interchange --sites "backbone.*"
     """
     from probe_kit.intervene import ReplaySource
-    from probe_kit.intervene.places import read_pairs
+    from probe_kit.intervene.pairs import read_pairs
     from probe_kit.runs import open_run
 
     opened = open_run(run, allow_partial=partial).in_wording(wording)
@@ -244,9 +244,10 @@ def check_options(name: str, options: Mapping[str, Any]) -> None:
 def _run(run: "Run", intervention: "Intervention", source: "ReplaySource") -> "InterventionResult":
     """Run an intervention with progress; print a line if its result was stored before."""
     from probe_kit.intervene import run_intervention
-    from probe_kit.intervene.outcomes import check_run_fits, is_stored, key_of, settings_of
     from probe_kit.intervene.places import unread_note
     from probe_kit.intervene.runner import check_supported, too_few_groups, unread_sites
+    from probe_kit.intervene.settings import check_run_fits, key_of, settings_of
+    from probe_kit.intervene.stored import is_stored
     from probe_kit.statistics.sufficiency import groups_for_not_used
 
     check_run_fits(run)

@@ -29,10 +29,12 @@ from probe_kit.intervene.erasers import (
     fit_eraser,
     half_differences,
 )
-from probe_kit.intervene.outcomes import items_of
+from probe_kit.intervene.pairs import Pair
 from probe_kit.intervene.patching.patch import Cell
-from probe_kit.intervene.places import Pair, SiteGroup, resolve_all, token_mask
+from probe_kit.intervene.places import SiteGroup, resolve_all
 from probe_kit.intervene.sessions import ReplaySession
+from probe_kit.intervene.settings import items_of
+from probe_kit.intervene.tokens import token_mask
 from probe_kit.runs.direction_files import FileDirection
 from probe_kit.runs.run import Run
 from probe_kit.statistics.folds import Fold, grouped_folds

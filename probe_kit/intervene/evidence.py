@@ -29,9 +29,9 @@ from probe_kit.intervene.kinds.joint import (
     is_read_jointly,
     stored_joint_places,
 )
-from probe_kit.intervene.outcomes import FIRST_CHUNK, PER_STEP
 from probe_kit.intervene.patching.attribution import LOCALISATION_SHARE
 from probe_kit.intervene.places import ALL, PlaceName, list_places, unread_places
+from probe_kit.intervene.settings import FIRST_CHUNK, PER_STEP
 from probe_kit.intervene.verdict import (
     Places,
     UseVerdict,

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from probe_kit.hooks.capturing.edits import LOG_FIELDS, EditLog
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.intervene.outcomes import CLEAN, CONTROL_INPUT, DONOR, IMAGE_SWAP, ConditionOutcomes
+from probe_kit.intervene.pairs import Chunk, Given, Pair
 from probe_kit.intervene.patching.patch import Cell, patched
-from probe_kit.intervene.places import Chunk, Given, Pair
 
 if TYPE_CHECKING:
     from probe_kit.hooks import ActivationCache

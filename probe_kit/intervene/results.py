@@ -18,21 +18,19 @@ from probe_kit.intervene.evidence import StoredEvidence, which_layer
 from probe_kit.intervene.kinds import kind_names, kind_of
 from probe_kit.intervene.kinds.base import Intervention, frame_of
 from probe_kit.intervene.kinds.image_swap import ImageSwapEffect
-from probe_kit.intervene.outcomes import (
+from probe_kit.intervene.outcomes import ConditionOutcomes, Effect
+from probe_kit.intervene.places import unread_note
+from probe_kit.intervene.settings import PER_STEP, key_of
+from probe_kit.intervene.stored import (
     CERTIFICATE,
     EFFECTS,
     EPISODES,
-    PER_STEP,
-    ConditionOutcomes,
-    Effect,
     Measurement,
     find_stored,
     is_stored,
-    key_of,
     read_interventions,
     stored_interventions,
 )
-from probe_kit.intervene.places import unread_note
 from probe_kit.intervene.verdict import UseVerdict, describe_readouts, size_of_groups
 from probe_kit.runs.layout import INTERVENTIONS
 from probe_kit.runs.reader import RunReader

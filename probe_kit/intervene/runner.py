@@ -12,20 +12,14 @@ from probe_kit.hooks.capturing.edits import LOG_FIELDS
 from probe_kit.hooks.registry import get_family
 from probe_kit.intervene.kinds.base import ConditionName, Intervention
 from probe_kit.intervene.kinds.image_swap import ImageSwap
-from probe_kit.intervene.outcomes import (
-    ConditionOutcomes,
-    arrays_of,
-    check_run_fits,
-    has_sides,
-    is_stored,
-    key_of,
-    settings_of,
-    with_texts,
-)
+from probe_kit.intervene.open_session import open_session
+from probe_kit.intervene.outcomes import ConditionOutcomes, arrays_of, with_texts
 from probe_kit.intervene.places import ALL, resolve_all, roles_of, unread_places
 from probe_kit.intervene.replay import Condition
 from probe_kit.intervene.results import InterventionResult, load_effects, save
-from probe_kit.intervene.sessions import LoadPolicy, Progress, ReplaySession, ReplaySource, open_session
+from probe_kit.intervene.sessions import LoadPolicy, Progress, ReplaySession, ReplaySource
+from probe_kit.intervene.settings import check_run_fits, has_sides, key_of, settings_of
+from probe_kit.intervene.stored import is_stored
 from probe_kit.runs.layout import INTERVENTIONS
 from probe_kit.runs.provenance import provenance_here
 from probe_kit.runs.results import Pieces, tidy_bundle

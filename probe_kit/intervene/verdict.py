@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 from probe_kit._tables.numbers import whole_percent
 from probe_kit.hooks.contract.sites import KV_STREAM
 from probe_kit.intervene.kinds.image_swap import SMALLEST_SHARE_OF_INTEREST, ImageSwapEffect
-from probe_kit.intervene.outcomes import FIRST_CHUNK, PER_STEP
 from probe_kit.intervene.places import list_places
+from probe_kit.intervene.settings import FIRST_CHUNK, PER_STEP
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.statistics.sufficiency import SMALLEST_EFFECT_OF_INTEREST, groups_to_decide
 from probe_kit.suite.items import Side

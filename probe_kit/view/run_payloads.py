@@ -18,8 +18,8 @@ from probe_kit.diagnose.results import diagnosis_table
 from probe_kit.env.scoring import RULES
 from probe_kit.errors import RunDamagedError
 from probe_kit.hooks.contract.sites import Site
-from probe_kit.intervene.outcomes import stored_interventions
 from probe_kit.intervene.results import InterventionResult, listed_interventions
+from probe_kit.intervene.stored import stored_interventions
 from probe_kit.retention import RetentionRow
 from probe_kit.retention.columns.columns import (
     ACCURACY,

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import Site, resolve_view
 from probe_kit.intervene.kinds.attention import PatchAttention, stored_patch_attention
-from probe_kit.intervene.outcomes import has_sides
+from probe_kit.intervene.settings import has_sides
 from probe_kit.retention import RetentionRow, RetentionTable, retention_table
 from probe_kit.retention.behaviour import ask_of
 from probe_kit.runs import Run

@@ -22,7 +22,8 @@ from probe_kit.errors import UsageError
 from probe_kit.extract import ExtractSettings, LeRobotSource, extract_run
 from probe_kit.hooks import Interventions, Policy
 from probe_kit.hooks.families.pi0.adapter import load_pi0_tiny
-from probe_kit.intervene.sessions import ReplaySource, open_session
+from probe_kit.intervene.open_session import open_session
+from probe_kit.intervene.sessions import ReplaySource
 from probe_kit.runs import Run, verify_run
 from probe_kit.suite import Suite
 from tests.support.lerobot_recordings import CAMERA, write_recording

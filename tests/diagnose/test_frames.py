@@ -9,7 +9,7 @@ import pandas as pd
 from probe_kit.diagnose.inputs import LEAST_GROUPS, frames_of, order_of_first_frames
 from probe_kit.extract.sources.inputs import Frame
 from probe_kit.hooks.contract.observation import Observation
-from probe_kit.intervene.sessions import ObservedSession
+from probe_kit.intervene.frame_session import ObservedSession
 
 
 def played(groups: int, items: int, layouts: int) -> pd.DataFrame:

@@ -28,7 +28,8 @@ from probe_kit.extract.sources.pictures import PictureSource
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks import Observation, Policy
 from probe_kit.intervene import AttentionReadout, InstructionSwap, ReplaySource, run_intervention
-from probe_kit.intervene.sessions import Frames, ObservedSession, open_session
+from probe_kit.intervene.frame_session import Frames, ObservedSession
+from probe_kit.intervene.open_session import open_session
 from probe_kit.retention.displays import attention_on_picture
 from probe_kit.runs import open_run, verify_run
 from probe_kit.train.builtin_columns import label_frame

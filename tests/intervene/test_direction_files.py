@@ -19,7 +19,7 @@ from probe_kit.intervene.patching import run_with_hooks
 from probe_kit.intervene.patching.patch import Cell
 from probe_kit.intervene.places import resolve_sites
 from probe_kit.intervene.replay import ConditionContext, replay
-from probe_kit.intervene.sessions import SceneSession
+from probe_kit.intervene.scene_session import SceneSession
 from probe_kit.runs import export_run
 from probe_kit.runs.direction_files import about_direction, names_file, read_direction, write_directions
 from probe_kit.train.results.probe_results import Direction, write_direction_file

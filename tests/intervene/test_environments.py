@@ -14,7 +14,9 @@ from probe_kit.extract import EnvSource, ExtractSettings, prepare
 from probe_kit.extract.config_files import moved_of
 from probe_kit.hooks import Observation
 from probe_kit.intervene import AttentionReadout, ImageSwap, InstructionSwap, Interchange, run_intervention
-from probe_kit.intervene.sessions import ObservedSession, ReplaySource, open_session
+from probe_kit.intervene.frame_session import ObservedSession
+from probe_kit.intervene.open_session import open_session
+from probe_kit.intervene.sessions import ReplaySource
 from probe_kit.runs import Run, open_run
 
 if TYPE_CHECKING:

@@ -29,20 +29,11 @@ from probe_kit.intervene import (
     Steering,
     run_intervention,
 )
-from probe_kit.intervene.places import (
-    TILES,
-    Pair,
-    PlaceName,
-    list_places,
-    resolve_sites,
-    role_token_mask,
-    token_mask,
-    tokens_overlapping,
-    unread_note,
-    unread_places,
-)
+from probe_kit.intervene.pairs import Pair
+from probe_kit.intervene.places import TILES, PlaceName, list_places, resolve_sites, unread_note, unread_places
 from probe_kit.intervene.runner import unread_sites
 from probe_kit.intervene.sessions import ReplaySession
+from probe_kit.intervene.tokens import role_token_mask, token_mask, tokens_overlapping
 from probe_kit.runs import Run
 from probe_kit.suite import Suite
 

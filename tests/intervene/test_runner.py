@@ -33,8 +33,9 @@ from probe_kit.intervene import (
     run_intervention,
     stored_interventions,
 )
+from probe_kit.intervene.open_session import load_policy_of, open_session
 from probe_kit.intervene.runner import too_few_groups
-from probe_kit.intervene.sessions import ReplaySession, load_policy_of, open_session
+from probe_kit.intervene.sessions import ReplaySession
 from probe_kit.retention import retention_table
 from probe_kit.runs import Run, open_run, verify_run
 from tests.intervene.answers import with_parts

@@ -29,9 +29,10 @@ from probe_kit.intervene import (
 from probe_kit.intervene.directions import fit_directions
 from probe_kit.intervene.kinds.base import ConditionName
 from probe_kit.intervene.kinds.interchange import localised_sites, target_sign
-from probe_kit.intervene.outcomes import FORMAT
-from probe_kit.intervene.places import resolve_sites, token_mask
+from probe_kit.intervene.places import resolve_sites
 from probe_kit.intervene.sessions import ReplaySession
+from probe_kit.intervene.settings import FORMAT
+from probe_kit.intervene.tokens import token_mask
 from probe_kit.intervene.verdict import Places
 from probe_kit.runs import Run
 from probe_kit.train import ArrayRun, train_probes

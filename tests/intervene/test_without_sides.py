@@ -15,10 +15,12 @@ from probe_kit.errors import OtherFramesError, UsageError
 from probe_kit.extract import ExtractSettings, LeRobotSource, extract_run
 from probe_kit.hooks import Observation
 from probe_kit.intervene import AttributionPatching, ImageSwap, Interchange, ReplaySource, run_intervention
+from probe_kit.intervene.frame_session import ObservedSession
+from probe_kit.intervene.open_session import open_session
 from probe_kit.intervene.outcomes import displacements_toward, sizes, spread_of
-from probe_kit.intervene.places import Pair, read_pairs
+from probe_kit.intervene.pairs import Pair, read_pairs
 from probe_kit.intervene.replay import replay
-from probe_kit.intervene.sessions import ObservedSession, SceneSession, open_session
+from probe_kit.intervene.scene_session import SceneSession
 from probe_kit.runs import Run, open_run
 from tests.intervene.answers import patches_of
 from tests.support.lerobot_recordings import CAMERA, write_recording

@@ -24,23 +24,14 @@ from probe_kit.intervene.outcomes import (
     RECORDED,
     ConditionOutcomes,
     Effect,
-    Measurement,
-    StoredResult,
     arrays_from_bytes,
     arrays_to_bytes,
-    has_sides,
-    stored_results,
 )
-from probe_kit.intervene.places import (
-    ALL,
-    TILE_ROLES,
-    TILES,
-    role_token_mask,
-    roles_of,
-    shown_cameras,
-    token_boxes,
-)
+from probe_kit.intervene.places import ALL, TILE_ROLES, TILES, roles_of
 from probe_kit.intervene.replay import CLEAN_RUN, Condition, ConditionContext, ConditionResult
+from probe_kit.intervene.settings import has_sides
+from probe_kit.intervene.stored import Measurement, StoredResult, stored_results
+from probe_kit.intervene.tokens import role_token_mask, shown_cameras, token_boxes
 from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.bootstrap import GAINS, student_interval, units_seed
 

@@ -21,7 +21,7 @@ from probe_kit.intervene.kinds.base import (
     p_of,
 )
 from probe_kit.intervene.kinds.interchange import cells_at, check_sites_and_roles, patch_of
-from probe_kit.intervene.outcomes import CLEAN, FIRST_CHUNK, ConditionOutcomes, Measurement
+from probe_kit.intervene.outcomes import CLEAN, ConditionOutcomes
 from probe_kit.intervene.patching.attribution import (
     AGREEMENT,
     AttributionEffect,
@@ -38,6 +38,8 @@ from probe_kit.intervene.patching.attribution import (
 from probe_kit.intervene.patching.patch import Cell, sites_of_cells
 from probe_kit.intervene.places import ALL, SEPARATOR, resolve_all
 from probe_kit.intervene.replay import CLEAN_RUN, SOURCE_RUN, Condition, ConditionContext, ConditionResult
+from probe_kit.intervene.settings import FIRST_CHUNK
+from probe_kit.intervene.stored import Measurement
 from probe_kit.runs.run import Run
 
 if TYPE_CHECKING:

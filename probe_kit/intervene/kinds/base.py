@@ -18,18 +18,12 @@ from probe_kit.hashing import derive_seed
 from probe_kit.hooks.capturing.edits import LOG_FIELDS
 from probe_kit.hooks.contract.declared import InterventionKind
 from probe_kit.hooks.contract.sites import KV_STREAM
-from probe_kit.intervene.outcomes import (
-    FIRST_CHUNK,
-    PER_STEP,
-    Choice,
-    ConditionOutcomes,
-    Effect,
-    Measurement,
-    categories_in,
-    has_sides,
-)
-from probe_kit.intervene.places import SEPARATOR, TILES, Pair
+from probe_kit.intervene.outcomes import ConditionOutcomes, Effect
+from probe_kit.intervene.pairs import Pair
+from probe_kit.intervene.places import SEPARATOR, TILES
 from probe_kit.intervene.replay import Condition, replay
+from probe_kit.intervene.settings import FIRST_CHUNK, PER_STEP, Choice, categories_in, has_sides
+from probe_kit.intervene.stored import Measurement
 from probe_kit.runs.direction_files import FileDirection, names_file, read_direction
 from probe_kit.runs.reader import RunReader
 from probe_kit.runs.run import Run

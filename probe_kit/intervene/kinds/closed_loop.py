@@ -36,10 +36,14 @@ from probe_kit.intervene.kinds.base import (
     test_against_controls,
 )
 from probe_kit.intervene.kinds.interchange import best_patch_targets, patch_of, patches_within
-from probe_kit.intervene.outcomes import CLEAN, FIRST_CHUNK, ConditionOutcomes, Measurement, categories_in
+from probe_kit.intervene.outcomes import CLEAN, ConditionOutcomes
+from probe_kit.intervene.pairs import Pair
 from probe_kit.intervene.patching.patch import Cell, sites_of_cells
-from probe_kit.intervene.places import ALL, SEPARATOR, TILES, Pair, resolve_sites, role_tokens
+from probe_kit.intervene.places import ALL, SEPARATOR, TILES, resolve_sites
 from probe_kit.intervene.replay import SOURCE_RUN, Condition, ConditionContext, ConditionResult
+from probe_kit.intervene.settings import FIRST_CHUNK, categories_in
+from probe_kit.intervene.stored import Measurement
+from probe_kit.intervene.tokens import role_tokens
 from probe_kit.runs.run import Run
 from probe_kit.statistics.paired_tests import sign_p
 from probe_kit.statistics.significance import SIGNIFICANCE

@@ -33,11 +33,14 @@ from probe_kit.intervene.kinds.base import (
     test_against_controls,
 )
 from probe_kit.intervene.kinds.interchange import cells_at
-from probe_kit.intervene.outcomes import CLEAN, ERASE, FIRST_CHUNK, PROBE_ACCURACY, ConditionOutcomes, Measurement
+from probe_kit.intervene.outcomes import CLEAN, ERASE, PROBE_ACCURACY, ConditionOutcomes
 from probe_kit.intervene.patching.attribution import LOCALISATION_SHARE
 from probe_kit.intervene.patching.patch import Cell
-from probe_kit.intervene.places import TILES, resolve_all, role_tokens
+from probe_kit.intervene.places import TILES, resolve_all
 from probe_kit.intervene.replay import CLEAN_RUN, Condition, ConditionContext, ConditionResult
+from probe_kit.intervene.settings import FIRST_CHUNK
+from probe_kit.intervene.stored import Measurement
+from probe_kit.intervene.tokens import role_tokens
 from probe_kit.runs.run import Run
 from probe_kit.statistics.folds import Fold
 from probe_kit.statistics.paired_tests import paired_greater_p

@@ -31,20 +31,10 @@ from probe_kit.intervene.kinds.base import (
     p_of,
     signed_interval,
 )
-from probe_kit.intervene.outcomes import (
-    CLEAN,
-    CONTROL_INPUT,
-    DONOR,
-    FIRST_CHUNK,
-    IMAGE_SWAP,
-    TILES_APART,
-    ConditionOutcomes,
-    Effect,
-    Measurement,
-    has_sides,
-    preferred_by_category,
-)
+from probe_kit.intervene.outcomes import CLEAN, CONTROL_INPUT, DONOR, IMAGE_SWAP, ConditionOutcomes, Effect
 from probe_kit.intervene.replay import CLEAN_RUN, CONTROL_RUN, DONOR_RUN, SOURCE_RUN, Condition
+from probe_kit.intervene.settings import FIRST_CHUNK, has_sides
+from probe_kit.intervene.stored import TILES_APART, Measurement, preferred_by_category
 from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.bootstrap import unbounded_student_interval
 from probe_kit.statistics.paired_tests import paired_greater_p

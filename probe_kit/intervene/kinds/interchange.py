@@ -37,21 +37,12 @@ from probe_kit.intervene.kinds.base import (
     test_against_controls,
 )
 from probe_kit.intervene.kinds.image_swap import SMALLEST_REACH
-from probe_kit.intervene.outcomes import (
-    CLEAN,
-    IMAGE_SWAP,
-    UNCHANGED,
-    ConditionOutcomes,
-    Measurement,
-    PooledConditions,
-    Rank,
-    pool_conditions,
-    stored_results,
-)
+from probe_kit.intervene.outcomes import CLEAN, IMAGE_SWAP, UNCHANGED, ConditionOutcomes
 from probe_kit.intervene.patching.attribution import LOCALISATION_SHARE
 from probe_kit.intervene.patching.patch import Cell, sites_of_cells
 from probe_kit.intervene.places import ALL, RESIDUAL, TILES, PlaceName, SiteGroup, resolve_all, roles_of
 from probe_kit.intervene.replay import CLEAN_RUN, SOURCE_RUN, Condition, patched_run
+from probe_kit.intervene.stored import Measurement, PooledConditions, Rank, pool_conditions, stored_results
 from probe_kit.runs.reader import RunReader
 from probe_kit.runs.run import Run
 from probe_kit.statistics.significance import SIGNIFICANCE

@@ -19,18 +19,13 @@ from probe_kit.intervene.kinds.base import (
     lines_of,
 )
 from probe_kit.intervene.kinds.interchange import cells_at, check_sites_and_roles
-from probe_kit.intervene.outcomes import (
-    CLEAN,
-    ConditionOutcomes,
-    Effect,
-    Measurement,
-    StoredResult,
-    stored_results,
-)
+from probe_kit.intervene.outcomes import CLEAN, ConditionOutcomes, Effect
+from probe_kit.intervene.pairs import Pair
 from probe_kit.intervene.patching.patch import Cell, all_but, sites_of_cells
 from probe_kit.intervene.patching.sweep import KEEP, choosing_half, find_minimal_set
-from probe_kit.intervene.places import SEPARATOR, Pair, list_places, resolve_all
+from probe_kit.intervene.places import SEPARATOR, list_places, resolve_all
 from probe_kit.intervene.replay import CLEAN_RUN, SOURCE_RUN, Condition, patched_run
+from probe_kit.intervene.stored import Measurement, StoredResult, stored_results
 from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.paired_tests import paired_greater_p, smallest_flip_p
 from probe_kit.statistics.significance import SIGNIFICANCE

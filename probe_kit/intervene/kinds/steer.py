@@ -19,8 +19,9 @@ from probe_kit.intervene.kinds.base import ConditionName
 from probe_kit.intervene.kinds.image_swap import SMALLEST_REACH
 from probe_kit.intervene.kinds.interchange import PatchEffect, PatchKind
 from probe_kit.intervene.patching.patch import Cell
-from probe_kit.intervene.places import TILES, resolve_all, role_tokens
+from probe_kit.intervene.places import TILES, resolve_all
 from probe_kit.intervene.replay import CLEAN_RUN, SOURCE_RUN, Condition, ConditionContext, ConditionResult
+from probe_kit.intervene.tokens import role_tokens
 from probe_kit.runs.run import Run
 
 if TYPE_CHECKING:

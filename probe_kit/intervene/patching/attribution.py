@@ -19,18 +19,11 @@ from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.sites import KV_STREAM
 from probe_kit.intervene.exchange import Exchange, SwapShare, share_columns, share_fields
 from probe_kit.intervene.outcomes import Effect
+from probe_kit.intervene.pairs import Given, Pair
 from probe_kit.intervene.patching.patch import Cell, infer, sites_of_cells
 from probe_kit.intervene.patching.sweep import sweep_cells
-from probe_kit.intervene.places import (
-    ALL,
-    RESIDUAL,
-    Given,
-    Pair,
-    PlaceName,
-    SiteGroup,
-    resolve_sites,
-    role_token_mask,
-)
+from probe_kit.intervene.places import ALL, RESIDUAL, PlaceName, SiteGroup, resolve_sites
+from probe_kit.intervene.tokens import role_token_mask
 
 if TYPE_CHECKING:
     import pandas as pd

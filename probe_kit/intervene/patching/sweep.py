@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from probe_kit.errors import UsageError
 from probe_kit.hashing import derive_seed
 from probe_kit.intervene.exchange import Exchange, SwapShare, pooled_share, share_columns
+from probe_kit.intervene.pairs import Given, Pair, groups_and_items
 from probe_kit.intervene.patching.patch import (
     Basis,
     Cell,
@@ -21,7 +22,7 @@ from probe_kit.intervene.patching.patch import (
     infer_patched,
     run_with_cache,
 )
-from probe_kit.intervene.places import Given, Pair, PlaceName, groups_and_items
+from probe_kit.intervene.places import PlaceName
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -23,9 +23,10 @@ from probe_kit.intervene import (
     stored_image_swaps,
 )
 from probe_kit.intervene.kinds.interchange import PatchEffect, best_cell
+from probe_kit.intervene.open_session import open_session
 from probe_kit.intervene.replay import CLEAN_RUN, Condition, ConditionContext, ConditionResult
 from probe_kit.intervene.rollout import roll_out
-from probe_kit.intervene.sessions import ReplaySession, open_session
+from probe_kit.intervene.sessions import ReplaySession
 from probe_kit.runs import Run, open_run, verify_run
 from probe_kit.suite import Suite
 from tests.intervene.answers import measured

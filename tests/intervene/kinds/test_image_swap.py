@@ -11,7 +11,8 @@ import pytest
 import probe_kit
 from probe_kit.env import SceneSpec
 from probe_kit.intervene import ImageSwapEffect, classify_all, classify_use
-from probe_kit.intervene.outcomes import TILES_APART, ConditionOutcomes
+from probe_kit.intervene.outcomes import ConditionOutcomes
+from probe_kit.intervene.stored import TILES_APART
 from probe_kit.intervene.verdict import classify_behaviour, size_of_groups
 from probe_kit.statistics.sufficiency import groups_for_not_used
 from tests.intervene.answers import Cell, follower, habit, outcomes_of, swaps_of

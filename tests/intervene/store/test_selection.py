@@ -26,8 +26,10 @@ from probe_kit.intervene.kinds.interchange import (
     stored_steering,
     stored_subspace_effects,
 )
-from probe_kit.intervene.outcomes import ATTENTION_FILE, FORMAT, arrays_to_bytes, find_stored, key_of
+from probe_kit.intervene.outcomes import ATTENTION_FILE, arrays_to_bytes
 from probe_kit.intervene.results import InterventionResult, listed_interventions, verdicts_of
+from probe_kit.intervene.settings import FORMAT, key_of
+from probe_kit.intervene.stored import find_stored
 from probe_kit.runs.layout import INTERVENTIONS
 from probe_kit.runs.results import write_bundle
 from probe_kit.train import ArrayRun
