@@ -38,7 +38,7 @@ from probe_kit.intervene.pairs import Chunk, Given, Pair, PairRow
 from probe_kit.intervene.patching.patch import Cell, patched
 from probe_kit.intervene.places import ALL, SiteGroup, resolve_sites
 from probe_kit.intervene.settings import key_of
-from probe_kit.intervene.tokens import roles_of_tokens
+from probe_kit.intervene.tokens import PairTokens, roles_of_tokens
 from probe_kit.runs.layout import DIAGNOSES
 from probe_kit.runs.reader import origin_of
 from probe_kit.runs.records import as_json
@@ -117,12 +117,12 @@ def measure_passage(
         donated, donor = _captured(session, pair.source, pair.seed, places)
         change = scale.changes(donated[None], clean[None])[0]
         squares[row] = change @ change
-        memo: dict[object, object] = {}
+        tokens = PairTokens(model, pair)
         for column, group in enumerate(places):
             differences[row, column] = _relative_difference(group, before, donor)
             # Elsewhere the patch would put in what is there already: an inference saved, and a share of 0.
             if squares[row] and differences[row, column] > LIKE_NONE:
-                with patched(model, pair, [Cell(group, ALL)], donor, memo=memo):
+                with patched(tokens, [Cell(group, ALL)], donor):
                     edited = session.act(pair.clean, pair.seed)
                 moved[row, column] = scale.changes(edited[None], clean[None])[0] @ change
     # A ratio of sums: pairs whose action hardly changes have little weight.

@@ -12,7 +12,6 @@ token. These are found in the tokens themselves.
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,34 +78,8 @@ class Directions:
         return np.float32(strength * self.halves[episode]) @ self.bases[name, episode]
 
 
-class Directed(Protocol):
-    """An intervention along directions: interchange, steering or closed loop."""
-
-    @property
-    def categories(self) -> tuple[str, ...] | None:
-        """Return the categories of the run; None for all."""
-
-    @property
-    def direction(self) -> str:
-        """Return its name, see `check_direction`."""
-
-    @property
-    def controls(self) -> int:
-        """Return the number of random ones."""
-
-    @property
-    def seed(self) -> int:
-        """Return the seed of controls and folds."""
-
-    @property
-    def vector(self) -> FileDirection | None:
-        """Return the direction of a file; None for one that is found here."""
-
-
-def check_direction(direction: str, vector: FileDirection | None = None) -> None:
-    """Raise UsageError for a name that is no direction to patch tokens within. vector: of a file."""
-    if vector is not None:
-        return
+def check_direction(direction: str) -> None:
+    """Raise UsageError for a name that is no direction to patch tokens within."""
     if direction.startswith(f"{MEAN_DIFFERENCE}:"):
         Method.of(direction)
     elif direction not in DIRECTIONS:
@@ -122,28 +95,37 @@ def control_names(count: int) -> tuple[str, ...]:
 
 
 def fit_token_directions(
-    session: ReplaySession, intervention: Directed, cells: Sequence[Cell], patterns: Sequence[str]
+    session: ReplaySession,
+    cells: Sequence[Cell],
+    patterns: Sequence[str],
+    direction: str,
+    *,
+    controls: int,
+    seed: int,
+    categories: Sequence[str] | None,
+    vector: FileDirection | None,
 ) -> dict[Cell, Directions]:
-    """Return the meaning of an intervention's direction in every cell: of the run's columns, or of all its tokens.
+    """Return the meaning of a direction in every cell: of the run's columns, or of all its tokens.
 
     `mean-difference:K`: the K directions along which the differences of class means at all positions lie most, the
     same for every token; from one clean inference per episode and place. patterns: the places as they were named;
-    those of a wildcard may be left out. Raises UnknownSiteError for a place of several sites or one that is not
+    those of a wildcard may be left out. direction: its name, see `check_direction`. controls: how many random ones
+    beside it. seed: of controls and folds. categories: of the run, None for all. vector: the direction of a file;
+    None for one that is found here. Raises UnknownSiteError for a place of several sites or one that is not
     stored, NoDirectionError for a named place without a direction, UsageError where there are too few episodes to
     learn from.
     """
-    direction, controls, seed = intervention.direction, intervention.controls, intervention.seed
-    if intervention.vector is not None:
-        return {cell: _of_file(session, cell, intervention.vector, controls, seed) for cell in cells}
-    items = items_of(session.run, intervention.categories, None)
+    if vector is not None:
+        return {cell: _of_file(session, cell, vector, controls, seed) for cell in cells}
+    items = items_of(session.run, categories, None)
     passed_over = PassedOver(session, patterns)
     fitted: dict[Cell, Directions] = {}
     if ":" not in direction:
-        categories = tuple(dict.fromkeys(session.categories_of(items)))
+        in_run = tuple(dict.fromkeys(session.categories_of(items)))
         for cell in cells:
             with passed_over.fitting(cell):
                 fitted[cell] = fit_directions(
-                    session.run, cell.site_group.only_site, cell.role, direction, controls, seed, categories
+                    session.run, cell.site_group.only_site, cell.role, direction, controls, seed, in_run
                 )
         return passed_over.left(fitted)
     for cell, category, features in collect_token_features(session, items, cells):

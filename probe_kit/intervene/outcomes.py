@@ -209,11 +209,6 @@ class ConditionOutcomes:
         """Return a `.npz`; the same numbers give the same bytes."""
         return arrays_to_bytes(self, UNSTORED)
 
-    @classmethod
-    def from_bytes(cls, content: bytes, seed_text: str = "") -> "ConditionOutcomes":
-        """Load what `to_bytes` gave."""
-        return cls(**arrays_from_bytes(content, "conditions"), seed_text=seed_text)
-
 
 @dataclass(frozen=True, kw_only=True)
 class Effect:

@@ -225,24 +225,20 @@ FINAL_NORM = "final_norm"
 
 
 def unread_places(
-    patterns: Iterable[str], streams: "Mapping[str, Stream]", interventions: Interventions
+    names: Iterable[str], streams: "Mapping[str, Stream]", interventions: Interventions
 ) -> tuple[str, ...]:
-    """Places of these patterns at the end of an unread stream: an edit there changes no action.
+    """Return those of some places that lie at the end of an unread stream: an edit there changes no action.
 
     streams: of the run or the policy, by name. interventions: declared by the family.
     """
-    places = []
-    for pattern in patterns:
-        parts = _PATTERN.fullmatch(pattern)
-        if parts is None or parts["stream"] not in interventions.unread or parts["stream"] not in streams:
-            continue
-        last, quantity = streams[parts["stream"]].layers - 1, parts["quantity"] or ""
-        reaches_end = parts["layer"] == "*" or int(parts["layer"] or 0) == last
-        if quantity in ("", RESIDUAL) and reaches_end:
-            places.append(str(PlaceName(parts["stream"], last, quantity)))
-        elif quantity == FINAL_NORM:
-            places.append(pattern)
-    return tuple(dict.fromkeys(places))
+    unread = []
+    for name in names:
+        parsed = PlaceName.parse(name)
+        if parsed.stream in interventions.unread and parsed.stream in streams:
+            is_last = parsed.quantity in ("", RESIDUAL) and parsed.layer == streams[parsed.stream].layers - 1
+            # The final norm lies behind the last layer, whatever number its site has.
+            unread += [name] * (is_last or parsed.quantity == FINAL_NORM)
+    return tuple(dict.fromkeys(unread))
 
 
 def unread_note(places: Iterable[str]) -> str:

@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from copy import copy
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property
@@ -158,12 +157,20 @@ class InterventionResult(Measurement):
         return *self._kind.sentences(self.effects, self), *self._which_layer(None)
 
     def to_rich(self, details: bool = True) -> "Table":
-        """The table for a terminal. details: split it where it is wide, else leave columns out by name."""
-        _ = self.legend  # effects and verdicts are computed once, for this table and for sentences
-        context = copy(self)
-        context.__dict__["explains"] = details
-        table = self._kind.table(self.effects, context)
-        return replace(table, overflow="split" if details else "leave out")
+        """The table for a terminal.
+
+        details: split it where it is wide, and say below it what each verdict rests on; else leave columns out by
+        name.
+        """
+        table = self._kind.table(self.effects, self)
+        if not details:
+            return replace(table, overflow="leave out")
+        reasons = [
+            f"{category_of(name).title}: {verdict.explanation}"
+            for name, verdict in (self.verdicts if self._kind.has_verdict else {}).items()
+            if verdict.explanation
+        ]
+        return replace(table, overflow="split", notes=("; ".join([*table.notes, *reasons]),))
 
     @property
     def legend(self) -> str:

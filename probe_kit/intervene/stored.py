@@ -21,12 +21,20 @@ from typing import Any, Self
 import numpy as np
 
 from probe_kit._system.bounded_files import parse_json
-from probe_kit.errors import NoInterventionsError
-from probe_kit.intervene.outcomes import BY_CONDITION, CLEAN, IMAGE_SWAP, UNCHANGED, ConditionOutcomes, Effect
+from probe_kit.errors import NoInterventionsError, RunDamagedError
+from probe_kit.intervene.outcomes import (
+    BY_CONDITION,
+    CLEAN,
+    IMAGE_SWAP,
+    UNCHANGED,
+    ConditionOutcomes,
+    Effect,
+    arrays_from_bytes,
+)
 from probe_kit.intervene.settings import FIRST_CHUNK, FORMAT, PER_STEP, key_of
 from probe_kit.runs.layout import INTERVENTIONS
 from probe_kit.runs.reader import RunReader, full_name
-from probe_kit.runs.results import HEAD, Bundle, complete_key, read_bundles
+from probe_kit.runs.results import HEAD, Bundle, advice_for, complete_key, fields_problem, read_bundles
 from probe_kit.runs.store import Location
 
 EPISODES, EFFECTS, CERTIFICATE = "episodes.npz", "effects.csv", "certificate.json"
@@ -40,7 +48,6 @@ class Measurement:
 
     settings: what decided its numbers, see `settings_of`. read: a stored file by its name; raises RunDamagedError
     if it was changed. files: their names. key: of its folder. created: ISO time (UTC), empty before it is stored.
-    explains: whether the caption of its table says what each verdict rests on, as sentences do.
     """
 
     run: RunReader = field(repr=False)
@@ -49,7 +56,6 @@ class Measurement:
     files: Collection[str] = ()
     key: str = ""
     created: str = ""
-    explains: bool = True
 
     @classmethod
     def of(cls, run: RunReader, bundle: Bundle) -> Self:
@@ -74,8 +80,18 @@ class Measurement:
 
     @cached_property
     def outcomes(self) -> ConditionOutcomes:
-        """The numbers of its conditions. Raises RunDamagedError if they were changed."""
-        return ConditionOutcomes.from_bytes(self.read(EPISODES), self.run.seed_text)
+        """The numbers of its conditions.
+
+        Raises RunDamagedError if they were changed, or have the names of another version of probe_kit.
+        """
+        stored = arrays_from_bytes(self.read(EPISODES), "conditions")
+        if problem := fields_problem(ConditionOutcomes, stored):
+            folder = f"{INTERVENTIONS}/{self.key}"
+            raise RunDamagedError(
+                f"{self.run.location}/{folder}/{EPISODES} {problem}: another version of probe_kit made it. "
+                f"{advice_for(folder)}"
+            )
+        return ConditionOutcomes(**stored, seed_text=self.run.seed_text)
 
     @cached_property
     def certificate(self) -> dict[str, Any]:

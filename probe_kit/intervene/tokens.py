@@ -5,8 +5,8 @@ says where a tile is seen. The policy itself says which patches see it, by its o
 that change when just those pixels do, before any patch looks at another.
 """
 
-from collections.abc import MutableMapping
-from typing import TYPE_CHECKING, Any
+from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,46 +62,63 @@ def token_mask(model: "Model", model_input: Given, stream: str, role: str) -> ND
     return mask_of(roles_of_tokens(model, model_input)[stream], stream, role)
 
 
-def role_token_mask(
-    model: "Model", pair: Pair, stream: str, role: str, memo: MutableMapping[Any, Any]
-) -> NDArray[np.bool_]:
-    """Return (T,) the tokens of a stream that play `role` in a pair's clean inference, tiles among the roles.
+class PairTokens:
+    """The tokens of a pair's clean inference by role, tiles among the roles.
 
-    memo: of this pair. A family's own role of that name, a camera called left, comes before the tile. Raises
-    EmptyRoleError if no token plays it, UnsupportedInterventionError for a family that does not say which token
-    sees what.
+    All patches of a pair share one of these: the model says once which token plays what, and once which patch sees
+    which tile.
     """
-    declared = model.role_names.get(model.tokens_of(stream), ())
-    if role not in TILES or role in declared or not pair.tiles:
-        if (stream, role) not in memo:
-            if "roles" not in memo:
-                memo["roles"] = roles_of_tokens(model, pair.clean)
-            memo[stream, role] = mask_of(memo["roles"][stream], stream, role)
-        return np.asarray(memo[stream, role])
-    policy: Policy = model  # type: ignore[assignment]  # only observations have tiles
-    assert isinstance(pair.clean, Observation)
-    policy.interventions.check("tiles", policy.card.family)
-    images = token_mask(policy, pair.clean, stream, f"image.{policy.card.cameras[0]}")
-    if role not in memo:
-        if "patches" not in memo:
-            memo["patches"] = patch_embeddings(policy, pair.clean, policy.card.cameras[0])
-        memo[role] = tokens_overlapping(policy, pair.clean, pair.tiles[TILES[role]], memo["patches"])
-    mask = np.zeros_like(images)
-    mask[np.flatnonzero(images)[memo[role]]] = True
-    if not mask.any():
-        raise EmptyRoleError(f"no patch of {pair.episode} sees the {TILES[role]} tile")
-    return mask
 
+    def __init__(self, model: "Model", pair: Pair) -> None:
+        self.model, self.pair = model, pair
+        self._masks: dict[tuple[str, str], NDArray[np.bool_]] = {}
+        self._selections: dict[tuple[str, str], TokenSelection] = {}
+        self._on_tile: dict[str, NDArray[np.bool_]] = {}
 
-def role_tokens(
-    model: "Model", pair: Pair, stream: str, role: str, memo: MutableMapping[Any, Any]
-) -> TokenSelection:
-    """Return where the tokens of `role_token_mask` are; computed once per pair."""
-    name = stream, role, "tokens"
-    if name not in memo:
-        memo[name] = TokenSelection.of(role_token_mask(model, pair, stream, role, memo), model.card.device)
-    tokens: TokenSelection = memo[name]
-    return tokens
+    def mask(self, stream: str, role: str) -> NDArray[np.bool_]:
+        """Return (T,) the tokens of a stream that play `role`.
+
+        Raises EmptyRoleError if none does, UnsupportedInterventionError for a tile and a family that does not say
+        which token sees what.
+        """
+        if (stream, role) not in self._masks:
+            declared = self.model.role_names.get(self.model.tokens_of(stream), ())
+            # A family's own role of that name, a camera called left, comes before the tile.
+            is_tile = role in TILES and role not in declared and bool(self.pair.tiles)
+            mask = self._tile_mask(stream, role) if is_tile else mask_of(self._roles[stream], stream, role)
+            self._masks[stream, role] = mask
+        return self._masks[stream, role]
+
+    def selection(self, stream: str, role: str) -> TokenSelection:
+        """Return where the tokens of `mask` are, as edits take them."""
+        if (stream, role) not in self._selections:
+            selection = TokenSelection.of(self.mask(stream, role), self.model.card.device)
+            self._selections[stream, role] = selection
+        return self._selections[stream, role]
+
+    def _tile_mask(self, stream: str, role: str) -> NDArray[np.bool_]:
+        policy: Policy = self.model  # type: ignore[assignment]  # only observations have tiles
+        assert isinstance(self.pair.clean, Observation)
+        policy.interventions.check("tiles", policy.card.family)
+        images = mask_of(self._roles[stream], stream, f"image.{policy.card.cameras[0]}")
+        if role not in self._on_tile:
+            pixels = self.pair.tiles[TILES[role]]
+            self._on_tile[role] = tokens_overlapping(policy, self.pair.clean, pixels, self._patches)
+        mask = np.zeros_like(images)
+        mask[np.flatnonzero(images)[self._on_tile[role]]] = True
+        if not mask.any():
+            raise EmptyRoleError(f"no patch of {self.pair.episode} sees the {TILES[role]} tile")
+        return mask
+
+    @cached_property
+    def _roles(self) -> "dict[str, Roles]":
+        return roles_of_tokens(self.model, self.pair.clean)
+
+    @cached_property
+    def _patches(self) -> NDArray[np.float32]:
+        policy: Policy = self.model  # type: ignore[assignment]
+        assert isinstance(self.pair.clean, Observation)
+        return patch_embeddings(policy, self.pair.clean, policy.card.cameras[0])
 
 
 def tokens_overlapping(

@@ -31,7 +31,7 @@ from probe_kit.intervene.places import ALL, TILE_ROLES, TILES, roles_of
 from probe_kit.intervene.replay import CLEAN_RUN, Condition, ConditionContext, ConditionResult
 from probe_kit.intervene.settings import has_sides
 from probe_kit.intervene.stored import Measurement, StoredResult, stored_results
-from probe_kit.intervene.tokens import role_token_mask, shown_cameras, token_boxes
+from probe_kit.intervene.tokens import shown_cameras, token_boxes
 from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.bootstrap import GAINS, student_interval, units_seed
 
@@ -177,24 +177,22 @@ def attention_recorded(
     family does not say.
     """
 
-    def mask_of(context: ConditionContext, role: str) -> NDArray[np.bool_]:
-        return role_token_mask(context.session.policy, context.pair, stream, role, context.memo)
-
     def play(context: ConditionContext) -> ConditionResult:
         from probe_kit.hooks.capturing.attention import capture_attention
 
         masks: list[NDArray[np.bool_] | None] = []
         for role in roles:
             try:
-                masks.append(mask_of(context, role))
+                masks.append(context.tokens.mask(stream, role))
             except EmptyRoleError:  # a family may have the role, and a tile be hidden by the arm
                 masks.append(None)
         with capture_attention(context.session.policy) as mass:
             chunk = context.act()
-        patches = _on_patches(mass, [mask_of(context, f"image.{camera}") for camera in boxes]) if boxes else None
+        on_cameras = [context.tokens.mask(stream, f"image.{camera}") for camera in boxes]
+        patches = _on_patches(mass, on_cameras) if boxes else None
         return ConditionResult(chunk, mass=shares_by_role(mass, masks), patches=patches)
 
-    return Condition(RECORDED, play, boxes)
+    return Condition(RECORDED, play, details=boxes)
 
 
 def _on_patches(mass: "AttentionMass", masks: Sequence[NDArray[np.bool_]]) -> NDArray[np.float32]:

@@ -69,7 +69,8 @@ def _estimated(cell: Cell, by_row: Mapping[tuple[int, int], float]) -> Condition
     def play(context: ConditionContext) -> ConditionResult:
         return ConditionResult(context.clean, estimated=by_row[context.pair.row, context.pair.step])
 
-    return Condition(f"{ESTIMATE}|{cell.site_group.name}|{cell.role}", play)
+    name = cell.site_group.name
+    return Condition(f"{ESTIMATE}|{name}|{cell.role}", play, (name,))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -20,6 +20,7 @@ from probe_kit.hooks.contract.declared import InterventionKind
 from probe_kit.hooks.contract.sites import KV_STREAM
 from probe_kit.intervene.outcomes import ConditionOutcomes, Effect
 from probe_kit.intervene.pairs import Pair
+from probe_kit.intervene.patching.patch import Cell
 from probe_kit.intervene.places import SEPARATOR, TILES
 from probe_kit.intervene.replay import Condition, replay
 from probe_kit.intervene.settings import FIRST_CHUNK, PER_STEP, Choice, categories_in, has_sides
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from probe_kit._tables.table import Table
+    from probe_kit.intervene.directions import Directions
     from probe_kit.intervene.sessions import ReplaySession
 
 Values = NDArray[np.float64]
@@ -211,8 +213,11 @@ class AlongDirection(Intervention):
     direction: `mean-difference` or `probe`, one vector per place found in means over tokens without the episode it
     is used on; `mean-difference:K`, K directions found in the tokens themselves, see `directions`; FILE#NAME, see
     `direction_files`; some kinds take `none`. controls: so many random directions of the data's own covariance,
-    orthogonal to it. vector: of a file; then `direction` is its name.
+    orthogonal to it. vector: of a file; then `direction` is its name. takes_none: of the class, whether tokens may
+    be edited along no direction.
     """
+
+    takes_none: ClassVar[bool] = True
 
     direction: str = NONE
     controls: int = 0
@@ -225,6 +230,29 @@ class AlongDirection(Intervention):
             vector = read_direction(self.direction)
             object.__setattr__(self, "vector", vector)
             object.__setattr__(self, "direction", vector.name)
+        elif self.direction != NONE or not self.takes_none:
+            from probe_kit.intervene.directions import check_direction
+
+            check_direction(self.direction)
+        elif self.controls:
+            raise UsageError("controls are directions beside another one; choose --direction, or --controls 0")
+
+    def fit_directions(
+        self, session: "ReplaySession", cells: Sequence[Cell], patterns: Sequence[str]
+    ) -> "dict[Cell, Directions]":
+        """Return its direction and the random ones in every cell; see `directions.fit_token_directions`."""
+        from probe_kit.intervene.directions import fit_token_directions
+
+        return fit_token_directions(
+            session,
+            cells,
+            patterns,
+            self.direction,
+            controls=self.controls,
+            seed=self.seed,
+            categories=self.categories,
+            vector=self.vector,
+        )
 
     def check_run(self, run: Run) -> None:
         """Raise UsageError also for a direction of an answer in a run without sides."""

@@ -43,7 +43,6 @@ from probe_kit.intervene.places import ALL, SEPARATOR, TILES, resolve_sites
 from probe_kit.intervene.replay import SOURCE_RUN, Condition, ConditionContext, ConditionResult
 from probe_kit.intervene.settings import FIRST_CHUNK, categories_in
 from probe_kit.intervene.stored import Measurement
-from probe_kit.intervene.tokens import role_tokens
 from probe_kit.runs.run import Run
 from probe_kit.statistics.paired_tests import sign_p
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -70,13 +69,13 @@ def identity_patch(sites: Sequence[Site]) -> Condition:
     """Return the inference as the run made it, with every site that any condition changes written back."""
 
     def play(context: ConditionContext) -> ConditionResult:
-        session, pair = context.session, context.pair
+        policy = context.session.policy
         with ExitStack() as stack:
             edit_logs = []
             for stream in dict.fromkeys(site.stream for site in sites):
                 of_stream = [site for site in sites if site.stream == stream]
-                tokens = role_tokens(session.policy, pair, stream, ALL, context.memo)
-                edit_logs.append(stack.enter_context(apply_patch(session.policy, of_stream, tokens, Identity())))
+                tokens = context.tokens.selection(stream, ALL)
+                edit_logs.append(stack.enter_context(apply_patch(policy, of_stream, tokens, Identity())))
             chunk = context.act()
         return ConditionResult(chunk, EditLog.sum(edit_logs))
 
@@ -109,17 +108,11 @@ class ClosedLoop(AlongDirection):
     controls: int = 1
 
     def __post_init__(self) -> None:
-        from probe_kit.intervene.directions import check_direction
-
         super().__post_init__()
         if self.readout != FIRST_CHUNK:
             raise UsageError("a closed loop is read where the cube ends; leave --readout out")
         if not self.targets or any(target.count(SEPARATOR) != 1 for target in self.targets):
             raise UsageError(f"targets are {self.targets}; expected PLACE|ROLE, such as backbone.02|image")
-        if self.direction != NONE:
-            check_direction(self.direction, self.vector)
-        elif self.controls:
-            raise UsageError("controls are directions beside another one; choose --direction, or --controls 0")
 
     @classmethod
     def from_options(cls, run: Run, **options: Any) -> Self:
@@ -159,8 +152,6 @@ class ClosedLoop(AlongDirection):
 
     def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
         """Return the identity patch, the image swap and every target. Raises UnknownSiteError, NoProbesError."""
-        from probe_kit.intervene.directions import fit_token_directions
-
         cells = [
             Cell(site_group, role)
             for site, (role,) in self.patterns
@@ -171,7 +162,7 @@ class ClosedLoop(AlongDirection):
         bases = (
             {}
             if self.direction == NONE
-            else fit_token_directions(session, self, within, [site for site, _ in self.patterns])
+            else self.fit_directions(session, within, [site for site, _ in self.patterns])
         )
         conditions = [identity_patch(source_sites), SOURCE_RUN]
         for cell in cells:

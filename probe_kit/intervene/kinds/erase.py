@@ -40,7 +40,6 @@ from probe_kit.intervene.places import TILES, resolve_all
 from probe_kit.intervene.replay import CLEAN_RUN, Condition, ConditionContext, ConditionResult
 from probe_kit.intervene.settings import FIRST_CHUNK
 from probe_kit.intervene.stored import Measurement
-from probe_kit.intervene.tokens import role_tokens
 from probe_kit.runs.run import Run
 from probe_kit.statistics.folds import Fold
 from probe_kit.statistics.paired_tests import paired_greater_p
@@ -226,12 +225,12 @@ def erased(cell: Cell, name: str, erasers: Mapping[str, Eraser]) -> Condition:
 
     def play(context: ConditionContext) -> ConditionResult:
         pair, session, site_group = context.pair, context.session, cell.site_group
-        tokens = role_tokens(session.policy, pair, site_group.stream, cell.role, context.memo)
+        tokens = context.tokens.selection(site_group.stream, cell.role)
         change = ApplyEraser(erasers[pair.episode]) if erasers else Identity()
         with apply_patch(session.policy, site_group.sites, tokens, change) as edit_log:
             return ConditionResult(context.act(), edit_log)
 
-    return Condition(_name_of(cell, name), play)
+    return Condition(_name_of(cell, name), play, (cell.site_group.name,))
 
 
 @dataclass(frozen=True)

@@ -411,13 +411,8 @@ class ImageSwap(Swap):
         if context.lacks_sides:
             return super().table(rows, context)
         verdicts = context.verdicts
-        reasons = [
-            f"{category_of(name).title}: {verdict.explanation}"
-            for name, verdict in verdicts.items()
-            if verdict.explanation and context.explains
-        ]
         reaches = [_REACH[row.reach_source].format(100 * row.reach) for row in rows]
-        caption = "; ".join(filter(None, (_LEGEND, *dict.fromkeys((context.legend, *reaches, *reasons)))))
+        caption = "; ".join(filter(None, (_LEGEND, *dict.fromkeys((context.legend, *reaches)))))
         parts: dict[str, Any] = {
             "Verdict": {
                 "verdict": lambda row: verdicts[row.category].verdict if row.category in verdicts else "–"

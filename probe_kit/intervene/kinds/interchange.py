@@ -494,8 +494,6 @@ class Interchange(PatchKind):
     roles: tuple[str, ...] = (ALL, "image", "language")
 
     def __post_init__(self) -> None:
-        from probe_kit.intervene.directions import check_direction
-
         super().__post_init__()
         if not self.sites or not self.roles:
             raise UsageError("an interchange needs at least one site and one role")
@@ -504,10 +502,6 @@ class Interchange(PatchKind):
                 "tiles have no mean in the run from which a direction could be found; patch them in full: leave "
                 "--direction out"
             )
-        if self.direction != NONE:
-            check_direction(self.direction, self.vector)
-        elif self.controls:
-            raise UsageError("controls are directions beside another one; choose --direction, or no --controls")
 
     @classmethod
     def from_options(cls, run: Run, **options: Any) -> Self:
@@ -517,14 +511,12 @@ class Interchange(PatchKind):
 
     def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
         """Return clean, images swapped, and every place at every role. Raises UnknownSiteError, NoProbesError."""
-        from probe_kit.intervene.directions import fit_token_directions
-
         cells = cells_at(session, resolve_all(self.sites, session.policy).values(), self.roles)
         source_sites = sites_of_cells(cells)
         conditions = [CLEAN_RUN, SOURCE_RUN]
         if self.direction == NONE:
             return conditions + [patch_of(cell, source_sites) for cell in cells]
-        bases = fit_token_directions(session, self, cells, self.sites)
+        bases = self.fit_directions(session, cells, self.sites)
         for cell, basis in bases.items():
             conditions += patches_within(self.direction, basis, cell, source_sites)
         return conditions

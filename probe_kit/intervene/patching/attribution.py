@@ -23,7 +23,7 @@ from probe_kit.intervene.pairs import Given, Pair
 from probe_kit.intervene.patching.patch import Cell, infer, sites_of_cells
 from probe_kit.intervene.patching.sweep import sweep_cells
 from probe_kit.intervene.places import ALL, RESIDUAL, PlaceName, SiteGroup, resolve_sites
-from probe_kit.intervene.tokens import role_token_mask
+from probe_kit.intervene.tokens import PairTokens
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -117,8 +117,8 @@ def estimate_patches(
     for model_input in (pair.clean, pair.source)[: 1 + (ends == "both")]:
         assert isinstance(model_input, Observation)
         slopes.append(gradients_at(model, [model_input], [pair.seed], sites, lambda chunks: slope(chunks[0]))[1])
-    memo: dict[Any, Any] = {}
-    masks = [role_token_mask(model, pair, cell.site_group.stream, cell.role, memo) for cell in cells]
+    tokens = PairTokens(model, pair)
+    masks = [tokens.mask(cell.site_group.stream, cell.role) for cell in cells]
     return clean, moved, sum_over_cells(activations, source, slopes, cells, masks)
 
 

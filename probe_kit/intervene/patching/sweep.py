@@ -19,10 +19,11 @@ from probe_kit.intervene.patching.patch import (
     all_but,
     as_tuple,
     infer,
-    infer_patched,
+    patched,
     run_with_cache,
 )
 from probe_kit.intervene.places import PlaceName
+from probe_kit.intervene.tokens import PairTokens
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -154,17 +155,19 @@ def sweep_cells(
         raise UsageError(f"a sweep of {len(sets)} sets of cells in {len(pairs)} pairs; give at least one of both")
     places = list(dict.fromkeys(cell.site_group.name for together in sets for cell in together))
     clean, moved = np.empty(len(pairs)), np.empty(len(pairs))
-    patched = np.empty((len(sets), len(pairs)))
+    of_sets = np.empty((len(sets), len(pairs)))
     for column, pair in enumerate(pairs):
         output, source = run_with_cache(model, pair.source, pair.seed, places)
         moved[column] = metric(output, pair.source)
         clean[column] = metric(infer(model, pair.clean, pair.seed), pair.clean)
+        tokens = PairTokens(model, pair)
         for row, together in enumerate(sets):
-            output = infer_patched(model, pair, together, source, along, complement)
-            patched[row, column] = metric(output, pair.clean)
+            with patched(tokens, together, source, along, complement):
+                output = infer(model, pair.clean, pair.seed)
+            of_sets[row, column] = metric(output, pair.clean)
     groups, items = groups_and_items(pairs)
     toward = np.array([float(np.sign(pair.toward)) for pair in pairs])
-    return Sweep(sets, np.array(groups), np.array(items), toward, clean, moved, patched)
+    return Sweep(sets, np.array(groups), np.array(items), toward, clean, moved, of_sets)
 
 
 def _order(name: PlaceName) -> tuple[object, ...]:
