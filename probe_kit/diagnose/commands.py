@@ -210,7 +210,7 @@ def _prepared(
     from probe_kit.diagnose.diagnosis import check_base_files
     from probe_kit.extract import prepare
     from probe_kit.extract.commands import print_plan
-    from probe_kit.intervene.pairs import check_pairs
+    from probe_kit.intervene.open_session import check_pairs
     from probe_kit.runs.store import locate
 
     in_scene = not {"dataset", "env", "pictures"} & set(typed)

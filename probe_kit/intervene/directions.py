@@ -42,6 +42,7 @@ Vector = NDArray[np.float32]
 MEAN_DIFFERENCE, PROBE = "mean-difference", "probe"
 DIRECTIONS = (MEAN_DIFFERENCE, PROBE)
 FOLDS = 5
+"""Of groups; a direction used on an episode is fitted on the folds that its group is not in."""
 _ROUNDING = 1e-6
 """Share of a number's size below which a difference of stored float32 means is rounding."""
 EVERY_EPISODE = ""
@@ -260,6 +261,7 @@ def _direction(training: NDArray[np.float64], is_left: NDArray[np.bool_], direct
     from sklearn.preprocessing import StandardScaler
 
     scaler = StandardScaler().fit(training)
+    # A strong penalty: features are many and episodes few.
     fitted = LogisticRegression(C=0.01, max_iter=1000).fit(scaler.transform(training), is_left)
     return _unit(fitted.coef_[0] / scaler.scale_)
 

@@ -135,7 +135,10 @@ class Frames:
 
 
 FRAMES = 4
-"""Frames of an episode that are used if nothing is said."""
+"""Frames of an episode that are used if nothing is said.
+
+Frames of one episode are alike, and the unit of tests is its group: more of them cost inferences and tell little.
+"""
 
 
 class ObservedSession(ReplaySession):

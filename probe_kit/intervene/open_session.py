@@ -1,18 +1,16 @@
 """Opening the session of a run: its policy and its source are loaded again, and compared with the run's."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from probe_kit.errors import (
-    SettingsMismatchError,
-)
+from probe_kit.errors import SettingsMismatchError, UsageError
 from probe_kit.hooks.checkpoints.checkpoint import cached_folder, pinned_commits
 from probe_kit.hooks.contract.card import EMBEDDED
 from probe_kit.hooks.family import SIZE
 from probe_kit.intervene.frame_session import Frames, ObservedSession
-from probe_kit.intervene.pairs import Pair, PairRow, check_pairs
+from probe_kit.intervene.pairs import Pair, PairRow
 from probe_kit.intervene.scene_session import SceneSession
 from probe_kit.intervene.sessions import LoadPolicy, ReplaySession, ReplaySource
 from probe_kit.intervene.settings import Choice, has_sides, items_of
@@ -65,6 +63,23 @@ def check_policy(run: Run, policy: "Policy") -> None:
         different = sorted(name for name in was | now if was.get(name) != now.get(name))
         lines = "; ".join(f"{name}: stored {was.get(name)!r}, here {now.get(name)!r}" for name in different)
         raise SettingsMismatchError(f"{run.location} was made with other options ({lines}). Give the same with -M")
+
+
+MOST_FRAMES = 8
+"""Numbers of frames that a message names."""
+
+
+def check_pairs(table: Sequence[PairRow], frames: Collection[tuple[str, int]]) -> None:
+    """Raise UsageError for a row that names none of the `frames`, each an episode and a number."""
+    for episode, number in (part for row in table for part in (row[:2], row[2:])):
+        if (episode, number) not in frames:
+            numbers = sorted(frame for name, frame in frames if name == episode)
+            first = next(iter(frames), ("none", 0))[0]
+            some = ", ".join(map(str, numbers[:MOST_FRAMES])) + ", …" * (len(numbers) > MOST_FRAMES)
+            its = f"of that episode {some}" if numbers else f"episodes such as {first!r}"
+            raise UsageError(
+                f"the run has no frame {number} of {episode!r}, which the table of pairs names; it has {its}"
+            )
 
 
 def open_session(

@@ -1,6 +1,6 @@
 """The outcomes of an intervention's conditions: per episode where the action goes, and how far it changed."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from io import BytesIO
 from typing import Any
@@ -42,15 +42,10 @@ def arrays_to_bytes(record: object, without: Sequence[str] = ()) -> bytes:
     return file.getvalue()
 
 
-def arrays_from_bytes(content: bytes, texts: str = "") -> dict[str, Any]:
-    """Return the arrays of a `.npz` by name. texts: the one that becomes a tuple of strings."""
+def arrays_from_bytes(content: bytes) -> dict[str, Any]:
+    """Return the arrays of a `.npz` by name."""
     with open_arrays(content) as arrays:
-        return with_texts(arrays, texts)
-
-
-def with_texts(arrays: Mapping[str, NDArray[Any]], texts: str) -> dict[str, Any]:
-    """Return arrays by name, one of them as a tuple of strings."""
-    return {name: tuple(map(str, value)) if name == texts else value for name, value in arrays.items()}
+        return dict(arrays)
 
 
 Array = NDArray[np.float64]
@@ -138,6 +133,10 @@ class ConditionOutcomes:
     mass: NDArray[np.float32] | None = None
     inferences: NDArray[np.int64] | None = None
     patches: NDArray[np.float32] | None = None
+
+    def __post_init__(self) -> None:
+        # Stored names are an array, and comparisons with one are element by element.
+        object.__setattr__(self, "conditions", tuple(map(str, self.conditions)))
 
     @property
     def has_sides(self) -> bool:

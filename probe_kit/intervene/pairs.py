@@ -1,6 +1,6 @@
 """Pairs of inferences, one patched into and one patched from; also those of a table of the user's own."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -69,8 +69,6 @@ def groups_and_items(pairs: Sequence[Pair]) -> tuple[list[str], list[str]]:
 
 PairRow = tuple[str, int, str, int]
 """Episode and frame of the clean inference, and of its donor."""
-MOST_FRAMES = 8
-"""Numbers of frames that a message names."""
 PAIR_COLUMNS = ("episode", "frame", "donor_episode", "donor_frame")
 
 
@@ -96,16 +94,3 @@ def read_pairs(path: Path) -> tuple[PairRow, ...]:
     if not rows:
         raise UsageError(f"{path} names no pair; expected a line per pair")
     return tuple(rows)
-
-
-def check_pairs(table: Sequence[PairRow], frames: Collection[tuple[str, int]]) -> None:
-    """Raise UsageError for a row that names none of the `frames`, each an episode and a number."""
-    for episode, number in (part for row in table for part in (row[:2], row[2:])):
-        if (episode, number) not in frames:
-            numbers = sorted(frame for name, frame in frames if name == episode)
-            first = next(iter(frames), ("none", 0))[0]
-            some = ", ".join(map(str, numbers[:MOST_FRAMES])) + ", …" * (len(numbers) > MOST_FRAMES)
-            its = f"of that episode {some}" if numbers else f"episodes such as {first!r}"
-            raise UsageError(
-                f"the run has no frame {number} of {episode!r}, which the table of pairs names; it has {its}"
-            )

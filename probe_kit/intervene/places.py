@@ -233,9 +233,10 @@ def unread_places(
     """
     unread = []
     for name in names:
-        parsed = PlaceName.parse(name)
-        if parsed.stream in interventions.unread and parsed.stream in streams:
-            is_last = parsed.quantity in ("", RESIDUAL) and parsed.layer == streams[parsed.stream].layers - 1
+        # Streams first: all of `kv` together is a place too, whose name `kv.*` has no parts.
+        if (stream := name.partition(".")[0]) in interventions.unread and stream in streams:
+            parsed = PlaceName.parse(name)
+            is_last = parsed.quantity in ("", RESIDUAL) and parsed.layer == streams[stream].layers - 1
             # The final norm lies behind the last layer, whatever number its site has.
             unread += [name] * (is_last or parsed.quantity == FINAL_NORM)
     return tuple(dict.fromkeys(unread))

@@ -13,7 +13,7 @@ from probe_kit.hooks.registry import get_family
 from probe_kit.intervene.kinds.base import ConditionName, Intervention
 from probe_kit.intervene.kinds.image_swap import ImageSwap
 from probe_kit.intervene.open_session import open_session
-from probe_kit.intervene.outcomes import ConditionOutcomes, arrays_of, with_texts
+from probe_kit.intervene.outcomes import ConditionOutcomes, arrays_of
 from probe_kit.intervene.places import ALL, resolve_all, roles_of, unread_note, unread_places
 from probe_kit.intervene.replay import Condition
 from probe_kit.intervene.results import InterventionResult, load_effects, save
@@ -147,12 +147,12 @@ def _replay_items(
     parts = []
     for number, item in enumerate(items):
         name = f"{number:06d}"
-        stored = pieces.read(name, ConditionOutcomes)
+        stored: dict[str, Any] | None = pieces.read(name, ConditionOutcomes)
         if stored is None:
             part = intervention.play(session, session.pairs(item), conditions)
             pieces.keep(name, arrays_of(part, ("seed_text",)))
         else:
-            part = ConditionOutcomes(**with_texts(stored, "conditions"))
+            part = ConditionOutcomes(**stored)
         parts.append(part)
         if progress is not None:
             progress(number + 1, len(items), item)

@@ -11,7 +11,7 @@ from probe_kit.intervene.pairs import PairRow
 from probe_kit.runs.reader import SIDE
 from probe_kit.runs.run import Run
 
-FORMAT = 2  # raise when stored numbers would be others
+FORMAT = 2  # raise when stored numbers would be others; with the settings it is hashed into the key
 DONORS = 2  # the rule of `draw_donors`; raise when it gives other donors
 FIRST_CHUNK: Readout = "first-chunk"
 PER_STEP: Readout = "per-step"

@@ -38,6 +38,7 @@ from probe_kit.runs.results import HEAD, Bundle, advice_for, complete_key, field
 from probe_kit.runs.store import Location
 
 EPISODES, EFFECTS, CERTIFICATE = "episodes.npz", "effects.csv", "certificate.json"
+# As in Act2Answer's scene; `env.SceneSpec` has the positions.
 TILES_APART = 0.31
 """Metres between the tiles of the default scene; taken for a run that stores no scene."""
 
@@ -84,7 +85,7 @@ class Measurement:
 
         Raises RunDamagedError if they were changed, or have the names of another version of probe_kit.
         """
-        stored = arrays_from_bytes(self.read(EPISODES), "conditions")
+        stored = arrays_from_bytes(self.read(EPISODES))
         if problem := fields_problem(ConditionOutcomes, stored):
             folder = f"{INTERVENTIONS}/{self.key}"
             raise RunDamagedError(

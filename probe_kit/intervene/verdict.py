@@ -33,6 +33,7 @@ Behaviour = Literal[
 ]
 USES: tuple[Behaviour, ...] = ("used", "partly used, one-sided", "partly used, graded")
 """Those in which the answer decides something."""
+# Choices, which `docs/causal.md` states as the rule; `docs/notes/causal.md` has how often they are wrong.
 DECIDES = 0.50
 """Net follow rate, and share of the reach, from which the answer decides; of the episodes of one side as well."""
 FEW = 0.10

@@ -45,10 +45,14 @@ from probe_kit.train.results.store import load_results, stored_targets
 from probe_kit.train.results.summary import best_sites_findings
 from probe_kit.view.viewed_run import Values, ViewedRun, decisions_toward_correct
 
+# Log-odds travel as 16-bit integers: a page of a large run holds millions, and as text each is twice as long.
 LOG_ODDS_SCALE = 256
 """Steps per unit of log-odds: the error is below 0.002."""
 MISSING = -32768
-"""In place of a log-odds that does not exist, such as that of an inference the episode did not reach."""
+"""In place of a log-odds that does not exist, such as that of an inference the episode did not reach.
+
+The least 16-bit integer, which no rounded log-odds takes: they are cut at 32767 steps on both sides.
+"""
 
 
 class Packed(str):

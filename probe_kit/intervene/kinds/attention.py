@@ -301,10 +301,14 @@ class AttentionShares:
     calls: NDArray[np.int64]
     mass: NDArray[np.float32]
 
+    def __post_init__(self) -> None:
+        # Stored names are an array.
+        object.__setattr__(self, "roles", tuple(map(str, self.roles)))
+
     @classmethod
     def from_bytes(cls, content: bytes) -> Self:
         """Load what `arrays_to_bytes` made of one."""
-        return cls(**arrays_from_bytes(content, "roles"))
+        return cls(**arrays_from_bytes(content))
 
     def only(self, selected: NDArray[np.bool_]) -> Self:
         """Some of the inferences. selected: (N,)."""

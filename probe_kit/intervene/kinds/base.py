@@ -303,8 +303,9 @@ class ConditionName:
 class EffectRow(Effect):
     """The effect of one edit in one category, with the columns that all kinds of edits have.
 
-    sites: that were edited. role: of the tokens. direction: empty if they were edited in full. net, net_ci:
-    the kind's share of episodes, with its 95 % interval by groups. max_action_change: largest difference in any
+    sites: that were edited. role: of the tokens. direction: empty if they were edited in full. net, net_ci: share
+    of episodes that do with the edit what the kind counts, such as a flip to the target side, minus the share that
+    do the reverse, with its 95 % interval by groups. max_action_change: largest difference in any
     action of any episode; 0 is bit for bit. fires, no_op_fires: of edited sites in all episodes, and those that
     changed nothing. relative_change: how far tokens were moved, in their own norms. key: of the intervention.
     """
@@ -329,8 +330,12 @@ class EffectRow(Effect):
         return " ".join(filter(None, (self.sites, self.role, self.direction)))
 
 
-def common_columns(outcomes: ConditionOutcomes, row: int, name: ConditionName, net: Values) -> dict[str, Any]:
-    """Return the columns of `EffectRow` of one condition. outcomes: of one category. net: (E,) its gains."""
+def common_columns(outcomes: ConditionOutcomes, row: int, name: ConditionName, gains: Values) -> dict[str, Any]:
+    """Return the columns of `EffectRow` of one condition.
+
+    outcomes: of one category. row: of the condition in them. gains: (E,) 1 where an episode does with the edit
+    what the kind counts and did not without it, −1 for the reverse.
+    """
     logged = dict(zip(LOG_FIELDS, outcomes.edit_log[row].T, strict=True))
     norm = float((logged["norm"] * logged["fires"]).sum())
     counts = {column: value for column, value in outcomes.counts.items() if column != "n_groups"}
@@ -340,8 +345,8 @@ def common_columns(outcomes: ConditionOutcomes, row: int, name: ConditionName, n
         "role": name.role,
         "direction": name.direction,
         "is_control": name.is_control,
-        "net": float(net.mean()),
-        "net_ci": net_interval(net, outcomes),
+        "net": float(gains.mean()),
+        "net_ci": net_interval(gains, outcomes),
         "max_action_change": float(outcomes.max_action_change[row].max()),
         "fires": int(logged["fires"].sum()),
         "no_op_fires": int(logged["no_op_fires"].sum()),
@@ -349,10 +354,10 @@ def common_columns(outcomes: ConditionOutcomes, row: int, name: ConditionName, n
     }
 
 
-def net_interval(net: Values, outcomes: ConditionOutcomes) -> tuple[float, float]:
+def net_interval(gains: Values, outcomes: ConditionOutcomes) -> tuple[float, float]:
     """Return the 95 % interval by groups of the mean over episodes of (E,) gains."""
     drawn = units_seed(outcomes.groups, outcomes.seed_text)
-    low, high = group_bootstrap(net[:, None], outcomes.groups, drawn, bounds=GAINS)
+    low, high = group_bootstrap(gains[:, None], outcomes.groups, drawn, bounds=GAINS)
     return float(low[0]), float(high[0])
 
 
@@ -370,26 +375,29 @@ class ControlTest(NamedTuple):
     p_fwe: float | None = None
 
 
-def test_against_controls(
+def compare_with_controls(
     values: Values,
     names: Sequence[ConditionName],
     outcomes: ConditionOutcomes,
-    untested: Collection[int],
-    no_controls: Collection[int],
+    *,
+    skipped: Collection[int] = (),
+    broken_controls: Collection[int] = (),
 ) -> list[ControlTest]:
     """Compare every condition that is no control with its own controls, in the order of the conditions.
 
-    values: (K, E) tested to be above zero. outcomes: of one category. untested: further rows that are not tested.
-    no_controls: rows that are no controls.
+    values: (K, E) tested to be above zero. names: of the K conditions. outcomes: of one category. skipped: rows
+    that are not tested though they are no controls, such as an identity patch. broken_controls: rows of controls
+    that nothing is compared with, such as those that disrupt the task.
     """
     controls = [
-        [at for at, other in enumerate(names) if other.is_control_of(name) and at not in no_controls]
+        [at for at, other in enumerate(names) if other.is_control_of(name) and at not in broken_controls]
         for name in names
     ]
     tests = [ControlTest(rows) for rows in controls]
-    tested = [at for at, name in enumerate(names) if not name.is_control and at not in untested]
+    tested = [at for at, name in enumerate(names) if not name.is_control and at not in skipped]
     if not tested:
         return tests
+    # Without controls an effect is compared with zero.
     beyond = np.array(
         [values[at] - values[controls[at]].mean(axis=0) if controls[at] else values[at] for at in tested]
     )

@@ -25,6 +25,7 @@ from probe_kit.intervene.kinds.base import (
     ConditionName,
     EffectRow,
     common_columns,
+    compare_with_controls,
     count_edits,
     edit_of,
     effect_table,
@@ -33,7 +34,6 @@ from probe_kit.intervene.kinds.base import (
     p_of,
     share_of_edits,
     signed_interval,
-    test_against_controls,
 )
 from probe_kit.intervene.kinds.interchange import best_patch_targets, patch_of, patches_within
 from probe_kit.intervene.outcomes import CLEAN, ConditionOutcomes
@@ -53,8 +53,9 @@ if TYPE_CHECKING:
     from probe_kit.intervene.sessions import ReplaySession
 
 MIN_IN_ZONE_RATIO = 0.5
-"""Share of the clean in-zone share below which the task is called disrupted."""
+"""Share of the clean in-zone share below which the task is called disrupted: most of the placing is gone."""
 CORRECT, WRONG = "correct", "wrong"
+"""Outcomes of `env.scoring` with the cube in a zone; the third, `oob`, is outside both."""
 Finding = Literal["identity patch", "control", "task disrupted", "confirmed", "not confirmed"]
 _LEGEND = (
     "every episode played again, same scene and seeds, with the edit at every inference; in a zone: whichever "
@@ -291,7 +292,7 @@ def closed_loop_effects(outcomes: ConditionOutcomes) -> list[ClosedLoopEffect]:
     net = wrong - wrong[0]
     left_out = set(np.flatnonzero(disrupted).tolist())
     clean = {at for at, name in enumerate(names) if name.site == CLEAN}
-    tests = test_against_controls(net, names, outcomes, left_out | clean, left_out)
+    tests = compare_with_controls(net, names, outcomes, skipped=left_out | clean, broken_controls=left_out)
     rows = []
     for at, (name, test) in enumerate(zip(names, tests, strict=True)):
         gained, lost = int((net[at] > 0).sum()), int((net[at] < 0).sum())

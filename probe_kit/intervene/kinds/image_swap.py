@@ -48,14 +48,15 @@ if TYPE_CHECKING:
 
 NAME = "image-swap"
 FEWEST_TO_EITHER_SIDE = 8
-"""Clean inferences that must go to either side before a reach is taken from them."""
+"""Clean inferences that must go to either side before a reach is taken from them: a median of fewer jumps."""
 SMALLEST_REACH = 0.02
-"""Metres. Two sides that are nearer to each other are no choice between tiles."""
+"""Metres. Two sides that are nearer to each other are no choice between tiles, which are 0.31 m apart."""
 REACHED = 0.25
-"""Share of the reach from which a side counts as reached."""
+"""Share of the reach, from the middle, where a side counts as reached: half-way, as the side is at 0.5."""
 SMALLEST_SHARE_OF_INTEREST = 0.10
-"""Of the reach. A displacement below it is a trace."""
+"""Of the reach. A displacement below it is a trace. Chosen, as the bound within which *not used* must lie."""
 FOLLOWS, REVERSES = 1, -1
+"""Responses of an episode to a swap; 0 is neither."""
 _LEGEND = (
     "moved: displacement toward the correct picture in units of the policy's own reach, "
     f"{SMALLEST_SHARE_OF_INTEREST} of which count; follow: goes to the correct picture, and to the other side "

@@ -27,6 +27,7 @@ from probe_kit.intervene.kinds.base import (
     EffectRow,
     Values,
     common_columns,
+    compare_with_controls,
     count_edits,
     effect_table,
     lines_of,
@@ -34,7 +35,6 @@ from probe_kit.intervene.kinds.base import (
     p_of,
     share_of_edits,
     signed_interval,
-    test_against_controls,
 )
 from probe_kit.intervene.kinds.image_swap import SMALLEST_REACH
 from probe_kit.intervene.outcomes import CLEAN, IMAGE_SWAP, UNCHANGED, ConditionOutcomes
@@ -146,7 +146,7 @@ def patch_effects(outcomes: ConditionOutcomes, target_side: str = IMAGE_SWAP) ->
     displacements = push * (outcomes.displacement[rows] - clean)
     exchange = outcomes.exchange()
     sign = 1.0 if exchange is None or target_side != IMAGE_SWAP else exchange.sign
-    tests = test_against_controls(sign * displacements, names, outcomes, (), ())
+    tests = compare_with_controls(sign * displacements, names, outcomes)
     effects = []
     for row, name, test, moved in zip(rows, names, tests, displacements, strict=True):
         # 1 where the action flips to the target side, −1 where it flips away from it.

@@ -41,7 +41,7 @@ EVERY, ALONE, WITHOUT, MINIMAL, SECOND = "every-cell", "alone", "without", "mini
 """Conditions: all cells; one of them, and all but it; the smallest set, and one that is found without it."""
 WITHOUT_MINIMAL = f"{WITHOUT}|{MINIMAL}"
 WORTH_SEARCHING = 0.5
-"""Effect of all cells together from which a smallest set is searched."""
+"""Effect of all cells together from which a smallest set is searched: of less, hardly any carries half."""
 MOST_PLACES = 3
 """Places that a short sentence names."""
 _LEGEND = (

@@ -40,9 +40,9 @@ Slope = Callable[["Tensor"], "Tensor"]
 EVERY_BLOCK = f"{KV_STREAM}.*"
 """The anchor that is all of `kv`."""
 AGREEMENT = 3.0
-"""Factor within which an anchor's estimate must lie of its exact effect. A choice."""
+"""Factor within which an anchor's estimate must lie of its exact effect. A choice: orders survive it."""
 LOCALISATION_SHARE = 0.5
-"""Share of the whole effect from which a place is called localised."""
+"""Share of the whole effect from which a place is called localised; as `exchange.CARRIES` of sets."""
 FIRST = 3
 """Cells that a sentence names."""
 

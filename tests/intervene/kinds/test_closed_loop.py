@@ -132,7 +132,7 @@ def test_shuffled_conditions_are_seldom_confirmed() -> None:
 
 def test_stored_answers_come_back_with_outcomes_and_without() -> None:
     outcomes = made([[RIGHT, WRONG], [OUT, WRONG]], NAMES[:2])
-    again = ConditionOutcomes(**arrays_from_bytes(outcomes.to_bytes(), "conditions"))
+    again = ConditionOutcomes(**arrays_from_bytes(outcomes.to_bytes()))
     assert again.episode_outcomes is not None
     np.testing.assert_array_equal(again.episode_outcomes, [[RIGHT, WRONG], [OUT, WRONG]])
 

@@ -224,7 +224,7 @@ def test_items_that_share_pictures_do_not_add_up() -> None:
 
 def test_answers_are_read_back_as_they_were() -> None:
     made = outcomes_of({"color": follower(4), "shape": habit(4)})
-    back = ConditionOutcomes(**arrays_from_bytes(made.to_bytes(), "conditions"))
+    back = ConditionOutcomes(**arrays_from_bytes(made.to_bytes()))
     assert back.to_bytes() == made.to_bytes()
     assert back.conditions == made.conditions
     np.testing.assert_array_equal(back.displacement, made.displacement)
