@@ -212,6 +212,7 @@ def intervene(
     }  # fmt: skip
     inside: dict[str, Any] = {
         "sites": sites, "roles": roles, "direction": direction, "controls": controls,
+        # Seed 0 is the default of every kind, and no kind without a seed refuses it.
         "coefficients": coefficients, "target_side": target_side, "seed": seed or None,
     }  # fmt: skip
     kind_options = {name: value for name, value in inside.items() if value is not None}

@@ -70,6 +70,7 @@ class Frames:
     @cached_property
     def by_name(self) -> dict[tuple[str, int], Frame]:
         """The frames by number and episode, or item: a table of pairs may name either."""
+        # Episodes come last, so that a name which is both is an episode's.
         names = {(frame.item, frame.number): frame for frame in self.index}
         return names | {(frame.episode, frame.number): frame for frame in self.index}
 

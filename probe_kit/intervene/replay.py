@@ -177,6 +177,7 @@ def replay(session: "ReplaySession", pairs: Sequence[Pair], conditions: Sequence
         outcomes.replay_error[column] = session.replay_error(pair, clean)
         chunks.append([])
         for number, condition in enumerate(conditions):
+            # The clean inference is not made again: `replay_error` has compared it with the run's.
             played = condition.play(context) if number else ConditionResult(clean)
             outcomes.displacement[number, column] = session.displacement(played.chunk, pair) + played.estimated
             outcomes.max_action_change[number, column] = float(np.abs(played.chunk - clean).max())

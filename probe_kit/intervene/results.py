@@ -214,7 +214,7 @@ def load_effects(run: RunReader, key: str | None = None, kind: str | None = None
     Raises NoInterventionsError, UsageError for a key that is not there, RunDamagedError if it was changed.
     """
     result = InterventionResult.of_stored(find_stored(run, key, kind))
-    _ = result.outcomes, result.certificate  # what was changed is said now
+    _ = result.outcomes, result.certificate  # read now, so that a changed file is refused here and not in a table
     return result
 
 
@@ -307,6 +307,7 @@ def listed_interventions(run: Any) -> list[ListedIntervention]:
         for stored in stored_interventions(reader):
             by_kind.setdefault(str(stored.settings["kind"]), set()).add(stored.key)
         for name, keys in by_kind.items():
+            # A kind of another package may be missing here; all of its results then count as used.
             # Keys of what is read, and of the kinds of which nothing takes another's place.
             preferred = kind_of(name).keys_in_use(reader) if name in kind_names() else None
             used |= keys if preferred is None else preferred

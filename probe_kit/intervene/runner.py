@@ -85,7 +85,7 @@ def run_intervention(
             **session.certificate,
         }
     save(run, settings, outcomes.in_spreads(), certificate, extra_files)
-    pieces.discard()
+    pieces.discard()  # only now: killed in between, the result is there, and the pieces are tidied away
     return load_effects(run, key)
 
 
@@ -146,7 +146,7 @@ def _replay_items(
     """Replay item by item; items of an interrupted attempt are loaded."""
     parts = []
     for number, item in enumerate(items):
-        name = f"{number:06d}"
+        name = f"{number:06d}"  # the key covers the items and their order, so that a number is always the same one
         stored: dict[str, Any] | None = pieces.read(name, ConditionOutcomes)
         if stored is None:
             part = intervention.play(session, session.pairs(item), conditions)

@@ -80,6 +80,7 @@ class SceneSession(ReplaySession):
             if layout not in frames:
                 planned = scene_row(0, Episode(worded, layout), int(record["scene_seed"]), 0)
                 frames[layout] = self.stage.look(planned)
+                # The other layout has the same state, and its row, if the run has it, begins with this very frame.
                 frames[_OTHER[layout]], tiles = self.stage.look_swapped(), self.stage.tile_masks()
             stored, drawn = record.get(FIRST_FRAME), frames[layout][1][FIRST_FRAME]
             if stored is not None and stored != drawn:

@@ -21,7 +21,8 @@ PER_STEP: Readout = "per-step"
 class Choice:
     """The part of a run that an intervention is made on, as settings; see `kinds.base.Intervention`.
 
-    Fields are those of every intervention. kind, usual_vary: of the class.
+    Fields are those of every intervention. kind, usual_vary: of the class. Apart from `Intervention`, because
+    sessions read it and interventions are built on sessions.
     """
 
     kind: ClassVar[str]

@@ -1,4 +1,4 @@
-"""Stored interventions of a run, `RUN/interventions/<key>/`, and the choice among them. Needs no model.
+"""Stored interventions of a run, `RUN/interventions/<key>/`, and the choice among them.
 
 settings.json      the head: what was asked, of which commits, and the hashes of the rest; written last
 episodes.npz       per condition and episode where the action would go, and how far it changed
@@ -229,6 +229,7 @@ def stored_results(run: RunReader, kind: str) -> list[StoredResult]:
     results = []
     for stored in stored_interventions(run, kind):
         family = stored.certificate.get("supported", {}).get("readout", FIRST_CHUNK)
+        # Where one inference is one action in greedy bins, the first says little: any other readout says more.
         is_wrong = family == PER_STEP != stored.readout
         for category, outcomes in stored.outcomes.by_category():
             rank = not is_wrong, outcomes.episodes.size, stored.readout == family
@@ -285,6 +286,7 @@ def pool_conditions(results: Iterable[StoredResult], setting: Sequence[str] = ()
     for result in results:
         outcomes = result.outcomes
         agreed = tuple(str(result.stored.settings.get(name)) for name in ("readout", *setting))
+        # Bytes, not closeness: another device or batch rounds otherwise, and effects are differences of actions.
         unchanged = [outcomes.of(name).tobytes() for name in (CLEAN, IMAGE_SWAP) if name in outcomes.conditions]
         same = (result.category, *agreed, tuple(outcomes.episodes.tolist()), *unchanged)
         sources = pooled.setdefault(same, PooledConditions(result, {})).sources

@@ -1,7 +1,8 @@
 """The verdict: does the action use the answer, and where inside does it pass? Loads no model.
 
-`classify_use` alone makes a verdict. Three questions have answers of their own: the behaviour (of the image swap),
-the place (of interchanges) and the tie (is what probes read the thing that is used?).
+`classify_use` alone makes a verdict; `docs/causal.md` has its rules. Three questions have answers of their own:
+the behaviour (of the image swap), the place (of interchanges) and the tie (is what probes read the thing that is
+used?).
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -230,6 +231,7 @@ class _Numbers(NamedTuple):
         is_beyond_half = decides or self.share_ends[0] > DECIDES
         if self.p >= SIGNIFICANCE:
             return None
+        # The first that holds: a policy that decides also moves.
         if is_beyond_half and self.follow >= DECIDES and self.share >= DECIDES:
             return "used"
         if is_moved and self.only_side is not None:
@@ -248,7 +250,7 @@ def classify_behaviour(effect: ImageSwapEffect, control: str | None) -> UseVerdi
     control: another category of the run that is used, which shows that use would have been seen; None if there is
     none, and then nothing is *not used*.
     """
-    for mirrored in (False, True):
+    for mirrored in (False, True):  # toward the correct picture, then the same rules against it
         numbers = _Numbers.of(effect, mirrored)
         behaviour = numbers.behaviour()
         if behaviour is not None:

@@ -172,6 +172,7 @@ class AttributionPatching(Intervention):
             members = [at for at, other in enumerate(kinds) if other == kind]
             best = {at for values in shares for at in sorted(members, key=lambda at: -abs(values[at]))[: self.top]}
             remaining = [at for at in members if at not in best]
+            # A seed per kind: what is drawn of one does not depend on which others are screened.
             draw = np.random.default_rng(derive_seed("attribution", self.seed, kind))
             top |= {cells[at] for at in best}
             drawn |= {cells[at] for at in draw.permutation(remaining)[: self.controls].tolist()}

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
 
 Values = NDArray[np.float64]
 CONTROL = "control-"
+"""The names of random directions begin with it, and so they are told from others in stored results."""
 OPTIONS = ("sites", "roles", "direction", "controls", "coefficients", "target_side", "seed")
 """Options of the command that a kind may take."""
 
@@ -66,7 +67,7 @@ class Intervention(Choice, ABC):
     """
 
     summary: ClassVar[str]
-    position: ClassVar[int] = 100
+    position: ClassVar[int] = 100  # behind all shipped kinds, which have 1 to 9
     options: ClassVar[Mapping[str, str]] = MappingProxyType({})
     needs: ClassVar[tuple[InterventionKind, ...]] = ("edit",)
     fits_always: ClassVar[bool] = False

@@ -126,6 +126,7 @@ def target_sign(outcomes: ConditionOutcomes, target_side: str) -> Values:
     """Return (E,) the side that is pushed to, +1 for left."""
     correct = outcomes.correct_sign
     sides = {"left": np.ones_like(correct), "right": -np.ones_like(correct), "correct": correct}
+    # `wrong`, and the image swap, after which the correct picture lies on the other side.
     return sides.get(target_side, -correct)
 
 

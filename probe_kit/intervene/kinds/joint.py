@@ -122,6 +122,7 @@ class JointPlaces(Intervention):
         }
         sets[SECOND] = {name: search.second for name, search in searched.items()}
         sets[MINIMAL] = {name: search.cells for name, search in searched.items()}
+        # One capture of the source at all sites serves every set.
         sites = sites_of_cells(cells)
         return [CLEAN_RUN, SOURCE_RUN, *(patched_run(name, by_name, sites) for name, by_name in sets.items())]
 

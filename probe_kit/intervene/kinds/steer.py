@@ -123,6 +123,7 @@ class Steering(PatchKind):
         cells = [Cell(site_group, self.role) for site_group in resolve_all(self.sites, session.policy).values()]
         conditions = [CLEAN_RUN, SOURCE_RUN]
         for cell, bases in self.fit_directions(session, cells, self.sites).items():
+            # Adding nothing must change nothing: `runner._ledgers` checks the hook itself by it.
             doses = [(self.direction, 0.0)]
             for coefficient in self.coefficients:
                 doses += [(name, coefficient) for name in (self.direction, *bases.control_names)]
