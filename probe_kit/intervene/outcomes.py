@@ -14,12 +14,8 @@ from probe_kit.intervene.exchange import Exchange
 
 CLEAN, IMAGE_SWAP, INSTRUCTION_SWAP, NOISE = "clean", "image_swap", "instruction_swap", "noise"
 """Conditions: as in the run, the two pictures swapped, the counterpart's instruction, the noise drawn anew."""
-ERASE, PROBE_ACCURACY = "erase", "probe_accuracy"
-"""A kind, and what its certificate calls what probes read behind its conditions."""
-ATTENTION, RECORDED, ATTENTION_FILE = "attention", "recorded", "attention.npz"
-"""A kind, its condition with recorded weights, and the file in which they are."""
-PATCHES_FILE = "attention_patches.npz"
-"""The attention on single patches of the first camera's picture, and where they lie in it."""
+RECORDED = "recorded"
+"""The condition with recorded attention weights."""
 DONOR, CONTROL_INPUT = "frame_swap", "control_input"
 """Conditions without sides: all inputs of the donor, and a change of the input that means nothing."""
 UNCHANGED = frozenset({CLEAN, IMAGE_SWAP, INSTRUCTION_SWAP, NOISE, RECORDED, DONOR, CONTROL_INPUT})

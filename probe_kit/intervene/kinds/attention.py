@@ -18,9 +18,6 @@ from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.sites import first_of
 from probe_kit.intervene.kinds.base import Intervention, effect_table
 from probe_kit.intervene.outcomes import (
-    ATTENTION,
-    ATTENTION_FILE,
-    PATCHES_FILE,
     RECORDED,
     ConditionOutcomes,
     Effect,
@@ -43,6 +40,8 @@ if TYPE_CHECKING:
     from probe_kit.hooks.capturing.attention import AttentionMass
     from probe_kit.intervene.sessions import ReplaySession
 
+ATTENTION, ATTENTION_FILE, PATCHES_FILE = "attention", "attention.npz", "attention_patches.npz"
+"""The kind, and its files: shares by role, and those on single patches with where these lie in the picture."""
 ROLES = ("image", *TILES, "language", "state", "special")
 """Whose tokens are asked about, where a family has them and, of tiles, says which tokens see them."""
 

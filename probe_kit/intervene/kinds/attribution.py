@@ -20,7 +20,7 @@ from probe_kit.intervene.kinds.base import (
     lines_of,
     p_of,
 )
-from probe_kit.intervene.kinds.interchange import cells_at, check_sites_and_roles, patch_of
+from probe_kit.intervene.kinds.interchange import cells_at, check_roles_apart, patch_of
 from probe_kit.intervene.outcomes import CLEAN, ConditionOutcomes
 from probe_kit.intervene.patching.attribution import (
     AGREEMENT,
@@ -103,7 +103,7 @@ class AttributionPatching(Intervention):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_sites_and_roles(self.sites, self.roles, "attribution needs")
+        check_roles_apart(self.roles, self.kind)
         if self.ends not in get_args(Ends) or self.top < 1:
             raise UsageError(
                 f"ends is {self.ends!r} and top {self.top}; expected {' or '.join(get_args(Ends))}, and 1 or more"

@@ -84,6 +84,13 @@ class Intervention(Choice, ABC):
                 f"expected some of {', '.join(OPTIONS)}"
             )
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for pattern in ("sites", "roles"):
+            # `roles` alone, without sites, may be empty: a readout of attention takes all that there are.
+            if hasattr(self, "sites") and getattr(self, pattern, None) == ():
+                raise UsageError(f"--kind {self.kind} needs at least one of --{pattern}; none is given")
+
     @classmethod
     def from_options(cls, run: Run, **options: Any) -> Self:
         """Return it as the command builds it. options: those that are given. Raises UsageError."""

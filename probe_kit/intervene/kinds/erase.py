@@ -33,7 +33,7 @@ from probe_kit.intervene.kinds.base import (
     share_of_edits,
 )
 from probe_kit.intervene.kinds.interchange import cells_at
-from probe_kit.intervene.outcomes import CLEAN, ERASE, PROBE_ACCURACY, ConditionOutcomes
+from probe_kit.intervene.outcomes import CLEAN, ConditionOutcomes
 from probe_kit.intervene.patching.attribution import LOCALISATION_SHARE
 from probe_kit.intervene.patching.patch import Cell
 from probe_kit.intervene.places import TILES, resolve_all
@@ -54,6 +54,8 @@ if TYPE_CHECKING:
     from probe_kit.intervene.sessions import ReplaySession
 
 LEACE = "leace"
+PROBE_ACCURACY = "probe_accuracy"
+"""Entry of the certificate: what probes read behind each condition, by category."""
 Finding = Literal[
     "identity patch", "control", "no baseline effect", "controls also disrupt", "effect", "no effect"
 ]
@@ -84,7 +86,7 @@ class ConceptErasure(Intervention):
     items that are played. Raises UsageError for a method that does not exist.
     """
 
-    kind: ClassVar[str] = ERASE
+    kind: ClassVar[str] = "erase"
     summary: ClassVar[str] = "Remove the decodable answer (weaker than interchange)."
     position: ClassVar[int] = 8
     fits_always: ClassVar[bool] = True
@@ -107,8 +109,6 @@ class ConceptErasure(Intervention):
         super().__post_init__()
         if self.readout != FIRST_CHUNK:
             raise UsageError("what erases is fitted on the first inference; leave --readout out")
-        if not self.sites or not self.roles:
-            raise UsageError("erasing needs at least one site and one role")
         if tiles := set(self.roles) & set(TILES):
             raise UsageError(
                 f"{', '.join(sorted(tiles))} is of other patches in every episode, and an eraser is of positions; "
@@ -131,10 +131,7 @@ class ConceptErasure(Intervention):
         """
         from probe_kit.intervene.directions import PassedOver, by_episode, collect_token_features, fit_by_fold
 
-        places = resolve_all(self.sites, session.policy)
-        cells = cells_at(session, places.values(), self.roles)
-        if not cells:
-            raise UsageError(f"no token of {', '.join(places)} has the role {', '.join(self.roles)}")
+        cells = cells_at(session, resolve_all(self.sites, session.policy).values(), self.roles)
         erasers: dict[Cell, dict[str, dict[str, Eraser]]] = {}
         accuracies: dict[str, dict[str, float]] = {}
         passed_over, method = PassedOver(session, self.sites), Method.of(self.method)

@@ -399,10 +399,10 @@ def patches_within(
     ]
 
 
-def check_sites_and_roles(sites: Sequence[str], roles: Sequence[str], subject: str) -> None:
-    """Raise UsageError without sites, or for roles that share tokens."""
-    if not sites or not roles or ALL in roles:
-        raise UsageError(f"{subject} at least one site, and roles that share no token (not all)")
+def check_roles_apart(roles: Sequence[str], kind: str) -> None:
+    """Raise UsageError for roles that share tokens: sets of such cells would patch tokens twice."""
+    if ALL in roles:
+        raise UsageError(f"--kind {kind} needs roles that share no token; leave all out")
 
 
 class PatchKind(AlongDirection):
@@ -496,8 +496,6 @@ class Interchange(PatchKind):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.sites or not self.roles:
-            raise UsageError("an interchange needs at least one site and one role")
         if set(self.roles) & set(TILES) and self.direction != NONE:
             raise UsageError(
                 "tiles have no mean in the run from which a direction could be found; patch them in full: leave "

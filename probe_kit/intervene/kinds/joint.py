@@ -18,7 +18,7 @@ from probe_kit.intervene.kinds.base import (
     interval_text,
     lines_of,
 )
-from probe_kit.intervene.kinds.interchange import cells_at, check_sites_and_roles
+from probe_kit.intervene.kinds.interchange import cells_at, check_roles_apart
 from probe_kit.intervene.outcomes import CLEAN, ConditionOutcomes, Effect
 from probe_kit.intervene.pairs import Pair
 from probe_kit.intervene.patching.patch import Cell, all_but, sites_of_cells
@@ -102,7 +102,7 @@ class JointPlaces(Intervention):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_sites_and_roles(self.sites, self.roles, "joint places need")
+        check_roles_apart(self.roles, self.kind)
 
     def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
         """Return clean, images swapped, the sets of cells. Raises UsageError for cells that are not parallel."""

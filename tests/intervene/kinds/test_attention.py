@@ -30,12 +30,13 @@ from probe_kit.intervene import (
     stored_attention,
 )
 from probe_kit.intervene.kinds.attention import (
+    ATTENTION_FILE,
     PatchAttention,
     attention_recorded,
     shares_by_role,
     stored_patch_attention,
 )
-from probe_kit.intervene.outcomes import ATTENTION_FILE, arrays_from_bytes, arrays_to_bytes
+from probe_kit.intervene.outcomes import arrays_from_bytes, arrays_to_bytes
 from probe_kit.intervene.pairs import Pair
 from probe_kit.intervene.places import TILES
 from probe_kit.intervene.replay import ConditionContext
