@@ -3,7 +3,6 @@
 The knowledge of a target is that of `probe-kit train`'s probes, which the run stores too.
 """
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from copy import copy
@@ -186,7 +185,7 @@ def diagnose_run(
     Raises UsageError for a model that does not act, a run with too few groups, an unknown input, a pair of a frame
     that the run lacks, or a base with other inputs, and of a target what `train_probes` raises.
     """
-    from probe_kit.intervene.open_session import open_session
+    from probe_kit.intervene.open_session import load_policy_of, open_session
     from probe_kit.intervene.sessions import ReplaySource
 
     check_network(run)
@@ -197,7 +196,7 @@ def diagnose_run(
     if target is not None:
         progress("probes")
     knowledge = None if target is None else measure_knowledge(run, target, seed)
-    base_policy = None if base is None else _load_base(run, source, base, load)
+    base_policy = None if base is None else (load or load_policy_of)(run, replace(source, checkpoint=base))
     settings = {
         "format": FORMAT,
         "stamp": run.stamp,
@@ -240,16 +239,16 @@ def check_network(run: "Run") -> None:
 
 
 def load_diagnosis(run: "Run", key: str) -> Diagnosis:
-    """A stored diagnosis, without a target. Raises RunDamagedError if it was changed."""
+    """A stored diagnosis, without a target.
+
+    Raises RunDamagedError if it was changed, or another version of probe_kit made it.
+    """
     bundle = read_bundle(run.location, DIAGNOSES, key)
     bundle.check_format(FORMAT)
-    return Diagnosis.from_json(json.loads(bundle.read(FILE)))
-
-
-def _load_base(run: "Run", source: "ReplaySource", checkpoint: str, load: "LoadPolicy | None") -> "Policy":
-    from probe_kit.intervene.open_session import load_policy_of
-
-    return (load or load_policy_of)(run, replace(source, checkpoint=checkpoint))
+    try:
+        return Diagnosis.from_json(bundle.read_json(FILE))
+    except ValueError as error:
+        raise bundle.damaged(FILE, "has other fields: another version of probe_kit made it") from error
 
 
 def check_base(run: "Run", source: "ReplaySource", base: str) -> None:

@@ -142,7 +142,7 @@ Frames of one episode are alike, and the unit of tests is its group: more of the
 """
 
 
-class ObservedSession(ReplaySession):
+class FrameSession(ReplaySession):
     """A policy and frames of recordings, or first observations of an environment.
 
     vary: the input that the source has of its donor. frames_each: of an episode. table: pairs of the user's own,

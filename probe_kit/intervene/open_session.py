@@ -9,7 +9,7 @@ from probe_kit.errors import SettingsMismatchError, UsageError
 from probe_kit.hooks.checkpoints.checkpoint import cached_folder, pinned_commits
 from probe_kit.hooks.contract.card import EMBEDDED
 from probe_kit.hooks.family import SIZE
-from probe_kit.intervene.frame_session import Frames, ObservedSession
+from probe_kit.intervene.frame_session import Frames, FrameSession
 from probe_kit.intervene.pairs import Pair, PairRow
 from probe_kit.intervene.scene_session import SceneSession
 from probe_kit.intervene.sessions import LoadPolicy, ReplaySession, ReplaySource
@@ -114,7 +114,7 @@ def open_session(
             check_pairs(table, frames.by_name)
             if choice is not None:
                 frames.check_varied(choice.varied)
-            session = ObservedSession(run, policy().with_cameras(list(frames.cameras)), frames, choice)
+            session = FrameSession(run, policy().with_cameras(list(frames.cameras)), frames, choice)
         check_policy(run, session.policy)
         on_failure.pop_all()
     return session
