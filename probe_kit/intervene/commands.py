@@ -307,7 +307,7 @@ def list_runs(
 
 
 def _facts(run: "Run") -> dict[str, Any]:
-    from probe_kit.intervene.results import listed_interventions
+    from probe_kit.intervene.inventory import listed_interventions
     from probe_kit.runs.reader import full_name
     from probe_kit.train.results.inventory import inventory
 
@@ -363,7 +363,7 @@ def show(
     recorded action has an error of 1. `--json` prints every episode too; `probe-kit labels RUN` writes the
     error of every frame. An unfinished run needs --partial for it.
     """
-    from probe_kit.intervene.results import listed_interventions
+    from probe_kit.intervene.inventory import listed_interventions
     from probe_kit.runs import label_run, open_run
     from probe_kit.runs.layout import INTERVENTIONS
     from probe_kit.runs.provenance import input_notes

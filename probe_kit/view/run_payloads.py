@@ -18,7 +18,8 @@ from probe_kit.diagnose.results import diagnosis_table
 from probe_kit.env.scoring import RULES
 from probe_kit.errors import RunDamagedError
 from probe_kit.hooks.contract.sites import Site
-from probe_kit.intervene.results import InterventionResult, listed_interventions
+from probe_kit.intervene.inventory import listed_interventions
+from probe_kit.intervene.results import InterventionResult
 from probe_kit.intervene.stored import stored_interventions
 from probe_kit.retention import RetentionRow
 from probe_kit.retention.columns.columns import (
@@ -78,7 +79,10 @@ def _packed(values: ArrayLike, kind: str) -> Packed:
 
 
 def code_words(words: Sequence[Any]) -> dict[str, Any]:
-    """`words` once each, and a `codes` entry per place; None stays None."""
+    """`words` once each, and a `codes` entry per place; None stays None.
+
+    A column of a large run repeats few words thousands of times.
+    """
     distinct = list(dict.fromkeys(words))
     code = {word: number for number, word in enumerate(distinct)}
     return {"words": distinct, "codes": [code[word] for word in words]}
@@ -90,7 +94,7 @@ def rounded(value: Any, digits: int = 4) -> float | None:
 
 
 def payload_script(name: str, value: Any, places: tuple[str, ...] = ()) -> bytes:
-    """The script `put(name, value)` in ASCII.
+    """The script `put(name, value)` in ASCII. A page that is opened as a file may load scripts, and fetch nothing.
 
     Text of `value` has visible signs in place of control and direction characters, and the last part alone of
     `places` and other absolute paths. No `<` is left, so that no text can end the script.
@@ -109,7 +113,7 @@ def _script(function: str, name: str, value: Any) -> bytes:
 
 
 def _encode(value: Any, places: tuple[str, ...]) -> Any:
-    if isinstance(value, Packed):
+    if isinstance(value, Packed):  # before text, which it is too: base64 has nothing to escape, and is long
         return value
     if isinstance(value, str):
         return without_places(terminal_safe(value), places)

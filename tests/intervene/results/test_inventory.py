@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from probe_kit.cli import app
 from probe_kit.errors import RunDamagedError
 from probe_kit.intervene import ConceptErasure, ImageSwap, load_effects
-from probe_kit.intervene.results import listed_interventions
+from probe_kit.intervene.inventory import listed_interventions
 from probe_kit.intervene.settings import FORMAT, key_of, settings_of
 from probe_kit.intervene.stored import stored_interventions
 from probe_kit.runs import Run, open_run
