@@ -95,7 +95,7 @@ def control_names(count: int) -> tuple[str, ...]:
     return tuple(f"control-{number + 1}" for number in range(count))
 
 
-def fit_token_directions(
+def fit_directions_in_cells(
     session: ReplaySession,
     cells: Sequence[Cell],
     patterns: Sequence[str],
@@ -121,11 +121,11 @@ def fit_token_directions(
     items = items_of(session.run, categories, None)
     passed_over = PassedOver(session, patterns)
     fitted: dict[Cell, Directions] = {}
-    if ":" not in direction:
+    if ":" not in direction:  # of the mean over tokens, which the run stores: no inference is made
         in_run = tuple(dict.fromkeys(session.categories_of(items)))
         for cell in cells:
             with passed_over.fitting(cell):
-                fitted[cell] = fit_directions(
+                fitted[cell] = fit_pooled_directions(
                     session.run, cell.site_group.only_site, cell.role, direction, controls, seed, in_run
                 )
         return passed_over.left(fitted)
@@ -205,7 +205,7 @@ def view_of(role: str) -> str:
     return "mean" if role == "all" else f"mean:{role}"
 
 
-def fit_directions(
+def fit_pooled_directions(
     run: Run,
     site: Site,
     role: str,

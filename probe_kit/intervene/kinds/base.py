@@ -248,10 +248,10 @@ class AlongDirection(Intervention):
     def fit_directions(
         self, session: "ReplaySession", cells: Sequence[Cell], patterns: Sequence[str]
     ) -> "dict[Cell, Directions]":
-        """Return its direction and the random ones in every cell; see `directions.fit_token_directions`."""
-        from probe_kit.intervene.directions import fit_token_directions
+        """Return its direction and the random ones in every cell; see `directions.fit_directions_in_cells`."""
+        from probe_kit.intervene.directions import fit_directions_in_cells
 
-        return fit_token_directions(
+        return fit_directions_in_cells(
             session,
             cells,
             patterns,
