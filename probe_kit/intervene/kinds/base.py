@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 Values = NDArray[np.float64]
 CONTROL = "control-"
-"""The names of random directions begin with it, and so they are told from others in stored results."""
+"""The names of random directions begin with it, by which stored results tell them apart."""
 OPTIONS = ("sites", "roles", "direction", "controls", "coefficients", "target_side", "seed")
 """Options of the command that a kind may take."""
 
