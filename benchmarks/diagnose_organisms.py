@@ -21,7 +21,8 @@ from probe_kit.diagnose.inputs import frames_of
 from probe_kit.diagnose.results import count_groups
 from probe_kit.extract import EnvSource, ExtractSettings, extract_run
 from probe_kit.hooks.families.pi0.adapter import load_pi0_tiny
-from probe_kit.intervene.sessions import ReplaySource, open_session
+from probe_kit.intervene.open_session import open_session
+from probe_kit.intervene.sessions import ReplaySource
 from probe_kit.runs import Run
 from probe_kit.suite import build_suite
 from tests.support.acting_checkpoints import GOLDEN, knowing

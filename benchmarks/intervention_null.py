@@ -26,10 +26,10 @@ from probe_kit.hooks import Policy, load_policy
 from probe_kit.intervene import ConditionOutcomes, ImageSwap, Interchange, ReplaySession, ReplaySource
 from probe_kit.intervene.kinds.image_swap import image_swap_effects
 from probe_kit.intervene.kinds.interchange import patch_effects
-from probe_kit.intervene.outcomes import EPISODES, Measurement
-from probe_kit.intervene.places import Pair
+from probe_kit.intervene.open_session import open_session
+from probe_kit.intervene.pairs import Pair
 from probe_kit.intervene.replay import replay
-from probe_kit.intervene.sessions import open_session
+from probe_kit.intervene.stored import EPISODES, Measurement
 from probe_kit.intervene.verdict import classify_behaviour
 from probe_kit.runs import Run
 from probe_kit.statistics.significance import SIGNIFICANCE

@@ -21,7 +21,7 @@ from probe_kit.intervene.commands import PairTable
 if TYPE_CHECKING:
     from probe_kit.extract.extraction import Extraction
     from probe_kit.intervene import ReplaySource
-    from probe_kit.intervene.outcomes import PairRow
+    from probe_kit.intervene.pairs import PairRow
     from probe_kit.runs import Run
     from probe_kit.runs.plan import Row
     from probe_kit.runs.store import Location
@@ -100,7 +100,7 @@ def diagnose(
     """
     from probe_kit.diagnose.diagnosis import diagnose_run
     from probe_kit.diagnose.inputs import names_of, read_paraphrases
-    from probe_kit.intervene.places import read_pairs
+    from probe_kit.intervene.pairs import read_pairs
     from probe_kit.train.command_options import TargetOptions
 
     # A camera's name is known once the source is open; any other mistake is said before.
@@ -210,7 +210,7 @@ def _prepared(
     from probe_kit.diagnose.diagnosis import check_base_files
     from probe_kit.extract import prepare
     from probe_kit.extract.commands import print_plan
-    from probe_kit.intervene.places import check_pairs
+    from probe_kit.intervene.open_session import check_pairs
     from probe_kit.runs.store import locate
 
     in_scene = not {"dataset", "env", "pictures"} & set(typed)
@@ -247,7 +247,7 @@ Planned = tuple[str, Sequence[Any], list[str]]
 def _planned(name: str, typed: Mapping[str, Any], request: _Request, out_folder: str | None) -> Planned:
     """Return what a diagnosis of this run, or of a planned one, would exchange and patch."""
     from probe_kit.diagnose.inputs import cameras_of
-    from probe_kit.intervene.outcomes import has_sides
+    from probe_kit.intervene.settings import has_sides
 
     if _is_run(name, typed):
         run = _stored(name, request)

@@ -3,7 +3,6 @@
 The knowledge of a target is that of `probe-kit train`'s probes, which the run stores too.
 """
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from copy import copy
@@ -34,9 +33,11 @@ from probe_kit.extract.sources.inputs import STATE, with_input
 from probe_kit.hooks.contract.card import EMBEDDED
 from probe_kit.hooks.contract.sites import KV_STREAM
 from probe_kit.hooks.family import SIZE
-from probe_kit.intervene.outcomes import PairRow, key_of
+from probe_kit.intervene.pairs import Chunk, Given, Pair, PairRow
 from probe_kit.intervene.patching.patch import Cell, patched
-from probe_kit.intervene.places import ALL, Chunk, Given, Pair, SiteGroup, resolve_sites, roles_of_tokens
+from probe_kit.intervene.places import ALL, SiteGroup, resolve_sites
+from probe_kit.intervene.settings import key_of
+from probe_kit.intervene.tokens import PairTokens, roles_of_tokens
 from probe_kit.runs.layout import DIAGNOSES
 from probe_kit.runs.reader import origin_of
 from probe_kit.runs.records import as_json
@@ -118,12 +119,12 @@ def measure_passage(
         donated, donor = _captured(session, pair.source, pair.seed, places)
         change = scale.changes(donated[None], clean[None])[0]
         squares[row] = change @ change
-        memo: dict[object, object] = {}
+        tokens = PairTokens(model, pair)
         for column, group in enumerate(places):
             differences[row, column] = _relative_difference(group, before, donor)
             # Elsewhere the patch would put in what is there already: an inference saved, and a share of 0.
             if squares[row] and differences[row, column] > LIKE_NONE:
-                with patched(model, pair, [Cell(group, ALL)], donor, memo=memo):
+                with patched(tokens, [Cell(group, ALL)], donor):
                     edited = session.act(pair.clean, pair.seed)
                 moved[row, column] = scale.changes(edited[None], clean[None])[0] @ change
     # A ratio of sums: pairs whose action hardly changes have little weight.
@@ -187,7 +188,8 @@ def diagnose_run(
     Raises UsageError for a model that does not act, a run with too few groups, an unknown input, a pair of a frame
     that the run lacks, or a base with other inputs, and of a target what `train_probes` raises.
     """
-    from probe_kit.intervene.sessions import ReplaySource, open_session
+    from probe_kit.intervene.open_session import load_policy_of, open_session
+    from probe_kit.intervene.sessions import ReplaySource
 
     check_network(run)
     check_names(inputs, names_of(cameras_of(run)))
@@ -197,7 +199,7 @@ def diagnose_run(
     if target is not None:
         progress("probes")
     knowledge = None if target is None else measure_knowledge(run, target, seed)
-    base_policy = None if base is None else _load_base(run, source, base, load)
+    base_policy = None if base is None else (load or load_policy_of)(run, replace(source, checkpoint=base))
     settings = {
         "format": FORMAT,
         "stamp": run.stamp,
@@ -240,16 +242,16 @@ def check_network(run: "Run") -> None:
 
 
 def load_diagnosis(run: "Run", key: str) -> Diagnosis:
-    """A stored diagnosis, without a target. Raises RunDamagedError if it was changed."""
+    """A stored diagnosis, without a target.
+
+    Raises RunDamagedError if it was changed, or another version of probe_kit made it.
+    """
     bundle = read_bundle(run.location, DIAGNOSES, key)
     bundle.check_format(FORMAT)
-    return Diagnosis.from_json(json.loads(bundle.read(FILE)))
-
-
-def _load_base(run: "Run", source: "ReplaySource", checkpoint: str, load: "LoadPolicy | None") -> "Policy":
-    from probe_kit.intervene.sessions import load_policy_of
-
-    return (load or load_policy_of)(run, replace(source, checkpoint=checkpoint))
+    try:
+        return Diagnosis.from_json(bundle.read_json(FILE))
+    except ValueError as error:
+        raise bundle.damaged(FILE, "has other fields: another version of probe_kit made it") from error
 
 
 def check_base(run: "Run", source: "ReplaySource", base: str) -> None:

@@ -27,10 +27,11 @@ from probe_kit.statistics.bootstrap import unbounded_student_interval
 from probe_kit.statistics.paired_tests import least_column_p, max_t
 from probe_kit.statistics.significance import SIGNIFICANCE
 
+# The first two are choices, which `docs/diagnose.md` states as the rule.
 DECIDES = 0.5
-"""Of what all inputs change together: from here on an input decides."""
+"""Of what all inputs change together: from here on an input decides, because it outweighs all others together."""
 TRACE = 0.01
-"""Of the variance: a tenth of the actions' spread. An effect below it does not matter."""
+"""Of the variance: a tenth of the actions' spread, squared. An effect below it does not matter."""
 LEAST_SPREAD = 1e-3
 """Of the largest spread of a number of the action: numbers with less are constant but for rounding.
 

@@ -27,10 +27,10 @@ from probe_kit.extract.sources.inputs import (
 )
 from probe_kit.hooks.contract.card import shown_cameras
 from probe_kit.hooks.contract.observation import Observation
-from probe_kit.intervene.sessions import ObservedSession
+from probe_kit.intervene.frame_session import FrameSession
 
 if TYPE_CHECKING:
-    from probe_kit.intervene.outcomes import PairRow
+    from probe_kit.intervene.pairs import PairRow
     from probe_kit.intervene.sessions import ReplaySession
     from probe_kit.runs import Run
 
@@ -134,7 +134,7 @@ def frames_of(
 
     paraphrases: by instruction, other words of the same meaning. Raises UsageError for a run with too few groups.
     """
-    listed = _observed(session, count) if isinstance(session, ObservedSession) else _drawn(session, count)
+    listed = _observed(session, count) if isinstance(session, FrameSession) else _drawn(session, count)
     frames = [_read(frame, paraphrases) for frame in listed]
     _check_groups(frames, lambda: f"{session.run.location} has", "Extract more episodes or items")
     return frames
@@ -148,7 +148,7 @@ def tabled_frames(
     table: of frames that the run has, which `open_session` checks. Of the scene they are first frames.
     paraphrases: as in `frames_of`. Raises UsageError for clean frames of too few groups.
     """
-    if isinstance(session, ObservedSession):
+    if isinstance(session, FrameSession):
         by_name = session.frames.by_name
     else:
         names = {name for row in table for name in (row[0], row[2])}
@@ -177,7 +177,7 @@ def _read(frame: Frame, paraphrases: Mapping[str, str]) -> Frame:
     return replace(frame, observe=lambda _: observation, other_words=other_words)
 
 
-def _observed(session: ObservedSession, count: int) -> Iterator[Frame]:
+def _observed(session: FrameSession, count: int) -> Iterator[Frame]:
     """Frames of recordings or of an environment: one of every group in turn, spread over groups and episodes."""
     by_group: dict[str, list[Frame]] = {}
     for frame in session.frames.index:

@@ -22,7 +22,10 @@ if TYPE_CHECKING:
     from probe_kit.hooks.contract.observation import Observation
 
 DONORS = 6
-"""For each frame: one donor alone often asks for the same action by chance. Inferences grow with their number."""
+"""Donors of each frame. One alone often asks for the same action by chance; inferences grow with their number.
+
+With six, and 24 frames, no verdict on the organisms of `docs/notes/causal.md` is wrong.
+"""
 Actions = NDArray[np.float32]
 Infer = Callable[[Sequence["Observation"], Sequence[int]], Actions]
 """From observations and seeds to actions (B, chunk, D), in any unit; deterministic for a seed."""

@@ -37,7 +37,10 @@ MATTERS: tuple[Verdict, ...] = ("decides", "moves")
 IDLE: tuple[Verdict, ...] = ("no effect", "does not arrive")
 """Verdicts that an input does not matter; `open` is none."""
 INPUTS_DECIDE = 0.25
-"""Of the variance of the actions: where all inputs together change less, the seed decides and no input does."""
+"""Of the variance of the actions: where all inputs together change less, the seed decides and no input does.
+
+A choice: half of the spread, which is a quarter of the variance.
+"""
 CARRIES = 0.5
 """Share of the change of the action from which a site is said to carry an input."""
 LIKE_NONE = 1e-6

@@ -74,6 +74,9 @@ REST_STEPS = 5
 class Trial:
     """An episode of one question, started in a scene that was just reset.
 
+    The scene knows arm, cube and tiles; the trial knows the question, and by Act2Answer's rules when it is over.
+    It is not called an episode, which is the planned question with its layout (`suite.items.Episode`).
+
     executed: the last action (7,) as executed: after the limits, no motion where the arm could
     not follow, and the gripper that was really commanded. None before the first.
     """

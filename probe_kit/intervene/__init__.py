@@ -27,11 +27,12 @@ if TYPE_CHECKING:
     )
     from probe_kit.intervene.kinds.joint import JointEffect, JointPlaces, stored_joint_places
     from probe_kit.intervene.kinds.steer import Steering
-    from probe_kit.intervene.outcomes import ConditionOutcomes, stored_interventions
+    from probe_kit.intervene.outcomes import ConditionOutcomes
     from probe_kit.intervene.patching.attribution import AttributionEffect
     from probe_kit.intervene.results import InterventionResult, load_effects
     from probe_kit.intervene.runner import run_intervention
     from probe_kit.intervene.sessions import ReplaySession, ReplaySource
+    from probe_kit.intervene.stored import stored_interventions
     from probe_kit.intervene.verdict import Behaviour, Places, UseVerdict, classify_all, classify_use
     from probe_kit.runs.direction_files import write_directions
 
@@ -114,7 +115,7 @@ __getattr__, __dir__ = lazy_names(
         "classify_all": "verdict",
         "load_effects": "results",
         "stored_image_swaps": "kinds.image_swap",
-        "stored_interventions": "outcomes",
+        "stored_interventions": "stored",
         "write_directions": "probe_kit.runs.direction_files",
     },
 )

@@ -202,7 +202,7 @@ def intervene(
     probe-kit intervene runs/mine --kind interchange --sites "backbone.*"
     """
     from probe_kit.intervene import ReplaySource
-    from probe_kit.intervene.places import read_pairs
+    from probe_kit.intervene.pairs import read_pairs
     from probe_kit.runs import open_run
 
     opened = open_run(run, allow_partial=partial).in_wording(wording)
@@ -212,12 +212,12 @@ def intervene(
     }  # fmt: skip
     inside: dict[str, Any] = {
         "sites": sites, "roles": roles, "direction": direction, "controls": controls,
+        # Seed 0 is the default of every kind, and no kind without a seed refuses it.
         "coefficients": coefficients, "target_side": target_side, "seed": seed or None,
     }  # fmt: skip
     kind_options = {name: value for name, value in inside.items() if value is not None}
     check_options(kind, kind_options)
     intervention = kind_of(kind).from_options(opened, **of_every_kind, **kind_options)
-    intervention.check_run(opened)
     source = ReplaySource(
         suite, checkpoint, read_options(model_options or []), weights_seed, device, moved_of(opened, typed)
     )
@@ -244,26 +244,24 @@ def check_options(name: str, options: Mapping[str, Any]) -> None:
 def _run(run: "Run", intervention: "Intervention", source: "ReplaySource") -> "InterventionResult":
     """Run an intervention with progress; print a line if its result was stored before."""
     from probe_kit.intervene import run_intervention
-    from probe_kit.intervene.outcomes import check_run_fits, is_stored, key_of, settings_of
-    from probe_kit.intervene.places import unread_note
-    from probe_kit.intervene.runner import check_supported, too_few_groups, unread_sites
+    from probe_kit.intervene.runner import check_intervention, too_few_groups
+    from probe_kit.intervene.settings import key_of, settings_of
+    from probe_kit.intervene.stored import is_stored
     from probe_kit.statistics.sufficiency import groups_for_not_used
 
-    check_run_fits(run)
-    check_supported(run, intervention)
+    check_intervention(run, intervention)
     was_stored = is_stored(run.location, key_of(settings_of(intervention, run)))
     few = {} if was_stored else too_few_groups(run, intervention)
     if few:
         counts = ", ".join(f"{category_of(name).title} has {count}" for name, count in few.items())
         needed = groups_for_not_used()
         say_note(f"“not used” needs {needed} groups of items and cannot be found: {counts}. Extract more items.")
-    unread = () if was_stored else unread_sites(run, intervention)
-    if unread:
-        say_note(unread_note(unread))
     with progress() as bar:
         fitted = counter(bar, "items fitted on") if intervention.fits_first else None
         replayed = counter(bar, "items replayed")
-        result = run_intervention(run, intervention, source, progress=replayed, on_fit_progress=fitted)
+        result = run_intervention(
+            run, intervention, source, progress=replayed, on_fit_progress=fitted, on_note=say_note
+        )
     if was_stored:
         say("loaded the stored result; no model was run")
     return result
@@ -309,7 +307,7 @@ def list_runs(
 
 
 def _facts(run: "Run") -> dict[str, Any]:
-    from probe_kit.intervene.results import listed_interventions
+    from probe_kit.intervene.inventory import listed_interventions
     from probe_kit.runs.reader import full_name
     from probe_kit.train.results.inventory import inventory
 
@@ -365,7 +363,7 @@ def show(
     recorded action has an error of 1. `--json` prints every episode too; `probe-kit labels RUN` writes the
     error of every frame. An unfinished run needs --partial for it.
     """
-    from probe_kit.intervene.results import listed_interventions
+    from probe_kit.intervene.inventory import listed_interventions
     from probe_kit.runs import label_run, open_run
     from probe_kit.runs.layout import INTERVENTIONS
     from probe_kit.runs.provenance import input_notes

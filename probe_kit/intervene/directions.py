@@ -12,7 +12,6 @@ token. These are found in the tokens themselves.
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,10 +28,12 @@ from probe_kit.intervene.erasers import (
     fit_eraser,
     half_differences,
 )
-from probe_kit.intervene.outcomes import items_of
+from probe_kit.intervene.pairs import Pair
 from probe_kit.intervene.patching.patch import Cell
-from probe_kit.intervene.places import Pair, SiteGroup, resolve_all, token_mask
+from probe_kit.intervene.places import SiteGroup, resolve_all
 from probe_kit.intervene.sessions import ReplaySession
+from probe_kit.intervene.settings import items_of
+from probe_kit.intervene.tokens import token_mask
 from probe_kit.runs.direction_files import FileDirection
 from probe_kit.runs.run import Run
 from probe_kit.statistics.folds import Fold, grouped_folds
@@ -41,6 +42,7 @@ Vector = NDArray[np.float32]
 MEAN_DIFFERENCE, PROBE = "mean-difference", "probe"
 DIRECTIONS = (MEAN_DIFFERENCE, PROBE)
 FOLDS = 5
+"""Of groups; a direction used on an episode is fitted on the folds that its group is not in."""
 _ROUNDING = 1e-6
 """Share of a number's size below which a difference of stored float32 means is rounding."""
 EVERY_EPISODE = ""
@@ -77,34 +79,8 @@ class Directions:
         return np.float32(strength * self.halves[episode]) @ self.bases[name, episode]
 
 
-class Directed(Protocol):
-    """An intervention along directions: interchange, steering or closed loop."""
-
-    @property
-    def categories(self) -> tuple[str, ...] | None:
-        """Return the categories of the run; None for all."""
-
-    @property
-    def direction(self) -> str:
-        """Return its name, see `check_direction`."""
-
-    @property
-    def controls(self) -> int:
-        """Return the number of random ones."""
-
-    @property
-    def seed(self) -> int:
-        """Return the seed of controls and folds."""
-
-    @property
-    def vector(self) -> FileDirection | None:
-        """Return the direction of a file; None for one that is found here."""
-
-
-def check_direction(direction: str, vector: FileDirection | None = None) -> None:
-    """Raise UsageError for a name that is no direction to patch tokens within. vector: of a file."""
-    if vector is not None:
-        return
+def check_direction(direction: str) -> None:
+    """Raise UsageError for a name that is no direction to patch tokens within."""
     if direction.startswith(f"{MEAN_DIFFERENCE}:"):
         Method.of(direction)
     elif direction not in DIRECTIONS:
@@ -119,29 +95,38 @@ def control_names(count: int) -> tuple[str, ...]:
     return tuple(f"control-{number + 1}" for number in range(count))
 
 
-def fit_token_directions(
-    session: ReplaySession, intervention: Directed, cells: Sequence[Cell], patterns: Sequence[str]
+def fit_directions_in_cells(
+    session: ReplaySession,
+    cells: Sequence[Cell],
+    patterns: Sequence[str],
+    direction: str,
+    *,
+    controls: int,
+    seed: int,
+    categories: Sequence[str] | None,
+    vector: FileDirection | None,
 ) -> dict[Cell, Directions]:
-    """Return the meaning of an intervention's direction in every cell: of the run's columns, or of all its tokens.
+    """Return the meaning of a direction in every cell: of the run's columns, or of all its tokens.
 
     `mean-difference:K`: the K directions along which the differences of class means at all positions lie most, the
     same for every token; from one clean inference per episode and place. patterns: the places as they were named;
-    those of a wildcard may be left out. Raises UnknownSiteError for a place of several sites or one that is not
+    those of a wildcard may be left out. direction: its name, see `check_direction`. controls: how many random ones
+    beside it. seed: of controls and folds. categories: of the run, None for all. vector: the direction of a file;
+    None for one that is found here. Raises UnknownSiteError for a place of several sites or one that is not
     stored, NoDirectionError for a named place without a direction, UsageError where there are too few episodes to
     learn from.
     """
-    direction, controls, seed = intervention.direction, intervention.controls, intervention.seed
-    if intervention.vector is not None:
-        return {cell: _of_file(session, cell, intervention.vector, controls, seed) for cell in cells}
-    items = items_of(session.run, intervention.categories, None)
+    if vector is not None:
+        return {cell: _of_file(session, cell, vector, controls, seed) for cell in cells}
+    items = items_of(session.run, categories, None)
     passed_over = PassedOver(session, patterns)
     fitted: dict[Cell, Directions] = {}
-    if ":" not in direction:
-        categories = tuple(dict.fromkeys(session.categories_of(items)))
+    if ":" not in direction:  # of the mean over tokens, which the run stores: no inference is made
+        in_run = tuple(dict.fromkeys(session.categories_of(items)))
         for cell in cells:
             with passed_over.fitting(cell):
-                fitted[cell] = fit_directions(
-                    session.run, cell.site_group.only_site, cell.role, direction, controls, seed, categories
+                fitted[cell] = fit_pooled_directions(
+                    session.run, cell.site_group.only_site, cell.role, direction, controls, seed, in_run
                 )
         return passed_over.left(fitted)
     for cell, category, features in collect_token_features(session, items, cells):
@@ -220,7 +205,7 @@ def view_of(role: str) -> str:
     return "mean" if role == "all" else f"mean:{role}"
 
 
-def fit_directions(
+def fit_pooled_directions(
     run: Run,
     site: Site,
     role: str,
@@ -276,6 +261,7 @@ def _direction(training: NDArray[np.float64], is_left: NDArray[np.bool_], direct
     from sklearn.preprocessing import StandardScaler
 
     scaler = StandardScaler().fit(training)
+    # A strong penalty: features are many and episodes few.
     fitted = LogisticRegression(C=0.01, max_iter=1000).fit(scaler.transform(training), is_left)
     return _unit(fitted.coef_[0] / scaler.scale_)
 

@@ -22,6 +22,7 @@ RANK = 5
 FEWEST = 4
 """Episodes of either answer that a position must have in training; with fewer it is left as it is."""
 _TINY = 1e-10
+"""Relative size of float64 sums below which a number is rounding."""
 NO_DIRECTION = (
     "the class means of left and right are equal, as before a layer combines picture and instruction; choose "
     "later --sites or other --roles (to patch whole tokens only: --direction none)"
@@ -144,6 +145,7 @@ def fit_control(
     usable = eraser.fitted
     if method.way == "leace":
         answer = _answer(tokens, is_left)
+        # Without its part along the answer, so that erasing the label takes nothing of the answer with it.
         label = np.where(tokens.present, draw.normal(size=len(is_left))[:, None], 0.0)
         share = (label * answer).sum(axis=0) / np.maximum((answer**2).sum(axis=0), _TINY)
         label = np.where(tokens.present, label - share * answer, 0.0)
@@ -256,6 +258,7 @@ def _inlp(
         for number in range(rank):
             past = directions[position, :number]
             residual = (values - (values @ past.T) @ past) / scale
+            # scikit-learn's default penalty, on values of unit spread.
             weights = LogisticRegression(C=1.0, max_iter=200).fit(residual, is_left[rows]).coef_
             if np.linalg.norm(weights) <= _TINY:
                 break

@@ -29,9 +29,9 @@ from probe_kit.intervene.kinds.joint import (
     is_read_jointly,
     stored_joint_places,
 )
-from probe_kit.intervene.outcomes import FIRST_CHUNK, PER_STEP
 from probe_kit.intervene.patching.attribution import LOCALISATION_SHARE
 from probe_kit.intervene.places import ALL, PlaceName, list_places, unread_places
+from probe_kit.intervene.settings import FIRST_CHUNK, PER_STEP
 from probe_kit.intervene.verdict import (
     Places,
     UseVerdict,
@@ -118,6 +118,7 @@ class StoredEvidence:
         return {name: self.verdict(name, encoded.get(name), ties.get(name, "")) for name in self.swaps}
 
 
+# The tie: is what probes read the thing that is used? Rules and words are those of `docs/causal.md`, *Tie*.
 TieAtSite = Literal["read", "unread", "another code", "in part", "not tested"]
 """read: a subspace that probes find carries the effect. unread: the whole site carries nothing, and is no part
 of several that are read together. another code: the site carries it, every such subspace nothing. in part:

@@ -14,7 +14,10 @@ from probe_kit.statistics.significance import SIGNIFICANCE
 
 Values = NDArray[np.float64]
 CARRIES, NOTHING = 0.5, 0.1
-"""Shares of the swap from which a set carries it, and below which, on both sides of 0, it carries nothing."""
+"""Shares of the swap from which a set carries it, and below which, on both sides of 0, it carries nothing.
+
+Choices. The second is `SMALLEST_SHARE_OF_INTEREST` of the image swap.
+"""
 
 
 class SwapShare(NamedTuple):
@@ -31,6 +34,7 @@ def share_of_whole(
     """Return Σ moved · whole / Σ whole² over episodes (E,), with its interval by groups (E,); None of nothing."""
     if not full.any():
         return None
+    # Items of a group share a picture and are not independent of each other, so that whole groups are drawn.
     names, group_of = np.unique(groups, return_inverse=True)
     above, below = np.bincount(group_of, moved * full), np.bincount(group_of, full**2)
     times = draw_groups(names.size, units_seed(groups, seed_text))
@@ -103,7 +107,7 @@ class Exchange:
     """The outputs of E clean inferences and of their sources.
 
     clean, source: (E,) numbers such as metres to the left. toward: (E,) ±1, where the source should move them.
-    groups, items: (E,). draws: text by which groups are drawn. flips: the seed of sign flips.
+    groups, items: (E,). seed_text: groups are drawn with a seed made of it. flips_seed: of sign flips.
     """
 
     clean: Values
@@ -111,8 +115,8 @@ class Exchange:
     toward: Values
     groups: NDArray[np.str_]
     items: NDArray[np.str_]
-    draws: str
-    flips: int
+    seed_text: str
+    flips_seed: int
 
     @property
     def full(self) -> Values:
@@ -146,14 +150,14 @@ class Exchange:
         """
         if min(self.p_values) >= SIGNIFICANCE:
             return None
-        return share_of_whole(moved, self.full, self.groups, self.draws)
+        return share_of_whole(moved, self.full, self.groups, self.seed_text)
 
     def test(self, moved: Values) -> tuple[Values, Values, Values]:
         """Return t, p and p_fwe (K,) that each of `moved` (K, E) is where the source leads.
 
         One-sided, by sign flips of whole groups; p_fwe against the largest t of all K.
         """
-        return max_t(self.leads * moved, self.items, self.groups, self.flips)
+        return max_t(self.leads * moved, self.items, self.groups, self.flips_seed)
 
     def readings(self, every: Values, alone: Values, lost: Values) -> Iterator[CellReading]:
         """Yield what C cells do.

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,8 +11,9 @@ from numpy.typing import NDArray
 from probe_kit.hooks.capturing.edits import LOG_FIELDS, EditLog
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.intervene.outcomes import CLEAN, CONTROL_INPUT, DONOR, IMAGE_SWAP, ConditionOutcomes
+from probe_kit.intervene.pairs import Chunk, Given, Pair
 from probe_kit.intervene.patching.patch import Cell, patched
-from probe_kit.intervene.places import Chunk, Given, Pair
+from probe_kit.intervene.tokens import PairTokens
 
 if TYPE_CHECKING:
     from probe_kit.hooks import ActivationCache
@@ -23,14 +25,18 @@ if TYPE_CHECKING:
 class ConditionContext:
     """One pair, with what its conditions share.
 
-    memo: results of one condition that another needs as well, by name. clean: (chunk, D) of the first condition,
-    empty before that was played.
+    clean: (chunk, D) of the first condition, empty before that was played.
     """
 
     session: "ReplaySession"
     pair: Pair
-    memo: dict[Any, Any] = field(default_factory=dict)
     clean: Chunk = field(default_factory=lambda: np.zeros((0, 7), np.float32))
+    _source: "ActivationCache | None" = field(default=None, init=False, repr=False)
+
+    @cached_property
+    def tokens(self) -> PairTokens:
+        """The tokens of the clean input."""
+        return PairTokens(self.session.policy, self.pair)
 
     def act(self) -> Chunk:
         """Return (chunk, D), the action on the clean input."""
@@ -40,12 +46,10 @@ class ConditionContext:
         """Return the activations of all these sites in the source's inference; made once."""
         from probe_kit.hooks import capture
 
-        if "source" not in self.memo:
-            with capture(self.session.policy, sites) as activations:
+        if self._source is None:
+            with capture(self.session.policy, sites) as self._source:
                 self.session.act(self.pair.source, self.pair.seed)
-            self.memo["source"] = activations
-        source: ActivationCache = self.memo["source"]
-        return source
+        return self._source
 
 
 @dataclass(frozen=True)
@@ -68,11 +72,13 @@ class ConditionResult:
 class Condition:
     """One way of making an inference again.
 
-    name: tells it from the others of its intervention. details: what `Intervention.extra_files` reads of it.
+    name: tells it from the others of its intervention. places: names of those that it edits, by which it is known
+    whether anything reads them. details: what `Intervention.extra_files` reads of it.
     """
 
     name: str
     play: Callable[[ConditionContext], ConditionResult] = field(repr=False)
+    places: tuple[str, ...] = ()
     details: Any = field(default=None, repr=False)
 
 
@@ -112,16 +118,15 @@ def patched_run(
     """
 
     def play(context: ConditionContext) -> ConditionResult:
-        pair = context.pair
-        patches = cells.get(pair.category, cells.get("", ()))
+        patches = cells.get(context.pair.category, cells.get("", ()))
         if not patches:
             return ConditionResult(context.act())
-        along = None if bases is None else bases.basis(direction, pair.episode)
-        source = context.source(source_sites)
-        with patched(context.session.policy, pair, patches, source, along, memo=context.memo) as edit_log:
+        along = None if bases is None else bases.basis(direction, context.pair.episode)
+        with patched(context.tokens, patches, context.source(source_sites), along) as edit_log:
             return ConditionResult(context.act(), edit_log)
 
-    return Condition(name, play)
+    places = (cell.site_group.name for together in cells.values() for cell in together)
+    return Condition(name, play, tuple(dict.fromkeys(places)))
 
 
 AttentionRecord = tuple[int, int, NDArray[np.float32], NDArray[np.float32] | None]
@@ -172,6 +177,7 @@ def replay(session: "ReplaySession", pairs: Sequence[Pair], conditions: Sequence
         outcomes.replay_error[column] = session.replay_error(pair, clean)
         chunks.append([])
         for number, condition in enumerate(conditions):
+            # The clean inference is not made again: `replay_error` has compared it with the run's.
             played = condition.play(context) if number else ConditionResult(clean)
             outcomes.displacement[number, column] = session.displacement(played.chunk, pair) + played.estimated
             outcomes.max_action_change[number, column] = float(np.abs(played.chunk - clean).max())

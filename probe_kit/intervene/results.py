@@ -1,8 +1,7 @@
 """The result of an intervention: a table, the verdicts, the ways to write them down, and what a run stores."""
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from copy import copy
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property
@@ -15,30 +14,25 @@ from probe_kit._system.counting import counted
 from probe_kit._system.escaping import csv_of_frame
 from probe_kit.errors import NoProbesError
 from probe_kit.intervene.evidence import StoredEvidence, which_layer
-from probe_kit.intervene.kinds import kind_names, kind_of
+from probe_kit.intervene.kinds import kind_of
 from probe_kit.intervene.kinds.base import Intervention, frame_of
 from probe_kit.intervene.kinds.image_swap import ImageSwapEffect
-from probe_kit.intervene.outcomes import (
+from probe_kit.intervene.outcomes import ConditionOutcomes, Effect
+from probe_kit.intervene.places import unread_note
+from probe_kit.intervene.settings import PER_STEP, key_of
+from probe_kit.intervene.stored import (
     CERTIFICATE,
     EFFECTS,
     EPISODES,
-    PER_STEP,
-    ConditionOutcomes,
-    Effect,
     Measurement,
     find_stored,
     is_stored,
-    key_of,
-    read_interventions,
-    stored_interventions,
 )
-from probe_kit.intervene.places import unread_note
 from probe_kit.intervene.verdict import UseVerdict, describe_readouts, size_of_groups
 from probe_kit.runs.layout import INTERVENTIONS
 from probe_kit.runs.reader import RunReader
 from probe_kit.runs.records import as_json
 from probe_kit.runs.results import tidy_bundle, write_bundle
-from probe_kit.runs.run import Run
 from probe_kit.statistics.paired_tests import smallest_flip_p
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.suite.categories import category_of
@@ -160,12 +154,20 @@ class InterventionResult(Measurement):
         return *self._kind.sentences(self.effects, self), *self._which_layer(None)
 
     def to_rich(self, details: bool = True) -> "Table":
-        """The table for a terminal. details: split it where it is wide, else leave columns out by name."""
-        _ = self.legend  # effects and verdicts are computed once, for this table and for sentences
-        context = copy(self)
-        context.__dict__["explains"] = details
-        table = self._kind.table(self.effects, context)
-        return replace(table, overflow="split" if details else "leave out")
+        """The table for a terminal.
+
+        details: split it where it is wide, and say below it what each verdict rests on; else leave columns out by
+        name.
+        """
+        table = self._kind.table(self.effects, self)
+        if not details:
+            return replace(table, overflow="leave out")
+        reasons = [
+            f"{category_of(name).title}: {verdict.explanation}"
+            for name, verdict in (self.verdicts if self._kind.has_verdict else {}).items()
+            if verdict.explanation
+        ]
+        return replace(table, overflow="split", notes=("; ".join([*table.notes, *reasons]),))
 
     @property
     def legend(self) -> str:
@@ -209,7 +211,7 @@ def load_effects(run: RunReader, key: str | None = None, kind: str | None = None
     Raises NoInterventionsError, UsageError for a key that is not there, RunDamagedError if it was changed.
     """
     result = InterventionResult.of_stored(find_stored(run, key, kind))
-    _ = result.outcomes, result.certificate  # what was changed is said now
+    _ = result.outcomes, result.certificate  # read now, so that a changed file is refused here and not in a table
     return result
 
 
@@ -250,86 +252,3 @@ def save(
     now = datetime.now(UTC).isoformat(timespec="microseconds")
     write_bundle(run.location, INTERVENTIONS, key, {"settings": dict(settings)}, files, {"created": now})
     return key
-
-
-# -- what a run stores ---------------------------------------------------------------------------------------
-
-COMMON = frozenset(
-    {"format", "kind", "run_settings", "stamp", "weights", "wording", "categories", "items", "readout", "donors"}
-)
-"""Settings of every intervention; the rest of its settings is its kind's own."""
-
-
-@dataclass(frozen=True)
-class ListedIntervention:
-    """One stored intervention.
-
-    state: `used` by verdicts, tables and figures, or of a kind that none of them reads; `other` if others say all
-    that it says, of more episodes or newly; `other episodes` if the run has others by now. parameters: the
-    settings of its kind alone, as stored.
-    """
-
-    key: str
-    state: str
-    created: str
-    kind: str
-    categories: tuple[str, ...]
-    items: int | None
-    wording: str
-    parameters: Mapping[str, Any]
-
-    @property
-    def words(self) -> str:
-        """Return a line about it."""
-        parts = [f"{self.kind} of {', '.join(self.categories)}"]
-        parts += [] if self.items is None else [f"{counted(self.items, 'item')} each"]
-        parts += [f"wording {self.wording}"] * bool(self.wording)
-        for name, value in self.parameters.items():
-            if value not in (None, []):
-                parts.append(f"{name} {', '.join(map(str, value)) if isinstance(value, list) else value}")
-        parts += ["another one stands in its place in tables"] * (self.state == "other")
-        parts += ["of other episodes than the run has now"] * (self.state == "other episodes")
-        return "; ".join([*parts, f"made {self.created[:16].replace('T', ' ')} UTC"])
-
-
-def listed_interventions(run: Any) -> list[ListedIntervention]:
-    """All of a run, oldest first. Raises RunDamagedError if one was changed."""
-    readers: list[RunReader] = [run.in_wording(name) for name in run.wordings] or [run]
-    current: set[str] = set()
-    used: set[str] = set()
-    for reader in readers:
-        by_kind: dict[str, set[str]] = {}
-        for stored in stored_interventions(reader):
-            by_kind.setdefault(str(stored.settings["kind"]), set()).add(stored.key)
-        for name, keys in by_kind.items():
-            # Keys of what is read, and of the kinds of which nothing takes another's place.
-            preferred = kind_of(name).keys_in_use(reader) if name in kind_names() else None
-            used |= keys if preferred is None else preferred
-            current |= keys
-    listed = []
-    for key, bundle in read_interventions(run.location).items():
-        settings = bundle.head["settings"]
-        intervention = ListedIntervention(
-            key=key,
-            state="used" if key in used else "other" if key in current else "other episodes",
-            created=bundle.times.get("created", ""),
-            kind=str(settings["kind"]),
-            categories=tuple(map(str, settings["categories"])),
-            items=settings.get("items"),
-            wording=str(settings.get("wording") or ""),
-            parameters={name: value for name, value in settings.items() if name not in COMMON},
-        )
-        listed.append(intervention)
-    return sorted(listed, key=lambda intervention: (intervention.created, intervention.key))
-
-
-def readers_of_results(run: Run) -> Iterator[Callable[[], object]]:
-    """A function per stored intervention, which reads all of it. Raises RunDamagedError where one is none.
-
-    Those of episodes that the run has no more are listed alone, as reading does.
-    """
-    read_interventions(run.location)
-    for wording in run.wordings or (None,):
-        reader = run if wording is None else run.in_wording(wording)
-        for stored in stored_interventions(reader):
-            yield InterventionResult.of_stored(stored).to_json

@@ -21,9 +21,10 @@ from probe_kit.hooks.capturing.edits import EditLog
 from probe_kit.hooks.contract.declared import PLAIN
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.intervene.outcomes import ConditionOutcomes
-from probe_kit.intervene.places import Chunk, Pair
+from probe_kit.intervene.pairs import Chunk, Pair
 from probe_kit.intervene.replay import AttentionRecord, Condition, ConditionContext, room_for, with_attention
-from probe_kit.intervene.sessions import ReplaySession, SceneSession
+from probe_kit.intervene.scene_session import SceneSession
+from probe_kit.intervene.sessions import ReplaySession
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Running an intervention: replay what is missing, store it, and read the result."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
@@ -12,20 +12,14 @@ from probe_kit.hooks.capturing.edits import LOG_FIELDS
 from probe_kit.hooks.registry import get_family
 from probe_kit.intervene.kinds.base import ConditionName, Intervention
 from probe_kit.intervene.kinds.image_swap import ImageSwap
-from probe_kit.intervene.outcomes import (
-    ConditionOutcomes,
-    arrays_of,
-    check_run_fits,
-    has_sides,
-    is_stored,
-    key_of,
-    settings_of,
-    with_texts,
-)
-from probe_kit.intervene.places import ALL, resolve_all, roles_of, unread_places
+from probe_kit.intervene.open_session import open_session
+from probe_kit.intervene.outcomes import ConditionOutcomes, arrays_of
+from probe_kit.intervene.places import ALL, resolve_all, roles_of, unread_note, unread_places
 from probe_kit.intervene.replay import Condition
 from probe_kit.intervene.results import InterventionResult, load_effects, save
-from probe_kit.intervene.sessions import LoadPolicy, Progress, ReplaySession, ReplaySource, open_session
+from probe_kit.intervene.sessions import LoadPolicy, Progress, ReplaySession, ReplaySource
+from probe_kit.intervene.settings import check_run_fits, has_sides, key_of, settings_of
+from probe_kit.intervene.stored import is_stored
 from probe_kit.runs.layout import INTERVENTIONS
 from probe_kit.runs.provenance import provenance_here
 from probe_kit.runs.results import Pieces, tidy_bundle
@@ -46,19 +40,19 @@ def run_intervention(
     load: LoadPolicy | None = None,
     progress: Progress | None = None,
     on_fit_progress: Progress | None = None,
+    on_note: Callable[[str], None] = lambda _: None,
 ) -> InterventionResult:
     """Intervene on a run's policy and store the result with the run; a stored result is loaded.
 
     intervention: `ImageSwap()` by default. source: where policy and pictures are, by default the embedded suite
     and the model's own checkpoint. load: how the policy is found, if not by its name. progress: called after every
     item replayed; on_fit_progress: after every item inferred before that, where directions or erasers are fitted.
+    on_note: called before the replay with a sentence about edits that cannot change anything; `notes` has it too.
     What was interrupted is continued. Raises UsageError for a run whose policy did not act, UnknownCategoryError,
     and what `open_session` raises.
     """
     intervention = intervention or ImageSwap()
-    check_run_fits(run)
-    intervention.check_run(run)
-    check_supported(run, intervention)
+    check_intervention(run, intervention)
     settings = settings_of(intervention, run)
     key = key_of(settings)
     if is_stored(run.location, key):
@@ -72,10 +66,13 @@ def run_intervention(
         check_roles(intervention, policy)
         items = intervention.eligible_items(session, requested)
         conditions = intervention.conditions(session)
+        places = [name for condition in conditions for name in condition.places]
+        unread = unread_places(places, policy.every_stream(), policy.interventions)
+        if unread:
+            on_note(unread_note(unread))
         progress = progress or notebook_progress("items replayed")
         outcomes = _replay_items(session, intervention, items, conditions, pieces, progress)
         extra_files = intervention.extra_files(session, conditions, outcomes)
-        places = [name for pattern, _ in intervention.patterns for name in resolve_all([pattern], policy)]
         certificate = {
             "policy": policy.card.to_json(),
             "provenance": provenance_here(policy.card.device, policy.card.dtype),
@@ -83,12 +80,12 @@ def run_intervention(
             "items": {"asked": len(requested), "played": len(items)},
             "supported": policy.interventions.to_json(),
             "edits": _ledgers(outcomes),
-            "unread": list(unread_places(places, policy.every_stream(), policy.interventions)),
+            "unread": list(unread),
             "passed_over": session.passed_over,
             **session.certificate,
         }
     save(run, settings, outcomes.in_spreads(), certificate, extra_files)
-    pieces.discard()
+    pieces.discard()  # only now: killed in between, the result is there, and the pieces are tidied away
     return load_effects(run, key)
 
 
@@ -113,16 +110,14 @@ def check_roles(intervention: Intervention, policy: "Policy") -> None:
             )
 
 
-def unread_sites(run: Run, intervention: Intervention) -> tuple[str, ...]:
-    """Places of an intervention that nothing reads, as the run's family declares, before anything is loaded."""
-    family = get_family(run.model)
-    if family is None:
-        return ()
-    return unread_places([pattern for pattern, _ in intervention.patterns], run.streams, family.interventions)
+def check_intervention(run: Run, intervention: Intervention) -> None:
+    """Raise, before anything is loaded, for a run that an intervention cannot be made on.
 
-
-def check_supported(run: Run, intervention: Intervention) -> None:
-    """Raise UnsupportedInterventionError, before anything is loaded, for what the run's family does not do."""
+    UsageError for a run without actions to compare or an option that does not apply to it, UnknownCategoryError,
+    UnsupportedInterventionError for what the run's family does not do.
+    """
+    check_run_fits(run)
+    intervention.check_run(run)
     if (family := get_family(run.model)) is not None:
         for kind in intervention.required_capabilities:
             family.check_intervention(kind)
@@ -151,13 +146,13 @@ def _replay_items(
     """Replay item by item; items of an interrupted attempt are loaded."""
     parts = []
     for number, item in enumerate(items):
-        name = f"{number:06d}"
-        stored = pieces.read(name)
+        name = f"{number:06d}"  # the key covers the items and their order, so that a number is always the same one
+        stored: dict[str, Any] | None = pieces.read(name, ConditionOutcomes)
         if stored is None:
             part = intervention.play(session, session.pairs(item), conditions)
             pieces.keep(name, arrays_of(part, ("seed_text",)))
         else:
-            part = ConditionOutcomes(**with_texts(stored, "conditions"))
+            part = ConditionOutcomes(**stored)
         parts.append(part)
         if progress is not None:
             progress(number + 1, len(items), item)

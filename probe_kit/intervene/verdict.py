@@ -1,7 +1,8 @@
 """The verdict: does the action use the answer, and where inside does it pass? Loads no model.
 
-`classify_use` alone makes a verdict. Three questions have answers of their own: the behaviour (of the image swap),
-the place (of interchanges) and the tie (is what probes read the thing that is used?).
+`classify_use` alone makes a verdict; `docs/causal.md` has its rules. Three questions have answers of their own:
+the behaviour (of the image swap), the place (of interchanges) and the tie (is what probes read the thing that is
+used?).
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -13,8 +14,8 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 from probe_kit._tables.numbers import whole_percent
 from probe_kit.hooks.contract.sites import KV_STREAM
 from probe_kit.intervene.kinds.image_swap import SMALLEST_SHARE_OF_INTEREST, ImageSwapEffect
-from probe_kit.intervene.outcomes import FIRST_CHUNK, PER_STEP
 from probe_kit.intervene.places import list_places
+from probe_kit.intervene.settings import FIRST_CHUNK, PER_STEP
 from probe_kit.statistics.significance import SIGNIFICANCE
 from probe_kit.statistics.sufficiency import SMALLEST_EFFECT_OF_INTEREST, groups_to_decide
 from probe_kit.suite.items import Side
@@ -33,6 +34,7 @@ Behaviour = Literal[
 ]
 USES: tuple[Behaviour, ...] = ("used", "partly used, one-sided", "partly used, graded")
 """Those in which the answer decides something."""
+# Choices, which `docs/causal.md` states as the rule; `docs/notes/causal.md` has how often they are wrong.
 DECIDES = 0.50
 """Net follow rate, and share of the reach, from which the answer decides; of the episodes of one side as well."""
 FEW = 0.10
@@ -229,6 +231,7 @@ class _Numbers(NamedTuple):
         is_beyond_half = decides or self.share_ends[0] > DECIDES
         if self.p >= SIGNIFICANCE:
             return None
+        # The first that holds: a policy that decides also moves.
         if is_beyond_half and self.follow >= DECIDES and self.share >= DECIDES:
             return "used"
         if is_moved and self.only_side is not None:
@@ -247,7 +250,7 @@ def classify_behaviour(effect: ImageSwapEffect, control: str | None) -> UseVerdi
     control: another category of the run that is used, which shows that use would have been seen; None if there is
     none, and then nothing is *not used*.
     """
-    for mirrored in (False, True):
+    for mirrored in (False, True):  # toward the correct picture, then the same rules against it
         numbers = _Numbers.of(effect, mirrored)
         behaviour = numbers.behaviour()
         if behaviour is not None:

@@ -11,7 +11,7 @@ Files are never written over: what changes gets another name, and counts when th
 
 import re
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass, fields
 from io import BytesIO
 from pathlib import PurePosixPath
 from typing import Annotated, Any, BinaryIO, ClassVar
@@ -272,6 +272,18 @@ def advice_for(folder: str) -> str:
     return f"Remove {folder} and run the same `probe-kit {_MAKERS[folder.partition('/')[0]]}` again"
 
 
+def fields_problem(record: type, names: Collection[str]) -> str:
+    """Return in what stored arrays are not the fields of a dataclass, for a message; empty if they are.
+
+    Fields with a default may be absent.
+    """
+    expected = fields(record)
+    absent = [field.name for field in expected if field.default is MISSING and field.name not in names]
+    unknown = sorted(set(names) - {field.name for field in expected})
+    parts = [f"lacks {', '.join(absent)}"] * bool(absent) + [f"holds {', '.join(unknown)}"] * bool(unknown)
+    return " and ".join(parts)
+
+
 # -- pieces of unfinished results --------------------------------------------------------------------------------
 
 
@@ -295,10 +307,12 @@ class Pieces:
         """Return the pieces of the bundle that will be stored as `home`/`key`."""
         return cls(run, f"{home}/.{key}{PARTIAL}", stamp, redo)
 
-    def read(self, name: str) -> dict[str, NDArray[Any]] | None:
+    def read(self, name: str, record: type) -> dict[str, NDArray[Any]] | None:
         """The arrays of one piece, or None if the work did not get that far.
 
-        Raises RunDamagedError if they were changed, or are another piece's or of other commits.
+        record: the dataclass whose fields they are; of several records, each has its name and a slash in front.
+        Raises RunDamagedError if they were changed, are another piece's or of other commits, or have the fields of
+        another version of probe_kit.
         """
         try:
             stored = self.run.read(self._key(name))
@@ -311,6 +325,11 @@ class Pieces:
                 f"episodes. Remove it; {self.redo}"
             )
         with open_arrays(stored) as arrays:
+            if problem := fields_problem(record, [field.rpartition("/")[2] for field in arrays]):
+                raise RunDamagedError(
+                    f"{self.run}/{self._key(name)} {problem}: another version of probe_kit began this. Remove "
+                    f"{self.folder}; {self.redo}"
+                )
             return dict(arrays)
 
     def keep(self, name: str, arrays: Mapping[str, NDArray[Any]]) -> None:

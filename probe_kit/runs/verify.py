@@ -149,7 +149,7 @@ _BATCH = 256
 """Objects that are handed to the threads at a time."""
 _RESULT_READERS = (
     "probe_kit.train.results.inventory:readers_of_results",
-    "probe_kit.intervene.results:readers_of_results",
+    "probe_kit.intervene.inventory:readers_of_results",
 )
 """Functions that give a reader per stored result of a run. They lie in folders above."""
 

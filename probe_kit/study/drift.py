@@ -33,7 +33,7 @@ from probe_kit.train.results.store import load_results
 Features = NDArray[np.float64]
 
 PERMUTATIONS = 999
-"""Of the labels of whole groups, for the p of a transfer."""
+"""Of the labels of whole groups, for the p of a transfer: with the observed order, p comes in steps of 1/1000."""
 _CONSTANT = 1e-9
 """Share of the largest deviation below which a feature does not vary."""
 

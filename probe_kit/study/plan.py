@@ -123,6 +123,7 @@ def untrained_cell(study: LoadedStudy, table: ProbesTable, cell: Cell) -> Cell |
 
 State = Literal["new", "partial", "whole", "damaged", "failed", "waiting", "skipped"]
 _MOST_CHANGES = 3
+"""Settings by which a stored run differs from the file, that a line of the plan names."""
 
 
 @dataclass(frozen=True)

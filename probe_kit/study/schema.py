@@ -86,6 +86,7 @@ def unknown(what: str, name: str, names: Collection[str]) -> str:
 
 
 SCHEMA_VERSION = 1
+"""Of study files, as their key `schema` says it; raise it when a file of before means something else."""
 
 
 def _each_once[Value](values: list[Value]) -> list[Value]:

@@ -82,7 +82,7 @@ def _label_words(viewed: ViewedRun, row: dict[str, Any], position: int) -> dict[
 def _refitted(viewed: ViewedRun, row: dict[str, Any], calls: int) -> Any:
     """Log-odds of the probes of each inference, None where only one inference was probed."""
     category, view = str(row["category"]), viewed.view
-    if len(viewed.refitted) < 2:
+    if len(viewed.refitted) < 2:  # one alone is that of `log_odds`
         return None
     log_odds = np.full((calls, len(viewed.sites)), np.nan)
     for call, results in viewed.refitted.items():

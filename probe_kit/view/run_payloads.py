@@ -18,8 +18,9 @@ from probe_kit.diagnose.results import diagnosis_table
 from probe_kit.env.scoring import RULES
 from probe_kit.errors import RunDamagedError
 from probe_kit.hooks.contract.sites import Site
-from probe_kit.intervene.outcomes import stored_interventions
-from probe_kit.intervene.results import InterventionResult, listed_interventions
+from probe_kit.intervene.inventory import listed_interventions
+from probe_kit.intervene.results import InterventionResult
+from probe_kit.intervene.stored import stored_interventions
 from probe_kit.retention import RetentionRow
 from probe_kit.retention.columns.columns import (
     ACCURACY,
@@ -45,10 +46,14 @@ from probe_kit.train.results.store import load_results, stored_targets
 from probe_kit.train.results.summary import best_sites_findings
 from probe_kit.view.viewed_run import Values, ViewedRun, decisions_toward_correct
 
+# Log-odds travel as 16-bit integers: a page of a large run holds millions, and as text each is twice as long.
 LOG_ODDS_SCALE = 256
 """Steps per unit of log-odds: the error is below 0.002."""
 MISSING = -32768
-"""In place of a log-odds that does not exist, such as that of an inference the episode did not reach."""
+"""In place of a log-odds that does not exist, such as that of an inference the episode did not reach.
+
+The least 16-bit integer, which no rounded log-odds takes: they are cut at 32767 steps on both sides.
+"""
 
 
 class Packed(str):
@@ -74,7 +79,10 @@ def _packed(values: ArrayLike, kind: str) -> Packed:
 
 
 def code_words(words: Sequence[Any]) -> dict[str, Any]:
-    """`words` once each, and a `codes` entry per place; None stays None."""
+    """`words` once each, and a `codes` entry per place; None stays None.
+
+    A column of a large run repeats few words thousands of times.
+    """
     distinct = list(dict.fromkeys(words))
     code = {word: number for number, word in enumerate(distinct)}
     return {"words": distinct, "codes": [code[word] for word in words]}
@@ -86,7 +94,7 @@ def rounded(value: Any, digits: int = 4) -> float | None:
 
 
 def payload_script(name: str, value: Any, places: tuple[str, ...] = ()) -> bytes:
-    """The script `put(name, value)` in ASCII.
+    """The script `put(name, value)` in ASCII. A page that is opened as a file may load scripts, and fetch nothing.
 
     Text of `value` has visible signs in place of control and direction characters, and the last part alone of
     `places` and other absolute paths. No `<` is left, so that no text can end the script.
@@ -105,7 +113,7 @@ def _script(function: str, name: str, value: Any) -> bytes:
 
 
 def _encode(value: Any, places: tuple[str, ...]) -> Any:
-    if isinstance(value, Packed):
+    if isinstance(value, Packed):  # before text, which it is too: base64 has nothing to escape, and is long
         return value
     if isinstance(value, str):
         return without_places(terminal_safe(value), places)

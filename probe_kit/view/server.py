@@ -35,8 +35,9 @@ from probe_kit.view.export import INDEX, page_files
 
 HOST = "127.0.0.1"
 TICK_S = 2.0
-"""Seconds between two listings of the commits of a run that grows."""
+"""Seconds between two listings of the commits of a run that grows: a listing of a bucket is a request."""
 _GZIP_FROM = 2000
+"""Bytes of an answer from which it is compressed: less fits into two packets either way."""
 _MOST_HEADER_BYTES = 1 << 20
 """Of a request: a browser sends the cookies of every other server of 127.0.0.1 too, at most 180 of 4 KB."""
 _LEADING_TO = '<!doctype html><meta charset="utf-8"><meta http-equiv="refresh" content="0; url={address}">\n'

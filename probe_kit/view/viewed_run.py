@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from probe_kit.errors import UsageError
 from probe_kit.hooks.contract.sites import Site, resolve_view
 from probe_kit.intervene.kinds.attention import PatchAttention, stored_patch_attention
-from probe_kit.intervene.outcomes import has_sides
+from probe_kit.intervene.settings import has_sides
 from probe_kit.retention import RetentionRow, RetentionTable, retention_table
 from probe_kit.runs import Run
 from probe_kit.runs.arrays import Rows, decode_bfloat16
@@ -53,7 +53,7 @@ class FrozenProbes:
         self, run: Run, results: ProbeResults, category: str, view: str, readings: dict[int, Values] | None = None
     ) -> None:
         self.run, self.curve = run, results.curves[category, view]
-        self._kept = readings
+        self._readings = readings
         self._results, self._category, self._view = results, category, view
         self._fold_of = dict(zip(self.curve.items.tolist(), self.curve.fold_of.tolist(), strict=True))
         self._place_of = {name: column for column, name in enumerate(self.curve.episodes.tolist())}
@@ -69,13 +69,13 @@ class FrozenProbes:
         Those of the run's own probes are the stored out-of-fold ones; NaN for an episode without any.
         """
         row = self.run.episodes.iloc[position]
-        if self._kept is None:
+        if self._readings is None:
             return self._stored(str(row["episode_id"]), str(row["side_correct"]))
         number = int(row["episode"])
-        if number not in self._kept:
+        if number not in self._readings:
             values, _ = self.log_odds(position)
-            self._kept[number] = values[0] if len(values) else np.full(len(self.sites), np.nan)
-        return self._kept[number]
+            self._readings[number] = values[0] if len(values) else np.full(len(self.sites), np.nan)
+        return self._readings[number]
 
     def _stored(self, episode: str, side_correct: str) -> Values:
         column = self._place_of.get(episode)
@@ -93,9 +93,10 @@ class FrozenProbes:
         side, item = str(row["side_correct"]), str(row["item_id"])
         calls = int(self._calls[position])
         log_odds = np.full((calls, len(self.sites)), np.nan)
+        # The fold that tests the item: its probe has seen neither the item nor its group.
         fold = self._fold_of.get(item)
         if not self._reads_activations:
-            if self._kept is None:
+            if self._readings is None:
                 log_odds[:1] = self._stored(str(row["episode_id"]), side)
             return log_odds, fold is not None
         for stream, probes in self._streams.items():
@@ -358,4 +359,5 @@ def _difference(run: Run, lender: ViewedRun) -> str | None:
 def _key(name: str, used: Sequence[str]) -> str:
     plain = _UNSAFE.sub("-", name).strip(".-") or "run"
     numbered = (plain if count == 1 else f"{plain}-{count}" for count in range(1, len(used) + 2))
+    # Exported pages have a folder per key, and not every file system tells cases apart.
     return next(key for key in numbered if key.lower() not in {other.lower() for other in used})

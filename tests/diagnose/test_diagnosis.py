@@ -7,23 +7,28 @@ import csv
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 from typer.testing import CliRunner
 
 import probe_kit as pk
 from probe_kit.cli import app
-from probe_kit.diagnose.diagnosis import diagnose_run, load_diagnosis, with_inputs_of
+from probe_kit.diagnose.diagnosis import FILE, FORMAT, diagnose_run, load_diagnosis, with_inputs_of
 from probe_kit.diagnose.inputs import frames_of, read_paraphrases
 from probe_kit.diagnose.results import Diagnosis
 from probe_kit.env import SceneSpec
-from probe_kit.errors import UsageError
+from probe_kit.errors import RunDamagedError, UsageError
 from probe_kit.extract import ExtractSettings, LeRobotSource, extract_run
 from probe_kit.hooks import Interventions, Policy
 from probe_kit.hooks.families.pi0.adapter import load_pi0_tiny
-from probe_kit.intervene.sessions import ReplaySource, open_session
+from probe_kit.intervene.open_session import open_session
+from probe_kit.intervene.sessions import ReplaySource
 from probe_kit.runs import Run, verify_run
+from probe_kit.runs.layout import DIAGNOSES
+from probe_kit.runs.results import write_bundle
+from probe_kit.runs.store import locate
 from probe_kit.suite import Suite
 from tests.support.lerobot_recordings import CAMERA, write_recording
 from tests.support.made_once import made_once
@@ -86,6 +91,19 @@ def test_the_same_command_reads_what_is_stored_and_the_run_stays_sound(folder: P
     key = json.loads(answer.stdout)["key"]
     assert load_diagnosis(run, key).to_json() == json.loads(answer.stdout)
     assert not verify_run(folder / "run", deep=True).problems
+
+
+def test_a_diagnosis_with_fields_of_another_version_is_refused_with_what_to_do(tmp_path: Path) -> None:
+    run, key = cast("Run", SimpleNamespace(location=locate(tmp_path))), "0123456789ab"
+    fields = {"key": key, "label": "mine", "n_frames": 1, "n_groups": 1, "inputs": [{"place": "backbone.00"}]}
+    head = {"settings": {"format": FORMAT}}
+    write_bundle(run.location, DIAGNOSES, key, head, {FILE: json.dumps(fields).encode()})
+    with pytest.raises(RunDamagedError) as refusal:
+        load_diagnosis(run, key)
+    assert str(refusal.value).endswith(
+        f"diagnosis.json has other fields: another version of probe_kit made it. Remove diagnoses/{key} and "
+        "run the same `probe-kit diagnose` again"
+    )
 
 
 def test_the_page_has_the_table_the_sentences_and_the_figure(folder: Path) -> None:

@@ -9,7 +9,7 @@ import pandas as pd
 from probe_kit.diagnose.inputs import LEAST_GROUPS, frames_of, order_of_first_frames
 from probe_kit.extract.sources.inputs import Frame
 from probe_kit.hooks.contract.observation import Observation
-from probe_kit.intervene.sessions import ObservedSession
+from probe_kit.intervene.frame_session import FrameSession
 
 
 def played(groups: int, items: int, layouts: int) -> pd.DataFrame:
@@ -53,7 +53,7 @@ def recorded(groups: int, length: int) -> Any:
         for group in range(groups)
         for number in range(length)
     ]
-    session = cast("Any", object.__new__(ObservedSession))
+    session = cast("Any", object.__new__(FrameSession))
     session.frames = SimpleNamespace(index=frames)
     return session
 

@@ -28,7 +28,8 @@ from probe_kit.extract.sources.pictures import PictureSource
 from probe_kit.hashing import derive_seed
 from probe_kit.hooks import Observation, Policy
 from probe_kit.intervene import AttentionReadout, InstructionSwap, ReplaySource, run_intervention
-from probe_kit.intervene.sessions import Frames, ObservedSession, open_session
+from probe_kit.intervene.frame_session import Frames, FrameSession
+from probe_kit.intervene.open_session import open_session
 from probe_kit.retention.displays import attention_on_picture
 from probe_kit.runs import open_run, verify_run
 from probe_kit.train.builtin_columns import label_frame
@@ -154,7 +155,7 @@ def test_pictures_are_shown_again_for_interventions_and_diagnoses(
     run: pk.Run, folder: Path, pi0_tiny: Policy
 ) -> None:
     with open_session(run, ReplaySource(), lambda *_: pi0_tiny) as session:
-        assert isinstance(session, ObservedSession)
+        assert isinstance(session, FrameSession)
         frames = session.frames.index
         assert [frame.group for frame in frames] == [f"g{number}" for number in range(COUNT)]
         for number in (0, COUNT - 1):

@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 from probe_kit.intervene import ConditionOutcomes, InterventionResult, UseVerdict
 from probe_kit.intervene.kinds.image_swap import ImageSwapEffect, image_swap_effects
 from probe_kit.intervene.kinds.interchange import PatchEffect, patch_effects
-from probe_kit.intervene.outcomes import CERTIFICATE, EPISODES, FIRST_CHUNK, IMAGE_SWAP, Measurement
+from probe_kit.intervene.outcomes import IMAGE_SWAP
 from probe_kit.intervene.results import save
+from probe_kit.intervene.settings import FIRST_CHUNK
+from probe_kit.intervene.stored import CERTIFICATE, EPISODES, Measurement
 from probe_kit.runs import Location
 from probe_kit.runs.records import as_json
 

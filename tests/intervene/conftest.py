@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from probe_kit.intervene import ReplaySource
-from probe_kit.intervene.sessions import ReplaySession, open_session
+from probe_kit.intervene.open_session import open_session
+from probe_kit.intervene.sessions import ReplaySession
 from probe_kit.runs import Run, open_run
 from probe_kit.suite import Suite
 

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from probe_kit.cli import app
 from probe_kit.intervene import ImageSwap
-from probe_kit.intervene.outcomes import settings_of
+from probe_kit.intervene.settings import settings_of
 from probe_kit.runs import Run
 from tests.intervene.answers import follower, habit, outcomes_of, store_outcomes
 

@@ -14,12 +14,12 @@ from probe_kit.cli import app
 from probe_kit.errors import UsageError
 from probe_kit.hooks import Site
 from probe_kit.intervene import Interchange, Steering
-from probe_kit.intervene.directions import Directions, fit_token_directions
+from probe_kit.intervene.directions import Directions
 from probe_kit.intervene.patching import run_with_hooks
 from probe_kit.intervene.patching.patch import Cell
 from probe_kit.intervene.places import resolve_sites
 from probe_kit.intervene.replay import ConditionContext, replay
-from probe_kit.intervene.sessions import SceneSession
+from probe_kit.intervene.scene_session import SceneSession
 from probe_kit.runs import export_run
 from probe_kit.runs.direction_files import about_direction, names_file, read_direction, write_directions
 from probe_kit.train.results.probe_results import Direction, write_direction_file
@@ -226,4 +226,4 @@ def test_steering_adds_so_many_vectors_of_the_file(session: SceneSession, tmp_pa
 
 def directions_of(session: SceneSession, asked: Steering) -> dict[Cell, Directions]:
     cells = [Cell(place, asked.role) for place in resolve_sites(SITE, session.policy)]
-    return fit_token_directions(session, asked, cells, asked.sites)
+    return asked.fit_directions(session, cells, asked.sites)

@@ -14,7 +14,9 @@ from probe_kit.extract import EnvSource, ExtractSettings, prepare
 from probe_kit.extract.config_files import moved_of
 from probe_kit.hooks import Observation
 from probe_kit.intervene import AttentionReadout, ImageSwap, InstructionSwap, Interchange, run_intervention
-from probe_kit.intervene.sessions import ObservedSession, ReplaySource, open_session
+from probe_kit.intervene.frame_session import FrameSession
+from probe_kit.intervene.open_session import open_session
+from probe_kit.intervene.sessions import ReplaySource
 from probe_kit.runs import Run, open_run
 
 if TYPE_CHECKING:
@@ -43,14 +45,14 @@ def played(_own_modules: None, pi0_tiny: "Pi0", tmp_path_factory: pytest.TempPat
 
 
 @pytest.fixture
-def session(played: Run, pi0_tiny: "Pi0") -> Iterator[ObservedSession]:
+def session(played: Run, pi0_tiny: "Pi0") -> Iterator[FrameSession]:
     with open_session(played, ReplaySource(), lambda *_: pi0_tiny, ImageSwap()) as opened, opened.ready():
-        assert isinstance(opened, ObservedSession)
+        assert isinstance(opened, FrameSession)
         yield opened
 
 
 @pytest.mark.slow
-def test_a_pair_has_the_picture_of_another_group_and_all_else_of_its_own(session: ObservedSession) -> None:
+def test_a_pair_has_the_picture_of_another_group_and_all_else_of_its_own(session: FrameSession) -> None:
     for item in session.items:
         for pair in session.pairs(item):
             clean, source, donor = pair.clean, pair.source, pair.donor
@@ -65,7 +67,7 @@ def test_a_pair_has_the_picture_of_another_group_and_all_else_of_its_own(session
 
 @pytest.mark.slow
 def test_the_first_action_of_every_episode_is_inferred_again_bit_for_bit(
-    played: Run, session: ObservedSession
+    played: Run, session: FrameSession
 ) -> None:
     assert played.inputs is not None
     actions = played.inputs.read("action")
@@ -143,7 +145,7 @@ def test_an_environment_whose_module_was_moved_is_given_by_the_option_of_extract
     monkeypatch.syspath_prepend(str(tmp_path / "new"))
     moved = moved_of(run, {"env": "hand_moved:ReachEnv", "device": "cpu"})
     with open_session(run, ReplaySource(moved=moved), lambda *_: pi0_tiny) as opened:
-        assert isinstance(opened, ObservedSession)
+        assert isinstance(opened, FrameSession)
         assert len(opened.frames.index) == len(run.episodes)
     with pytest.raises(UsageError, match=r"--dataset does not apply: .* is given with --env, --env-option"):
         moved_of(run, {"dataset": tmp_path})

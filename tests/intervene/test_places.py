@@ -1,6 +1,6 @@
 """Places by name: whole layers, quantities and heads; a head is patched as a plain torch hook patches it."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,20 +29,12 @@ from probe_kit.intervene import (
     Steering,
     run_intervention,
 )
-from probe_kit.intervene.places import (
-    TILES,
-    Pair,
-    PlaceName,
-    list_places,
-    resolve_sites,
-    role_token_mask,
-    token_mask,
-    tokens_overlapping,
-    unread_note,
-    unread_places,
-)
-from probe_kit.intervene.runner import unread_sites
+from probe_kit.intervene.kinds.base import Intervention
+from probe_kit.intervene.pairs import Pair
+from probe_kit.intervene.places import TILES, PlaceName, list_places, resolve_sites, unread_note, unread_places
+from probe_kit.intervene.replay import Condition
 from probe_kit.intervene.sessions import ReplaySession
+from probe_kit.intervene.tokens import PairTokens, token_mask, tokens_overlapping
 from probe_kit.runs import Run
 from probe_kit.suite import Suite
 
@@ -195,32 +187,56 @@ UNREAD = Interventions(unread=("backbone",))
 
 
 @pytest.mark.parametrize(
-    ("patterns", "places"),
+    ("names", "places"),
     [
-        (["backbone.*"], ("backbone.03",)),
-        (["backbone.03", "backbone.*"], ("backbone.03",)),
-        (["backbone.02", "expert.03", "kv.*", "backbone.*.heads.*"], ()),
+        (["backbone.02", "backbone.03"], ("backbone.03",)),
+        (["backbone.03", "backbone.03"], ("backbone.03",)),
+        (["backbone.02", "expert.03", "kv.02", "backbone.03.heads.1"], ()),
         (["backbone.03.residual"], ("backbone.03.residual",)),
         (["backbone.03.final_norm"], ("backbone.03.final_norm",)),
     ],
 )
 def test_the_end_of_an_unread_stream_is_unread_and_nothing_before_it(
-    patterns: list[str], places: tuple[str, ...]
+    names: list[str], places: tuple[str, ...]
 ) -> None:
-    assert unread_places(patterns, STREAMS, UNREAD) == places
-    assert unread_places(patterns, STREAMS, Interventions()) == ()
+    assert unread_places(names, STREAMS, UNREAD) == places
+    assert unread_places(names, STREAMS, Interventions()) == ()
     assert not places or places[0] in unread_note(places)
 
 
-def test_unread_places_of_every_kind_are_known_before_anything_is_loaded(copy: Run) -> None:
-    last = f"backbone.{copy.streams['backbone'].layers - 1:02d}"
-    for intervention in (
-        Interchange(),
-        Steering(sites=(last,), role="language"),
-        JointPlaces(sites=(last,), roles=("image", "language")),
-    ):
-        assert unread_sites(copy, intervention) == (last,)
-    assert unread_sites(copy, Steering(sites=("backbone.01",), role="language")) == ()
+@pytest.mark.parametrize(
+    "intervention",
+    [
+        Interchange(roles=("image",)),
+        Steering(sites=("backbone.*",), role="language", categories=("color",)),
+        JointPlaces(sites=("backbone.03",), roles=("image", "language"), categories=("color",)),
+    ],
+    ids=lambda intervention: str(intervention.kind),
+)
+def test_conditions_name_the_places_that_they_edit(session: ReplaySession, intervention: Intervention) -> None:
+    edited = {place for condition in intervention.conditions(session) for place in condition.places}
+    assert "backbone.03" in edited
+    assert "backbone.00" not in edited or isinstance(intervention, Interchange)
+
+
+@dataclass(frozen=True, kw_only=True)
+class FirstLayer(Interchange):
+    """A kind that patches fewer places than `--sites` names."""
+
+    def conditions(self, session: ReplaySession) -> list[Condition]:
+        return [condition for condition in super().conditions(session) if "backbone.03" not in condition.places]
+
+
+@pytest.mark.parametrize(("kind", "is_noted"), [(Interchange, True), (FirstLayer, False)])
+def test_a_note_before_the_replay_names_what_is_really_patched(
+    copy: Run, small_suite: Suite, twin: "Policy", kind: type[Interchange], is_noted: bool
+) -> None:
+    notes: list[str] = []
+    intervention = kind(roles=("image",), categories=("color",), items=1, seed=int(is_noted))
+    source = ReplaySource(small_suite.folder)
+    result = run_intervention(copy, intervention, source, load=lambda *_: twin, on_note=notes.append)
+    assert [note.startswith("unread: backbone.03. ") for note in notes] == [True] * is_noted
+    assert any(note.startswith("unread: ") for note in result.notes) == is_noted
 
 
 def test_a_wildcard_passes_over_places_without_a_direction_and_a_named_place_is_refused(
@@ -259,7 +275,7 @@ def test_the_patches_of_a_tile_lie_where_its_pixels_do(session: ReplaySession, r
     """Across, the middle of the patches is the middle of the pixels."""
     middles = {}
     for role, side in TILES.items():
-        mask = role_token_mask(session.policy, replay_input, "backbone", role, {})
+        mask = PairTokens(session.policy, replay_input).mask("backbone", role)
         images = np.flatnonzero(session.policy.roles([replay_input.clean])["backbone"][0].mask("image"))
         assert 0 < mask.sum() < images.size / 2
         assert set(np.flatnonzero(mask)) <= set(images)
@@ -282,7 +298,7 @@ def test_all_pixels_are_seen_by_all_patches_but_the_padding_and_none_by_none(
     assert not tokens_overlapping(session.policy, replay_input.clean, ~every).any()
     nothing = replace(replay_input, tiles=dict.fromkeys(("left", "right"), ~every))
     with pytest.raises(EmptyRoleError, match="sees the left tile"):
-        role_token_mask(session.policy, nothing, "backbone", "image.left", {})
+        PairTokens(session.policy, nothing).mask("backbone", "image.left")
 
 
 @pytest.mark.slow
@@ -292,11 +308,11 @@ def test_both_tiles_are_held_against_the_same_plain_patches(
     (replay_input, _) = session.pairs(str(copy.episodes["item_id"][0]))
     act, seen = session.policy.act, []
     monkeypatch.setattr(session.policy, "act", lambda own, seeds: seen.append(own[0].image) or act(own, seeds))
-    memo: dict[object, object] = {}
-    together = [role_token_mask(session.policy, replay_input, "backbone", role, memo) for role in TILES]
+    tokens = PairTokens(session.policy, replay_input)
+    together = [tokens.mask("backbone", role) for role in TILES]
     assert len(seen) == 1 + len(TILES)
     for role, mask in zip(TILES, together, strict=True):
-        np.testing.assert_array_equal(mask, role_token_mask(session.policy, replay_input, "backbone", role, {}))
+        np.testing.assert_array_equal(mask, PairTokens(session.policy, replay_input).mask("backbone", role))
 
 
 @pytest.mark.slow

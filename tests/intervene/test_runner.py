@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import asdict, replace
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -33,10 +34,14 @@ from probe_kit.intervene import (
     run_intervention,
     stored_interventions,
 )
+from probe_kit.intervene.open_session import load_policy_of, open_session
+from probe_kit.intervene.outcomes import arrays_of
 from probe_kit.intervene.runner import too_few_groups
-from probe_kit.intervene.sessions import ReplaySession, load_policy_of, open_session
+from probe_kit.intervene.sessions import ReplaySession
+from probe_kit.intervene.stored import EPISODES
 from probe_kit.retention import retention_table
 from probe_kit.runs import Run, open_run, verify_run
+from probe_kit.runs.results import Pieces
 from tests.intervene.answers import with_parts
 
 if TYPE_CHECKING:
@@ -173,6 +178,34 @@ def test_a_damaged_piece_is_not_continued_from(
     shutil.copy(first, second)
     with pytest.raises(RunDamagedError, match=second.name):
         run_intervention(mine, ImageSwap(items=2), source, load=lambda *_: twin)
+
+
+def test_a_piece_of_another_version_is_refused_with_what_to_do(
+    mine: Run, effects: InterventionResult, source: ReplaySource, twin: "Policy"
+) -> None:
+    folder = mine.path / "interventions" / effects.key
+    shutil.rmtree(folder)
+    pieces = Pieces.of(mine.location, "interventions", effects.key, mine.stamp, "")
+    arrays = arrays_of(effects.outcomes, ("seed_text",))
+    pieces.keep("000000", {"lateral" if name == "displacement" else name: arrays[name] for name in arrays})
+    with pytest.raises(RunDamagedError) as refusal:
+        run_intervention(mine, ImageSwap(items=2), source, load=lambda *_: twin)
+    assert str(refusal.value).endswith(
+        f"000000.npz lacks displacement and holds lateral: another version of probe_kit began this. Remove "
+        f"interventions/.{effects.key}.partial; the same `probe-kit intervene` then plays it again"
+    )
+
+
+def test_a_stored_intervention_of_another_version_is_refused_with_what_to_do(
+    mine: Run, effects: InterventionResult
+) -> None:
+    (stored,) = stored_interventions(mine)
+    arrays = arrays_of(effects.outcomes, ("seed_text",))
+    del arrays["displacement"]
+    content = BytesIO()
+    np.savez(content, allow_pickle=False, **arrays)
+    with pytest.raises(RunDamagedError, match=r"episodes\.npz lacks displacement: another version"):
+        _ = replace(stored, read={EPISODES: content.getvalue()}.__getitem__).outcomes
 
 
 @pytest.mark.parametrize("name", [*FILES, "settings.json"])

@@ -26,12 +26,13 @@ from probe_kit.intervene import (
     run_intervention,
     stored_site_effects,
 )
-from probe_kit.intervene.directions import fit_directions
+from probe_kit.intervene.directions import fit_pooled_directions
 from probe_kit.intervene.kinds.base import ConditionName
 from probe_kit.intervene.kinds.interchange import localised_sites, target_sign
-from probe_kit.intervene.outcomes import FORMAT
-from probe_kit.intervene.places import resolve_sites, token_mask
+from probe_kit.intervene.places import resolve_sites
 from probe_kit.intervene.sessions import ReplaySession
+from probe_kit.intervene.settings import FORMAT
+from probe_kit.intervene.tokens import token_mask
 from probe_kit.intervene.verdict import Places
 from probe_kit.runs import Run
 from probe_kit.train import ArrayRun, train_probes
@@ -155,7 +156,7 @@ def test_steering_by_nothing_changes_nothing_and_controls_move_as_far(
 @pytest.mark.slow
 def test_the_mean_difference_is_found_without_the_episode_it_is_used_on(copy: Run) -> None:
     """Where it lies is planted; a probe's weights and controls are of length 1 as well."""
-    axes = fit_directions(copy, Site("backbone", 2), "image", "mean-difference", 3, seed=0)
+    axes = fit_pooled_directions(copy, Site("backbone", 2), "image", "mean-difference", 3, seed=0)
     episodes = copy.episodes
     assert set(axes.halves) == set(episodes["episode_id"])
     name, category = str(episodes["episode_id"][0]), str(episodes["category"][0])
@@ -179,7 +180,7 @@ def test_the_mean_difference_is_found_without_the_episode_it_is_used_on(copy: Ru
 @pytest.mark.slow
 def test_a_direction_that_does_not_exist_is_refused(copy: Run) -> None:
     with pytest.raises(UsageError, match="expected one of mean-difference, probe"):
-        fit_directions(copy, Site("backbone", 2), "image", "mean-difference:1", 0, seed=0)
+        fit_pooled_directions(copy, Site("backbone", 2), "image", "mean-difference:1", 0, seed=0)
 
 
 @pytest.mark.slow
@@ -188,14 +189,14 @@ def test_a_direction_that_does_not_exist_is_refused(copy: Run) -> None:
 def test_the_networks_input_has_no_direction(copy: Run, direction: str, role: str) -> None:
     """The suite asks of every picture both ways; the first layer combines it with the words."""
     with pytest.raises(UsageError, match=f"color, .*00.*, role {role}: no direction for {direction}"):
-        fit_directions(copy, Site("backbone", 0), role, direction, 1, seed=0)
+        fit_pooled_directions(copy, Site("backbone", 0), role, direction, 1, seed=0)
 
 
 @pytest.mark.slow
 def test_the_probes_direction_is_another_one(copy: Run) -> None:
     episode = str(copy.episodes["episode_id"][0])
     mean, probe = (
-        fit_directions(copy, Site("backbone", 2), "image", name, 0, seed=0).basis(name, episode)[0]
+        fit_pooled_directions(copy, Site("backbone", 2), "image", name, 0, seed=0).basis(name, episode)[0]
         for name in ("mean-difference", "probe")
     )
     assert 0 < float(mean @ probe) < 0.999

@@ -19,10 +19,10 @@ from probe_kit.intervene.kinds.joint import (
     describe_joint_places,
     describe_remainder,
 )
-from probe_kit.intervene.outcomes import PER_STEP
 from probe_kit.intervene.patching import Cell
 from probe_kit.intervene.places import resolve_sites
 from probe_kit.intervene.replay import Condition
+from probe_kit.intervene.settings import PER_STEP
 from tests.intervene.answers import measured, patches_of, swaps_of
 from tests.intervene.wirings import WIRINGS, WORDS, WiredSession, outcomes_of, replay_inputs
 

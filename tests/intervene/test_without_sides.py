@@ -15,10 +15,12 @@ from probe_kit.errors import OtherFramesError, UsageError
 from probe_kit.extract import ExtractSettings, LeRobotSource, extract_run
 from probe_kit.hooks import Observation
 from probe_kit.intervene import AttributionPatching, ImageSwap, Interchange, ReplaySource, run_intervention
+from probe_kit.intervene.frame_session import FrameSession
+from probe_kit.intervene.open_session import open_session
 from probe_kit.intervene.outcomes import displacements_toward, sizes, spread_of
-from probe_kit.intervene.places import Pair, read_pairs
+from probe_kit.intervene.pairs import Pair, read_pairs
 from probe_kit.intervene.replay import replay
-from probe_kit.intervene.sessions import ObservedSession, SceneSession, open_session
+from probe_kit.intervene.scene_session import SceneSession
 from probe_kit.runs import Run, open_run
 from tests.intervene.answers import patches_of
 from tests.support.lerobot_recordings import CAMERA, write_recording
@@ -58,15 +60,15 @@ def table(shown: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def observed(shown: Run, table: Path, twin: "Policy") -> Iterator[ObservedSession]:
+def observed(shown: Run, table: Path, twin: "Policy") -> Iterator[FrameSession]:
     choice = ImageSwap(pairs=read_pairs(table))
     with open_session(shown, ReplaySource(), lambda *_: twin, choice) as opened, opened.ready():
-        assert isinstance(opened, ObservedSession)
+        assert isinstance(opened, FrameSession)
         yield opened
 
 
 def test_recordings_of_scene_frames_give_the_numbers_of_the_scene_bit_for_bit(
-    session: SceneSession, scene_pairs: list[Pair], observed: ObservedSession
+    session: SceneSession, scene_pairs: list[Pair], observed: FrameSession
 ) -> None:
     """Same frames and seeds: the chunks, the displacements toward the source and the shares of patches."""
     recorded = [pair for item in observed.items for pair in observed.pairs(item)]
@@ -142,7 +144,7 @@ def test_what_needs_sides_or_another_input_is_refused_by_name(
 def test_a_frame_with_two_donors_is_read_toward_each_of_them(shown: Run, table: Path, twin: "Policy") -> None:
     choice = ImageSwap(pairs=(*read_pairs(table), ("episode-000000", 0, "episode-000004", 0)))
     with open_session(shown, ReplaySource(), lambda *_: twin, choice) as opened, opened.ready():
-        assert isinstance(opened, ObservedSession)
+        assert isinstance(opened, FrameSession)
         near, far = (pair for pair in opened.pairs(opened.items[0]) if pair.row == 0)
         for pair in (near, far):
             apart = (opened.act(pair.source, pair.seed) - opened.act(pair.clean, pair.seed)).astype(float).ravel()
@@ -157,7 +159,7 @@ def test_pairs_are_refused_in_the_scene(copy: Run, table: Path) -> None:
         ImageSwap(pairs=read_pairs(table)).check_run(copy)
 
 
-def test_recordings_that_were_changed_or_moved_are_refused(shown: Run, observed: ObservedSession) -> None:
+def test_recordings_that_were_changed_or_moved_are_refused(shown: Run, observed: FrameSession) -> None:
     run = open_run(shown.path)
     run.__dict__["origins"] = (replace(shown.origins[0], files={}),)
     with pytest.raises(UsageError, match="--dataset"):

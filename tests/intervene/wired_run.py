@@ -9,9 +9,9 @@ import pandas as pd
 from probe_kit.hooks import Site, capture
 from probe_kit.intervene import ImageSwap, Interchange, JointPlaces, UseVerdict
 from probe_kit.intervene.kinds.base import Intervention
-from probe_kit.intervene.outcomes import FORMAT
 from probe_kit.intervene.places import ALL
 from probe_kit.intervene.results import verdicts_of
+from probe_kit.intervene.settings import FORMAT
 from probe_kit.train import ArrayRun, train_probes
 from tests.intervene.answers import store_outcomes
 from tests.intervene.wirings import BLOCKS, IMAGE, WORDS, WiredSession, outcomes_of, replay_inputs

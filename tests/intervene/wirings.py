@@ -23,9 +23,9 @@ from probe_kit.hooks.contract.declared import Interventions
 from probe_kit.hooks.contract.sites import kv_stream
 from probe_kit.hooks.families.shared.taps import kv_tap
 from probe_kit.intervene import ConditionOutcomes
-from probe_kit.intervene.places import Pair
+from probe_kit.intervene.pairs import Pair
 from probe_kit.intervene.replay import CLEAN_RUN, SOURCE_RUN, Condition, replay
-from probe_kit.intervene.sessions import SceneSession
+from probe_kit.intervene.scene_session import SceneSession
 from probe_kit.models.decoding import PromptKV
 
 WIDTH, BLOCKS, CHUNK, METRES = 24, 3, 4, 0.15

@@ -9,14 +9,9 @@ import pytest
 
 from probe_kit.errors import NoInterventionsError
 from probe_kit.intervene import AttentionShares, UseVerdict
-from probe_kit.intervene.kinds.attention import PatchAttention
-from probe_kit.intervene.outcomes import (
-    ATTENTION_FILE,
-    FORMAT,
-    PATCHES_FILE,
-    ConditionOutcomes,
-    arrays_to_bytes,
-)
+from probe_kit.intervene.kinds.attention import ATTENTION_FILE, PATCHES_FILE, PatchAttention
+from probe_kit.intervene.outcomes import ConditionOutcomes, arrays_to_bytes
+from probe_kit.intervene.settings import FORMAT
 from probe_kit.retention import RetentionRow, retention_table
 from probe_kit.retention.displays import (
     AttentionDisplay,

@@ -9,7 +9,7 @@ import stat
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from threading import Event, Thread
 from typing import Any
@@ -21,7 +21,7 @@ from typer.testing import CliRunner
 
 from probe_kit._system.drafts import full_disk_in_words
 from probe_kit.cli import app
-from probe_kit.errors import DiskSpaceError
+from probe_kit.errors import DiskSpaceError, RunDamagedError
 from probe_kit.extract.rollout.capturing import EpisodeBuffers
 from probe_kit.hooks.contract.sites import Site, Stream
 from probe_kit.runs import open_run, seal, verify_run
@@ -183,6 +183,38 @@ def test_equal_numbers_of_two_processes_leave_the_first_commit(
     first.write(episode(plan, 0))
     assert len(seen) == 2
     assert (tmp_path / "run" / commit_key(0)).stat().st_ino == seen[0] == seen[1]
+
+
+@dataclass
+class Measured:
+    score: float
+    null: float | None = None
+
+
+@pytest.mark.parametrize(
+    ("names", "problem"),
+    [
+        (("color/score",), ""),
+        (("color/score", "color/null"), ""),
+        (("color/accuracy",), "lacks score and holds accuracy"),
+        (("color/null",), "lacks score"),
+    ],
+)
+def test_pieces_of_another_version_are_refused_with_what_to_do(
+    tmp_path: Path, names: tuple[str, ...], problem: str
+) -> None:
+    pieces = Pieces.of(locate(tmp_path), "probes", "0123456789ab", "stamp", "the same command then starts again")
+    arrays = dict.fromkeys(names, np.arange(3))
+    pieces.keep("site", arrays)
+    if not problem:
+        assert (pieces.read("site", Measured) or {}).keys() == arrays.keys()
+        return
+    with pytest.raises(RunDamagedError) as refusal:
+        pieces.read("site", Measured)
+    assert str(refusal.value).endswith(
+        f"site.npz {problem}: another version of probe_kit began this. Remove probes/.0123456789ab.partial; "
+        "the same command then starts again"
+    )
 
 
 @pytest.mark.slow

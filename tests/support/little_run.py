@@ -11,7 +11,7 @@ from probe_kit.env.scoring import CHANNELS
 from probe_kit.env.spec import SceneSpec
 from probe_kit.hashing import derive_seed
 from probe_kit.intervene import ConditionOutcomes, ImageSwap
-from probe_kit.intervene.outcomes import settings_of
+from probe_kit.intervene.settings import settings_of
 from probe_kit.runs import Run, open_run, seal
 from probe_kit.runs.commits import Seconds
 from probe_kit.runs.layout import StoredStream

@@ -11,7 +11,8 @@ import torch
 from probe_kit.diagnose.results import Change, Verdict
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.families.shared.lerobot.policy import MASK, TOKENS
-from probe_kit.intervene.sessions import LoadPolicy, ReplaySource, load_policy_of
+from probe_kit.intervene.open_session import load_policy_of
+from probe_kit.intervene.sessions import LoadPolicy, ReplaySource
 from probe_kit.models.building import initialise
 from probe_kit.runs import Run
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from probe_kit.intervene.outcomes import stored_interventions
+from probe_kit.intervene.stored import stored_interventions
 from probe_kit.runs import Run, open_run
 from probe_kit.runs.commits import write_failure
 from probe_kit.runs.store import locate

@@ -19,8 +19,10 @@ from probe_kit.errors import RunDamagedError, UsageError
 from probe_kit.hashing import sha256_json
 from probe_kit.hooks.contract.sites import Site
 from probe_kit.intervene.kinds.image_swap import ImageSwap, stored_image_swaps
-from probe_kit.intervene.outcomes import ConditionOutcomes, settings_of, stored_interventions
+from probe_kit.intervene.outcomes import ConditionOutcomes
 from probe_kit.intervene.results import save
+from probe_kit.intervene.settings import settings_of
+from probe_kit.intervene.stored import stored_interventions
 from probe_kit.retention import retention_table
 from probe_kit.runs import Run, open_run
 from probe_kit.runs.layout import DIAGNOSES

@@ -18,29 +18,17 @@ from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.sites import first_of
 from probe_kit.intervene.kinds.base import Intervention, effect_table
 from probe_kit.intervene.outcomes import (
-    ATTENTION,
-    ATTENTION_FILE,
-    PATCHES_FILE,
     RECORDED,
     ConditionOutcomes,
     Effect,
-    Measurement,
-    StoredResult,
     arrays_from_bytes,
     arrays_to_bytes,
-    has_sides,
-    stored_results,
 )
-from probe_kit.intervene.places import (
-    ALL,
-    TILE_ROLES,
-    TILES,
-    role_token_mask,
-    roles_of,
-    shown_cameras,
-    token_boxes,
-)
+from probe_kit.intervene.places import ALL, TILE_ROLES, TILES, roles_of
 from probe_kit.intervene.replay import CLEAN_RUN, Condition, ConditionContext, ConditionResult
+from probe_kit.intervene.settings import has_sides
+from probe_kit.intervene.stored import Measurement, StoredResult, stored_results
+from probe_kit.intervene.tokens import shown_cameras, token_boxes
 from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.bootstrap import GAINS, student_interval, units_seed
 
@@ -52,6 +40,8 @@ if TYPE_CHECKING:
     from probe_kit.hooks.capturing.attention import AttentionMass
     from probe_kit.intervene.sessions import ReplaySession
 
+ATTENTION, ATTENTION_FILE, PATCHES_FILE = "attention", "attention.npz", "attention_patches.npz"
+"""The kind, and its files: shares by role, and those on single patches with where these lie in the picture."""
 ROLES = ("image", *TILES, "language", "state", "special")
 """Whose tokens are asked about, where a family has them and, of tiles, says which tokens see them."""
 
@@ -186,24 +176,22 @@ def attention_recorded(
     family does not say.
     """
 
-    def mask_of(context: ConditionContext, role: str) -> NDArray[np.bool_]:
-        return role_token_mask(context.session.policy, context.pair, stream, role, context.memo)
-
     def play(context: ConditionContext) -> ConditionResult:
         from probe_kit.hooks.capturing.attention import capture_attention
 
         masks: list[NDArray[np.bool_] | None] = []
         for role in roles:
             try:
-                masks.append(mask_of(context, role))
+                masks.append(context.tokens.mask(stream, role))
             except EmptyRoleError:  # a family may have the role, and a tile be hidden by the arm
                 masks.append(None)
         with capture_attention(context.session.policy) as mass:
             chunk = context.act()
-        patches = _on_patches(mass, [mask_of(context, f"image.{camera}") for camera in boxes]) if boxes else None
+        on_cameras = [context.tokens.mask(stream, f"image.{camera}") for camera in boxes]
+        patches = _on_patches(mass, on_cameras) if boxes else None
         return ConditionResult(chunk, mass=shares_by_role(mass, masks), patches=patches)
 
-    return Condition(RECORDED, play, boxes)
+    return Condition(RECORDED, play, details=boxes)
 
 
 def _on_patches(mass: "AttentionMass", masks: Sequence[NDArray[np.bool_]]) -> NDArray[np.float32]:
@@ -312,10 +300,14 @@ class AttentionShares:
     calls: NDArray[np.int64]
     mass: NDArray[np.float32]
 
+    def __post_init__(self) -> None:
+        # Stored names are an array.
+        object.__setattr__(self, "roles", tuple(map(str, self.roles)))
+
     @classmethod
     def from_bytes(cls, content: bytes) -> Self:
         """Load what `arrays_to_bytes` made of one."""
-        return cls(**arrays_from_bytes(content, "roles"))
+        return cls(**arrays_from_bytes(content))
 
     def only(self, selected: NDArray[np.bool_]) -> Self:
         """Some of the inferences. selected: (N,)."""

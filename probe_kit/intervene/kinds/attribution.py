@@ -20,8 +20,8 @@ from probe_kit.intervene.kinds.base import (
     lines_of,
     p_of,
 )
-from probe_kit.intervene.kinds.interchange import cells_at, check_sites_and_roles, patch_of
-from probe_kit.intervene.outcomes import CLEAN, FIRST_CHUNK, ConditionOutcomes, Measurement
+from probe_kit.intervene.kinds.interchange import cells_at, check_roles_apart, patch_of
+from probe_kit.intervene.outcomes import CLEAN, ConditionOutcomes
 from probe_kit.intervene.patching.attribution import (
     AGREEMENT,
     AttributionEffect,
@@ -38,6 +38,8 @@ from probe_kit.intervene.patching.attribution import (
 from probe_kit.intervene.patching.patch import Cell, sites_of_cells
 from probe_kit.intervene.places import ALL, SEPARATOR, resolve_all
 from probe_kit.intervene.replay import CLEAN_RUN, SOURCE_RUN, Condition, ConditionContext, ConditionResult
+from probe_kit.intervene.settings import FIRST_CHUNK
+from probe_kit.intervene.stored import Measurement
 from probe_kit.runs.run import Run
 
 if TYPE_CHECKING:
@@ -67,7 +69,8 @@ def _estimated(cell: Cell, by_row: Mapping[tuple[int, int], float]) -> Condition
     def play(context: ConditionContext) -> ConditionResult:
         return ConditionResult(context.clean, estimated=by_row[context.pair.row, context.pair.step])
 
-    return Condition(f"{ESTIMATE}|{cell.site_group.name}|{cell.role}", play)
+    name = cell.site_group.name
+    return Condition(f"{ESTIMATE}|{name}|{cell.role}", play, (name,))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,7 +103,7 @@ class AttributionPatching(Intervention):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_sites_and_roles(self.sites, self.roles, "attribution needs")
+        check_roles_apart(self.roles, self.kind)
         if self.ends not in get_args(Ends) or self.top < 1:
             raise UsageError(
                 f"ends is {self.ends!r} and top {self.top}; expected {' or '.join(get_args(Ends))}, and 1 or more"
@@ -169,6 +172,7 @@ class AttributionPatching(Intervention):
             members = [at for at, other in enumerate(kinds) if other == kind]
             best = {at for values in shares for at in sorted(members, key=lambda at: -abs(values[at]))[: self.top]}
             remaining = [at for at in members if at not in best]
+            # A seed per kind: what is drawn of one does not depend on which others are screened.
             draw = np.random.default_rng(derive_seed("attribution", self.seed, kind))
             top |= {cells[at] for at in best}
             drawn |= {cells[at] for at in draw.permutation(remaining)[: self.controls].tolist()}

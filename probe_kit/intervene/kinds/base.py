@@ -18,18 +18,13 @@ from probe_kit.hashing import derive_seed
 from probe_kit.hooks.capturing.edits import LOG_FIELDS
 from probe_kit.hooks.contract.declared import InterventionKind
 from probe_kit.hooks.contract.sites import KV_STREAM
-from probe_kit.intervene.outcomes import (
-    FIRST_CHUNK,
-    PER_STEP,
-    Choice,
-    ConditionOutcomes,
-    Effect,
-    Measurement,
-    categories_in,
-    has_sides,
-)
-from probe_kit.intervene.places import SEPARATOR, TILES, Pair
+from probe_kit.intervene.outcomes import ConditionOutcomes, Effect
+from probe_kit.intervene.pairs import Pair
+from probe_kit.intervene.patching.patch import Cell
+from probe_kit.intervene.places import SEPARATOR, TILES
 from probe_kit.intervene.replay import Condition, replay
+from probe_kit.intervene.settings import FIRST_CHUNK, PER_STEP, Choice, categories_in, has_sides
+from probe_kit.intervene.stored import Measurement
 from probe_kit.runs.direction_files import FileDirection, names_file, read_direction
 from probe_kit.runs.reader import RunReader
 from probe_kit.runs.run import Run
@@ -41,10 +36,12 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from probe_kit._tables.table import Table
+    from probe_kit.intervene.directions import Directions
     from probe_kit.intervene.sessions import ReplaySession
 
 Values = NDArray[np.float64]
 CONTROL = "control-"
+"""The names of random directions begin with it, by which stored results tell them apart."""
 OPTIONS = ("sites", "roles", "direction", "controls", "coefficients", "target_side", "seed")
 """Options of the command that a kind may take."""
 
@@ -70,7 +67,7 @@ class Intervention(Choice, ABC):
     """
 
     summary: ClassVar[str]
-    position: ClassVar[int] = 100
+    position: ClassVar[int] = 100  # behind all shipped kinds, which have 1 to 9
     options: ClassVar[Mapping[str, str]] = MappingProxyType({})
     needs: ClassVar[tuple[InterventionKind, ...]] = ("edit",)
     fits_always: ClassVar[bool] = False
@@ -86,6 +83,13 @@ class Intervention(Choice, ABC):
                 f"{cls.__name__} declares the option {unknown[0]!r}, which `probe-kit intervene` does not have; "
                 f"expected some of {', '.join(OPTIONS)}"
             )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for pattern in ("sites", "roles"):
+            # `roles` alone, without sites, may be empty: a readout of attention takes all that there are.
+            if hasattr(self, "sites") and getattr(self, pattern, None) == ():
+                raise UsageError(f"--kind {self.kind} needs at least one of --{pattern}; none is given")
 
     @classmethod
     def from_options(cls, run: Run, **options: Any) -> Self:
@@ -217,8 +221,11 @@ class AlongDirection(Intervention):
     direction: `mean-difference` or `probe`, one vector per place found in means over tokens without the episode it
     is used on; `mean-difference:K`, K directions found in the tokens themselves, see `directions`; FILE#NAME, see
     `direction_files`; some kinds take `none`. controls: so many random directions of the data's own covariance,
-    orthogonal to it. vector: of a file; then `direction` is its name.
+    orthogonal to it. vector: of a file; then `direction` is its name. takes_none: of the class, whether tokens may
+    be edited along no direction.
     """
+
+    takes_none: ClassVar[bool] = True
 
     direction: str = NONE
     controls: int = 0
@@ -231,6 +238,29 @@ class AlongDirection(Intervention):
             vector = read_direction(self.direction)
             object.__setattr__(self, "vector", vector)
             object.__setattr__(self, "direction", vector.name)
+        elif self.direction != NONE or not self.takes_none:
+            from probe_kit.intervene.directions import check_direction
+
+            check_direction(self.direction)
+        elif self.controls:
+            raise UsageError("controls are directions beside another one; choose --direction, or --controls 0")
+
+    def fit_directions(
+        self, session: "ReplaySession", cells: Sequence[Cell], patterns: Sequence[str]
+    ) -> "dict[Cell, Directions]":
+        """Return its direction and the random ones in every cell; see `directions.fit_directions_in_cells`."""
+        from probe_kit.intervene.directions import fit_directions_in_cells
+
+        return fit_directions_in_cells(
+            session,
+            cells,
+            patterns,
+            self.direction,
+            controls=self.controls,
+            seed=self.seed,
+            categories=self.categories,
+            vector=self.vector,
+        )
 
     def check_run(self, run: Run) -> None:
         """Raise UsageError also for a direction of an answer in a run without sides."""
@@ -281,8 +311,9 @@ class ConditionName:
 class EffectRow(Effect):
     """The effect of one edit in one category, with the columns that all kinds of edits have.
 
-    sites: that were edited. role: of the tokens. direction: empty if they were edited in full. net, net_ci:
-    the kind's share of episodes, with its 95 % interval by groups. max_action_change: largest difference in any
+    sites: that were edited. role: of the tokens. direction: empty if they were edited in full. net, net_ci: share
+    of episodes that do with the edit what the kind counts, such as a flip to the target side, minus the share that
+    do the reverse, with its 95 % interval by groups. max_action_change: largest difference in any
     action of any episode; 0 is bit for bit. fires, no_op_fires: of edited sites in all episodes, and those that
     changed nothing. relative_change: how far tokens were moved, in their own norms. key: of the intervention.
     """
@@ -307,8 +338,12 @@ class EffectRow(Effect):
         return " ".join(filter(None, (self.sites, self.role, self.direction)))
 
 
-def common_columns(outcomes: ConditionOutcomes, row: int, name: ConditionName, net: Values) -> dict[str, Any]:
-    """Return the columns of `EffectRow` of one condition. outcomes: of one category. net: (E,) its gains."""
+def common_columns(outcomes: ConditionOutcomes, row: int, name: ConditionName, gains: Values) -> dict[str, Any]:
+    """Return the columns of `EffectRow` of one condition.
+
+    outcomes: of one category. row: of the condition in them. gains: (E,) 1 where an episode does with the edit
+    what the kind counts and did not without it, −1 for the reverse.
+    """
     logged = dict(zip(LOG_FIELDS, outcomes.edit_log[row].T, strict=True))
     norm = float((logged["norm"] * logged["fires"]).sum())
     counts = {column: value for column, value in outcomes.counts.items() if column != "n_groups"}
@@ -318,8 +353,8 @@ def common_columns(outcomes: ConditionOutcomes, row: int, name: ConditionName, n
         "role": name.role,
         "direction": name.direction,
         "is_control": name.is_control,
-        "net": float(net.mean()),
-        "net_ci": net_interval(net, outcomes),
+        "net": float(gains.mean()),
+        "net_ci": net_interval(gains, outcomes),
         "max_action_change": float(outcomes.max_action_change[row].max()),
         "fires": int(logged["fires"].sum()),
         "no_op_fires": int(logged["no_op_fires"].sum()),
@@ -327,10 +362,10 @@ def common_columns(outcomes: ConditionOutcomes, row: int, name: ConditionName, n
     }
 
 
-def net_interval(net: Values, outcomes: ConditionOutcomes) -> tuple[float, float]:
+def net_interval(gains: Values, outcomes: ConditionOutcomes) -> tuple[float, float]:
     """Return the 95 % interval by groups of the mean over episodes of (E,) gains."""
     drawn = units_seed(outcomes.groups, outcomes.seed_text)
-    low, high = group_bootstrap(net[:, None], outcomes.groups, drawn, bounds=GAINS)
+    low, high = group_bootstrap(gains[:, None], outcomes.groups, drawn, bounds=GAINS)
     return float(low[0]), float(high[0])
 
 
@@ -348,26 +383,29 @@ class ControlTest(NamedTuple):
     p_fwe: float | None = None
 
 
-def test_against_controls(
+def compare_with_controls(
     values: Values,
     names: Sequence[ConditionName],
     outcomes: ConditionOutcomes,
-    untested: Collection[int],
-    no_controls: Collection[int],
+    *,
+    skipped: Collection[int] = (),
+    broken_controls: Collection[int] = (),
 ) -> list[ControlTest]:
     """Compare every condition that is no control with its own controls, in the order of the conditions.
 
-    values: (K, E) tested to be above zero. outcomes: of one category. untested: further rows that are not tested.
-    no_controls: rows that are no controls.
+    values: (K, E) tested to be above zero. names: of the K conditions. outcomes: of one category. skipped: rows
+    that are not tested though they are no controls, such as an identity patch. broken_controls: rows of controls
+    that nothing is compared with, such as those that disrupt the task.
     """
     controls = [
-        [at for at, other in enumerate(names) if other.is_control_of(name) and at not in no_controls]
+        [at for at, other in enumerate(names) if other.is_control_of(name) and at not in broken_controls]
         for name in names
     ]
     tests = [ControlTest(rows) for rows in controls]
-    tested = [at for at, name in enumerate(names) if not name.is_control and at not in untested]
+    tested = [at for at, name in enumerate(names) if not name.is_control and at not in skipped]
     if not tested:
         return tests
+    # Without controls an effect is compared with zero.
     beyond = np.array(
         [values[at] - values[controls[at]].mean(axis=0) if controls[at] else values[at] for at in tested]
     )

@@ -25,6 +25,7 @@ from probe_kit.intervene.kinds.base import (
     ConditionName,
     EffectRow,
     common_columns,
+    compare_with_controls,
     count_edits,
     edit_of,
     effect_table,
@@ -33,13 +34,15 @@ from probe_kit.intervene.kinds.base import (
     p_of,
     share_of_edits,
     signed_interval,
-    test_against_controls,
 )
 from probe_kit.intervene.kinds.interchange import best_patch_targets, patch_of, patches_within
-from probe_kit.intervene.outcomes import CLEAN, FIRST_CHUNK, ConditionOutcomes, Measurement, categories_in
+from probe_kit.intervene.outcomes import CLEAN, ConditionOutcomes
+from probe_kit.intervene.pairs import Pair
 from probe_kit.intervene.patching.patch import Cell, sites_of_cells
-from probe_kit.intervene.places import ALL, SEPARATOR, TILES, Pair, resolve_sites, role_tokens
+from probe_kit.intervene.places import ALL, SEPARATOR, TILES, resolve_sites
 from probe_kit.intervene.replay import SOURCE_RUN, Condition, ConditionContext, ConditionResult
+from probe_kit.intervene.settings import FIRST_CHUNK, categories_in
+from probe_kit.intervene.stored import Measurement
 from probe_kit.runs.run import Run
 from probe_kit.statistics.paired_tests import sign_p
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -50,8 +53,9 @@ if TYPE_CHECKING:
     from probe_kit.intervene.sessions import ReplaySession
 
 MIN_IN_ZONE_RATIO = 0.5
-"""Share of the clean in-zone share below which the task is called disrupted."""
+"""Share of the clean in-zone share below which the task is called disrupted: most of the placing is gone."""
 CORRECT, WRONG = "correct", "wrong"
+"""Outcomes of `env.scoring` with the cube in a zone; the third, `oob`, is outside both."""
 Finding = Literal["identity patch", "control", "task disrupted", "confirmed", "not confirmed"]
 _LEGEND = (
     "every episode played again, same scene and seeds, with the edit at every inference; in a zone: whichever "
@@ -66,13 +70,13 @@ def identity_patch(sites: Sequence[Site]) -> Condition:
     """Return the inference as the run made it, with every site that any condition changes written back."""
 
     def play(context: ConditionContext) -> ConditionResult:
-        session, pair = context.session, context.pair
+        policy = context.session.policy
         with ExitStack() as stack:
             edit_logs = []
             for stream in dict.fromkeys(site.stream for site in sites):
                 of_stream = [site for site in sites if site.stream == stream]
-                tokens = role_tokens(session.policy, pair, stream, ALL, context.memo)
-                edit_logs.append(stack.enter_context(apply_patch(session.policy, of_stream, tokens, Identity())))
+                tokens = context.tokens.selection(stream, ALL)
+                edit_logs.append(stack.enter_context(apply_patch(policy, of_stream, tokens, Identity())))
             chunk = context.act()
         return ConditionResult(chunk, EditLog.sum(edit_logs))
 
@@ -105,17 +109,11 @@ class ClosedLoop(AlongDirection):
     controls: int = 1
 
     def __post_init__(self) -> None:
-        from probe_kit.intervene.directions import check_direction
-
         super().__post_init__()
         if self.readout != FIRST_CHUNK:
             raise UsageError("a closed loop is read where the cube ends; leave --readout out")
         if not self.targets or any(target.count(SEPARATOR) != 1 for target in self.targets):
             raise UsageError(f"targets are {self.targets}; expected PLACE|ROLE, such as backbone.02|image")
-        if self.direction != NONE:
-            check_direction(self.direction, self.vector)
-        elif self.controls:
-            raise UsageError("controls are directions beside another one; choose --direction, or --controls 0")
 
     @classmethod
     def from_options(cls, run: Run, **options: Any) -> Self:
@@ -155,8 +153,6 @@ class ClosedLoop(AlongDirection):
 
     def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
         """Return the identity patch, the image swap and every target. Raises UnknownSiteError, NoProbesError."""
-        from probe_kit.intervene.directions import fit_token_directions
-
         cells = [
             Cell(site_group, role)
             for site, (role,) in self.patterns
@@ -167,7 +163,7 @@ class ClosedLoop(AlongDirection):
         bases = (
             {}
             if self.direction == NONE
-            else fit_token_directions(session, self, within, [site for site, _ in self.patterns])
+            else self.fit_directions(session, within, [site for site, _ in self.patterns])
         )
         conditions = [identity_patch(source_sites), SOURCE_RUN]
         for cell in cells:
@@ -296,7 +292,7 @@ def closed_loop_effects(outcomes: ConditionOutcomes) -> list[ClosedLoopEffect]:
     net = wrong - wrong[0]
     left_out = set(np.flatnonzero(disrupted).tolist())
     clean = {at for at, name in enumerate(names) if name.site == CLEAN}
-    tests = test_against_controls(net, names, outcomes, left_out | clean, left_out)
+    tests = compare_with_controls(net, names, outcomes, skipped=left_out | clean, broken_controls=left_out)
     rows = []
     for at, (name, test) in enumerate(zip(names, tests, strict=True)):
         gained, lost = int((net[at] > 0).sum()), int((net[at] < 0).sum())

@@ -31,20 +31,10 @@ from probe_kit.intervene.kinds.base import (
     p_of,
     signed_interval,
 )
-from probe_kit.intervene.outcomes import (
-    CLEAN,
-    CONTROL_INPUT,
-    DONOR,
-    FIRST_CHUNK,
-    IMAGE_SWAP,
-    TILES_APART,
-    ConditionOutcomes,
-    Effect,
-    Measurement,
-    has_sides,
-    preferred_by_category,
-)
+from probe_kit.intervene.outcomes import CLEAN, CONTROL_INPUT, DONOR, IMAGE_SWAP, ConditionOutcomes, Effect
 from probe_kit.intervene.replay import CLEAN_RUN, CONTROL_RUN, DONOR_RUN, SOURCE_RUN, Condition
+from probe_kit.intervene.settings import FIRST_CHUNK, has_sides
+from probe_kit.intervene.stored import TILES_APART, Measurement, preferred_by_category
 from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.bootstrap import unbounded_student_interval
 from probe_kit.statistics.paired_tests import paired_greater_p
@@ -58,14 +48,15 @@ if TYPE_CHECKING:
 
 NAME = "image-swap"
 FEWEST_TO_EITHER_SIDE = 8
-"""Clean inferences that must go to either side before a reach is taken from them."""
+"""Clean inferences that must go to either side before a reach is taken from them: a median of fewer jumps."""
 SMALLEST_REACH = 0.02
-"""Metres. Two sides that are nearer to each other are no choice between tiles."""
+"""Metres. Two sides that are nearer to each other are no choice between tiles, which are 0.31 m apart."""
 REACHED = 0.25
-"""Share of the reach from which a side counts as reached."""
+"""Share of the reach, from the middle, where a side counts as reached: half-way, as the side is at 0.5."""
 SMALLEST_SHARE_OF_INTEREST = 0.10
-"""Of the reach. A displacement below it is a trace."""
+"""Of the reach. A displacement below it is a trace. Chosen, as the bound within which *not used* must lie."""
 FOLLOWS, REVERSES = 1, -1
+"""Responses of an episode to a swap; 0 is neither."""
 _LEGEND = (
     "moved: displacement toward the correct picture in units of the policy's own reach, "
     f"{SMALLEST_SHARE_OF_INTEREST} of which count; follow: goes to the correct picture, and to the other side "
@@ -421,13 +412,8 @@ class ImageSwap(Swap):
         if context.lacks_sides:
             return super().table(rows, context)
         verdicts = context.verdicts
-        reasons = [
-            f"{category_of(name).title}: {verdict.explanation}"
-            for name, verdict in verdicts.items()
-            if verdict.explanation and context.explains
-        ]
         reaches = [_REACH[row.reach_source].format(100 * row.reach) for row in rows]
-        caption = "; ".join(filter(None, (_LEGEND, *dict.fromkeys((context.legend, *reaches, *reasons)))))
+        caption = "; ".join(filter(None, (_LEGEND, *dict.fromkeys((context.legend, *reaches)))))
         parts: dict[str, Any] = {
             "Verdict": {
                 "verdict": lambda row: verdicts[row.category].verdict if row.category in verdicts else "–"

@@ -22,16 +22,7 @@ from probe_kit.intervene.kinds.image_swap import (
     swap_columns,
     swap_rates,
 )
-from probe_kit.intervene.outcomes import (
-    CLEAN,
-    IMAGE_SWAP,
-    INSTRUCTION_SWAP,
-    NOISE,
-    ConditionOutcomes,
-    Effect,
-    Measurement,
-    has_sides,
-)
+from probe_kit.intervene.outcomes import CLEAN, IMAGE_SWAP, INSTRUCTION_SWAP, NOISE, ConditionOutcomes, Effect
 from probe_kit.intervene.replay import (
     CLEAN_RUN,
     CONTROL_RUN,
@@ -41,6 +32,8 @@ from probe_kit.intervene.replay import (
     ConditionContext,
     ConditionResult,
 )
+from probe_kit.intervene.settings import has_sides
+from probe_kit.intervene.stored import Measurement
 from probe_kit.statistics.significance import SIGNIFICANCE
 
 if TYPE_CHECKING:

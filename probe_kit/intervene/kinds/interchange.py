@@ -27,6 +27,7 @@ from probe_kit.intervene.kinds.base import (
     EffectRow,
     Values,
     common_columns,
+    compare_with_controls,
     count_edits,
     effect_table,
     lines_of,
@@ -34,24 +35,14 @@ from probe_kit.intervene.kinds.base import (
     p_of,
     share_of_edits,
     signed_interval,
-    test_against_controls,
 )
 from probe_kit.intervene.kinds.image_swap import SMALLEST_REACH
-from probe_kit.intervene.outcomes import (
-    CLEAN,
-    IMAGE_SWAP,
-    UNCHANGED,
-    ConditionOutcomes,
-    Measurement,
-    PooledConditions,
-    Rank,
-    pool_conditions,
-    stored_results,
-)
+from probe_kit.intervene.outcomes import CLEAN, IMAGE_SWAP, UNCHANGED, ConditionOutcomes
 from probe_kit.intervene.patching.attribution import LOCALISATION_SHARE
 from probe_kit.intervene.patching.patch import Cell, sites_of_cells
 from probe_kit.intervene.places import ALL, RESIDUAL, TILES, PlaceName, SiteGroup, resolve_all, roles_of
 from probe_kit.intervene.replay import CLEAN_RUN, SOURCE_RUN, Condition, patched_run
+from probe_kit.intervene.stored import Measurement, PooledConditions, Rank, pool_conditions, stored_results
 from probe_kit.runs.reader import RunReader
 from probe_kit.runs.run import Run
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -135,6 +126,7 @@ def target_sign(outcomes: ConditionOutcomes, target_side: str) -> Values:
     """Return (E,) the side that is pushed to, +1 for left."""
     correct = outcomes.correct_sign
     sides = {"left": np.ones_like(correct), "right": -np.ones_like(correct), "correct": correct}
+    # `wrong`, and the image swap, after which the correct picture lies on the other side.
     return sides.get(target_side, -correct)
 
 
@@ -155,7 +147,7 @@ def patch_effects(outcomes: ConditionOutcomes, target_side: str = IMAGE_SWAP) ->
     displacements = push * (outcomes.displacement[rows] - clean)
     exchange = outcomes.exchange()
     sign = 1.0 if exchange is None or target_side != IMAGE_SWAP else exchange.sign
-    tests = test_against_controls(sign * displacements, names, outcomes, (), ())
+    tests = compare_with_controls(sign * displacements, names, outcomes)
     effects = []
     for row, name, test, moved in zip(rows, names, tests, displacements, strict=True):
         # 1 where the action flips to the target side, −1 where it flips away from it.
@@ -407,10 +399,10 @@ def patches_within(
     ]
 
 
-def check_sites_and_roles(sites: Sequence[str], roles: Sequence[str], subject: str) -> None:
-    """Raise UsageError without sites, or for roles that share tokens."""
-    if not sites or not roles or ALL in roles:
-        raise UsageError(f"{subject} at least one site, and roles that share no token (not all)")
+def check_roles_apart(roles: Sequence[str], kind: str) -> None:
+    """Raise UsageError for roles that share tokens: sets of such cells would patch tokens twice."""
+    if ALL in roles:
+        raise UsageError(f"--kind {kind} needs roles that share no token; leave all out")
 
 
 class PatchKind(AlongDirection):
@@ -503,20 +495,12 @@ class Interchange(PatchKind):
     roles: tuple[str, ...] = (ALL, "image", "language")
 
     def __post_init__(self) -> None:
-        from probe_kit.intervene.directions import check_direction
-
         super().__post_init__()
-        if not self.sites or not self.roles:
-            raise UsageError("an interchange needs at least one site and one role")
         if set(self.roles) & set(TILES) and self.direction != NONE:
             raise UsageError(
                 "tiles have no mean in the run from which a direction could be found; patch them in full: leave "
                 "--direction out"
             )
-        if self.direction != NONE:
-            check_direction(self.direction, self.vector)
-        elif self.controls:
-            raise UsageError("controls are directions beside another one; choose --direction, or no --controls")
 
     @classmethod
     def from_options(cls, run: Run, **options: Any) -> Self:
@@ -526,14 +510,12 @@ class Interchange(PatchKind):
 
     def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
         """Return clean, images swapped, and every place at every role. Raises UnknownSiteError, NoProbesError."""
-        from probe_kit.intervene.directions import fit_token_directions
-
         cells = cells_at(session, resolve_all(self.sites, session.policy).values(), self.roles)
         source_sites = sites_of_cells(cells)
         conditions = [CLEAN_RUN, SOURCE_RUN]
         if self.direction == NONE:
             return conditions + [patch_of(cell, source_sites) for cell in cells]
-        bases = fit_token_directions(session, self, cells, self.sites)
+        bases = self.fit_directions(session, cells, self.sites)
         for cell, basis in bases.items():
             conditions += patches_within(self.direction, basis, cell, source_sites)
         return conditions

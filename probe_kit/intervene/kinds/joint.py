@@ -18,19 +18,14 @@ from probe_kit.intervene.kinds.base import (
     interval_text,
     lines_of,
 )
-from probe_kit.intervene.kinds.interchange import cells_at, check_sites_and_roles
-from probe_kit.intervene.outcomes import (
-    CLEAN,
-    ConditionOutcomes,
-    Effect,
-    Measurement,
-    StoredResult,
-    stored_results,
-)
+from probe_kit.intervene.kinds.interchange import cells_at, check_roles_apart
+from probe_kit.intervene.outcomes import CLEAN, ConditionOutcomes, Effect
+from probe_kit.intervene.pairs import Pair
 from probe_kit.intervene.patching.patch import Cell, all_but, sites_of_cells
 from probe_kit.intervene.patching.sweep import KEEP, choosing_half, find_minimal_set
-from probe_kit.intervene.places import SEPARATOR, Pair, list_places, resolve_all
+from probe_kit.intervene.places import SEPARATOR, list_places, resolve_all
 from probe_kit.intervene.replay import CLEAN_RUN, SOURCE_RUN, Condition, patched_run
+from probe_kit.intervene.stored import Measurement, StoredResult, stored_results
 from probe_kit.runs.reader import RunReader
 from probe_kit.statistics.paired_tests import paired_greater_p, smallest_flip_p
 from probe_kit.statistics.significance import SIGNIFICANCE
@@ -46,7 +41,7 @@ EVERY, ALONE, WITHOUT, MINIMAL, SECOND = "every-cell", "alone", "without", "mini
 """Conditions: all cells; one of them, and all but it; the smallest set, and one that is found without it."""
 WITHOUT_MINIMAL = f"{WITHOUT}|{MINIMAL}"
 WORTH_SEARCHING = 0.5
-"""Effect of all cells together from which a smallest set is searched."""
+"""Effect of all cells together from which a smallest set is searched: of less, hardly any carries half."""
 MOST_PLACES = 3
 """Places that a short sentence names."""
 _LEGEND = (
@@ -107,7 +102,7 @@ class JointPlaces(Intervention):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_sites_and_roles(self.sites, self.roles, "joint places need")
+        check_roles_apart(self.roles, self.kind)
 
     def conditions(self, session: "ReplaySession") -> Sequence[Condition]:
         """Return clean, images swapped, the sets of cells. Raises UsageError for cells that are not parallel."""
@@ -127,6 +122,7 @@ class JointPlaces(Intervention):
         }
         sets[SECOND] = {name: search.second for name, search in searched.items()}
         sets[MINIMAL] = {name: search.cells for name, search in searched.items()}
+        # One capture of the source at all sites serves every set.
         sites = sites_of_cells(cells)
         return [CLEAN_RUN, SOURCE_RUN, *(patched_run(name, by_name, sites) for name, by_name in sets.items())]
 

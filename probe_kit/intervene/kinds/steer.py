@@ -19,7 +19,7 @@ from probe_kit.intervene.kinds.base import ConditionName
 from probe_kit.intervene.kinds.image_swap import SMALLEST_REACH
 from probe_kit.intervene.kinds.interchange import PatchEffect, PatchKind
 from probe_kit.intervene.patching.patch import Cell
-from probe_kit.intervene.places import TILES, resolve_all, role_tokens
+from probe_kit.intervene.places import TILES, resolve_all
 from probe_kit.intervene.replay import CLEAN_RUN, SOURCE_RUN, Condition, ConditionContext, ConditionResult
 from probe_kit.runs.run import Run
 
@@ -41,11 +41,12 @@ def steered(cell: Cell, name: str, coefficient: float, target_side: TargetSide, 
         side = {"left": 1.0, "right": -1.0, "correct": 1.0 if is_left else -1.0, "wrong": -1.0 if is_left else 1.0}
         strength = coefficient * (1.0 if pair.side is None else side[target_side])
         shift = bases.shift(name, pair.episode, strength)
-        tokens = role_tokens(session.policy, pair, site_group.stream, cell.role, context.memo)
+        tokens = context.tokens.selection(site_group.stream, cell.role)
         with apply_patch(session.policy, site_group.sites, tokens, AddVector(shift)) as edit_log:
             return ConditionResult(context.act(), edit_log)
 
-    return Condition(str(ConditionName(cell.site_group.name, cell.role, name, f"{coefficient:g}")), play)
+    condition = ConditionName(cell.site_group.name, cell.role, name, f"{coefficient:g}")
+    return Condition(str(condition), play, (condition.site,))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,6 +64,7 @@ class Steering(PatchKind):
     kind: ClassVar[str] = "steer"
     summary: ClassVar[str] = "Add a direction to tokens, with controls of the same norm."
     position: ClassVar[int] = 6
+    takes_none: ClassVar[bool] = False
     options: ClassVar[Mapping[str, str]] = {
         "sites": "where tokens are moved; required",
         "roles": "the one whose tokens are moved; required",
@@ -81,15 +83,12 @@ class Steering(PatchKind):
     controls: int = 5
 
     def __post_init__(self) -> None:
-        from probe_kit.intervene.directions import check_direction
-
         super().__post_init__()
         if self.role in TILES:
             raise UsageError(
                 f"{self.role} has no mean in the run from which a direction could be found; steer `image`, or "
                 "patch the tile (--kind interchange)"
             )
-        check_direction(self.direction, self.vector)
         if self.target_side not in get_args(TargetSide):
             raise UsageError(
                 f"target_side is {self.target_side!r}; expected one of {', '.join(get_args(TargetSide))}"
@@ -121,11 +120,10 @@ class Steering(PatchKind):
 
         Raises UnknownSiteError, and NoDirectionError for a named place without a direction.
         """
-        from probe_kit.intervene.directions import fit_token_directions
-
         cells = [Cell(site_group, self.role) for site_group in resolve_all(self.sites, session.policy).values()]
         conditions = [CLEAN_RUN, SOURCE_RUN]
-        for cell, bases in fit_token_directions(session, self, cells, self.sites).items():
+        for cell, bases in self.fit_directions(session, cells, self.sites).items():
+            # Adding nothing must change nothing: `runner._ledgers` checks the hook itself by it.
             doses = [(self.direction, 0.0)]
             for coefficient in self.coefficients:
                 doses += [(name, coefficient) for name in (self.direction, *bases.control_names)]

@@ -16,6 +16,8 @@ from probe_kit._system.imports import lazy_names
 
 if TYPE_CHECKING:
     from probe_kit.hooks.capturing.readouts import logit_lens, project_heads
+    from probe_kit.intervene.open_session import find_pairs, open_session
+    from probe_kit.intervene.pairs import Pair
     from probe_kit.intervene.patching.attribution import Screen, attribute_cells
     from probe_kit.intervene.patching.patch import (
         AttentionPattern,
@@ -35,8 +37,6 @@ if TYPE_CHECKING:
         find_minimal_cells,
         sweep_cells,
     )
-    from probe_kit.intervene.places import Pair
-    from probe_kit.intervene.sessions import find_pairs, open_session
 
 __all__ = [
     "AttentionPattern",
@@ -69,7 +69,7 @@ __getattr__, __dir__ = lazy_names(
         "Cell": "patch",
         "HookPoint": "patch",
         "MinimalCells": "sweep",
-        "Pair": "probe_kit.intervene.places",
+        "Pair": "probe_kit.intervene.pairs",
         "Screen": "attribution",
         "Sweep": "sweep",
         "all_but": "patch",
@@ -78,9 +78,9 @@ __getattr__, __dir__ = lazy_names(
         "compare_alone_and_without": "sweep",
         "find_cells": "patch",
         "find_minimal_cells": "sweep",
-        "find_pairs": "probe_kit.intervene.sessions",
+        "find_pairs": "probe_kit.intervene.open_session",
         "logit_lens": "probe_kit.hooks.capturing.readouts",
-        "open_session": "probe_kit.intervene.sessions",
+        "open_session": "probe_kit.intervene.open_session",
         "patch_cells": "patch",
         "project_heads": "probe_kit.hooks.capturing.readouts",
         "run_with_cache": "patch",

@@ -19,18 +19,11 @@ from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.sites import KV_STREAM
 from probe_kit.intervene.exchange import Exchange, SwapShare, share_columns, share_fields
 from probe_kit.intervene.outcomes import Effect
+from probe_kit.intervene.pairs import Given, Pair
 from probe_kit.intervene.patching.patch import Cell, infer, sites_of_cells
 from probe_kit.intervene.patching.sweep import sweep_cells
-from probe_kit.intervene.places import (
-    ALL,
-    RESIDUAL,
-    Given,
-    Pair,
-    PlaceName,
-    SiteGroup,
-    resolve_sites,
-    role_token_mask,
-)
+from probe_kit.intervene.places import ALL, RESIDUAL, PlaceName, SiteGroup, resolve_sites
+from probe_kit.intervene.tokens import PairTokens
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -47,9 +40,9 @@ Slope = Callable[["Tensor"], "Tensor"]
 EVERY_BLOCK = f"{KV_STREAM}.*"
 """The anchor that is all of `kv`."""
 AGREEMENT = 3.0
-"""Factor within which an anchor's estimate must lie of its exact effect. A choice."""
+"""Factor within which an anchor's estimate must lie of its exact effect. A choice: orders survive it."""
 LOCALISATION_SHARE = 0.5
-"""Share of the whole effect from which a place is called localised."""
+"""Share of the whole effect from which a place is called localised; as `exchange.CARRIES` of sets."""
 FIRST = 3
 """Cells that a sentence names."""
 
@@ -124,8 +117,8 @@ def estimate_patches(
     for model_input in (pair.clean, pair.source)[: 1 + (ends == "both")]:
         assert isinstance(model_input, Observation)
         slopes.append(gradients_at(model, [model_input], [pair.seed], sites, lambda chunks: slope(chunks[0]))[1])
-    memo: dict[Any, Any] = {}
-    masks = [role_token_mask(model, pair, cell.site_group.stream, cell.role, memo) for cell in cells]
+    tokens = PairTokens(model, pair)
+    masks = [tokens.mask(cell.site_group.stream, cell.role) for cell in cells]
     return clean, moved, sum_over_cells(activations, source, slopes, cells, masks)
 
 

@@ -1,10 +1,10 @@
 """One inference of a model: with activations captured, changed by functions, or patched from another inference."""
 
-from collections.abc import Callable, Iterator, Mapping, MutableMapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Union
+from typing import TYPE_CHECKING, Union
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,20 +21,9 @@ from probe_kit.hooks.capturing.edits import (
 from probe_kit.hooks.contract.declared import ALL_EDITS
 from probe_kit.hooks.contract.observation import Observation
 from probe_kit.hooks.contract.sites import Site, plays
-from probe_kit.intervene.places import (
-    ALL,
-    ANSWERS_NOTHING,
-    RESIDUAL,
-    SEPARATOR,
-    TILE_ROLES,
-    Given,
-    Pair,
-    SiteGroup,
-    positions_of,
-    resolve_sites,
-    role_tokens,
-    roles_of_tokens,
-)
+from probe_kit.intervene.pairs import Given, Pair
+from probe_kit.intervene.places import ALL, RESIDUAL, SEPARATOR, TILE_ROLES, SiteGroup, positions_of, resolve_sites
+from probe_kit.intervene.tokens import ANSWERS_NOTHING, PairTokens, roles_of_tokens
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -195,45 +184,31 @@ def patch_cells(
     """
     together = as_tuple(cells)
     _, source = run_with_cache(model, pair.source, pair.seed, [cell.site_group.name for cell in together])
-    return infer_patched(model, pair, together, source, along, complement)
-
-
-def infer_patched(
-    model: "Model",
-    pair: Pair,
-    cells: Sequence[Cell],
-    source: "ActivationCache",
-    along: Basis | None = None,
-    complement: bool = False,
-) -> Output:
-    """Return the same with activations of the source that are captured already; one inference."""
-    with patched(model, pair, cells, source, along, complement):
+    with patched(PairTokens(model, pair), together, source, along, complement):
         return infer(model, pair.clean, pair.seed)
 
 
 @contextmanager
 def patched(
-    model: "Model",
-    pair: Pair,
+    tokens: PairTokens,
     cells: Sequence[Cell],
     source: "ActivationCache",
     along: Basis | None = None,
     complement: bool = False,
-    memo: MutableMapping[Any, Any] | None = None,
 ) -> Iterator[EditLog]:
-    """Patch cells of a pair while the model infers once; every patch of the package is made here.
+    """Patch cells while the model of `tokens` infers once; every patch of the package is made here.
 
-    memo: what is known of the pair's tokens, shared by its patches. Gives the log of the edits.
+    source: activations of the pair's source, at the sites of the cells. along, complement: see `patch_cells`.
+    Gives the log of the edits.
     """
-    memo = {} if memo is None else memo
     changes: dict[Site, list[tuple[TokenSelection, TokenEdit]]] = {}
     for cell in cells:
         # Several cells may lie at one site: their edits are collected, so that the site is hooked once.
-        tokens = role_tokens(model, pair, cell.site_group.stream, cell.role, memo)
-        change = cell.site_group.limit(_change(source, tokens.count, along, complement))
+        selection = tokens.selection(cell.site_group.stream, cell.role)
+        change = cell.site_group.limit(_change(source, selection.count, along, complement))
         for site in cell.site_group.sites:
-            changes.setdefault(site, []).append((tokens, change))
-    with apply_patches(model, changes) as log:
+            changes.setdefault(site, []).append((selection, change))
+    with apply_patches(tokens.model, changes) as log:
         yield log
 
 

@@ -69,7 +69,7 @@ class SweepCheckpoint:
 
         Raises RunDamagedError if they were changed, or are of another site or of other commits.
         """
-        arrays = self.pieces.read(f"{view}+{site}")
+        arrays = self.pieces.read(f"{view}+{site}", SiteProbe)
         if arrays is None:
             return None
         return {

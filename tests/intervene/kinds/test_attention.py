@@ -30,15 +30,18 @@ from probe_kit.intervene import (
     stored_attention,
 )
 from probe_kit.intervene.kinds.attention import (
+    ATTENTION_FILE,
     PatchAttention,
     attention_recorded,
     shares_by_role,
     stored_patch_attention,
 )
-from probe_kit.intervene.outcomes import ATTENTION_FILE, arrays_from_bytes, arrays_to_bytes
-from probe_kit.intervene.places import BANDS, TILES, Pair, patch_embeddings, token_boxes, tokens_overlapping
+from probe_kit.intervene.outcomes import arrays_from_bytes, arrays_to_bytes
+from probe_kit.intervene.pairs import Pair
+from probe_kit.intervene.places import TILES
 from probe_kit.intervene.replay import ConditionContext
 from probe_kit.intervene.sessions import ReplaySession
+from probe_kit.intervene.tokens import BANDS, patch_embeddings, token_boxes, tokens_overlapping
 from probe_kit.runs import Run, open_run, verify_run
 from tests.intervene.answers import follower, measured, outcomes_of, said_of
 from tests.support.smolvla_checkpoints import write_smolvla

@@ -18,9 +18,9 @@ from probe_kit.intervene import (
     run_intervention,
 )
 from probe_kit.intervene.kinds.attribution import EXACT
-from probe_kit.intervene.outcomes import Measurement
 from probe_kit.intervene.patching.attribution import kind_of_place
 from probe_kit.intervene.results import verdicts_of
+from probe_kit.intervene.stored import Measurement
 from probe_kit.runs import Run
 from tests.intervene.answers import measured, said_of
 from tests.intervene.wirings import WiredSession, outcomes_of, replay_inputs

@@ -23,9 +23,11 @@ from probe_kit.intervene import (
     stored_image_swaps,
 )
 from probe_kit.intervene.kinds.interchange import PatchEffect, best_cell
+from probe_kit.intervene.open_session import open_session
+from probe_kit.intervene.outcomes import arrays_from_bytes
 from probe_kit.intervene.replay import CLEAN_RUN, Condition, ConditionContext, ConditionResult
 from probe_kit.intervene.rollout import roll_out
-from probe_kit.intervene.sessions import ReplaySession, open_session
+from probe_kit.intervene.sessions import ReplaySession
 from probe_kit.runs import Run, open_run, verify_run
 from probe_kit.suite import Suite
 from tests.intervene.answers import measured
@@ -130,7 +132,7 @@ def test_shuffled_conditions_are_seldom_confirmed() -> None:
 
 def test_stored_answers_come_back_with_outcomes_and_without() -> None:
     outcomes = made([[RIGHT, WRONG], [OUT, WRONG]], NAMES[:2])
-    again = ConditionOutcomes.from_bytes(outcomes.to_bytes())
+    again = ConditionOutcomes(**arrays_from_bytes(outcomes.to_bytes()))
     assert again.episode_outcomes is not None
     np.testing.assert_array_equal(again.episode_outcomes, [[RIGHT, WRONG], [OUT, WRONG]])
 

@@ -11,7 +11,8 @@ import pytest
 import probe_kit
 from probe_kit.env import SceneSpec
 from probe_kit.intervene import ImageSwapEffect, classify_all, classify_use
-from probe_kit.intervene.outcomes import TILES_APART, ConditionOutcomes
+from probe_kit.intervene.outcomes import ConditionOutcomes, arrays_from_bytes
+from probe_kit.intervene.stored import TILES_APART
 from probe_kit.intervene.verdict import classify_behaviour, size_of_groups
 from probe_kit.statistics.sufficiency import groups_for_not_used
 from tests.intervene.answers import Cell, follower, habit, outcomes_of, swaps_of
@@ -223,7 +224,7 @@ def test_items_that_share_pictures_do_not_add_up() -> None:
 
 def test_answers_are_read_back_as_they_were() -> None:
     made = outcomes_of({"color": follower(4), "shape": habit(4)})
-    back = ConditionOutcomes.from_bytes(made.to_bytes())
+    back = ConditionOutcomes(**arrays_from_bytes(made.to_bytes()))
     assert back.to_bytes() == made.to_bytes()
     assert back.conditions == made.conditions
     np.testing.assert_array_equal(back.displacement, made.displacement)

@@ -19,8 +19,9 @@ from probe_kit.intervene import (
     run_intervention,
 )
 from probe_kit.intervene.kinds.instruction_swap import input_sensitivity
-from probe_kit.intervene.places import resolve_sites, roles_of, token_mask
+from probe_kit.intervene.places import resolve_sites, roles_of
 from probe_kit.intervene.sessions import ReplaySession
+from probe_kit.intervene.tokens import token_mask
 from probe_kit.runs import Run
 from tests.intervene.answers import with_parts
 

@@ -10,10 +10,10 @@ from probe_kit._terminal.console import out
 from probe_kit.errors import UnsupportedInterventionError, UsageError
 from probe_kit.hooks.contract.declared import Interventions
 from probe_kit.intervene import Interchange, InterventionResult, ReplaySource, run_intervention
+from probe_kit.intervene.inventory import listed_interventions
 from probe_kit.intervene.kinds.interchange import localised_by_category, stored_site_effects
 from probe_kit.intervene.kinds.joint import JointPlaces, stored_joint_places
 from probe_kit.intervene.patching.sweep import MOST_SINGLY, find_minimal_set
-from probe_kit.intervene.results import listed_interventions
 from probe_kit.runs import Run
 
 if TYPE_CHECKING:

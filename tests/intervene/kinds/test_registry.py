@@ -16,10 +16,10 @@ from probe_kit.errors import UsageError
 from probe_kit.hooks import Site
 from probe_kit.hooks.contract.declared import InterventionKind, asked_as
 from probe_kit.intervene import commands, kinds, load_effects
+from probe_kit.intervene.inventory import listed_interventions
 from probe_kit.intervene.kinds import every_kind, kind_names, kind_of
 from probe_kit.intervene.kinds.base import Intervention
 from probe_kit.intervene.places import TILE_ROLES
-from probe_kit.intervene.results import listed_interventions
 from probe_kit.retention import retention_table
 from probe_kit.runs import Run
 from probe_kit.suite import Suite

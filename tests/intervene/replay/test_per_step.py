@@ -17,8 +17,8 @@ from probe_kit.intervene import (
     ReplaySource,
     run_intervention,
 )
-from probe_kit.intervene.outcomes import key_of, settings_of
-from probe_kit.intervene.sessions import open_session
+from probe_kit.intervene.open_session import open_session
+from probe_kit.intervene.settings import key_of, settings_of
 from probe_kit.runs import Run
 from probe_kit.suite import Suite
 

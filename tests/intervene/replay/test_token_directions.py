@@ -13,7 +13,6 @@ from probe_kit.intervene.directions import (
     TokenFeatures,
     by_episode,
     fit_by_fold,
-    fit_token_directions,
     half_differences_of,
 )
 from probe_kit.intervene.erasers import Method, PaddedTokens
@@ -101,7 +100,7 @@ def test_they_are_the_leading_differences_of_class_means_of_the_other_folds(
     asked = Interchange(
         categories=("color",), sites=("backbone.02",), roles=("image",), direction="mean-difference:2", controls=1
     )
-    (axes,) = fit_token_directions(session, asked, [Cell(place, "image")], asked.sites).values()
+    (axes,) = asked.fit_directions(session, [Cell(place, "image")], asked.sites).values()
     session.on_fit_progress = None
     assert captured == [(done, len(items)) for done in range(1, len(items) + 1)]
     replay_inputs = [replay_input for item in items for replay_input in session.pairs(item)]

@@ -10,8 +10,9 @@ from typer.testing import CliRunner
 from probe_kit.cli import app
 from probe_kit.errors import RunDamagedError
 from probe_kit.intervene import ConceptErasure, ImageSwap, load_effects
-from probe_kit.intervene.outcomes import FORMAT, key_of, settings_of, stored_interventions
-from probe_kit.intervene.results import listed_interventions
+from probe_kit.intervene.inventory import listed_interventions
+from probe_kit.intervene.settings import FORMAT, key_of, settings_of
+from probe_kit.intervene.stored import stored_interventions
 from probe_kit.runs import Run, open_run
 from probe_kit.runs.layout import INTERVENTIONS
 from probe_kit.runs.results import write_bundle

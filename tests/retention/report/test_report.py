@@ -23,7 +23,7 @@ from rich.console import Console
 
 from probe_kit._tables.table import Table
 from probe_kit.errors import UsageError
-from probe_kit.intervene.outcomes import FORMAT
+from probe_kit.intervene.settings import FORMAT
 from probe_kit.intervene.verdict import Behaviour
 from probe_kit.retention import RetentionTable, retention_table
 from probe_kit.retention.columns.columns import all_columns

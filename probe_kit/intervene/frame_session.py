@@ -1,0 +1,277 @@
+"""The session of a run without sides: frames of recordings, or first observations of an environment.
+
+A pair is two frames: the source is the clean frame with one of the inputs of a donor, another frame of another
+group.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit.errors import (
+    OtherFramesError,
+    UsageError,
+)
+from probe_kit.extract.sources.inputs import (
+    INSTRUCTION,
+    PICTURE,
+    STATE,
+    Frame,
+    draw_donors,
+    hardly_changed,
+    with_input,
+)
+from probe_kit.hashing import derive_seed
+from probe_kit.hooks.checkpoints.third_party import copied, while_acting
+from probe_kit.hooks.contract.observation import Observation
+from probe_kit.intervene.outcomes import directions_of, spread_of
+from probe_kit.intervene.pairs import Chunk, Given, Pair, PairRow
+from probe_kit.intervene.settings import Choice
+from probe_kit.runs.layout import stored_inputs_of
+from probe_kit.runs.run import Run
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from probe_kit.hooks import Policy
+
+from probe_kit.intervene.sessions import ReplaySession, ReplaySource
+
+CACHED = 256
+"""Observations that are kept: those of the nearest frames are compared again and again."""
+_CONTENT = "content_blake2b"
+
+
+class Frames:
+    """All frames of a run that can be shown again: of each row those that its source gives without an action.
+
+    cameras: of the policy, those that get a picture. index: the frames, in the order of rows and inferences.
+    """
+
+    def __init__(self, run: Run, source: ReplaySource) -> None:
+        """Raises UsageError if files of the source are gone, OtherFramesError for another version of it."""
+        from probe_kit.extract.config_files import source_again
+        from probe_kit.extract.sources.source import Played
+
+        self.run, inputs = run, stored_inputs_of(run.settings)
+        opened = source_again(run, source.moved).open()
+        opened.check_same(run.settings)
+        opened.columns = tuple(inputs["columns"])
+        self._name, self._rows = opened.name, {row.episode_id: row for row in opened.rows(run.settings["seed"])}
+        self._player = opened.play(Played())()
+        self.cameras = tuple(camera if isinstance(camera, str) else camera[0] for camera in inputs["cameras"])
+        self._cached = lru_cache(maxsize=CACHED)(self.observe)
+        self.index = list(self._listed())
+
+    @cached_property
+    def by_name(self) -> dict[tuple[str, int], Frame]:
+        """The frames by number and episode, or item: a table of pairs may name either."""
+        # Episodes come last, so that a name which is both is an episode's.
+        names = {(frame.item, frame.number): frame for frame in self.index}
+        return names | {(frame.episode, frame.number): frame for frame in self.index}
+
+    def check_varied(self, vary: str) -> None:
+        """Raise UsageError for an input that the frames do not have, such as a mistyped camera."""
+        inputs = (INSTRUCTION, PICTURE, *(f"{PICTURE}.{name}" for name in self.cameras), STATE)
+        if vary not in inputs:
+            raise UsageError(f"vary is {vary!r}; expected one of {', '.join(inputs)}")
+
+    def observe(self, frame: Frame) -> Observation:
+        """Show a frame. Raises OtherFramesError if it is not the run's."""
+        row = self._rows[frame.episode]
+        stored = self.run.episodes.iloc[frame.row].get(_CONTENT)
+        if stored != row.columns.get(_CONTENT):
+            raise OtherFramesError(
+                f"{self._name}: the files of {frame.item} are not those of {self.run.location}: their hash "
+                "differs. Give the files of the run"
+            )
+        single = row if row.frames is None else replace(row, frames=(frame.number,))
+        observation = self._player.answer("begin", (single, False))
+        assert isinstance(observation, Observation)
+        if frame.state.size and not np.array_equal(observation.state.astype(np.float64), frame.state):
+            raise OtherFramesError(
+                f"{self._name}, {frame.episode}: the state at the beginning is not that of {self.run.location}. "
+                "Take all randomness from the episode's seed, and use the run's version"
+            )
+        pictures = {name: np.array(picture) for name, picture in observation.cameras.items()}
+        return replace(
+            observation, image=np.array(observation.image), state=np.array(observation.state), cameras=pictures
+        )
+
+    def close(self) -> None:
+        """Free what the player holds."""
+        self._player.close()
+
+    def _listed(self) -> Iterator[Frame]:
+        inputs = self.run.inputs
+        assert inputs is not None
+        states = inputs.read("state").astype(np.float64) if "state" in inputs.kinds else None
+        kind = next((name for name in ("prediction", "action") if name in inputs.kinds), None)
+        actions = None if kind is None else inputs.read(kind)
+        for row, record in enumerate(self.run.episodes.to_dict("records")):
+            planned = self._rows.get(str(record["episode_id"]))
+            if planned is None:
+                raise OtherFramesError(
+                    f"{self._name} has no episode {record['episode_id']!r} any more; use the run's version"
+                )
+            for call, number in enumerate((0,) if planned.frames is None else planned.frames):
+                yield Frame(
+                    name=f"{record['episode_id']}@{number}",
+                    group=str(record["group_id"]),
+                    seed=derive_seed(int(record["policy_seed"]), "inference", number),
+                    instruction=str(record["instruction"]),
+                    state=np.zeros(0) if states is None else states[row, call],
+                    observe=self._cached,
+                    row=row,
+                    number=number,
+                    item=str(record["item_id"]),
+                    episode=str(record["episode_id"]),
+                    category=str(record["category"]),
+                    stored=None if actions is None else np.asarray(actions[row, call], np.float32),
+                )
+
+
+FRAMES = 4
+"""Frames of an episode that are used if nothing is said.
+
+Frames of one episode are alike, and the unit of tests is its group: more of them cost inferences and tell little.
+"""
+
+
+class FrameSession(ReplaySession):
+    """A policy and frames of recordings, or first observations of an environment.
+
+    vary: the input that the source has of its donor. frames_each: of an episode. table: pairs of the user's own,
+    by which donors are chosen. items: those whose clean actions are the unit of displacements.
+    """
+
+    def __init__(self, run: Run, policy: "Policy", frames: Frames, choice: Choice | None = None) -> None:
+        """Raises UsageError for a varied input that no other group varies; see also `Frames.check_varied`."""
+        super().__init__(run, policy)
+        self.frames = frames
+        self.vary, self.frames_each = PICTURE, FRAMES
+        self.table: tuple[PairRow, ...] = ()
+        self.items: Sequence[str] = tuple(dict.fromkeys(frame.item for frame in frames.index))
+        self._ends: dict[tuple[int, int, str], tuple[Chunk, NDArray[np.float64]]] = {}
+        self._spread = _state_spread(frames.index)
+        if choice is not None:
+            self.vary, self.frames_each = choice.varied, choice.frames or FRAMES
+            self.table, self.items = choice.pairs, choice.items_in(run)
+            self._check_vary()
+
+    def close(self) -> None:
+        """Close the environment."""
+        self.frames.close()
+
+    def pairs(self, item: str) -> list[Pair]:
+        """Return the pairs of an item's frames; frames without a donor are left out."""
+        pairs = []
+        for frame, donor in self._donors(item):
+            clean, other = frame.observation, donor.observation
+            pairs.append(
+                Pair(
+                    clean=clean,
+                    source=with_input(clean, self.vary, other),
+                    donor=other,
+                    donor_name=donor.name,
+                    control=hardly_changed(clean, self.vary, self._spread),
+                    seed=frame.seed,
+                    group=frame.group,
+                    item=item,
+                    row=frame.row,
+                    step=frame.number,
+                    episode=frame.name if self.run.recorded else frame.episode,
+                    category=frame.category,
+                    stored=frame.stored,
+                )
+            )
+        return pairs
+
+    def _donors(self, item: str) -> list[tuple[Frame, Frame]]:
+        """Return frames of an item with the donor of each: of the table, or drawn."""
+        if self.table:
+            return [(frame, donor) for frame, donor in self._tabled if frame.item == item]
+        index = self.frames.index
+        rows = [at for at, frame in enumerate(index) if frame.item == item]
+        spaced = np.linspace(0, len(rows) - 1, min(self.frames_each, len(rows))).round().astype(int)
+        donors = []
+        for row in (rows[at] for at in np.unique(spaced)):
+            # A draw of its own for every frame: items are replayed one by one, and resumed at any of them.
+            rng = np.random.default_rng(derive_seed("donor", self.vary, index[row].name))
+            donors += [(index[row], index[donor]) for _, donor in draw_donors(index, self.vary, rng, of=[row])]
+        return donors
+
+    @cached_property
+    def _tabled(self) -> list[tuple[Frame, Frame]]:
+        """Frames and donors of the user's own table, which `open_session` has checked."""
+        by_name = self.frames.by_name
+        return [(by_name[row[:2]], by_name[row[2:]]) for row in self.table]
+
+    def _check_vary(self) -> None:
+        """Raise UsageError for an input that no frame of another group varies."""
+        if not any(self._donors(item) for item in self.items):
+            raise UsageError(
+                f"no frame of another group has another {self.vary}; extract more episodes, or choose another "
+                "--vary"
+            )
+
+    # -- actions and readout -----------------------------------------------------------------------------
+
+    def act(self, model_input: Given, seed: int) -> Chunk:
+        """Return (chunk, D): one prediction in the checkpoint's own units, alone in its batch."""
+        assert isinstance(model_input, Observation)
+        with while_acting(self.run.model, self.policy.card.checkpoint):
+            return np.asarray(self.policy.predict(copied([model_input]), [seed])[0], np.float32)
+
+    def displacement(self, chunk: Chunk, pair: Pair) -> float:
+        """Return how far a chunk lies toward the source's, in spreads of clean actions; 0 is the clean action."""
+        clean, direction = self._end(pair)
+        return float((chunk.astype(np.float64).ravel() - clean.astype(np.float64).ravel()) @ direction)
+
+    def slope(self, pair: Pair) -> "Callable[[Tensor], Tensor]":
+        """Return the same up to a constant. Raises UsageError for a family whose gradients are in other units."""
+        clean, direction = self._end(pair)
+        assert isinstance(pair.clean, Observation)
+        if not np.array_equal(clean, self.policy.act(copied([pair.clean]), [pair.seed])[0]):
+            raise UsageError(
+                f"gradients of {self.policy.card.family} are of an arm's actions, and these frames have "
+                "predictions in other units. Patch exactly: --kind interchange"
+            )
+        return lambda actions: (actions.flatten() * actions.new_tensor(direction)).sum()
+
+    def _end(self, pair: Pair) -> tuple[Chunk, NDArray[np.float64]]:
+        """Return the clean chunk, and the direction (N,) that displacements of this pair are read along."""
+        at = pair.row, pair.step, pair.donor_name  # a table may give a frame several donors
+        if at not in self._ends:
+            clean, source = self.act(pair.clean, pair.seed), self.act(pair.source, pair.seed)
+            start, end = (chunk.astype(np.float64).ravel()[None] for chunk in (clean, source))
+            (direction,), _ = directions_of(start, end, self.weights)
+            self._ends[at] = clean, direction
+        return self._ends[at]
+
+    @cached_property
+    def weights(self) -> NDArray[np.float64]:
+        """Return (N,) 1 / spread² of every number of the clean actions, over all pairs of the items."""
+        clean = [self.act(pair.clean, pair.seed).ravel() for item in self.items for pair in self.pairs(item)]
+        return spread_of(np.array(clean))
+
+    # -- words -------------------------------------------------------------------------------------------
+
+    def has_other_instruction(self, item: str) -> bool:
+        """Whether a frame of the item has a donor."""
+        return bool(self._donors(item))
+
+    def with_other_instruction(self, pair: Pair) -> Observation | None:
+        """Return the source: a swap of the instruction varies just that."""
+        return pair.source if isinstance(pair.source, Observation) else None
+
+
+def _state_spread(frames: Sequence[Frame]) -> NDArray[np.float64]:
+    """Return (D,) the standard deviation of every number of the state, 1 where it has none."""
+    spread = np.std([frame.state for frame in frames], axis=0)
+    # 1 where a number never changes: `hardly_changed` then moves it by a hundredth of its unit.
+    return np.where(spread > 0, spread, 1.0)

@@ -1,0 +1,96 @@
+"""Pairs of inferences, one patched into and one patched from; also those of a table of the user's own."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Union
+
+import numpy as np
+from numpy.typing import NDArray
+
+from probe_kit._system.text_tables import open_table
+from probe_kit.errors import UsageError
+from probe_kit.hooks.contract.observation import Observation
+from probe_kit.suite.items import Side
+
+if TYPE_CHECKING:
+    from probe_kit.hooks import Prompt
+
+
+Given = Union[Observation, "Prompt"]
+"""An observation of a policy, or a question to a model that answers."""
+Chunk = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two inferences with the same seed.
+
+    clean: what is patched into. source: what activations are patched from; it must have as many tokens. toward:
+    +1 or −1, the direction of the metric in which the source should move the output. group: the unit that is
+    resampled and flipped, such as a couple of items; item: the unit that is averaged before; both may be empty
+    for pairs that are independent of each other.
+
+    Pairs of a run have more. row, episode, category: of the run. side: of the correct picture; None without sides.
+    tiles: (H, W) where each tile is seen in the clean picture. stored: (n, D) actions of the clean inference that
+    the run has, None where it does not say. step: which inference of the episode it is, or the recorded frame.
+    donor: of frames without sides, the other frame of which the source has one input. donor_name: of that frame.
+    control: the clean one after a change of that input that means nothing.
+    """
+
+    clean: Given
+    source: Given
+    seed: int = 0
+    toward: int = 1
+    group: str = ""
+    item: str = ""
+    row: int = -1
+    episode: str = ""
+    category: str = ""
+    side: Side | None = None
+    donor: Given | None = None
+    donor_name: str = ""
+    control: Given | None = None
+    tiles: Mapping[Side, NDArray[np.bool_]] = field(default=MappingProxyType({}), repr=False)
+    stored: Chunk | None = field(default=None, repr=False)
+    step: int = 0
+
+
+def groups_and_items(pairs: Sequence[Pair]) -> tuple[list[str], list[str]]:
+    """The group and the item of every pair; a pair without one is alone in its own."""
+    groups = [pair.group or f"pair {at}" for at, pair in enumerate(pairs)]
+    return groups, [pair.item or f"{groups[at]}, pair {at}" for at, pair in enumerate(pairs)]
+
+
+# -- tables of the user's own --------------------------------------------------------------------------------
+
+# -- tables of the user's own --------------------------------------------------------------------------------
+
+PairRow = tuple[str, int, str, int]
+"""Episode and frame of the clean inference, and of its donor."""
+PAIR_COLUMNS = ("episode", "frame", "donor_episode", "donor_frame")
+
+
+def read_pairs(path: Path) -> tuple[PairRow, ...]:
+    """Return the rows of a table with the columns episode, frame, donor_episode, donor_frame.
+
+    Raises UsageError.
+    """
+    table = open_table(path, PAIR_COLUMNS)
+    if missing := [name for name in PAIR_COLUMNS if name not in table.names]:
+        raise UsageError(f"{path} has no column {missing[0]!r}; expected {', '.join(PAIR_COLUMNS)}")
+    rows = []
+    for line, cells in table.rows(PAIR_COLUMNS):
+        for column in PAIR_COLUMNS[1::2]:
+            if not (text := cells[column] or "").isdecimal():
+                raise UsageError(
+                    f"{table.where(line, column)} is {text!r}; expected the number of a frame, from 0"
+                )
+        clean, frame, donor, donor_frame = (cells[name] or "" for name in PAIR_COLUMNS)
+        # A recorded episode may be called by its number.
+        clean, donor = (f"episode-{int(name):06d}" if name.isdecimal() else name for name in (clean, donor))
+        rows.append((clean, int(frame), donor, int(donor_frame)))
+    if not rows:
+        raise UsageError(f"{path} names no pair; expected a line per pair")
+    return tuple(rows)

@@ -1,0 +1,294 @@
+"""Stored interventions of a run, `RUN/interventions/<key>/`, and the choice among them.
+
+settings.json      the head: what was asked, of which commits, and the hashes of the rest; written last
+episodes.npz       per condition and episode where the action would go, and how far it changed
+effects.csv        the same in numbers per category, for people and other programs
+attention.npz      of the kind `attention`: shares per inference, block, iteration, head and role
+attention_patches.npz  of it, where the family says which token sees what: shares per inference, block and patch
+certificate.json   what was loaded, and what was checked
+
+A stored intervention is chosen by what it is about, never by when it was made: another map, role, direction,
+coefficient, or a try on fewer episodes replaces nothing. Conditions that were played on the same episodes are
+pooled, whichever intervention they came with. Needs no model.
+"""
+
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from math import hypot
+from typing import Any, Self
+
+import numpy as np
+
+from probe_kit._system.bounded_files import parse_json
+from probe_kit.errors import NoInterventionsError, RunDamagedError
+from probe_kit.intervene.outcomes import (
+    BY_CONDITION,
+    CLEAN,
+    IMAGE_SWAP,
+    UNCHANGED,
+    ConditionOutcomes,
+    Effect,
+    arrays_from_bytes,
+)
+from probe_kit.intervene.settings import FIRST_CHUNK, FORMAT, PER_STEP, key_of
+from probe_kit.runs.layout import INTERVENTIONS
+from probe_kit.runs.reader import RunReader, full_name
+from probe_kit.runs.results import HEAD, Bundle, advice_for, complete_key, fields_problem, read_bundles
+from probe_kit.runs.store import Location
+
+EPISODES, EFFECTS, CERTIFICATE = "episodes.npz", "effects.csv", "certificate.json"
+# As in Act2Answer's scene; `env.SceneSpec` has the positions.
+TILES_APART = 0.31
+"""Metres between the tiles of the default scene; taken for a run that stores no scene."""
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """One intervention of a run, stored or about to be: what effects, their table and their sentences are made of.
+
+    settings: what decided its numbers, see `settings_of`. read: a stored file by its name; raises RunDamagedError
+    if it was changed. files: their names. key: of its folder. created: ISO time (UTC), empty before it is stored.
+    """
+
+    run: RunReader = field(repr=False)
+    settings: Mapping[str, Any]
+    read: Callable[[str], bytes] = field(repr=False)
+    files: Collection[str] = ()
+    key: str = ""
+    created: str = ""
+
+    @classmethod
+    def of(cls, run: RunReader, bundle: Bundle) -> Self:
+        """Return one that a run stores."""
+        settings, created = bundle.head["settings"], bundle.times.get("created", "")
+        return cls(run, settings, bundle.read, bundle.files, bundle.key, created)
+
+    @property
+    def kind(self) -> str:
+        """Return the kind of the intervention."""
+        return str(self.settings["kind"])
+
+    @property
+    def readout(self) -> str:
+        """Return `first-chunk` or `per-step`."""
+        return str(self.settings.get("readout", FIRST_CHUNK))
+
+    @property
+    def newest(self) -> tuple[str, str]:
+        """Return the time at which it was made, and the key, which decide between equals."""
+        return self.created, self.key
+
+    @cached_property
+    def outcomes(self) -> ConditionOutcomes:
+        """The numbers of its conditions.
+
+        Raises RunDamagedError if they were changed, or have the names of another version of probe_kit.
+        """
+        stored = arrays_from_bytes(self.read(EPISODES))
+        if problem := fields_problem(ConditionOutcomes, stored):
+            folder = f"{INTERVENTIONS}/{self.key}"
+            raise RunDamagedError(
+                f"{self.run.location}/{folder}/{EPISODES} {problem}: another version of probe_kit made it. "
+                f"{advice_for(folder)}"
+            )
+        return ConditionOutcomes(**stored, seed_text=self.run.seed_text)
+
+    @cached_property
+    def certificate(self) -> dict[str, Any]:
+        """The record of what was loaded and checked. Raises RunDamagedError if it was changed."""
+        certificate: dict[str, Any] = parse_json(self.read(CERTIFICATE))
+        return certificate
+
+    def rows[Row: Effect](self, of_category: Callable[[ConditionOutcomes], Iterable[Row]]) -> list[Row]:
+        """Return the rows of all categories, in the order of the episodes, each with the key."""
+        parts = (of_category(part) for _, part in self.outcomes.by_category())
+        key: dict[str, Any] = {"key": self.key}  # every kind's rows have it, as their last column
+        return [replace(row, **key) for rows in parts for row in rows]
+
+    # -- words of tables -----------------------------------------------------------------------------------------
+
+    @property
+    def subject(self) -> str:
+        """Return model and suite, as titles have them."""
+        label = full_name(self.run.label, self.run.random_weights)
+        # The label of a run of recordings says on what already.
+        name = self.run.suite.partition("#")[0]
+        return label if self.run.label.endswith(f" on {name}") else f"{label} on {self.run.suite}"
+
+    @property
+    def lacks_sides(self) -> bool:
+        """Whether the run has no correct picture on a side."""
+        return not self.outcomes.has_sides
+
+    @property
+    def exchange(self) -> str:
+        """Return the change of inputs that effects are shares of."""
+        return f"exchange of the {self.settings.get('vary') or ''}" if self.lacks_sides else "image swap"
+
+    def in_words(self, text: str) -> str:
+        """Return a text about the image swap, about what was exchanged in this run."""
+        return text.replace("image swap", self.exchange)
+
+    @property
+    def verdicts(self) -> Mapping[str, Any]:
+        """Return by category the `UseVerdict`; those of an `InterventionResult`, here none."""
+        return {}
+
+    @property
+    def legend(self) -> str:
+        """Return what a reader of the verdicts must know."""
+        return ""
+
+    @property
+    def tiles_apart(self) -> float:
+        """Return metres between the middles of the tiles of the run's scene, or of the default one."""
+        scene: Any = self.run.settings.get("scene", {})
+        if "tile_left" not in scene or "tile_right" not in scene:
+            return TILES_APART
+        (left_x, left_y), (right_x, right_y) = scene["tile_left"], scene["tile_right"]
+        return hypot(left_x - right_x, left_y - right_y)
+
+
+def is_stored(run: Location, key: str) -> bool:
+    """Whether complete results called `key` are there."""
+    return run.exists(f"{INTERVENTIONS}/{key}/{HEAD}")
+
+
+def read_interventions(run: Location) -> dict[str, Bundle]:
+    """Every complete intervention by key. Raises RunDamagedError if one was changed or has another format."""
+    bundles = read_bundles(run, INTERVENTIONS)
+    for key, bundle in bundles.items():
+        bundle.check_format(FORMAT)
+        if (key_of_settings := key_of(bundle.head["settings"])) != key:
+            raise bundle.head_damaged(f"has the settings of {key_of_settings}")
+    return bundles
+
+
+def stored_interventions(run: RunReader, kind: str | None = None) -> list[Measurement]:
+    """Return those of the episodes that the run has now, in the wording it is in, oldest first.
+
+    kind: only these. Raises RunDamagedError if any of the run was changed, lost its settings or has another
+    format.
+    """
+    required = {
+        "stamp": run.stamp, "run_settings": run.settings_sha256,
+        "wording": run.wording, **({} if kind is None else {"kind": kind}),
+    }  # fmt: skip
+    fitting = [
+        Measurement.of(run, bundle)
+        for bundle in read_interventions(run.location).values()
+        if all(bundle.head["settings"].get(name) == value for name, value in required.items())
+    ]
+    return sorted(fitting, key=lambda intervention: intervention.newest)
+
+
+def find_stored(run: RunReader, key: str | None = None, kind: str | None = None) -> Measurement:
+    """The one whose key begins with `key`, or the newest of `kind`.
+
+    Raises NoInterventionsError if there is none, UsageError for a key that is not there or not the only one.
+    """
+    candidates = stored_interventions(run, kind)
+    if key is None:
+        if not candidates:
+            raise NoInterventionsError(
+                f"{run.location} has no stored intervention{'' if kind is None else f' of kind {kind}'} on its "
+                f"episodes. Run `probe-kit intervene {run.location}`"
+            )
+        return candidates[-1]
+    by_key = {intervention.key: intervention for intervention in candidates}
+    return by_key[complete_key(key, by_key, run.location, "interventions")]
+
+
+# -- the choice among stored ones ----------------------------------------------------------------------------
+
+
+Rank = tuple[bool, int, bool]
+"""The larger, the more a result says: rightly read, of more episodes, as its family says it should be read.
+
+Wrongly read is the first inference of a family in which that says little (`per-step`).
+"""
+
+
+@dataclass(frozen=True)
+class StoredResult:
+    """The part of one stored intervention that is of one category. outcomes: of its episodes alone."""
+
+    stored: Measurement
+    category: str
+    outcomes: ConditionOutcomes
+    rank: Rank
+
+
+def stored_results(run: RunReader, kind: str) -> list[StoredResult]:
+    """Return results by category as the run has them; of each what says most comes last.
+
+    Of what says as much the newest. Raises RunDamagedError.
+    """
+    order = {name: at for at, name in enumerate(dict.fromkeys(run.episodes["category"].astype(str)))}
+    results = []
+    for stored in stored_interventions(run, kind):
+        family = stored.certificate.get("supported", {}).get("readout", FIRST_CHUNK)
+        # Where one inference is one action in greedy bins, the first says little: any other readout says more.
+        is_wrong = family == PER_STEP != stored.readout
+        for category, outcomes in stored.outcomes.by_category():
+            rank = not is_wrong, outcomes.episodes.size, stored.readout == family
+            results.append(StoredResult(stored, category, outcomes, rank))
+    return sorted(
+        results,
+        key=lambda result: (
+            order.get(result.category, len(order)), result.category, result.rank, result.stored.newest,
+        ),
+    )  # fmt: skip
+
+
+def preferred_by_category(run: RunReader, kind: str, readout: str | None = None) -> dict[str, StoredResult]:
+    """Return by category, of all that is stored of a kind, the result that says most. Raises RunDamagedError.
+
+    readout: of those alone; None for any.
+    """
+    results = stored_results(run, kind)
+    return {result.category: result for result in results if readout in (None, result.stored.readout)}
+
+
+@dataclass(frozen=True)
+class PooledConditions:
+    """Conditions that several interventions played on the same episodes of one category.
+
+    like: one of them. sources: by condition, of whom it is; without those in which nothing was changed.
+    """
+
+    like: StoredResult
+    sources: dict[str, StoredResult]
+
+    def outcomes(self, conditions: Sequence[str]) -> ConditionOutcomes:
+        """Some of the conditions, in the order that is asked for, behind what was unchanged."""
+        base = self.like.outcomes
+        unchanged = [name for name in (CLEAN, IMAGE_SWAP) if name in base.conditions]
+        every = [(base, name) for name in unchanged] + [(self.sources[name].outcomes, name) for name in conditions]
+        stacked: dict[str, Any] = {}
+        for array in BY_CONDITION:
+            values = [getattr(outcomes, array) for outcomes, _ in every]
+            rows = (outcomes.conditions.index(name) for outcomes, name in every)
+            has_all = all(value is not None for value in values)  # an older one may be stored without it
+            stacked[array] = (
+                np.stack([value[row] for value, row in zip(values, rows, strict=True)]) if has_all else None
+            )
+        return replace(base, conditions=tuple(name for _, name in every), **stacked)
+
+
+def pool_conditions(results: Iterable[StoredResult], setting: Sequence[str] = ()) -> list[PooledConditions]:
+    """Pool what was played on the same episodes, with the same actions where nothing was changed.
+
+    results: as `stored_results` orders them. setting: names of settings in which they must agree as well.
+    """
+    pooled: dict[tuple[object, ...], PooledConditions] = {}
+    for result in results:
+        outcomes = result.outcomes
+        agreed = tuple(str(result.stored.settings.get(name)) for name in ("readout", *setting))
+        # Bytes, not closeness: another device or batch rounds otherwise, and effects are differences of actions.
+        unchanged = [outcomes.of(name).tobytes() for name in (CLEAN, IMAGE_SWAP) if name in outcomes.conditions]
+        same = (result.category, *agreed, tuple(outcomes.episodes.tolist()), *unchanged)
+        sources = pooled.setdefault(same, PooledConditions(result, {})).sources
+        sources.update({name: result for name in outcomes.conditions if name not in UNCHANGED})
+    return list(pooled.values())
