@@ -76,12 +76,16 @@ class ScoredAnswers:
 
 
 def scored(run: RunReader, score: str, with_side_words: bool = False) -> RunReader:
-    """A VLM run by a score; a policy run as it is. Raises UsageError for an unknown score."""
+    """A VLM run by a score, in place of any that it was read by; a policy run as it is.
+
+    Raises UsageError for an unknown score.
+    """
     if score not in SCORES:
         raise UsageError(f"score is {score!r}; expected one of {', '.join(SCORES)}")
     if run.ask is None:
         return run
-    return cast("RunReader", ScoredAnswers(run, score, with_side_words))
+    unscored = run._run if isinstance(run, ScoredAnswers) else run
+    return cast("RunReader", ScoredAnswers(unscored, score, with_side_words))
 
 
 def left_out(runs: Sequence[RunReader]) -> list[str]:

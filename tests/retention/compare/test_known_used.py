@@ -173,6 +173,13 @@ def test_another_score_of_the_vlm_is_another_join(runs: tuple[SaidRun, SaidRun])
     assert balanced.score == "order-balanced"
 
 
+def test_a_run_that_is_scored_again_is_read_by_the_last_score_alone(runs: tuple[SaidRun, SaidRun]) -> None:
+    vlm, _ = runs
+    again = scored(scored(vlm, "logits"), "text")
+    assert again.episodes["outcome"].tolist() == scored(vlm, "text").episodes["outcome"].tolist()
+    assert again.episodes["outcome"].tolist() != scored(vlm, "logits").episodes["outcome"].tolist()
+
+
 def test_probes_that_beat_nothing_are_said_to_encode_nothing(runs: tuple[SaidRun, SaidRun]) -> None:
     vlm, policy = runs
     found = match_runs(vlm, policy, probes(policy, {"color": [0.95], "shape": [0.5]}, null_top=0.75))
