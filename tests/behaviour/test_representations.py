@@ -11,7 +11,7 @@ import pytest
 
 from probe_kit.errors import ProbeKitError
 from probe_kit.intervene import stored_interventions
-from probe_kit.intervene.results import listed_interventions
+from probe_kit.intervene.inventory import listed_interventions
 from probe_kit.runs import Run, open_run, verify_run
 from probe_kit.runs.commits import write_failure
 from probe_kit.runs.records import HASH

@@ -20,6 +20,7 @@ from probe_kit.intervene import (
     stored_image_swaps,
 )
 from probe_kit.intervene.evidence import StoredEvidence
+from probe_kit.intervene.inventory import listed_interventions
 from probe_kit.intervene.kinds.attention import ATTENTION_FILE
 from probe_kit.intervene.kinds.interchange import (
     localised_by_category,
@@ -28,7 +29,7 @@ from probe_kit.intervene.kinds.interchange import (
     stored_subspace_effects,
 )
 from probe_kit.intervene.outcomes import arrays_to_bytes
-from probe_kit.intervene.results import InterventionResult, listed_interventions, verdicts_of
+from probe_kit.intervene.results import InterventionResult, verdicts_of
 from probe_kit.intervene.settings import FORMAT, key_of
 from probe_kit.intervene.stored import find_stored
 from probe_kit.runs.layout import INTERVENTIONS
