@@ -77,7 +77,9 @@ def test_what_reads_runs_knows_neither_models_nor_simulators(room: str, graph: G
         )
     }
     assert imported_rooms
-    strange = {other for other in imported_rooms if other not in READS_ONLY and not other.startswith(READS_ONLY[0] + ".")}
+    strange = {
+        other for other in imported_rooms if other not in READS_ONLY and not other.startswith(READS_ONLY[0] + ".")
+    }
     assert not strange
 
 
