@@ -238,7 +238,7 @@ def recorded_run(small_suite: "Suite", tmp_path_factory: pytest.TempPathFactory)
 
     settings = ExtractSettings(
         "pi0-tiny", random_weights=True, suite=small_suite.folder, scene=SceneSpec(max_steps=4), tokens="all",
-        batch=2, env_workers=0,  # fewer scenes and no processes, which a run this small does not repay
+        env_workers=0,  # a run this small does not repay processes
     )  # fmt: skip
     return open_run(made_once(tmp_path_factory, "recorded", lambda folder: extract_run(settings, folder)))
 

@@ -98,7 +98,9 @@ def folder(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path
     from probe_kit.env import SceneSpec
     from probe_kit.extract import ExtractSettings, extract_run
 
-    settings = ExtractSettings("expert", suite=small_suite.folder, items=2, seed=7, scene=SceneSpec(max_steps=2))
+    settings = ExtractSettings(
+        "expert", suite=small_suite.folder, items=2, seed=7, scene=SceneSpec(max_steps=2), env_workers=0
+    )
     extract_run(settings, folder / "a-run")
     return folder
 
