@@ -203,7 +203,9 @@ def tables_in(text: str) -> int:
     return len(re.findall(r"^─{20,} *$", text, re.MULTILINE))
 
 
-@pytest.mark.parametrize("width", WIDTHS)
+@pytest.mark.parametrize(
+    "width", [WIDTHS[0], *(pytest.param(width, marks=pytest.mark.slow) for width in WIDTHS[1:-1]), WIDTHS[-1]]
+)
 @pytest.mark.parametrize("name", PRINTED)
 def test_a_command_prints_one_table_and_ends_on_a_sentence(
     name: str, width: int, run: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch
