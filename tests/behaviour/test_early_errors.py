@@ -107,12 +107,13 @@ def folder(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path
 
 @pytest.fixture(scope="module")
 def answers(folder: Path, small_suite: Suite) -> dict[str, tuple[int, str, list[str]]]:
-    arguments = [[word.replace("SUITE", str(small_suite.folder)) for word in case.split()] for case in CASES]
+    commands = (*CASES, "models")
+    arguments = [[word.replace("SUITE", str(small_suite.folder)) for word in line.split()] for line in commands]
     done = subprocess.run(
         [sys.executable, "-c", ONE_AFTER_THE_OTHER], input=json.dumps(arguments), cwd=folder, encoding="utf-8",
         capture_output=True, check=True, timeout=300,
     )  # fmt: skip
-    return dict(zip(CASES, (tuple(answer) for answer in json.loads(done.stdout)), strict=True))
+    return dict(zip(commands, (tuple(answer) for answer in json.loads(done.stdout)), strict=True))
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -123,6 +124,11 @@ def test_a_mistake_that_needs_no_weights_is_named_before_anything_heavy_is_loade
     said = answers[case][1].replace("\n", " ")
     assert (answers[case][0], answers[case][2]) == (code, []), said
     assert message in said
+
+
+def test_the_list_of_models_loads_nothing_heavy(answers: dict[str, tuple[int, str, list[str]]]) -> None:
+    code, printed, loaded = answers["models"]
+    assert (code, loaded) == (0, []), printed
 
 
 def test_families_say_what_they_need(monkeypatch: pytest.MonkeyPatch) -> None:
