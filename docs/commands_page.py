@@ -5,6 +5,7 @@ every command and a table of its arguments and options, and below `intervene` a 
 """
 
 import re
+from functools import cache
 from typing import Any
 
 import typer
@@ -60,6 +61,7 @@ def kinds_markdown() -> str:
     return "\n".join(["| kind | option | meaning |", "|---|---|---|", *rows])
 
 
+@cache
 def _root() -> Any:
     from probe_kit.cli import app
 

@@ -30,6 +30,10 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as a shell starts what runs in its background
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+# Tests start many processes; without bytecode each would compile the package anew, and each worker the tests.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
 gc.disable()  # until all tests are collected: imports and tests make objects that stay
 CHECKOUT = Path(__file__).parents[1]
 GOLDEN = Path(__file__).parent / "golden"
@@ -233,8 +237,9 @@ def recorded_run(small_suite: "Suite", tmp_path_factory: pytest.TempPathFactory)
     from probe_kit.runs import open_run
 
     settings = ExtractSettings(
-        "pi0-tiny", random_weights=True, suite=small_suite.folder, scene=SceneSpec(max_steps=4), tokens="all"
-    )
+        "pi0-tiny", random_weights=True, suite=small_suite.folder, scene=SceneSpec(max_steps=4), tokens="all",
+        env_workers=0,  # a run this small does not repay processes
+    )  # fmt: skip
     return open_run(made_once(tmp_path_factory, "recorded", lambda folder: extract_run(settings, folder)))
 
 

@@ -169,17 +169,6 @@ def test_ctrl_c_keeps_what_is_finished_and_the_same_command_continues(small_suit
     assert all(now[name] == stamp for name, stamp in kept.items())
 
 
-def test_help_is_there() -> None:
-    assert "demo" in probe_kit("--help").stdout
-
-
-def test_importing_the_command_line_loads_nothing_heavy() -> None:
-    heavy = ("torch", "lerobot", "transformers", "pybullet", "sklearn", "pandas", "xarray", "zarr", "matplotlib")
-    code = f"import sys, probe_kit.cli; print([m for m in {heavy} if m in sys.modules])"
-    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, encoding="utf-8", check=True)
-    assert loaded.stdout.strip() == "[]"
-
-
 def test_help_groups_all_commands_by_what_one_wants_to_do() -> None:
     import typer
 
@@ -205,7 +194,7 @@ def test_there_are_at_most_thirty_two_commands_with_those_of_groups() -> None:
 def test_the_version_is_that_of_the_package() -> None:
     import probe_kit as package
 
-    assert probe_kit("--version").stdout == f"probe-kit {package.__version__}\n"
+    assert in_process("--version").stdout == f"probe-kit {package.__version__}\n"
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Collection
+from functools import cache
 from pathlib import Path
 from typing import Any, get_args
 
@@ -97,6 +98,7 @@ REQUIRED = {
 }
 
 
+@cache
 def help_of(command: str) -> str:
     """Help with every line break and frame removed, so that no wrapping hides a text."""
     shown = CliRunner().invoke(app, [*command.split(), HELP_ALL], env={"COLUMNS": "300"}).stdout

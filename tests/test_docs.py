@@ -3,18 +3,27 @@
 import inspect
 import os
 import re
+import runpy
 import subprocess
 import sys
-from html import unescape
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import pytest
+import typer
+import yaml
+from markdown.extensions.toc import slugify
 
 from probe_kit import errors
+from probe_kit.cli import app, commands_of
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
+PAGES = {
+    path.relative_to(DOCS).as_posix(): path.read_text(encoding="utf-8") for path in sorted(DOCS.rglob("*.md"))
+}
+"""The text of every page by its path in the folder."""
 ERRORS = [
     error
     for _, error in inspect.getmembers(errors, inspect.isclass)
@@ -43,10 +52,7 @@ def test_the_architecture_page_names_files_that_exist() -> None:
     assert [name for name in named if not (ROOT / "probe_kit" / name).exists()] == []
 
 
-def text_of(page: Path) -> str:
-    return unescape(re.sub(r"<[^>]+>", "", page.read_text(encoding="utf-8")))
-
-
+@pytest.mark.slow
 def test_every_page_of_the_folder_is_built(site: Path) -> None:
     pages = {path.stem for path in DOCS.glob("*.md")}
     assert pages <= {path.stem for path in site.glob("*.html")}
@@ -54,34 +60,65 @@ def test_every_page_of_the_folder_is_built(site: Path) -> None:
     assert list((site / "notebooks").glob("*.png"))
 
 
+@pytest.mark.slow
 def test_a_readers_browser_fetches_nothing_from_elsewhere(site: Path) -> None:
     loading = re.compile(r"<(?:script|img|iframe|link)[^>]*(?:src|href)=\"(https?:)?//[^\"]*\"[^>]*>")
-    found = {tag for page in site.rglob("*.html") for tag in loading.findall(page.read_text(encoding="utf-8"))}
-    assert not found
+    fetched = {tag for page in site.rglob("*.html") for tag in loading.findall(page.read_text(encoding="utf-8"))}
+    assert not fetched
 
 
-def test_every_command_and_option_stands_on_the_page_of_commands(site: Path) -> None:
-    import typer
+def pages_in(entry: Any) -> list[str]:
+    """The files of a part of the navigation of mkdocs.yml."""
+    if isinstance(entry, str):
+        return [entry]
+    return [page for part in (entry.values() if isinstance(entry, dict) else entry) for page in pages_in(part)]
 
-    from probe_kit.cli import app
 
-    shown = text_of(site / "commands.html")
-    todo = [("probe-kit", typer.main.get_command(app))]
-    options = 0
-    while todo:
-        name, command = todo.pop()
-        if hasattr(command, "commands"):
-            todo += [(f"{name} {child}", found) for child, found in command.commands.items()]
+def test_every_page_and_notebook_stands_in_the_navigation_once() -> None:
+    text = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    listed = pages_in(yaml.safe_load(text[text.index("\nnav:") :])["nav"])
+    notebooks = {f"notebooks/{path.stem}.md" for path in (ROOT / "notebooks").glob("*.ipynb")}
+    assert sorted(listed) == sorted(PAGES.keys() | notebooks)
+
+
+def without_code(markdown: str) -> str:
+    return re.sub(r"^```.*?^```", "", markdown, flags=re.MULTILINE | re.DOTALL)
+
+
+def headings(page: str) -> set[str]:
+    """The anchors of a page's headings, as the site makes them."""
+    return {slugify(title, "-") for title in re.findall(r"^#+ (.*)$", without_code(PAGES[page]), re.MULTILINE)}
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_every_link_leads_to_a_file_and_to_a_heading_of_it(page: str) -> None:
+    """Those of the built reference are checked by mkdocs, in the slow tests."""
+    broken = []
+    for link in re.findall(r"\]\(([^)\s]+)\)", without_code(PAGES[page])):
+        if re.match(r"[a-z]+:", link):
             continue
-        until_next = rf"^{name}\W*$(.*?)(?=^probe-kit [a-z -]+¶$|\Z)"
-        (section,) = re.findall(until_next, shown, re.MULTILINE | re.DOTALL)
+        target, _, heading = link.partition("#")
+        file = (DOCS / page).parent / target if target else DOCS / page
+        if "notebooks" in file.parts:
+            file = ROOT / "notebooks" / f"{file.stem}.ipynb"
+        name = file.resolve().relative_to(DOCS).as_posix() if file.resolve().is_relative_to(DOCS) else ""
+        if not file.is_file() or (heading and heading not in headings(name)):
+            broken.append(link)
+    assert not broken
+
+
+def test_every_command_and_option_stands_on_the_page_of_commands() -> None:
+    shown = runpy.run_path(str(DOCS / "commands_page.py"))["commands_markdown"]()
+    options = 0
+    for path, command in commands_of(typer.main.get_command(app), None):
+        (section,) = re.findall(rf"^### probe-kit {path}$(.*?)(?=^##|\Z)", shown, re.MULTILINE | re.DOTALL)
         for parameter in command.params:
             option = (
                 (*parameter.secondary_opts, *parameter.opts)[-1]
                 if parameter.param_type_name == "option"
                 else parameter.name.upper()
             )
-            assert option == "--help" or re.search(rf"(?<![\w-]){option}(?![\w-])", section), f"{name} {option}"
+            assert option == "--help" or re.search(rf"(?<![\w-]){option}(?![\w-])", section), f"{path} {option}"
             options += 1
     assert options > 80
 

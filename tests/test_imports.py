@@ -6,10 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.import_graph import children, circles, import_graph, levels, packages, upward
+from tests.support.import_graph import Graph, children, circles, import_graph, levels, packages, upward
 
 PACKAGE = Path(__file__).parents[1] / "probe_kit"
-GRAPH = import_graph(PACKAGE)
 
 TOP = {"__init__", "__main__", "cli", "doctor", "doctor_command"}
 BASE = {path.stem for path in PACKAGE.glob("*.py")} - TOP | {"_terminal", "_system", "_execution", "_tables"}
@@ -46,35 +45,41 @@ READS_ONLY = (
 """All that probes and tables may know of the rooms that hold models and simulators."""
 
 
-def test_no_module_imports_itself_by_way_of_others() -> None:
-    assert circles(GRAPH) == []
+@pytest.fixture(scope="module")
+def graph() -> Graph:
+    return import_graph(PACKAGE)
 
 
-def test_no_package_imports_one_that_comes_after_it() -> None:
-    assert upward(GRAPH, FOLDERS, "probe_kit") == []
+def test_no_module_imports_itself_by_way_of_others(graph: Graph) -> None:
+    assert circles(graph) == []
 
 
-@pytest.mark.parametrize("folder", sorted(packages(GRAPH)))
-def test_no_two_children_of_a_folder_import_each_other(folder: str) -> None:
+def test_no_package_imports_one_that_comes_after_it(graph: Graph) -> None:
+    assert upward(graph, FOLDERS, "probe_kit") == []
+
+
+def test_no_two_children_of_a_folder_import_each_other(graph: Graph) -> None:
     """A newcomer reads a folder from the bottom up, on at most 14 levels."""
-    inside = children(GRAPH, folder)
-    assert circles(inside) == []
-    assert levels(inside) <= MOST_LEVELS
+    folders = {folder: children(graph, folder) for folder in packages(graph)}
+    assert {folder: circles(inside) for folder, inside in folders.items() if circles(inside)} == {}
+    assert {folder for folder, inside in folders.items() if levels(inside) > MOST_LEVELS} == set()
 
 
 @pytest.mark.parametrize("room", ["train", "retention"])
-def test_what_reads_runs_knows_neither_models_nor_simulators(room: str) -> None:
-    seen = {
+def test_what_reads_runs_knows_neither_models_nor_simulators(room: str, graph: Graph) -> None:
+    imported_rooms = {
         other
-        for module, imported in GRAPH.items()
+        for module, imported in graph.items()
         if module.startswith(f"probe_kit.{room}")
         for other in imported
         if other.startswith(
             ("probe_kit.extract", "probe_kit.runs", "probe_kit.hooks", "probe_kit.env", "probe_kit.models")
         )
     }
-    assert seen
-    strange = {other for other in seen if other not in READS_ONLY and not other.startswith(READS_ONLY[0] + ".")}
+    assert imported_rooms
+    strange = {
+        other for other in imported_rooms if other not in READS_ONLY and not other.startswith(READS_ONLY[0] + ".")
+    }
     assert not strange
 
 

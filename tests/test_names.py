@@ -6,11 +6,10 @@ A name says what it holds; a docstring begins with a verb or a noun.
 import ast
 import re
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
-PACKAGE = Path(__file__).parents[1] / "probe_kit"
+from tests.support.parsed import PACKAGE, package_trees
 
 FILLERS = frozenset(
     [
@@ -92,11 +91,10 @@ CHECKS = {"names": fillers, "docstrings": first_words}
 
 @pytest.mark.parametrize("check", CHECKS)
 def test_the_package_is_written_in_the_words_of_the_field(check: str) -> None:
-    files = sorted(file.relative_to(PACKAGE.parent).as_posix() for file in PACKAGE.rglob("*.py"))
     wrong = [
-        f"{file}:{line}: {text}"
-        for file in files
-        for line, text in CHECKS[check](ast.parse((PACKAGE.parent / file).read_text(encoding="utf-8")))
+        f"{file.relative_to(PACKAGE.parent)}:{line}: {text}"
+        for file, tree in package_trees().items()
+        for line, text in CHECKS[check](tree)
     ]
     assert not wrong, "\n".join(wrong)
 

@@ -299,6 +299,8 @@ class Family:
         if not self.declared:
             return None
         location, loader_options = self._located(checkpoint, options)
+        if not is_configured(location):
+            return None  # before the loader is imported, and torch with it
         load = self._imported(self.loader)
         with naming_checkpoint(self.name, str(location)):
             return outline_of(self.name, load, location, dtype, self._with_defaults(loader_options, location))
@@ -322,7 +324,7 @@ class Family:
         location = self.location(checkpoint, options.get(SIZE))
         if location is None or is_complete(location):
             return
-        outline = self.outline(checkpoint, options) if is_configured(location) else None
+        outline = self.outline(checkpoint, options)
         reason = None if outline is None else outline.misfit()
         if (outline is None or outline.model is None) and (bare := without_revision(location)) in self.not_acting:
             reason = f"{bare} puts out numbers that no arm here can execute"

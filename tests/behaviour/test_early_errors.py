@@ -98,19 +98,22 @@ def folder(small_suite: Suite, tmp_path_factory: pytest.TempPathFactory) -> Path
     from probe_kit.env import SceneSpec
     from probe_kit.extract import ExtractSettings, extract_run
 
-    settings = ExtractSettings("expert", suite=small_suite.folder, items=2, seed=7, scene=SceneSpec(max_steps=2))
+    settings = ExtractSettings(
+        "expert", suite=small_suite.folder, items=2, seed=7, scene=SceneSpec(max_steps=2), env_workers=0
+    )
     extract_run(settings, folder / "a-run")
     return folder
 
 
 @pytest.fixture(scope="module")
 def answers(folder: Path, small_suite: Suite) -> dict[str, tuple[int, str, list[str]]]:
-    arguments = [[word.replace("SUITE", str(small_suite.folder)) for word in case.split()] for case in CASES]
+    commands = (*CASES, "models")
+    arguments = [[word.replace("SUITE", str(small_suite.folder)) for word in line.split()] for line in commands]
     done = subprocess.run(
         [sys.executable, "-c", ONE_AFTER_THE_OTHER], input=json.dumps(arguments), cwd=folder, encoding="utf-8",
         capture_output=True, check=True, timeout=300,
     )  # fmt: skip
-    return dict(zip(CASES, (tuple(answer) for answer in json.loads(done.stdout)), strict=True))
+    return dict(zip(commands, (tuple(answer) for answer in json.loads(done.stdout)), strict=True))
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -121,6 +124,11 @@ def test_a_mistake_that_needs_no_weights_is_named_before_anything_heavy_is_loade
     said = answers[case][1].replace("\n", " ")
     assert (answers[case][0], answers[case][2]) == (code, []), said
     assert message in said
+
+
+def test_the_list_of_models_loads_nothing_heavy(answers: dict[str, tuple[int, str, list[str]]]) -> None:
+    code, printed, loaded = answers["models"]
+    assert (code, loaded) == (0, []), printed
 
 
 def test_families_say_what_they_need(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -201,7 +209,9 @@ def tables_in(text: str) -> int:
     return len(re.findall(r"^─{20,} *$", text, re.MULTILINE))
 
 
-@pytest.mark.parametrize("width", WIDTHS)
+@pytest.mark.parametrize(
+    "width", [WIDTHS[0], *(pytest.param(width, marks=pytest.mark.slow) for width in WIDTHS[1:-1]), WIDTHS[-1]]
+)
 @pytest.mark.parametrize("name", PRINTED)
 def test_a_command_prints_one_table_and_ends_on_a_sentence(
     name: str, width: int, run: Path, capsys: Capture, monkeypatch: pytest.MonkeyPatch

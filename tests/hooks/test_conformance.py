@@ -39,7 +39,7 @@ from probe_kit.hooks.families.pi0.adapter import Pi0
 from probe_kit.hooks.testing import ANSWER_CHECKS, POLICY_CHECKS
 from tests.support.contracts import GOLDEN
 from tests.support.encoder_vla.policy import CHUNK, STEPS, WIDTH, EncoderPolicy, EncoderVLA, load, write_checkpoint
-from tests.support.parsed import parsed
+from tests.support.parsed import package_nodes
 from tests.support.position_models import PositionModel, always, likes
 
 
@@ -508,16 +508,9 @@ def test_every_check_is_a_sentence_with_an_advice() -> None:
 
 def test_pytest_is_imported_nowhere() -> None:
     """The checks run where it is not installed."""
-    root = Path(probe_kit.__file__).parent
-    assert [path for path in root.rglob("*.py") if "pytest" in imported(path)] == []
-
-
-def imported(path: Path) -> set[str]:
-    """Top-level packages that a module imports, wherever the statement stands."""
-    tree = parsed(path)
-    names = [each.name for node in ast.walk(tree) if isinstance(node, ast.Import) for each in node.names]
-    names += [node.module or "" for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
-    return {name.partition(".")[0] for name in names}
+    imported = [(path, alias.name) for path, node in package_nodes(ast.Import) for alias in node.names]
+    imported += [(path, node.module or "") for path, node in package_nodes(ast.ImportFrom)]
+    assert [path for path, module in imported if module.partition(".")[0] == "pytest"] == []
 
 
 def test_a_failure_carries_the_advice_of_its_check_unless_it_has_its_own() -> None:

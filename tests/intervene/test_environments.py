@@ -22,7 +22,7 @@ from probe_kit.runs import Run, open_run
 if TYPE_CHECKING:
     from probe_kit.hooks.families.pi0.adapter import Pi0
 
-EPISODES = 12
+EPISODES = 6
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -36,8 +36,8 @@ def _own_modules() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def played(_own_modules: None, pi0_tiny: "Pi0", tmp_path_factory: pytest.TempPathFactory) -> Run:
-    """Twelve episodes in six groups, whose block and colour differ by the seed."""
-    source = EnvSource("reach_env:ReachEnv", max_steps=6)
+    """Six episodes in three groups, whose block and colour differ by the seed."""
+    source = EnvSource("reach_env:ReachEnv", max_steps=6, options={"count": str(EPISODES)})
     settings = ExtractSettings("pi0-tiny", source=source, captured_calls=2, execute=3, env_workers=0, batch=1)
     folder = tmp_path_factory.mktemp("played") / "run"
     prepare(settings, model=pi0_tiny).run(folder)

@@ -54,8 +54,8 @@ def apply(diff: str, package: Path) -> None:
 @pytest.fixture
 def use(tmp_path: Path, outcome_table: Callable[..., pd.DataFrame]) -> Callable[[str, str], str]:
     """Runs Python with a table of a run, in a copy of the package to which a section's diff was applied."""
-    ignored = shutil.ignore_patterns("__pycache__", "*.safetensors")
-    shutil.copytree(ROOT / "probe_kit", tmp_path / "probe_kit", ignore=ignored)
+    weights = shutil.ignore_patterns("*.safetensors")
+    shutil.copytree(ROOT / "probe_kit", tmp_path / "probe_kit", ignore=weights)
     data = tmp_path / "episodes.json"
     outcome_table(6, 4, 2).assign(distance_correct=0.125).to_json(data)
 

@@ -23,7 +23,7 @@ from probe_kit.study.archive import table_record
 from probe_kit.suite import Suite
 from tests.study.small_study import small_study
 
-FEW, MANY = 25, 300
+FEW, MANY = 15, 300
 Undo = Callable[[], object]
 
 

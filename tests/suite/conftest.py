@@ -14,8 +14,8 @@ from tests.support.made_once import made_once
 
 @pytest.fixture(scope="session")
 def embedded(tmp_path_factory: pytest.TempPathFactory) -> Suite:
-    """All embedded categories with 40 items each."""
-    return load_suite(made_once(tmp_path_factory, "embedded", lambda at: build_suite(at, items_per_category=40)))
+    """All embedded categories with 20 items each."""
+    return load_suite(made_once(tmp_path_factory, "embedded", lambda at: build_suite(at, items_per_category=20)))
 
 
 @pytest.fixture

@@ -470,7 +470,7 @@ def test_every_concept_is_target_as_often_as_distractor(embedded: Suite) -> None
 @pytest.mark.parametrize("category", list(GENERATORS))
 def test_each_original_layout_has_as_many_answers_left_as_right(embedded: Suite, category: str) -> None:
     sides = Counter(item.correct_side for item in embedded.items if item.category == category)
-    assert sides["left"] == sides["right"] == 20
+    assert sides["left"] == sides["right"] == 10
 
 
 def test_no_phrase_leans_to_a_side_in_the_original_layout(embedded: Suite) -> None:

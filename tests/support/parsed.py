@@ -2,7 +2,6 @@
 
 import ast
 import gc
-from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
@@ -23,9 +22,9 @@ def package_trees() -> dict[Path, ast.Module]:
     return trees
 
 
-def package_nodes[Node: ast.AST](kind: type[Node]) -> Iterator[tuple[Path, Node]]:
-    """Yield every node of a kind, such as `ast.Call`, with its file."""
-    for path, tree in package_trees().items():
-        for node in ast.walk(tree):
-            if isinstance(node, kind):
-                yield path, node
+@cache
+def package_nodes[Node: ast.AST](kind: type[Node]) -> list[tuple[Path, Node]]:
+    """Return every node of a kind, such as `ast.Call`, with its file."""
+    return [
+        (path, node) for path, tree in package_trees().items() for node in ast.walk(tree) if isinstance(node, kind)
+    ]

@@ -27,14 +27,15 @@ def prose_of_module(path: Path, name: str) -> Iterator[Prose]:
     tree = parsed(path)
     docstrings: dict[ast.Constant, bool] = {}
     _collect_docstrings(tree, docstrings, public=True)
+    nodes = list(ast.walk(tree))
     helps = {
         keyword.value
-        for node in ast.walk(tree)
+        for node in nodes
         if isinstance(node, ast.Call)
         for keyword in node.keywords
         if keyword.arg == "help"
     }
-    for node in ast.walk(tree):
+    for node in nodes:
         if not isinstance(node, ast.Constant) or not isinstance(node.value, str):
             continue
         place = f"{name}:{node.lineno}"
@@ -53,7 +54,7 @@ def remarks_of_module(path: Path, name: str) -> Iterator[Prose]:
         if token.type == tokenize.COMMENT:
             yield Prose(f"{name}:{token.start[0]}", token.string.lstrip("# "), "comment")
     docstrings: dict[ast.Constant, bool] = {}
-    _collect_docstrings(ast.parse(source), docstrings, public=True)
+    _collect_docstrings(parsed(path), docstrings, public=True)
     for node in docstrings:
         yield Prose(f"{name}:{node.lineno}", str(node.value), "docstring")
 

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import cache
 from itertools import product
 from pathlib import Path
 from typing import Any, Literal
@@ -119,24 +120,26 @@ def combination(
     return add_image_swap(row, evidence)
 
 
-def every_combination() -> Iterator[tuple[str, str, str, str, RetentionRow]]:
-    for rate_, backbone, action, swapped in product(RATES, PARTS, PARTS, SWAPS):
-        for control, located in ((True, None), (False, None), (True, ()), (True, ("backbone.02",))):
-            yield rate_, backbone, action, swapped, combination(rate_, backbone, action, swapped, control, located)
-
-
-ALL = list(every_combination())
+@cache
+def every_combination() -> list[tuple[str, str, str, str, RetentionRow]]:
+    """Made when a test first needs it, and not by each process that collects the tests."""
+    locating = ((True, None), (False, None), (True, ()), (True, ("backbone.02",)))
+    return [
+        (rate_, backbone, action, swapped, combination(rate_, backbone, action, swapped, control, located))
+        for rate_, backbone, action, swapped in product(RATES, PARTS, PARTS, SWAPS)
+        for control, located in locating
+    ]
 
 
 def test_no_combination_of_rate_streams_and_swap_lacks_a_word_or_a_number() -> None:
-    for *_, row in ALL:
+    for *_, row in every_combination():
         text = conclusion(row)
         assert not text or text.endswith(".")
         assert not re.search(r"None|–|nan|  |\.\.|;\.|: \.|\(\)|^; ", text), text
 
 
 def test_use_is_concluded_from_a_swap_and_knowledge_never_beside_an_interval_that_includes_one_half() -> None:
-    for rate_, backbone, _, swapped, row in ALL:
+    for rate_, backbone, _, swapped, row in every_combination():
         text = conclusion(row)
         assert ("The answer is used" in text) == (swapped in ("follows", "reverses")), text
         assert ("The answer is used in the first chunk, against the correct picture" in text) == (
@@ -152,7 +155,7 @@ def test_use_is_concluded_from_a_swap_and_knowledge_never_beside_an_interval_tha
 
 
 def test_absence_is_said_of_a_bounded_backbone_only_and_more_items_are_asked_for_what_is_open_only() -> None:
-    for rate_, backbone, _, swapped, row in ALL:
+    for rate_, backbone, _, swapped, row in every_combination():
         text = conclusion(row)
         assert ("bsent from the backbone" not in text) or backbone == "absent", text
         if "items cannot tell" in text or "takes about" in text:
