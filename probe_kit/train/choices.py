@@ -11,7 +11,7 @@ CORRECT: Side = "side.correct"
 """The target of probes unless another is named."""
 SIDES: dict[str, str] = {
     CORRECT: "side of the correct picture",
-    "side.chosen": "side on which the cube was placed (rule disc), or that a VLM named; other episodes are left out",
+    "side.chosen": "side on which the cube was placed (rule disc), or that a VLM named; others are left out",
     "side.shuffled": "control: side of the correct picture, flipped for a random half of the items",
 }
 """Targets that are sides of a picture."""
