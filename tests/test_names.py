@@ -86,6 +86,10 @@ def first_words(tree: ast.Module) -> Iterator[tuple[int, str]]:
             yield getattr(node, "lineno", 1), docstring.splitlines()[0]
 
 
+RULES = {
+    "names": "a name says what it holds; these are fillers",
+    "docstrings": "a docstring begins with a verb or a noun; these begin with a pronoun or a preposition",
+}
 CHECKS = {"names": fillers, "docstrings": first_words}
 
 
@@ -96,7 +100,7 @@ def test_the_package_is_written_in_the_words_of_the_field(check: str) -> None:
         for file, tree in package_trees().items()
         for line, text in CHECKS[check](tree)
     ]
-    assert not wrong, "\n".join(wrong)
+    assert not wrong, f"{RULES[check]}\n" + "\n".join(wrong)
 
 
 @pytest.mark.parametrize(

@@ -174,7 +174,8 @@ class Outcome:
 
     zone: by the rule of the paper, with radius `epsilon`. cube_xy, cube_z: the middle of the cube.
     distance_correct, distance_wrong: in the plane, to the tile centres. cube_moved: it is further than
-    `SceneSpec.moved` from where it started. on_tile: it touches a tile. is_grasped: both fingers touch it.
+    `SceneSpec.moved` from where it started. on_tile, is_grasped: at the end it touches a tile, both
+    fingers touch it; `Run.behaviour` says whether they ever did.
     clipped: how many actions the limits changed. truncation_reason: why the episode was cut, None if it is
     running or stopped early by itself.
     """

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from probe_kit.hooks import Policy
 
 REDO = "the same `probe-kit intervene` then plays it again"
+"""The remedy for a damaged piece of an unfinished intervention."""
 
 
 def run_intervention(
@@ -73,6 +74,7 @@ def run_intervention(
         progress = progress or notebook_progress("items replayed")
         outcomes = _replay_items(session, intervention, items, conditions, pieces, progress)
         extra_files = intervention.extra_files(session, conditions, outcomes)
+        # What made the numbers and what was checked of them; the notes below a table are made of it.
         certificate = {
             "policy": policy.card.to_json(),
             "provenance": provenance_here(policy.card.device, policy.card.dtype),
@@ -92,9 +94,9 @@ def run_intervention(
 def check_roles(intervention: Intervention, policy: "Policy") -> None:
     """Raise UsageError for a role that no token at its sites plays: the table would be silent about it.
 
-    Of the roles that are tried if none are named, one that is there will do.
+    The default roles are tried where none are named; then one of them that the policy has is enough.
     """
-    usual = next((field.default for field in fields(intervention) if field.name == "roles"), ())
+    default_roles = next((field.default for field in fields(intervention) if field.name == "roles"), ())
     patterns_of: dict[tuple[str, ...], list[str]] = {}
     for pattern, roles in intervention.patterns:
         patterns_of.setdefault(roles, []).append(pattern)
@@ -102,7 +104,7 @@ def check_roles(intervention: Intervention, policy: "Policy") -> None:
         streams = list(dict.fromkeys(group.stream for group in resolve_all(patterns, policy).values()))
         present = {role for stream in streams for role in roles_of(policy, stream, roles)}
         missing = [role for role in roles if role not in present]
-        if missing and not (present and roles == usual):
+        if missing and not (present and roles == default_roles):
             declared = [name for stream in streams for name in policy.role_names.get(policy.tokens_of(stream), ())]
             raise UsageError(
                 f"no token of {', '.join(streams)} has the role {missing[0]!r}; expected one of "
@@ -167,7 +169,7 @@ def _replay_check(outcomes: ConditionOutcomes) -> dict[str, Any]:
         "compared": int(errors.size),
         "equal": int((errors == 0).sum()),
         "largest_difference": float(errors.max(initial=0.0)),
-        # One that differs stops an intervention before anything is stored.
+        # All of them: `play` raises for an outcome that differs from the run's.
         **({} if outcomes.episode_outcomes is None else {"outcomes_equal": int(outcomes.replay_error.size)}),
     }
 

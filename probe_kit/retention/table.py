@@ -62,7 +62,8 @@ class RetentionTable:
     results: the probes that the rows were made of, by location of the run and target; figures and reports of the
     table draw these. Rows of targets that are no side have no mean, as their metrics differ.
     wordings: of runs that were asked in several, every two against each other.
-    iterations: of the expert, or action tokens, that take part. notes: what a reader must know, a sentence each:
+    iterations: flow-matching iterations of the expert, or positions of action tokens, that take part.
+    notes: what a reader must know, a sentence each:
     which runs have no probes, and which settings the rows mix. vlm_vla: VLM − VLA, if that was requested. runs: as
     the rows read them, VLM runs first.
     """

@@ -128,8 +128,10 @@ class Run:
     control_features: Mapping[str, NDArray[np.floating]] = MappingProxyType({})
 
     def __init__(
-        self, location: Location, wording: str | None = None, item_ids: frozenset[str] | None = None
+        self, path: Path | str | Location, wording: str | None = None, item_ids: frozenset[str] | None = None
     ) -> None:
+        """Read the records of the run at `path`; `open_run` also refuses an unfinished one."""
+        location = locate(path)
         self.location, self.wording, self.item_ids = location, wording, item_ids
         self.root = read_root(location)
         self.root.check()

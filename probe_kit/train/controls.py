@@ -40,10 +40,14 @@ SIDE_DEFAULT = (RANDOM_FEATURES, "pixels")
 NOT_BY_DEFAULT = frozenset({"action", "position"})
 """Controls of other targets that must be asked for.
 
-A policy's own action is no leak: whether a site exceeds it is another question. The layout is in no instruction.
+A policy's own action is no leak: whether a site exceeds it is another question. No model reads the layout: that
+`position` gives a label away is a fact of the table, for which no site can be blamed.
 """
 _SIDE_SEEDS = {RANDOM_FEATURES: "binding", UNTRAINED: "twin"}
-"""Words in the seeds of the controls that sites of a side are compared with."""
+"""Words in the seeds of the controls that sites of a side are compared with.
+
+Numbers depend on them: another word would draw other exchanges.
+"""
 
 
 @dataclass(frozen=True)
@@ -123,7 +127,7 @@ def add_controls(
                     stream: problem.control_curve(_layer_probes(prepared.inputs, problem, width, seed))
                     for stream, width in widths.items()
                 }
-                # Of a side one score, as wide as the backbone.
+                # Of a side one score, as wide as the backbone: the table of leaks has no streams.
                 scored = references
                 if problem.is_side:
                     scored = {"": references.get("backbone", next(iter(references.values())))}
@@ -176,7 +180,9 @@ def control_score(name: str, category: str, curve: ProbeCurve, stream: str = "",
 def _compared(
     results: ProbeResults, name: str, key: tuple[str, str], stream: str, references: Matrix
 ) -> Iterator[ControlComparison]:
-    """Yield every site of a stream against the mean of (S', E) scores of a control, or the best untrained site."""
+    """Yield every site of a stream against the mean of a control's scores, or the best untrained site.
+
+    references: (S', E) scores of the control's S' sites on the E samples."""
     curve, settings = results.curves[key], results.settings
     rows = curve.stream(stream)
     if settings.is_side:

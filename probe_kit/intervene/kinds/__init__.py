@@ -40,7 +40,7 @@ def every_kind() -> "list[type[Intervention]]":
 
 def kinds_that_need(capability: "InterventionKind") -> tuple[str, ...]:
     """Return the kinds that a family supports only with a capability, the last one of their `needs`."""
-    return tuple(kind.kind for kind in every_kind() if kind.needs[-1] == capability)
+    return tuple(kind.kind for kind in every_kind() if capability in kind.needs[-1:])
 
 
 def register(name: str, module: str) -> None:

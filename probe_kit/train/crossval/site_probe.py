@@ -96,15 +96,16 @@ def _predict_by_ridge(samples: Samples, labels: Matrix, task: Task, folds: list[
         by_sample = np.zeros((PENALTIES.size, len(labels)))
         for inner in fold.inner:
             truth = labels[inner.test]
-            worth: Matrix = np.ones(1)
-            if classes:  # one over the number of samples of each one's class
+            weights: Matrix = np.ones(1)
+            if classes:  # one over the number of samples of each sample's class: the sum is balanced accuracy
                 counts = np.stack([(truth == number).sum(axis=0) for number in range(classes)])
-                worth = 1 / np.take_along_axis(counts, truth.astype(np.intp), axis=0)
+                weights = 1 / np.take_along_axis(counts, truth.astype(np.intp), axis=0)
             for step, predicted in enumerate(_along_penalties(samples, labels, classes, inner)):
-                gains = (predicted == truth) * worth if classes else -((truth - predicted) ** 2)
+                gains = (predicted == truth) * weights if classes else -((truth - predicted) ** 2)
                 quality[step] += gains.sum(axis=0)
                 by_sample[step, inner.test] = gains[:, 0]
         scale = np.abs(quality).max(axis=0) + 1e-300  # not zero
+        # Rounded, so that sums in another order are still ties; of these argmax takes the first, the largest λ.
         best = len(quality) - 1 - (quality / scale).round(12)[::-1].argmax(axis=0)
         for step, predicted in enumerate(_along_penalties(samples, labels, classes, fold.outer)):
             columns = np.flatnonzero(best == step)
@@ -145,13 +146,14 @@ class SiteProbe:
     """The results of a site's probe on E samples, with F outer folds and P label permutations.
 
     decisions: (E,) out-of-fold decision values of a side (positive: left), else predicted class numbers or
-    quantities. scores: (E,) their mean is the metric; of a side whether the decision is right. strengths: (F,) the
-    C or λ chosen in each outer fold. weights, intercepts: (F, D) float32 and (F,) of each outer fold's probe of a
-    side, on raw features; D is 0 for other targets. spreads: (F,) deviation of the fold's training samples along
-    its weights, in units of the features. null: (P,) metric under the label permutations. inner: (F, E) quality of
-    each sample's prediction in the inner folds of each outer fold, by which penalties are chosen, the larger the
-    better; 0 for the samples that the outer fold tests. Of a side the log-likelihood of its label, else minus the
-    mean of the permutations'.
+    quantities. scores: (E,) their mean is the metric; of a side whether the decision is right. strengths: (F,)
+    chosen in each outer fold: C of logistic probes, λ of ridge, of which the larger penalises more. weights,
+    intercepts: (F, D) float32 and (F,) of each outer fold's probe of a side, on raw features; D is 0 for other
+    targets. spreads: (F,) deviation of the fold's training samples along its weights, in units of the features.
+    null: (P,) metric under the label permutations. inner: (F, E) quality of each sample's prediction in the inner
+    folds of each outer fold, by which penalties are chosen, the larger the better; 0 for the samples that the
+    outer fold tests. Of a side the log-likelihood of its label. Of others the gain of `_predict_by_ridge` or the
+    log-likelihood, minus the mean over the label permutations.
     """
 
     decisions: Matrix
