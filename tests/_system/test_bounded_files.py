@@ -137,7 +137,7 @@ ELSEWHERE = {
     "suite/pictures.py": "`stored_picture`: files of the package",
     "suite/build.py": "files of the package",
     "view/export.py": "files of the package",
-    "retention/report/parts.py": "files of the package",
+    "retention/report/page.py": "files of the package",
     "runs/provenance.py": "files of the package",
     "extract/rollout/worker.py": "the video that it has just written",
     "runs/folder.py": "objects of a run, by its own check of regular files",
