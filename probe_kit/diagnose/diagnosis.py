@@ -63,7 +63,8 @@ def measure_knowledge(run: "Run", target: "Target | str", seed: int = 0) -> Know
     from probe_kit.train import train_probes
 
     results = train_probes(run, [EVERYWHERE], target=target, seed=seed)
-    # A layer of a stream with iterations is one site of a diagnosis: the farthest above chance stands for it.
+    # A layer of a stream with iterations is one site of a diagnosis: the farthest above chance stands for it. As
+    # the largest of several it is biased upward; the retention below is by sites that other questions chose.
     frame = results.scores.assign(excess=lambda scores: scores["score"] - scores["chance"])
     best = frame.sort_values("excess", ascending=False).drop_duplicates(["stream", "layer"]).sort_index()
     sites = tuple(
@@ -106,7 +107,7 @@ def places_of(model: "Model") -> list[SiteGroup]:
 def measure_passage(
     session: "ReplaySession", pairs: Sequence[Pair], scale: ActionScale
 ) -> tuple[SitePassage, ...]:
-    """Return difference and carried share at every site, over pairs of equally many tokens.
+    """Return difference and carried share at every site, over pairs of equally many tokens; see `SitePassage`.
 
     Two inferences per pair, and one per site. scale: of the session's actions. Raises what `capture` and `patched`
     raise.
@@ -127,7 +128,8 @@ def measure_passage(
                 with patched(tokens, [Cell(group, ALL)], donor):
                     edited = session.act(pair.clean, pair.seed)
                 moved[row, column] = scale.changes(edited[None], clean[None])[0] @ change
-    # A ratio of sums: pairs whose action hardly changes have little weight.
+    # Least squares through 0, of the patch's change on the donor's over all pairs. As a ratio of sums it gives
+    # pairs whose action hardly changes little weight, where a mean of ratios would divide by almost 0.
     shares = moved.sum(axis=0) / squares.sum() if squares.any() else np.full(len(places), np.nan)
     return tuple(
         SitePassage(group.name, float(difference), float(share))
@@ -226,7 +228,7 @@ def diagnose_run(
         if base_policy is not None:
             progress("inputs of the base")
             diagnosed = exchange.against(_inference(session, base_policy), diagnosed)
-    clean = [drawn[index] for index in dict(rows)] or drawn
+    clean = [drawn[index] for index in dict(rows)] or drawn  # of a table of pairs, each clean frame once
     groups = len({frame.group for frame in clean})
     diagnosis = Diagnosis(key, run.label, len(clean), groups, diagnosed, base or "")
     now = datetime.now(UTC).isoformat(timespec="microseconds")
@@ -279,7 +281,7 @@ def check_base_files(
 
     if (family := get_family(family_name)) is None:
         return
-    # A size stands for a checkpoint, and both are given here.
+    # The option `size` chooses a released checkpoint of the family; here `base` names the checkpoint itself.
     unsized = {name: value for name, value in options.items() if name != SIZE}
     try:
         family.check(base, options=unsized, fetch=fetch)
@@ -322,7 +324,7 @@ def _plain(inputs: object) -> object:
 
 def _inference(session: "ReplaySession", policy: "Policy | None" = None) -> Infer:
     """Inferences of a session, one by one. policy: another one on the same observations."""
-    acting = copy(session)
+    acting = copy(session)  # which keeps its own policy for the measurements inside
     acting.policy = policy or session.policy
 
     def infer(observations: Sequence["Observation"], seeds: Sequence[int]) -> Actions:
@@ -347,7 +349,7 @@ def _measure(
 
 def _look_inside(session: "ReplaySession", exchange: InputExchange, diagnosed: InputDiagnosis) -> InputDiagnosis:
     """The input with its sites, where it was exchanged, with one donor per frame of equally many tokens."""
-    if diagnosed.matters is None:
+    if diagnosed.matters is None:  # it was not exchanged: the policy or the run has no such input
         return diagnosed
     frames = exchange.frames
     pairs = []

@@ -86,6 +86,7 @@ def run_intervention(
             "passed_over": session.passed_over,
             **session.certificate,
         }
+    # Only now: the unit, spreads of all clean actions, is known once every item was replayed.
     save(run, settings, outcomes.in_spreads(), certificate, extra_files)
     pieces.discard()  # only now: killed in between, the result is there, and the pieces are tidied away
     return load_effects(run, key)

@@ -365,6 +365,7 @@ def retention_table(
         members, key_of_run = _of_sides(members, key_of_run, score, with_side_words)
     every = [run for _, run in members]
     names = distinct_labels(every, labels)
+    # Rows of labels show no success rate, so that no rule judges them and no trajectory is read.
     judging = (rule, last_steps, with_behaviour) if targets is None else (DEFAULT_RULE, 1, False)
     table_runs = [
         TableRun.of(run, *judging, label=names[str(run.location)], group=group) for group, run in members

@@ -61,6 +61,7 @@ _ANSWERED: dict[Modes, str] = {
     "both": "a policy answers by where the cube ends, a model that was asked by what it says",
 }
 _SIDES = {"left": "on the left", "right": "on the right"}
+# `oob`, out of bounds, is the paper's word for a cube on neither picture.
 _OUTCOMES = {
     "correct": "the cube ended on it",
     "wrong": "the cube ended on the other picture",
@@ -170,7 +171,7 @@ def _sides(source: FigureSource, pictures_of: PicturesBySubject) -> dict[str, An
     further_views = []
     for mean in table.means:
         rows = [row for row in table.rows if (*row.key, row.view) == (*mean.key, mean.view)]
-        if mean.key in warnings:  # the summary is of the first view
+        if mean.key in warnings:  # its run was met before, by another view; the summary is of the first
             sentences = [f"{title_of(row.category)}: {conclusion(row)}" for row in rows]
             further_views.append((f"{model_name(mean)}, view {mean.view}", sentences))
         else:
@@ -371,8 +372,9 @@ def arranged(
     return {subject: list(by_title.values()) for subject, by_title in subjects.items()}
 
 
-def _kind(exhibit: ReportFigure) -> str:
-    return exhibit.title.partition(",")[0]
+def _kind(figure: ReportFigure) -> str:
+    """Its title before the first comma; behind it stands the category or the view."""
+    return figure.title.partition(",")[0]
 
 
 def data_uri(exhibit: ReportFigure, places: tuple[str, ...] = ()) -> tuple[str, str]:
@@ -453,6 +455,7 @@ def provenance(name: str, run: RunReader, results: Sequence[ProbeResults]) -> di
         "streams": "; ".join(_stream(run, stream) for stream in run.streams) or "none",
         **_protocol(settings),
         "run settings sha256": run.settings_sha256,
+        # Empty for a script, which has no hooks; a line without text is not shown.
         "hooks on equals hooks off": {True: "yes, bit for bit", None: ""}.get(
             certificate.get("hooks_on_equals_hooks_off"), "no"
         ),
@@ -537,10 +540,10 @@ def _of_target(probes: ProbeResults) -> str:
 
 @dataclass(frozen=True)
 class Words:
-    """entries: name, meaning and place of each word, by what they stand in.
+    """The glossary of a page: words of its tables, each with an anchor such as `word-7` that cells link to.
 
-    headings: the place of a column's word and meaning; two tables may give a word two meanings. values: the place
-    of a cell's text that is a word.
+    entries: name, meaning and anchor of each word, by the title of the table. headings: the anchor of a column's
+    word and meaning; two tables may give a word two meanings. values: the anchor of a cell's text that is a word.
     """
 
     entries: Mapping[str, tuple[tuple[str, str, str], ...]]
@@ -572,7 +575,7 @@ def words_of(tables: Sequence[Table]) -> Words:
 
 
 def _word(cell: str) -> str:
-    """A verdict without its direction, side and bound."""
+    """A verdict without direction, side and bound: `used` of `against: used (left)`."""
     return cell.removeprefix("against: ").partition(" (")[0]
 
 
