@@ -222,7 +222,7 @@ def add_intervention(fence: Fence, name: str, folder: str, kind: str, *arguments
 
 COLOR = ("--categories", "color", "--items", 12)
 TWO = ("--categories", "color,state", "--items", 12)
-SMALL = ("--env-workers", 0, "--frames", "none")
+SMALL = ("--env-workers", 1, "--frames", "none")
 UNTRAINED, ASKED = "untrained", "asked/instruction-224x224"
 CONTROLS = "position,instruction,pixels,random-features"
 

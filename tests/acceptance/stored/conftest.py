@@ -49,7 +49,7 @@ def play(folder: Path) -> None:
     """Play, ask and fit all of `StoredRuns`."""
     runs = StoredRuns(folder)
     both, color = ("--categories", "color,state"), ("--categories", "color")
-    policy = ("--model", "pi0-tiny", "--items", "12", "--batch", "2", "--env-workers", "0", "--max-steps", "3")
+    policy = ("--model", "pi0-tiny", "--items", "12", "--batch", "8", "--env-workers", "0", "--max-steps", "3")
     policy += ("--execute", "3")
     probes = ("--permutations", "3", "--controls", "none", "--views", "mean")
     probe_kit("extract", *policy, *both, "--out", runs.trained, "--label", "trained")
