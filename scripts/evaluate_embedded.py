@@ -16,7 +16,6 @@ from probe_kit.env import SceneSpec
 from probe_kit.extract import AskSettings, ExtractSettings, ask_run, extract_run
 from probe_kit.extract.prompts import TEMPLATES
 from probe_kit.retention import RetentionRow, retention_table
-from probe_kit.retention.behaviour import ask_of
 from probe_kit.retention.columns.text import verdict
 from probe_kit.retention.rows.row import MEAN
 from probe_kit.runs import Run
@@ -62,7 +61,7 @@ def main(
 
 def _rows(runs: list[Run]) -> list[RetentionRow]:
     """Of every run by itself; those that act by every rule."""
-    judged = [(run, rule) for run in runs for rule in (RULES[:1] if ask_of(run) else RULES)]
+    judged = [(run, rule) for run in runs for rule in (RULES[:1] if run.ask else RULES)]
     return [row for run, rule in judged for row in retention_table([run], rule=rule).rows if row.category != MEAN]
 
 

@@ -51,20 +51,20 @@ ELSEWHERE = {
 
 
 def _imported() -> list[tuple[str, str, str]]:
-    """Return benchmark, module and name of everything that benchmarks import from probe_kit."""
+    """Return file, module and name of everything that benchmarks and scripts import from probe_kit."""
     return [
-        (file.stem, node.module, alias.name)
-        for file in sorted(FOLDER.glob("*.py"))
+        (file.name, node.module, alias.name)
+        for file in sorted([*FOLDER.glob("*.py"), *(FOLDER.parent / "scripts").rglob("*.py")])
         for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
         if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("probe_kit")
         for alias in node.names
     ]
 
 
-def test_benchmarks_import_what_the_package_has() -> None:
+def test_benchmarks_and_scripts_import_what_the_package_has() -> None:
     missing = [
-        f"{benchmark}: {module}.{name}"
-        for benchmark, module, name in _imported()
+        f"{file}: {module}.{name}"
+        for file, module, name in _imported()
         if not hasattr(importlib.import_module(module), name) and find_spec(f"{module}.{name}") is None
     ]
     assert not missing
