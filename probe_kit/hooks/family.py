@@ -44,7 +44,7 @@ from probe_kit.hooks.contract.declared import (
     ProtocolRow,
     check_options,
 )
-from probe_kit.hooks.outline import Outline, bytes_to_fetch, is_complete, is_configured, outline_of
+from probe_kit.hooks.outline import Outline, bytes_to_fetch, configuration_folder, is_complete, outline_of
 from probe_kit.models.bounds import MOST_STEPS
 
 if TYPE_CHECKING:
@@ -299,11 +299,12 @@ class Family:
         if not self.declared:
             return None
         location, loader_options = self._located(checkpoint, options)
-        if not is_configured(location):
+        if (folder := configuration_folder(location)) is None:
             return None  # before the loader is imported, and torch with it
         load = self._imported(self.loader)
         with naming_checkpoint(self.name, str(location)):
-            return outline_of(self.name, load, location, dtype, self._with_defaults(loader_options, location))
+            values = self._with_defaults(loader_options, location)
+            return outline_of(self.name, load, str(location), folder, dtype, values)
 
     def is_here(self, checkpoint: str | None, options: Mapping[str, Any]) -> bool:
         """Whether a checkpoint with its weights is in a folder or in the hub's cache. Asks no network."""

@@ -52,16 +52,13 @@ class Outline:
 
 
 def outline_of(
-    name: str, load: Any, location: str | None, dtype: str | None, options: Mapping[str, Any]
-) -> Outline | None:
-    """The outline of the checkpoint at `location`; None where its configuration is not here.
+    name: str, load: Any, location: str, folder: Path, dtype: str | None, options: Mapping[str, Any]
+) -> Outline:
+    """The outline of the checkpoint at `location`, whose configuration lies in `folder`.
 
     name: of the family. load: its loader. options: as the loader gets them. No network is asked and no weights are
     read. Raises what loading raises for a checkpoint in a folder.
     """
-    folder = _folder(location)
-    if location is None or folder is None:
-        return None
     complete = is_complete(location)
     key = (name, location, dtype, repr(sorted(options.items())), complete, file_state(folder))
     if key in _OUTLINES:
@@ -95,13 +92,11 @@ def _lacks_repository(error: BaseException | None) -> bool:
     return False
 
 
-def is_configured(location: str | None) -> bool:
-    """Whether the configuration of a checkpoint is in a folder or in the hub's cache. Asks no network."""
-    return _folder(location) is not None
+def configuration_folder(location: str | None) -> Path | None:
+    """The folder, or that of the hub's cache, with the configuration of a checkpoint; None where it is not here.
 
-
-def _folder(location: str | None) -> Path | None:
-    """The folder with the configuration of a checkpoint; None where it is not here."""
+    Asks no network.
+    """
     folder = None if location is None else _local(location)
     if location is None or folder is None:
         return None
