@@ -246,7 +246,8 @@ _LEGENDS = {
     "backbone %": "Backbone: accuracy of probes in the backbone, at sites that other questions chose",
     "action %": "Action: the same at the action's sites",
     "success %": "Success: the cube ends on the correct picture",
-    "retention": "Retention: share of the backbone's signal left in the action",
+    "retention": "Retention: share of the backbone's signal left in the action; a mean is of the scores, not of "
+    "these shares",
 }
 """The meaning of a column."""
 _TESTS = {
