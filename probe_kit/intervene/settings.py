@@ -121,7 +121,7 @@ def check_run_fits(run: Run) -> None:
     """Raise UsageError for a run whose policy did not act, or acted in a way that is not done again here."""
     settings = run.settings
     why = None
-    if "ask" in settings:
+    if run.ask is not None:
         why = f"{run.model} was asked and did not act; intervene on a run of `probe-kit extract`"
     elif run.weights_sha256 is None or not run.streams:
         why = f"{run.model} is scripted: it has no network in which anything could be changed"

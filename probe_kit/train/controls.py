@@ -182,7 +182,8 @@ def _compared(
 ) -> Iterator[ControlComparison]:
     """Yield every site of a stream against the mean of a control's scores, or the best untrained site.
 
-    references: (S', E) scores of the control's S' sites on the E samples."""
+    references: (S', E) scores of the control's S' sites on the E samples.
+    """
     curve, settings = results.curves[key], results.settings
     rows = curve.stream(stream)
     if settings.is_side:

@@ -183,14 +183,17 @@ def probe_site(
     columns, column_of = (columns, np.arange(columns.shape[1])) if task is None else _distinct(columns)
     predictions = _predict(samples, columns, task, folds)
     scores = _scores(predictions.values, columns, task, folds)
-    inner: NDArray[np.floating] = np.stack([quality.first for quality in predictions.inner]).astype(np.float32)
-    if task is not None:
+    inner: NDArray[np.floating]
+    # Only directions of a side are stored; other probes are refitted where they are transferred.
+    directions: Sequence[FittedFold] = ()
+    if task is None:
+        directions = predictions.folds
+        inner = np.stack([quality.first for quality in predictions.inner]).astype(np.float32)
+    else:
         trained = zip(predictions.inner, folds, strict=True)
         inner = np.stack(
             [_above_permutations(quality, column_of[1:], fold.outer.train) for quality, fold in trained]
         )
-    # Only directions of a side are stored; other probes are refitted where they are transferred.
-    directions = predictions.folds if task is None else ()
     none = np.zeros(len(folds))
     return SiteProbe(
         decisions=predictions.values[:, 0],
@@ -230,11 +233,12 @@ def _predict(samples: Samples, labels: NDArray[Any], task: Task | None, folds: l
     truth = labels == 1
     values, fitted = np.empty(labels.shape), cross_validate(samples, truth, folds)
     for fold, probe in zip(folds, fitted, strict=True):
-        values[fold.outer.test] = probe.decisions
+        decisions = probe.decisions
         if task == "binary":
             # Less the log-odds of the training classes: balanced accuracy takes both as equally frequent.
             share = truth[fold.outer.train].mean(axis=0)
-            values[fold.outer.test] = probe.decisions > np.log(share / (1 - share))
+            decisions = decisions > np.log(share / (1 - share))
+        values[fold.outer.test] = decisions
     strengths = np.array([probe.strengths[0] for probe in fitted])
     return Predictions(values, strengths, [probe.inner for probe in fitted], fitted)
 
