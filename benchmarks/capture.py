@@ -86,7 +86,7 @@ class Benchmark:
         return self._to_host(with_tokens=True)
 
     def output_hidden_states(self) -> Output:
-        """transformers collects."""
+        """Let transformers collect."""
         with hidden_states(self.subject):
             return self.plain()
 

@@ -198,7 +198,9 @@ FULL: dict[str, Values] = {
 class Subject:
     """A model and one inference of it.
 
-    infer: one inference; its numbers must not change by capture. roles: of its batch.
+    Attributes:
+        infer: One inference; its numbers must not change by capture.
+        roles: Of its batch.
     """
 
     model: Model
@@ -270,7 +272,7 @@ def written(family: str, folder: Path, sizes: Mapping[str, Values] = LARGER) -> 
 
 @contextmanager
 def hidden_states(subject: Subject) -> Iterator[list[int]]:
-    """transformers' own switch on every stack; gives how many hidden states each call returned."""
+    """Switch on hidden states in every stack; yields how many each call returned."""
     stacks, counts = subject.stacks, []
 
     def count(_module: nn.Module, _inputs: Any, output: Any) -> None:

@@ -29,9 +29,15 @@ LARGEST = 0.5 - 1e-4
 
 @dataclass(frozen=True)
 class World:
-    """top: accuracy above chance of the best possible probe at the backbone's best site. retention: the expert's
-    best as a share of it. sizes: items of every group. sites: of either stream. plateau: whether the last 40 % of
-    the sites are equally good, else they are around a peak. one_site: only one site holds anything.
+    """A stream of the backbone and one of the expert, with the accuracy that each site allows.
+
+    Attributes:
+        top: Accuracy above chance of the best possible probe at the backbone's best site.
+        retention: The expert's best as a share of it.
+        sizes: Items of every group.
+        sites: Of either stream.
+        plateau: Whether the last 40 % of the sites are equally good, else they are around a peak.
+        one_site: Only one site holds anything.
     """
 
     name: str

@@ -74,7 +74,7 @@ def coded(values: Matrix, task: Task) -> Matrix:
 
 
 def p_values(kind: str, task: Task, fitted: int, seed: int) -> tuple[float, float]:
-    """p of the first site alone, and the least p of the first `fitted` sites with the family-wise correction."""
+    """The p of the first site alone, and the least family-wise p of the first `fitted` sites."""
     draw = np.random.default_rng(derive_seed("label null", kind, seed))
     sites, values = features(draw)[:fitted], coded(KINDS[kind](draw).ravel(), task)
     group, episode, frame = (axis.ravel() for axis in np.indices(SHAPE))

@@ -83,7 +83,14 @@ def discriminant(
 
 
 def p_values(world: World, seed: int, by_item: bool = False, nested: bool = False) -> tuple[float, float]:
-    """p of the first site alone, and the family-wise p of the best; by_item: with those of before."""
+    """The p of the first site alone, and the family-wise p of the best.
+
+    Args:
+        world: How data and noise are drawn.
+        seed: Of the draw.
+        by_item: Also the p values of the test by items, which preceded the one by groups.
+        nested: Choose the regularisation in inner folds.
+    """
     generator = np.random.default_rng(seed)
     groups = np.repeat(np.arange(world.groups), 4)
     pattern = np.tile([True, False, False, True], world.groups)

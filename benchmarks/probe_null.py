@@ -36,7 +36,7 @@ def neighbouring_sites(generator: np.random.Generator) -> NDArray[np.float64]:
 
 
 def p_values(seed: int) -> tuple[float, float]:
-    """p of the first site alone, and the least family-wise p of all sites."""
+    """The p of the first site alone, and the least family-wise p of all sites."""
     items, labels = np.repeat(np.arange(ITEMS), 2), np.tile([True, False], ITEMS)
     sites = neighbouring_sites(np.random.default_rng(seed))
     permuted = flip_groups(labels, items, PERMUTATIONS, seed)

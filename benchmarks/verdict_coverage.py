@@ -44,7 +44,10 @@ Sizes = NDArray[np.int64]
 class Rates:
     """A kind of world of success rates.
 
-    rate: true share. alike: correlation of the episodes of a group (beta-binomial). sizes: episodes of G groups.
+    Attributes:
+        rate: True share.
+        alike: Correlation of the episodes of a group (beta-binomial).
+        sizes: Episodes of G groups.
     """
 
     name: str

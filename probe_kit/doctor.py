@@ -42,8 +42,9 @@ _PYTHONS = ((3, 12), (3, 14))  # from, and below
 class Finding:
     """One thing that was looked at.
 
-    state: `ok`, `note` (something cannot be used, the demo can), or `missing` (the demo cannot run).
-    advice: what to do, empty if nothing.
+    Attributes:
+        state: `ok`, `note` (something cannot be used, the demo can), or `missing` (the demo cannot run).
+        advice: What to do, empty if nothing.
     """
 
     subject: str
@@ -208,8 +209,9 @@ def _gpu(gpus: list[dict[str, Any]]) -> Finding:
 def _trial(subject: str, function: str, advice: str) -> "dict[str, Any] | Finding":
     """Return what a function of this module returns in a process of its own, or the finding that it failed.
 
-    advice: what to do where it failed. A trial without an answer in time is no failure: the machine is busy, and
-    installing again would not help.
+    Args:
+        advice: What to do where it failed. A trial without an answer in time is no failure: the machine is busy,
+            and installing again would not help.
     """
     code = f"import json, probe_kit.doctor as d; print('\\n' + json.dumps(d.{function}()))"
     try:

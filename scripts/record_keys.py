@@ -99,7 +99,7 @@ FAMILIES: dict[str, Callable[[], dict[str, torch.Tensor]]] = {
 
 
 def _on_meta(config: Any) -> Any:
-    """lerobot moves its policies to the device of the configuration."""
+    """Set the meta device, to which lerobot moves its policies."""
     config.device = "meta"
     return config
 

@@ -47,7 +47,7 @@ HEAD = "model.paligemma_with_expert.paligemma.lm_head.weight"
 
 
 def lerobots_policy(checkpoint: Path) -> Any:
-    """lerobot's policy with the checkpoint's weights, through torch's strict loading alone."""
+    """The policy of lerobot with the checkpoint's weights, through torch's strict loading alone."""
     config: Any = PreTrainedConfig.from_pretrained(checkpoint)
     config.compile_model, config.device = False, "cpu"
     if config.type == "pi0_fast":

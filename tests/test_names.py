@@ -72,7 +72,7 @@ def fillers(tree: ast.Module) -> Iterator[tuple[int, str]]:
 
 
 def first_words(tree: ast.Module) -> Iterator[tuple[int, str]]:
-    """Lines and first lines of docstrings that begin with a pronoun or a preposition.
+    """Lines and first lines of docstrings that begin with a pronoun, a preposition or a shape.
 
     The docstring of a function that returns a Boolean may begin with "Whether".
     """
@@ -81,16 +81,48 @@ def first_words(tree: ast.Module) -> Iterator[tuple[int, str]]:
             continue
         docstring = (ast.get_docstring(node) or "").strip()
         word = PRONOUNS.match(docstring)
+        if docstring.startswith(("(", "[")):
+            yield getattr(node, "lineno", 1), docstring.splitlines()[0]
         boolean = isinstance(node, FUNCTIONS) and node.returns is not None and ast.unparse(node.returns) == "bool"
         if word and not (boolean and word.group().lower() == "whether"):
             yield getattr(node, "lineno", 1), docstring.splitlines()[0]
 
 
+def parameters_in_prose(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Lines and names of parameters and fields that a docstring explains outside of `Args:` or `Attributes:`."""
+    for node in ast.walk(tree):
+        if isinstance(node, FUNCTIONS):
+            arguments = node.args
+            every = [
+                *arguments.posonlyargs,
+                *arguments.args,
+                *arguments.kwonlyargs,
+                arguments.vararg,
+                arguments.kwarg,
+            ]
+            names = [argument.arg for argument in every if argument is not None]
+        elif isinstance(node, ast.ClassDef):
+            names = [
+                line.target.id
+                for line in node.body
+                if isinstance(line, ast.AnnAssign) and isinstance(line.target, ast.Name)
+            ]
+        else:
+            continue
+        prose = re.split(r"^(?:Args|Attributes):$", ast.get_docstring(node) or "", maxsplit=1, flags=re.MULTILINE)[
+            0
+        ]
+        for name in names:
+            if re.search(rf"(?:^|[.;,] |\band )`?{re.escape(name)}`?: ", prose, re.MULTILINE):
+                yield node.lineno, name
+
+
 RULES = {
+    "parameters": "a docstring explains parameters under `Args:` and fields under `Attributes:`",
     "names": "a name says what it holds; these are fillers",
-    "docstrings": "a docstring begins with a verb or a noun; these begin with a pronoun or a preposition",
+    "docstrings": "a docstring begins with a verb or a noun; these begin with a pronoun, a preposition or a shape",
 }
-CHECKS = {"names": fillers, "docstrings": first_words}
+CHECKS = {"parameters": parameters_in_prose, "names": fillers, "docstrings": first_words}
 
 
 @pytest.mark.parametrize("check", CHECKS)
@@ -120,7 +152,14 @@ def test_a_filler_is_found_wherever_a_name_is_given(line: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("first", "allowed"), [("What it is.", False), ("Of a run.", False), ("The run.", True), ("Return it.", True)]
+    ("first", "allowed"),
+    [
+        ("What it is.", False),
+        ("Of a run.", False),
+        ("The run.", True),
+        ("Return it.", True),
+        ("(N, D) rows.", False),
+    ],
 )
 def test_a_docstring_begins_with_a_verb_or_a_noun(first: str, allowed: bool) -> None:
     assert list(first_words(ast.parse(f"def f():\n    '{first}'"))) == ([] if allowed else [(1, first)])
@@ -129,3 +168,16 @@ def test_a_docstring_begins_with_a_verb_or_a_noun(first: str, allowed: bool) -> 
 def test_whether_is_for_booleans_alone() -> None:
     assert not list(first_words(ast.parse("def f() -> bool:\n    'Whether it is.'")))
     assert list(first_words(ast.parse("def f() -> int:\n    'Whether it is.'")))
+
+
+@pytest.mark.parametrize(
+    "prose", ["Return it.\n\nvalues: (N,).", "Add; values: (N,).", "Add.\n\nunit: m, values: (N,)."]
+)
+def test_a_parameter_is_found_in_prose(prose: str) -> None:
+    function = f'def f(unit, values):\n    """{prose}"""'
+    assert (1, "values") in list(parameters_in_prose(ast.parse(function)))
+
+
+def test_a_parameter_stands_under_args() -> None:
+    function = 'def f(values):\n    """Return it.\n\n    Args:\n        values: (N,).\n    """'
+    assert not list(parameters_in_prose(ast.parse(function)))

@@ -35,8 +35,10 @@ class Idle:
 class Lost:
     """The message of a pool about a worker that is gone.
 
-    worker: the worker, as a sentence names it. why: the predicate of that sentence. counts: False for a loss that
-    is no sign against the tasks of the worker, such as that of a whole node.
+    Attributes:
+        worker: The worker, as a sentence names it.
+        why: The predicate of that sentence.
+        counts: False for a loss that is no sign against the tasks of the worker, such as that of a whole node.
     """
 
     worker: str
@@ -109,8 +111,11 @@ class TaskQueue[T]:
     A task that failed, or was in the hands of a worker that died, is suspect: it is tried again when all others
     are handed out, by a worker that holds nothing else, so that it can take no other task down with it.
 
-    tasks: by key, read one ahead. noun: a word for one of them. tries: failures after which it is given up.
-    fits: whether a worker can do a task; all tasks are then read at once.
+    Args:
+        tasks: By key, read one ahead.
+        noun: A word for one of them.
+        tries: Failures after which it is given up.
+        fits: Whether a worker can do a task; all tasks are then read at once.
     """
 
     def __init__(
@@ -170,7 +175,8 @@ class TaskQueue[T]:
     def retry(self, slot: int, key: Hashable, counts: bool = True) -> bool:
         """Take a task that failed back from a worker. Returns whether it is tried again.
 
-        counts: False for a failure that is no sign against the task.
+        Args:
+            counts: False for a failure that is no sign against the task.
         """
         task = self._held[slot].pop(key)
         self._failures[key] += counts  # an entry, also of 0, makes the task a suspect

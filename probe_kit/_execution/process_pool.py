@@ -74,8 +74,9 @@ LONGEST_WAIT_S = 1.0
 class ProcessPool:
     """Workers in processes, numbered from 0. A context manager.
 
-    environment: by number, variables of the process beyond those of this one. exits: by exit code, the predicate
-    of a sentence that says why a process ended.
+    Args:
+        environment: By number, variables of the process beyond those of this one.
+        exits: By exit code, the predicate of a sentence that says why a process ended.
     """
 
     def __init__(

@@ -59,7 +59,9 @@ class RayPool:
     """Workers as actors on the nodes of a cluster, numbered from 0. A context manager.
 
     Each holds a core and its GPUs, so that nodes share them. One without room begins later and delays no other.
-    gpus: by the resources of the cluster (`CPU`, `GPU`), the GPUs of every worker.
+
+    Args:
+        gpus: By the resources of the cluster (`CPU`, `GPU`), the GPUs of every worker.
     """
 
     def __init__(
@@ -159,7 +161,10 @@ def ray_cluster(address: str) -> Iterator[Any]:
     """The module `ray`, connected to the cluster at `address` while the body runs.
 
     A connection that was there before stays. This process prints what workers print.
-    Raises MissingExtraError without Ray, and UsageError if nothing answers at the address.
+
+    Raises:
+        MissingExtraError: Without Ray.
+        UsageError: If nothing answers at the address.
     """
     ray = require("ray", "ray")
     if ray.is_initialized():

@@ -92,8 +92,10 @@ _MOST_YAML_BYTES = 16 << 20
 def load_yaml(file: Path) -> Any:
     """Return the value in a file of safe YAML.
 
-    Raises OSError as `read_regular` does, ValueError for other text, for text that nests too deeply, and for
-    aliases that stand for more than `MOST_NODES` values: nine lines can stand for a billion.
+    Raises:
+        OSError: As `read_regular` does.
+        ValueError: For other text, for text that nests too deeply, and for aliases that stand for more than
+            `MOST_NODES` values: nine lines can stand for a billion.
     """
     import yaml
 
@@ -130,8 +132,9 @@ _HALF = re.compile(r"\\u[dD][89a-fA-F]")
 def parse_json(content: bytes | str, **options: Any) -> Any:
     """The value. options: hooks of `json.loads`.
 
-    Raises ValueError for text that is not UTF-8 or JSON, nests too deeply, has half characters, repeats a key, or
-    may hold more than `MOST_VALUES` values.
+    Raises:
+        ValueError: For text that is not UTF-8 or JSON, nests too deeply, has half characters, repeats a key, or
+            may hold more than `MOST_VALUES` values.
     """
     try:
         text = content.decode("utf-8-sig") if isinstance(content, bytes) else content
@@ -151,7 +154,8 @@ def parse_json(content: bytes | str, **options: Any) -> Any:
 def parse_strict_json(content: bytes) -> Any:
     """The value of JSON that probe_kit wrote itself.
 
-    Raises ValueError for what `parse_json` refuses, for a byte order mark, and for a number that is not finite.
+    Raises:
+        ValueError: For what `parse_json` refuses, for a byte order mark, and for a number that is not finite.
     """
     if content.startswith(BOM_UTF8):
         raise ValueError("it begins with a byte order mark")
@@ -176,7 +180,9 @@ def _finite(number: str) -> float:
 def load_json(file: Path, most: int = MOST_BYTES) -> Any:
     """Return the value in a file of at most `most` bytes.
 
-    Raises OSError as `read_regular` does, ValueError as `parse_json` does.
+    Raises:
+        OSError: As `read_regular` does.
+        ValueError: As `parse_json` does.
     """
     return parse_json(read_regular(file, most))
 
@@ -230,8 +236,9 @@ UNREADABLE = (OSError, ValueError, EOFError, KeyError, AttributeError, RuntimeEr
 def open_arrays(source: Path | BinaryIO | bytes) -> "NpzFile":
     """Open an `.npz` file; a context manager that holds arrays by name. Nothing is unpickled.
 
-    Raises ValueError for a file whose arrays have more than `MOST_ARRAY_BYTES` once they are unpacked, and one of
-    `UNREADABLE` for one that is no such file.
+    Raises:
+        ValueError: For a file whose arrays have more than `MOST_ARRAY_BYTES` once they are unpacked, and one of
+            `UNREADABLE` for one that is no such file.
     """
     import numpy as np
 

@@ -17,8 +17,10 @@ def lazy_names(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], 
     """The module-level `__getattr__` and `__dir__` (PEP 562) of `package`.
 
     `dir`, `help` and the completion of names find `homes` among the names of the package; `dir` imports nothing.
-    homes: name → module inside the package, `module:other_name` where it is called otherwise there, or `module:`
-    where the name is the module's own; a module of another package begins with `probe_kit.`.
+
+    Args:
+        homes: Name → module inside the package, `module:other_name` where it is called otherwise there, or
+            `module:` where the name is the module's own; a module of another package begins with `probe_kit.`.
     """
 
     def load(name: str) -> Any:
@@ -77,7 +79,10 @@ def install_command(extra: str = "", rebuild: str = "") -> str:
     """Shell command that installs probe_kit again, with an extra or with one package built anew.
 
     In a checkout's own environment it is `./with-uv`, which brings uv. Elsewhere it is the pip of the running
-    Python, or `uv pip` where that Python has none. rebuild: a package that needs numpy while it is compiled.
+    Python, or `uv pip` where that Python has none.
+
+    Args:
+        rebuild: A package that needs numpy while it is compiled.
     """
     if _is_of_checkout():
         options = [f"--extra {extra}"] * bool(extra) + [f"--reinstall-package {rebuild}"] * bool(rebuild)

@@ -23,7 +23,8 @@ _NVIDIA = Path("/proc/driver/nvidia/gpus")
 def check_device_name(device: str, present: bool = True) -> None:
     """Raise UsageError for what is no device, or is one that this machine surely lacks; says what it has.
 
-    present: False accepts a device of another machine.
+    Args:
+        present: False accepts a device of another machine.
     """
     match = _DEVICE.fullmatch(device)
     if match is None or match["kind"] not in _KINDS:

@@ -31,6 +31,7 @@ def open_parquet(source: Path | BinaryIO, extra: str) -> Iterator[Any]:
     """Yield a `pyarrow.parquet.ParquetFile`; `read_parquet` reads its cells.
 
     Texts stay in their dictionaries: a column of one long text in every row is small until it is written out.
+
     Raises OSError for what is no regular file, pyarrow's ArrowException for another format, MissingExtraError.
     """
     parquet = require("pyarrow.parquet", extra)
@@ -49,7 +50,8 @@ def open_parquet(source: Path | BinaryIO, extra: str) -> Iterator[Any]:
 def read_parquet(parquet: Any, columns: Sequence[str] | None = None, groups: Sequence[int] | None = None) -> Any:
     """Return some columns and row groups of a file of `open_parquet` as a `pyarrow.Table`; None for all.
 
-    Raises TooLargeError before more than `MOST_BYTES` or `MOST_VALUES` are in memory.
+    Raises:
+        TooLargeError: Before more than `MOST_BYTES` or `MOST_VALUES` are in memory.
     """
     pa = require("pyarrow", "export")
 

@@ -87,8 +87,10 @@ def check_spellings(cells: Sequence[Any], where: Callable[[int], str], error: Ca
     """Raise `error` for two spellings of what is probably one name: `red` and `Red`, `7` and `007`.
 
     Signs that print nothing, such as a soft hyphen, are a spelling too.
-    cells: texts as they were written, and values of other types, which have one spelling. where: the place of a
-    row, for the message.
+
+    Args:
+        cells: Texts as they were written, and values of other types, which have one spelling.
+        where: The place of a row, for the message.
     """
     spelled: dict[str, tuple[str, int]] = {}
     for row, cell in enumerate(cells):
@@ -172,13 +174,17 @@ def values_of(
 ) -> list[Cell]:
     """The values of a column whose texts spell numbers, true and false, classes, or nothing.
 
-    cells: texts as `cell_of` gives them, or typed values of a data frame. where: the place of a row, for messages.
-    semicolons: whether they separate the cells: where a comma is the decimal sign, `1.000` may be a thousand.
-    as_names: whether texts such as `10 cm` are names of classes. otherwise: how the caller says so, for a message.
-    Numbers may have a decimal comma or a percent sign where the whole column has it. A column with yes or no has
-    the classes `yes` and `no`. Raises UsageError for a text that looks like a quantity and is not a plain number
-    (unless they are `as_names`), for a cell that may mean a missing value, and for two spellings of
-    one class.
+    Args:
+        cells: Texts as `cell_of` gives them, or typed values of a data frame.
+        where: The place of a row, for messages.
+        semicolons: Whether they separate the cells: where a comma is the decimal sign, `1.000` may be a thousand.
+        as_names: Whether texts such as `10 cm` are names of classes.
+        otherwise: How the caller says so, for a message. Numbers may have a decimal comma or a percent sign where
+            the whole column has it. A column with yes or no has the classes `yes` and `no`.
+
+    Raises:
+        UsageError: For a text that looks like a quantity and is not a plain number (unless they are `as_names`),
+            for a cell that may mean a missing value, and for two spellings of one class.
     """
     texts: list[Cell] = [name_of(cell) if isinstance(cell, str) else cell for cell in cells]
     for row, cell in enumerate(texts):

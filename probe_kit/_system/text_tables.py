@@ -46,7 +46,11 @@ class _BrokenHeadingError(ProbeKitError):
 class TextTable:
     """A file whose heading was read.
 
-    names: the headings. line: of the heading. encoding: of Python. error: raised for rows that cannot be used.
+    Attributes:
+        names: The headings.
+        line: Of the heading.
+        encoding: Of Python.
+        error: Raised for rows that cannot be used.
     """
 
     path: Path
@@ -64,8 +68,9 @@ class TextTable:
     def rows(self, columns: Sequence[str] | None = None) -> Iterator[tuple[int, dict[str, str | None]]]:
         """Line and cells by heading of every row, None for a missing cell; rows without any text are left out.
 
-        columns: those to read; by default all with a heading. Raises `error` for a column that occurs twice, for
-        a row with more or fewer cells than the heading, and by default for a cell without a heading.
+        Args:
+            columns: Those to read; by default all with a heading. Raises `error` for a column that occurs twice,
+                for a row with more or fewer cells than the heading, and by default for a cell without a heading.
         """
         read = [name for name in self.names if name] if columns is None else columns
         unnamed = [at for at, name in enumerate(self.names) if not name] if columns is None else []
@@ -106,9 +111,10 @@ def open_table(
 ) -> TextTable:
     """Read the heading of a CSV or TSV file in UTF-8 or UTF-16.
 
-    keys: headings of such a table; they decide where a heading has more than one separator. The separator is a
-    comma, a semicolon or a tab, or what a first line `sep=;` declares. Raises `error` for a file that cannot be
-    read, is in another encoding, or has a heading that several separators explain.
+    Args:
+        keys: Headings of such a table; they decide where a heading has more than one separator. The separator is a
+            comma, a semicolon or a tab, or what a first line `sep=;` declares. Raises `error` for a file that
+            cannot be read, is in another encoding, or has a heading that several separators explain.
     """
     encoding = _encoding(path, error)
     with _opened(path, encoding, error) as file:

@@ -24,8 +24,11 @@ _NUMBER = re.compile(r"[-+−±]?\d|< \d|n/a|–|$")
 class Cell:
     """Text, and how formats that can show it do.
 
-    sort: by which a page sorts, the text by default. heat: a share that colours the ground. strong: bold. alarm:
-    red. note: shown on a page by pointing at the cell.
+    Attributes:
+        sort: By which a page sorts, the text by default.
+        heat: A share that colours the ground.
+        strong: bold. alarm: red.
+        note: Shown on a page by pointing at the cell.
     """
 
     text: str
@@ -51,7 +54,8 @@ class Cell:
 class Heading:
     """The text over a column. help: its entry in a glossary. group: a name over adjoining columns.
 
-    is_detail: whether the column needs room, and is left out of terminals and LaTeX.
+    Attributes:
+        is_detail: Whether the column needs room, and is left out of terminals and LaTeX.
     """
 
     text: str
@@ -64,7 +68,9 @@ class Heading:
 class Row:
     """The cells of a line.
 
-    is_mean: it averages others; is_difference: it compares them. Pages keep both below the others when they sort.
+    Attributes:
+        is_mean: It averages others.
+        is_difference: It compares them. Pages keep both below the others when they sort.
     """
 
     cells: tuple[Cell, ...]
@@ -76,11 +82,13 @@ class Row:
 class Content:
     """The part of a table that a renderer reads: its text, and the numbers behind it.
 
-    names: how many of the first columns name the rows. notes: sentences below it, which need no capital letter and
-    no stop. numbers: an object per row or per number, shares in [0, 1], None where unknown. overflow: of a
-    terminal, what is done with columns that do not fit: `split` into further tables, `leave out` by name, first
-    `fold` intervals below their values, or `wrap` text, for columns of words. is_partial: whether runs are missing
-    that could be played; a note names them.
+    Attributes:
+        names: How many of the first columns name the rows.
+        notes: Sentences below it, which need no capital letter and no stop.
+        numbers: An object per row or per number, shares in [0, 1], None where unknown.
+        is_partial: Whether runs are missing that could be played; a note names them.
+        overflow: Of a terminal, what is done with columns that do not fit: `split` into further tables, `leave
+            out` by name, first `fold` intervals below their values, or `wrap` text, for columns of words.
     """
 
     title: str

@@ -21,10 +21,14 @@ _ARTICLE = {"text": "text", "boolean": "true or false", "integer": "a number", "
 class LabelTable:
     """Some columns of a table of labels, as cells of Python types.
 
-    source: the file, or `DataFrame`. unit: `line` of a file, or `row` where there are no lines. names: all columns
-    of the table. columns: cells of those that were asked for: texts of a CSV file, texts and typed values of a
-    data frame, None where missing. lines: number of every row in its file. semicolons: whether they separate
-    the cells.
+    Attributes:
+        source: The file, or `DataFrame`.
+        unit: `line` of a file, or `row` where there are no lines.
+        names: All columns of the table.
+        columns: Cells of those that were asked for: texts of a CSV file, texts and typed values of a data frame,
+            None where missing.
+        lines: Number of every row in its file.
+        semicolons: Whether they separate the cells.
     """
 
     source: str

@@ -175,8 +175,11 @@ EVERY = 60.0
 class Heartbeat:
     """A progress callback (finished, total, …): a line after `FIRST` seconds, every `EVERY`, and at the end.
 
-    what: what is counted. say: takes each line. clock: seconds, of any origin. The rate is that of what was done
-    since the first call: before it a model was loaded, or a run that is continued was made.
+    Args:
+        what: What is counted.
+        say: Takes each line.
+        clock: Seconds, of any origin. The rate is that of what was done since the first call: before it a model
+            was loaded, or a run that is continued was made.
     """
 
     def __init__(

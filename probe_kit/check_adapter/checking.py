@@ -50,8 +50,15 @@ def subjects_of(
 ) -> list[Subject]:  # fmt: skip
     """Return the family under check: as a policy, as a model that answers, or both.
 
-    options: as KEY=VALUE. instructions: at least two, None for those of the embedded suite.
-    Raises UnknownModelError, UsageError, MissingExtraError and CheckpointError as `Family.check` does.
+    Args:
+        options: As KEY=VALUE.
+        instructions: At least two, None for those of the embedded suite.
+
+    Raises:
+        UnknownModelError: As `Family.check` does.
+        UsageError: As `Family.check` does.
+        MissingExtraError: As `Family.check` does.
+        CheckpointError: As `Family.check` does.
     """
     family = find_family(model)
     load_options = family.check(checkpoint, device, dtype, False, read_pairs(options), 0)
@@ -101,8 +108,9 @@ def outcomes(subjects: Sequence[Subject]) -> Iterator[Outcome]:
 def _run(subject: Subject, mismatch: bool) -> None:
     """Extract or ask about two episodes, in the folder of the subject, and load every site again.
 
-    mismatch: do not act, as actions do not fit the arm. Raises what `extract_run` and `ask_run` raise, and
-    CheckFailedError for a run that is not whole.
+    Args:
+        mismatch: Do not act, as actions do not fit the arm. Raises what `extract_run` and `ask_run` raise, and
+            CheckFailedError for a run that is not whole.
     """
     common: dict[str, Any] = {
         "checkpoint": subject.given_checkpoint, "options": subject.options, "device": subject.device,

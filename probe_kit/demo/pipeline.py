@@ -55,8 +55,11 @@ COMPATIBLE: Mapping[Truth, tuple[str, ...]] = {
 class Organism:
     """A model by its name, and the verdict that is true of it per category; `absent` or `not shown` if not named.
 
-    folder: what its run is called. answers: it answers questions and does not act. max_steps: actions per
-    episode; None for as many as its scene has. view: the tokens whose mean is probed.
+    Attributes:
+        folder: What its run is called.
+        answers: It answers questions and does not act.
+        max_steps: Actions per episode; None for as many as its scene has.
+        view: The tokens whose mean is probed.
     """
 
     name: str
@@ -155,8 +158,11 @@ def probed(
 ) -> tuple[Run, ProbeResults]:
     """The organism's run on `suite`, in `folder`, and its probes, compared with random-features.
 
-    What exchanged pictures do is stored too, and finished work is reused. stage: gives a progress callback (done,
-    total, …) for a stage of this name. untrained: run of an untrained network, as a control.
+    What exchanged pictures do is stored too, and finished work is reused.
+
+    Args:
+        stage: Gives a progress callback (done, total, …) for a stage of this name.
+        untrained: Run of an untrained network, as a control.
     """
     run = extract_run(
         settings_of(organism, suite), folder / organism.folder, progress=stage(f"episodes, {organism.name}")
@@ -195,8 +201,10 @@ def findings(runs: Sequence[tuple[Organism, Run]]) -> list[Finding]:
 def measured(row: RetentionRow, another_acts: bool) -> Truth:
     """The row's verdict. Where only a category that follows is wanting, another organism's counts as one.
 
-    another_acts: whether the trained one acts on some category. It has the same scene, questions and network, so
-    that following would be seen in every other; a policy that was not trained to act follows nowhere by itself.
+    Args:
+        another_acts: Whether the trained one acts on some category. It has the same scene, questions and network,
+            so that following would be seen in every other; a policy that was not trained to act follows nowhere by
+            itself.
     """
     use, reading = row.image_swap.use, readable(row)
     if use is None or (use.is_bounded and reading in ("absent", "not shown")):
@@ -314,7 +322,8 @@ def _questions(folder: Path, size: Size, stage: NamedProgress) -> Suite:
 def run_demo(folder: Path, stage: NamedProgress, size: Size = QUICK) -> Demo:
     """Suite, answers, episodes, probes, table, figure, film and report in `folder`; called again, it continues.
 
-    stage: gives a progress callback (done, total, …) for a stage of this name.
+    Args:
+        stage: Gives a progress callback (done, total, …) for a stage of this name.
     """
     suite = _questions(folder, size, stage)
     vlm_run = answered(VLM, suite, folder, stage)

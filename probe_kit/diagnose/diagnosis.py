@@ -109,8 +109,10 @@ def measure_passage(
 ) -> tuple[SitePassage, ...]:
     """Return difference and carried share at every site, over pairs of equally many tokens; see `SitePassage`.
 
-    Two inferences per pair, and one per site. scale: of the session's actions. Raises what `capture` and `patched`
-    raise.
+    Two inferences per pair, and one per site.
+
+    Args:
+        scale: Of the session's actions. Raises what `capture` and `patched` raise.
     """
     model, places = session.policy, places_of(session.policy)
     differences = np.zeros((len(pairs), len(places)))
@@ -181,14 +183,23 @@ def diagnose_run(
 ) -> Diagnosis:
     """Diagnose the inputs of a run's model on first frames of the run; a stored diagnosis is loaded.
 
-    frames: how many. inputs: their names, such as `instruction`; empty for all. inside: whether sites are patched.
-    paraphrases: by instruction, other words of the same meaning; they are the control of the instruction. target:
-    probed at every site, as by `train_probes`. base: the checkpoint that the run's was tuned from, for a
-    comparison on the same pairs. pairs: a table of your own in place of drawn donors: episode and frame, and those
-    of the donor; `frames` is then not used. seed: of the draw of donors. source, load: as for `run_intervention`;
-    both load the base too. progress: called with the name of every step.
-    Raises UsageError for a model that does not act, a run with too few groups, an unknown input, a pair of a frame
-    that the run lacks, or a base with other inputs, and of a target what `train_probes` raises.
+    Args:
+        frames: How many.
+        inputs: Their names, such as `instruction`; empty for all.
+        inside: Whether sites are patched.
+        paraphrases: By instruction, other words of the same meaning; they are the control of the instruction.
+            target: probed at every site, as by `train_probes`.
+        base: The checkpoint that the run's was tuned from, for a comparison on the same pairs.
+        pairs: A table of your own in place of drawn donors: episode and frame, and those of the donor; `frames` is
+            then not used.
+        seed: Of the draw of donors.
+        source: As for `run_intervention`; both load the base too.
+        load: As `source`.
+        progress: Called with the name of every step.
+
+    Raises:
+        UsageError: For a model that does not act, a run with too few groups, an unknown input, a pair of a frame
+            that the run lacks, or a base with other inputs, and of a target what `train_probes` raises.
     """
     from probe_kit.intervene.open_session import load_policy_of, open_session
     from probe_kit.intervene.sessions import ReplaySource
@@ -246,7 +257,8 @@ def check_network(run: "Run") -> None:
 def load_diagnosis(run: "Run", key: str) -> Diagnosis:
     """A stored diagnosis, without a target.
 
-    Raises RunDamagedError if it was changed, or another version of probe_kit made it.
+    Raises:
+        RunDamagedError: If it was changed, or another version of probe_kit made it.
     """
     bundle = read_bundle(run.location, DIAGNOSES, key)
     bundle.check_format(FORMAT)
@@ -273,8 +285,11 @@ def check_base_files(
 ) -> None:
     """Raise what `Family.check` raises for the base, and UsageError if its files declare other inputs.
 
-    checkpoint, options: of the model that was tuned from it. cameras: those that get a picture. fetch: see
-    `Family.check`. No weights are read.
+    Args:
+        checkpoint: Of the model that was tuned from it.
+        options: As `checkpoint`.
+        cameras: Those that get a picture.
+        fetch: See `Family.check`. No weights are read.
     """
     from probe_kit.hooks.contract.model import Policy
     from probe_kit.hooks.registry import get_family

@@ -43,7 +43,9 @@ Divided by their own spread, such numbers would turn rounding into large changes
 class ActionScale:
     """The spread of every number of the action, over frames, seeds and the steps of a chunk.
 
-    spread: (D,) in the action's own units. varies: (D,) the numbers that are compared.
+    Attributes:
+        spread: (D,) in the action's own units.
+        varies: (D,) the numbers that are compared.
     """
 
     spread: NDArray[np.float64]
@@ -72,11 +74,16 @@ class ActionScale:
 class Exchanges:
     """The changes of the action by exchanges of one input, pair by pair.
 
-    exchanged, control, every: (P,) shares of the variance, see `ActionScale.shares`: with the donor's input, with
-    the control of the input (None where the model takes none), and with all inputs of the donor. groups: (P,).
-    frames: (P,) ascending. repeated: (P,) whether an earlier donor of the frame holds the same value.
-    largest: (P,) the largest change of any number of the action under the donor's input. blanked: (F,) the same of
-    every frame under the blank.
+    Attributes:
+        exchanged: (P,) shares of the variance, see `ActionScale.shares`: with the donor's input, with the control
+            of the input (None where the model takes none), and with all inputs of the donor.
+        control: As `exchanged`.
+        every: As `exchanged`.
+        groups: (P,).
+        frames: (P,) ascending.
+        repeated: (P,) whether an earlier donor of the frame holds the same value.
+        largest: (P,) the largest change of any number of the action under the donor's input.
+        blanked: (F,) the same of every frame under the blank.
     """
 
     exchanged: NDArray[np.float64]

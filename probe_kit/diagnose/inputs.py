@@ -38,7 +38,8 @@ if TYPE_CHECKING:
 def inputs_of(frames: Sequence[Frame], camera: str = "") -> tuple[str, ...]:
     """The inputs that every frame holds: words, pictures and state. Raises UsageError without frames.
 
-    camera: the name of the first one, needed where there are several.
+    Args:
+        camera: The name of the first one, needed where there are several.
     """
     if not frames:
         raise UsageError("the source has no frame; diagnose needs at least two that differ")
@@ -68,7 +69,10 @@ def controls_of(frame: Frame, name: str, spread: NDArray[np.float64]) -> list[Ob
     """The frame's observation after changes of one input that mean nothing, the best first; see `hardly_changed`.
 
     Without other words of the frame, the first letter's case and the full stop change, or one of them: a tokenizer
-    of words may know only one spelling. spread: (D,) of the state.
+    of words may know only one spelling.
+
+    Args:
+        spread: (D,) of the state.
     """
     clean = frame.observation
     if name != INSTRUCTION:
@@ -97,7 +101,8 @@ COLUMNS = ("instruction", "other")
 def read_paraphrases(file: Path) -> dict[str, str]:
     """Return, by instruction, its other words.
 
-    Raises UsageError for a file without the columns, a blank cell, and an instruction with two other texts.
+    Raises:
+        UsageError: For a file without the columns, a blank cell, and an instruction with two other texts.
     """
     table = open_table(file, COLUMNS)
     if missing := [name for name in COLUMNS if name not in table.names]:
@@ -132,7 +137,11 @@ def frames_of(
 
     Of the scene, two first frames of each group; of other sources, frames of as many groups as possible.
 
-    paraphrases: by instruction, other words of the same meaning. Raises UsageError for a run with too few groups.
+    Args:
+        paraphrases: By instruction, other words of the same meaning.
+
+    Raises:
+        UsageError: For a run with too few groups.
     """
     listed = _observed(session, count) if isinstance(session, FrameSession) else _drawn(session, count)
     frames = [_read(frame, paraphrases) for frame in listed]
@@ -145,8 +154,12 @@ def tabled_frames(
 ) -> tuple[list[Frame], list[tuple[int, int]]]:
     """Return the frames that a table of pairs names, each once, and its rows as (frame, donor) among them.
 
-    table: of frames that the run has, which `open_session` checks. Of the scene they are first frames.
-    paraphrases: as in `frames_of`. Raises UsageError for clean frames of too few groups.
+    Args:
+        table: Of frames that the run has, which `open_session` checks. Of the scene they are first frames.
+        paraphrases: As in `frames_of`.
+
+    Raises:
+        UsageError: For clean frames of too few groups.
     """
     if isinstance(session, FrameSession):
         by_name = session.frames.by_name
@@ -217,7 +230,8 @@ def _first_frames(session: "ReplaySession", rows: Iterable[int]) -> Iterator[Fra
 def order_of_first_frames(episodes: pd.DataFrame, groups: int) -> pd.Index:
     """Return the rows of the scene's episodes in the order in which their first frames are taken.
 
-    groups: that are taken first, with two frames each; then come further groups, then further frames.
+    Args:
+        groups: That are taken first, with two frames each; then come further groups, then further frames.
     """
     by_item = episodes.groupby("item_id", sort=False)
     order = pd.DataFrame({"group": pd.factorize(episodes["group_id"])[0], "layout": by_item.cumcount()})

@@ -36,8 +36,10 @@ def count_inferences(
 ) -> int:
     """Return how many inferences a diagnosis takes at most.
 
-    sites: that are patched, 0 for none. base: whether a base checkpoint is compared. pairs: of a table; None for
-    donors that are drawn.
+    Args:
+        sites: That are patched, 0 for none.
+        base: Whether a base checkpoint is compared.
+        pairs: Of a table; None for donors that are drawn.
     """
     checkpoints, pairs = 1 + base, frames * DONORS if pairs is None else pairs
     # Clean ones twice and with another seed; per input the donors' value, all of their inputs, control and blank.
@@ -50,7 +52,9 @@ def count_inferences(
 class InputExchange:
     """Exchanges of inputs between frames, and what they change.
 
-    seed: of the draw of donors. table: pairs (frame, donor) of the user's own in order; empty for drawn ones.
+    Attributes:
+        seed: Of the draw of donors.
+        table: Pairs (frame, donor) of the user's own in order; empty for drawn ones.
     """
 
     infer: Infer
@@ -64,9 +68,14 @@ class InputExchange:
     ) -> tuple[InputDiagnosis, ...]:
         """Return how much of the action every input decides.
 
-        names: of the inputs; empty for all. absent: inputs that the model is said never to read, such as
-        by `Model.absent_inputs`. camera: the name of the first one. Raises UsageError for an unknown name, fewer
-        than two groups, or a policy that gives other actions for the same observation and seed.
+        Args:
+            names: Of the inputs; empty for all.
+            absent: Inputs that the model is said never to read, such as by `Model.absent_inputs`.
+            camera: The name of the first one.
+
+        Raises:
+            UsageError: For an unknown name, fewer than two groups, or a policy that gives other actions for the
+                same observation and seed.
         """
         available = inputs_of(self.frames, camera)
         check_names(names, available)
@@ -76,7 +85,9 @@ class InputExchange:
     def against(self, base: Infer, inputs: Sequence[InputDiagnosis]) -> tuple[InputDiagnosis, ...]:
         """Return the inputs with their comparison with a base checkpoint, of those that were exchanged.
 
-        base: infers with it. inputs: that `measure` of this object returned. Raises what `measure` raises.
+        Args:
+            base: Infers with it.
+            inputs: That `measure` of this object returned. Raises what `measure` raises.
         """
         other = InputExchange(base, self.frames, self.seed, self.table)
         compared = []

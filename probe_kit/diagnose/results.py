@@ -59,9 +59,11 @@ NO_LIMITS = (nan, nan)
 class SitePassage:
     """One site of the network. Means over pairs.
 
-    name: as `--sites` names it. difference: norm of the difference of the activations, relative to the clean
-    ones. carried: the change of the action under the patch of this site, projected on the change under the donor's
-    input, 1 for all of it; NaN where the donor changes no action.
+    Attributes:
+        name: As `--sites` names it.
+        difference: Norm of the difference of the activations, relative to the clean ones.
+        carried: The change of the action under the patch of this site, projected on the change under the donor's
+            input, 1 for all of it; NaN where the donor changes no action.
     """
 
     name: str
@@ -86,8 +88,12 @@ Change = Literal["lost in fine-tuning", "weaker", "never there", "in both", "str
 class BaseComparison:
     """One input in the base checkpoint, and the difference to it.
 
-    verdict, share: of the base, on the same pairs. difference: of the shares, tuned minus base; ci: its 95 %
-    interval by groups; p: two-sided, by sign flips of whole groups.
+    Attributes:
+        verdict: Of the base, on the same pairs.
+        share: As `verdict`.
+        difference: Of the shares, tuned minus base.
+        ci: Its 95 % interval by groups.
+        p: Two-sided, by sign flips of whole groups.
     """
 
     change: Change
@@ -102,11 +108,17 @@ class BaseComparison:
 class InputDiagnosis:
     """One input: does it arrive, how much of the action does it decide, and which sites lie on its way?
 
-    share: the total-effect index, 1 where nothing else matters, with its 95 % interval by groups (Student).
-    control: the index of a change that should not matter. every: of all inputs together. p: exact, one-sided, by
-    permutation in whole groups: the input changes more than its control. unchanged: inferences, of `n_inferences`
-    with another value or a blank, in which no number of the action changed. reason: of the verdict. passage: the
-    sites in the order of the network; note: why there are none. base: the same in the base checkpoint.
+    Attributes:
+        reason: Of the verdict.
+        share: The total-effect index, 1 where nothing else matters, with its 95 % interval by groups (Student).
+        control: The index of a change that should not matter.
+        every: Of all inputs together.
+        p: Exact, one-sided, by permutation in whole groups: the input changes more than its control.
+        unchanged: Inferences, of `n_inferences` with another value or a blank, in which no number of the action
+            changed.
+        passage: The sites in the order of the network.
+        note: Why there are none.
+        base: The same in the base checkpoint.
     """
 
     name: str
@@ -173,8 +185,12 @@ def describe_passage(passage: Sequence[SitePassage], verdict: Verdict) -> str:
 class SiteKnowledge:
     """One layer of a stream, at its best iteration.
 
-    name: as `--sites` names it. part: of the model, such as `backbone`. score: held out; chance: of this site.
-    signal: whether it exceeds chance, family-wise, and every control.
+    Attributes:
+        name: As `--sites` names it.
+        part: Of the model, such as `backbone`.
+        score: Held out.
+        chance: Of this site.
+        signal: Whether it exceeds chance, family-wise, and every control.
     """
 
     name: str
@@ -188,8 +204,10 @@ class SiteKnowledge:
 class Knowledge:
     """The knowledge of one target. key: of the probes, which the run stores.
 
-    metric: of the scores. retention: share of the backbone's score above chance that the action part has, NaN
-    where it is undefined; note: why.
+    Attributes:
+        metric: Of the scores.
+        retention: Share of the backbone's score above chance that the action part has, NaN where it is undefined.
+        note: why.
     """
 
     target: str
@@ -232,8 +250,13 @@ class Knowledge:
 class Diagnosis:
     """The diagnosis of every input of a run's model.
 
-    key: of the stored diagnosis. label: of the run. n_frames, n_groups: that were used. base: the checkpoint that
-    it is compared with. knowledge: of a target.
+    Attributes:
+        key: Of the stored diagnosis.
+        label: Of the run.
+        n_frames: That were used.
+        n_groups: As `n_frames`.
+        base: The checkpoint that it is compared with.
+        knowledge: Of a target.
     """
 
     key: str

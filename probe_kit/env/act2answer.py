@@ -25,7 +25,9 @@ from probe_kit.suite.items import LAYOUTS, Episode, Item, Layout, Side, other_si
 class Question:
     """An instruction with the picture of each side in one layout.
 
-    pictures: RGB images by the side they lie on *in this layout*. side_correct: likewise.
+    Attributes:
+        pictures: RGB images by the side they lie on *in this layout*.
+        side_correct: likewise.
     """
 
     name: str
@@ -38,7 +40,8 @@ class Question:
     def from_item(cls, item: Item, layout: Layout) -> Self:
         """The question of an item. An item without hashes is taken as it is.
 
-        Raises SuiteError if a picture is missing or broken, or has other pixels than the item says.
+        Raises:
+            SuiteError: If a picture is missing or broken, or has other pixels than the item says.
         """
         from probe_kit.suite.pictures import load_picture
 
@@ -210,8 +213,10 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, Info]:
         """Start an episode; `info["tile_visibility"]` says how much of each picture the camera sees.
 
-        Raises SuiteError for a missing or broken picture and SceneError for an unknown option, in both cases
-        before anything moved. Raises EpisodeOverError after `close`.
+        Raises:
+            SuiteError: For a missing or broken picture.
+            SceneError: For an unknown option, in both cases before anything moved.
+            EpisodeOverError: After `close`.
         """
         super().reset(seed=seed)
         if self._closed:
@@ -258,9 +263,12 @@ class Act2AnswerEnv(gym.Env[Observation, NDArray[np.float32]]):  # type: ignore[
     def advance(self, action: ArrayLike) -> tuple[float, bool, bool, Info]:
         """Carry out one action without drawing a picture: reward, terminated, truncated, info.
 
-        A policy that executes a chunk of actions blindly needs a picture only before the next chunk, and
-        drawing is most of the work. Raises ActionError for a bad action, with nothing moved, and
-        EpisodeOverError before `reset` or after the end.
+        A policy that executes a chunk of actions blindly needs a picture only before the next chunk, and drawing
+        is most of the work.
+
+        Raises:
+            ActionError: For a bad action, with nothing moved.
+            EpisodeOverError: Before `reset` or after the end.
         """
         trial = self.trial
         if trial.over:
@@ -407,7 +415,8 @@ def _question(options: dict[str, Any]) -> Question:
 class Recorder:
     """Notes the state of an environment, now and after every action. Looking changes nothing in the simulator.
 
-    env: an Act2AnswerEnv that was just reset, wrapped or not.
+    Args:
+        env: An Act2AnswerEnv that was just reset, wrapped or not.
     """
 
     def __init__(self, env: Act2AnswerEnv) -> None:

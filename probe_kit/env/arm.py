@@ -93,7 +93,8 @@ LINKS = (
 def write_urdf(folder: Path) -> Path:
     """Write the description into `folder` and return its path.
 
-    Raises SceneError if the meshes are not installed.
+    Raises:
+        SceneError: If the meshes are not installed.
     """
     meshes = _find_meshes()
     parts = [_link_xml(link, meshes) + (_joint_xml(link) if link.parent else "") for link in LINKS]
@@ -153,14 +154,19 @@ def _numbers(vector: XYZ) -> str:
 class ArmModel:
     """The constants of one arm: joints, links, fingers and limits.
 
-    urdf: finds the description file on this machine, or writes it into the folder it is given.
-    base: where it stands in the world. joints, fingers, tool: link indices in PyBullet's order.
-    closed, opened: finger joint positions in metres; both fingers move alike.
-    down: rotation (3, 3) of the tool link when the gripper points down and its fingers open along y.
-    posture: joint angles the arm starts from when it looks for its home pose, and drifts back to.
-    clearance: lowest tool height at which the finger tips stay off the table.
-    hand_drop: how far the middle of a held object hangs below the tool.
-    pads: finger joint position at which the pads would meet.
+    Attributes:
+        urdf: Finds the description file on this machine, or writes it into the folder it is given.
+        base: Where it stands in the world.
+        joints: Link indices in PyBullet's order.
+        fingers: As `joints`.
+        tool: As `joints`.
+        closed: Finger joint positions in metres; both fingers move alike.
+        opened: As `closed`.
+        down: Rotation (3, 3) of the tool link when the gripper points down and its fingers open along y.
+        posture: Joint angles the arm starts from when it looks for its home pose, and drifts back to.
+        clearance: Lowest tool height at which the finger tips stay off the table.
+        hand_drop: How far the middle of a held object hangs below the tool.
+        pads: Finger joint position at which the pads would meet.
     """
 
     urdf: Callable[[Path], Path]
@@ -356,9 +362,14 @@ OPEN_ABOVE = 0.5
 class Move:
     """The motion that one action asks of the arm.
 
-    q_from, q_to: (n,) commanded joints before and after. opening: 1 open, 0 closed.
-    clipped: a limit changed the action. ik_error: metres that remain to the wanted position.
-    shift, turn: (3,) metres and radians by which the commanded pose really moved, in the words of the action.
+    Attributes:
+        q_from: (n,) commanded joints before and after.
+        q_to: As `q_from`.
+        opening: 1 open, 0 closed.
+        clipped: A limit changed the action.
+        ik_error: Metres that remain to the wanted position.
+        shift: (3,) metres and radians by which the commanded pose really moved, in the words of the action.
+        turn: As `shift`.
     """
 
     q_from: Array
@@ -391,7 +402,8 @@ def check_action(action: ArrayLike) -> Array:
 class DeltaController:
     """Keeps the commanded tool pose `target` and joints `q`, and moves both by one action at a time.
 
-    euler: how the rotation of an action is read, see `SceneSpec`.
+    Args:
+        euler: How the rotation of an action is read, see `SceneSpec`.
     """
 
     def __init__(self, arm: Arm, limits: LimitSpec, q: Array, euler: Euler = "zyx") -> None:

@@ -91,9 +91,12 @@ class Solution:
 class SerialChain:
     """A chain of n revolute joints, described by its screws at q = 0 in the world frame.
 
-    axes, points: (n, 3) unit axis of each joint and a point on it.
-    tip: pose of the tool at q = 0.
-    lower, upper: (n,) joint limits in radians.
+    Attributes:
+        axes: (n, 3) unit axis of each joint and a point on it.
+        points: As `axes`.
+        tip: Pose of the tool at q = 0.
+        lower: (n,) joint limits in radians.
+        upper: As `lower`.
     """
 
     axes: Array
@@ -109,9 +112,10 @@ class SerialChain:
     def solve(self, target: Pose, start: Array, posture: Array, iterations: int = 30) -> Solution:
         """Joint angles that bring the tool to `target`, within the limits, by damped least squares.
 
-        start: (n,) where to begin; pass the last commanded angles for 2 or 3 iterations.
-        posture: (n,) what a redundant chain drifts to while it keeps the tool in place.
-        An unreachable target raises nothing: look at the errors of the solution.
+        Args:
+            start: (n,) where to begin; pass the last commanded angles for 2 or 3 iterations.
+            posture: (n,) what a redundant chain drifts to while it keeps the tool in place. An unreachable target
+                raises nothing: look at the errors of the solution.
         """
         q = start
         for _ in range(iterations):

@@ -61,12 +61,20 @@ LED_TO = sum(len(parts) for parts in ACTIONS.values())
 class Trajectory:
     """One episode of T actions in T + 1 frames; float32, metres, radians, seconds, newtons, in the world frame.
 
-    tool: (T + 1, 6) measured x, y, z, roll, pitch, yaw, the angles relative to pointing down. opening: (T + 1,) of
-    the gripper, 1 open. cube, tile_left, tile_right: (T + 1, 7) middle of the body x, y, z and its quaternion
-    x, y, z, w. cube_speed: (T + 1,). finger_force: (T + 1, 2) with which each finger presses on the cube. held:
-    (T + 1,) bool, both fingers touch the cube. touches: (T + 1, 2) bool, the cube touches the left or right tile.
-    commanded: (T, 7) actions as they came. executed: (T, 7) what the commanded pose really advanced by, after
-    limits, a gripper that is kept shut, and poses out of reach (zero then). ik_error: (T,) metres that remained.
+    Attributes:
+        tool: (T + 1, 6) measured x, y, z, roll, pitch, yaw, the angles relative to pointing down.
+        opening: (T + 1,) of the gripper, 1 open.
+        cube: (T + 1, 7) middle of the body x, y, z and its quaternion x, y, z, w.
+        cube_speed: (T + 1,).
+        tile_left: As `cube`.
+        tile_right: As `cube`.
+        finger_force: (T + 1, 2) with which each finger presses on the cube. held: (T + 1,) bool, both fingers
+            touch the cube.
+        touches: (T + 1, 2) bool, the cube touches the left or right tile.
+        commanded: (T, 7) actions as they came.
+        executed: (T, 7) what the commanded pose really advanced by, after limits, a gripper that is kept shut, and
+            poses out of reach (zero then).
+        ik_error: (T,) metres that remained.
     """
 
     tool: Values
@@ -156,8 +164,11 @@ def distance(a: XY, b: XY) -> float:
 def zone(distance_correct: float, distance_wrong: float, radius: float) -> Zone:
     """Return the zone in which the cube ended, from its distances to both tile centres (all in one unit).
 
-    A cube on the edge of a zone is inside. Out of bounds if it is in neither; if a distance is not a
-    number, because the simulator broke, it is in neither. Raises SceneError if it would be in both.
+    A cube on the edge of a zone is inside. Out of bounds if it is in neither; if a distance is not a number,
+    because the simulator broke, it is in neither.
+
+    Raises:
+        SceneError: If it would be in both.
     """
     on_correct, on_wrong = distance_correct <= radius, distance_wrong <= radius
     if on_correct and on_wrong:
@@ -172,12 +183,17 @@ def zone(distance_correct: float, distance_wrong: float, radius: float) -> Zone:
 class Outcome:
     """The stored result of one finished or running episode. Metres, in the world frame.
 
-    zone: by the rule of the paper, with radius `epsilon`. cube_xy, cube_z: the middle of the cube.
-    distance_correct, distance_wrong: in the plane, to the tile centres. cube_moved: it is further than
-    `SceneSpec.moved` from where it started. on_tile, is_grasped: at the end it touches a tile, both
-    fingers touch it; `Run.behaviour` says whether they ever did.
-    clipped: how many actions the limits changed. truncation_reason: why the episode was cut, None if it is
-    running or stopped early by itself.
+    Attributes:
+        zone: By the rule of the paper, with radius `epsilon`.
+        cube_xy: The middle of the cube.
+        cube_z: As `cube_xy`.
+        distance_correct: In the plane, to the tile centres.
+        distance_wrong: As `distance_correct`.
+        cube_moved: It is further than `SceneSpec.moved` from where it started.
+        on_tile: At the end it touches a tile, both fingers touch it; `Run.behaviour` says whether they ever did.
+        is_grasped: As `on_tile`.
+        clipped: How many actions the limits changed.
+        truncation_reason: Why the episode was cut, None if it is running or stopped early by itself.
     """
 
     zone: Zone
@@ -227,7 +243,9 @@ def success_by_radius(
 ) -> dict[float, float]:
     """Success rate for each zone radius in metres, from the stored distances: no episode runs again.
 
-    Raises ValueError without outcomes, SceneError if a radius makes the zones overlap.
+    Raises:
+        ValueError: Without outcomes.
+        SceneError: If a radius makes the zones overlap.
     """
     distances = [(o.distance_correct, o.distance_wrong) for o in outcomes]
     if not distances:
@@ -238,7 +256,8 @@ def success_by_radius(
 def success_at(distances: Iterable[tuple[float, float]], radius: float) -> float:
     """Success rate at a zone radius, metres, from distances to the correct and the wrong tile, metres.
 
-    Raises SceneError if the radius makes the zones overlap.
+    Raises:
+        SceneError: If the radius makes the zones overlap.
     """
     return float(np.mean([zone(correct, wrong, radius) == "correct" for correct, wrong in distances]))
 
@@ -263,10 +282,13 @@ EVENTS = ("first motion", "grasp", "first lateral move", "release")
 class Events:
     """Frames of one episode at which something was first the case; None for what never happened.
 
-    first_motion: the tool has left its place. grasp: the cube is held. first_lateral_move: after the grasp, the
-    tool has moved `LATERAL` along the line between the tiles from where it grasped: before the grasp it goes
-    where the cube is, whatever the question. release: the cube is not held any more, and not again. Frame t
-    follows action t, so that the action with that number brought it about.
+    Attributes:
+        first_motion: The tool has left its place.
+        grasp: The cube is held.
+        first_lateral_move: After the grasp, the tool has moved `LATERAL` along the line between the tiles from
+            where it grasped: before the grasp it goes where the cube is, whatever the question.
+        release: The cube is not held any more, and not again. Frame t follows action t, so that the action with
+            that number brought it about.
     """
 
     first_motion: int | None
@@ -408,9 +430,13 @@ def _turned_back(away: NDArray[np.float32], quaternion: NDArray[np.float32]) -> 
 class Judgement:
     """The verdict of a rule on one episode.
 
-    outcome: at its end. correct, wrong, oob: share of the judged steps, whole numbers where only the last one is
-    judged. both: at its end the cube counts for both pictures, which is called correct. idle: the outcome if
-    nothing had moved since before the first action.
+    Attributes:
+        outcome: At its end.
+        correct: Share of the judged steps, whole numbers where only the last one is judged.
+        wrong: As `correct`.
+        oob: As `correct`.
+        both: At its end the cube counts for both pictures, which is called correct.
+        idle: The outcome if nothing had moved since before the first action.
     """
 
     outcome: Zone
@@ -430,8 +456,12 @@ def judge(
 ) -> Judgement:
     """Judge one episode by a rule.
 
-    last_steps: how many control steps at the end count, each as much as the others. An episode that ended before
-    `max_steps` is taken to have stayed as it was until then. Raises UsageError for fewer than one.
+    Args:
+        last_steps: How many control steps at the end count, each as much as the others. An episode that ended
+            before `max_steps` is taken to have stayed as it was until then.
+
+    Raises:
+        UsageError: For fewer than one.
     """
     if last_steps < 1:
         raise UsageError(f"the last {last_steps} steps of an episode cannot be judged; expected at least 1")
@@ -514,19 +544,26 @@ TIE = 1e-3
 class Behaviour:
     """One episode. Metres, shares from 0 to 1, control steps; None where there is nothing to say.
 
-    grasped, released: both fingers ever touched the cube, and let go of it after that. released_at: frame of the
-    first release. moved: the cube was ever further than `SceneSpec.moved` from its start, seen from above.
-    furthest: how far it was at most.
-    hand_starts_over, hand_starts_nearer: which picture the hand is over, and nearer to, before the first action.
-    first_choice: the picture whose box the hand was brought into first. The box it began in counts from when the
-    hand is nearer to that picture by more than `SceneSpec.moved`, or was away and came back.
-    dwell_correct, dwell_wrong: steps over either box, counted likewise; dwell_start: what is left out so.
-    min_distance_correct, min_distance_wrong: of the hand, seen from above, over the whole episode.
-    closer_to: to which picture the hand came closer than it was at the start, by the larger gain.
-    release_near: the picture whose box the hand was over at the first release, counted likewise; None if it
-    released nothing.
-    correct_side_share: share of steps with the hand on the correct side of the line between the pictures.
-    start_side_correct: whether it began on that side.
+    Attributes:
+        grasped: Both fingers ever touched the cube, and let go of it after that.
+        released: As `grasped`.
+        released_at: Frame of the first release.
+        moved: The cube was ever further than `SceneSpec.moved` from its start, seen from above.
+        furthest: How far it was at most.
+        hand_starts_over: Which picture the hand is over, and nearer to, before the first action.
+        hand_starts_nearer: As `hand_starts_over`.
+        first_choice: The picture whose box the hand was brought into first. The box it began in counts from when
+            the hand is nearer to that picture by more than `SceneSpec.moved`, or was away and came back.
+        dwell_correct: Steps over either box, counted likewise.
+        dwell_wrong: As `dwell_correct`.
+        dwell_start: What is left out so.
+        min_distance_correct: Of the hand, seen from above, over the whole episode.
+        min_distance_wrong: As `min_distance_correct`.
+        closer_to: To which picture the hand came closer than it was at the start, by the larger gain.
+        release_near: The picture whose box the hand was over at the first release, counted likewise; None if it
+            released nothing.
+        correct_side_share: Share of steps with the hand on the correct side of the line between the pictures.
+        start_side_correct: Whether it began on that side.
     """
 
     grasped: bool

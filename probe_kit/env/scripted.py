@@ -40,10 +40,11 @@ class Waypoint:
 class ScriptedExpert:
     """Carries the cube to the correct tile (`mirrored`: to the wrong one), through the public actions alone.
 
-    env: an Act2AnswerEnv, wrapped or not. Call `reset` after each reset of the environment.
-    grasp_height: of the tool, metres; None for the middle of the cube.
-    tolerance: distance in metres at which a way-point counts as reached. Demonstrations whose executed actions
-    are noisy need a wider one, or the expert lingers.
+    Args:
+        env: An Act2AnswerEnv, wrapped or not. Call `reset` after each reset of the environment.
+        grasp_height: Of the tool, metres; None for the middle of the cube.
+        tolerance: Distance in metres at which a way-point counts as reached. Demonstrations whose executed actions
+            are noisy need a wider one, or the expert lingers.
     """
 
     def __init__(
@@ -145,7 +146,8 @@ class ScriptedExpert:
 class Idle:
     """Never moves the tool, and leaves the gripper as it was at the start: shut around a cube in hand, else open.
 
-    env: an Act2AnswerEnv, wrapped or not.
+    Args:
+        env: An Act2AnswerEnv, wrapped or not.
     """
 
     def __init__(self, env: Any) -> None:
@@ -179,7 +181,10 @@ def to_openpi(observation: Mapping[str, Any], prompt: str, size: int = 224) -> d
     """One observation as an openpi policy server expects it.
 
     `observation/image`: (size, size, 3) uint8, the whole picture shrunk and padded with black to a square.
-    `observation/state`: (8,) float32. `prompt`: the instruction.
+    `observation/state`: (8,) float32.
+
+    Args:
+        prompt: The instruction.
     """
     return {
         "observation/image": _padded(Image.fromarray(observation["pixels"]["image"]), size),
@@ -199,7 +204,8 @@ def _padded(image: Image.Image, size: int) -> Any:
 def save_gif(path: Path, pictures: Sequence[Picture], fps: float = 5.0) -> None:
     """Write pictures (H, W, 3) uint8 as an endless GIF; collect them with `env.render()` after each action.
 
-    Raises ValueError if there are none.
+    Raises:
+        ValueError: If there are none.
     """
     if not pictures:
         raise ValueError(f"{path}: no pictures to write; call `env.render()` at least once.")

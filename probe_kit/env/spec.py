@@ -38,8 +38,14 @@ _MOST = {"max_steps": 10_000}
 class CameraSpec:
     """A pinhole camera without distortion; the default is the Bridge third-person view of SimplerEnv.
 
-    eye, forward: position and viewing direction (any length) in the world; +z is up in the picture.
-    width, height: rendered pixels. fov: vertical field of view in degrees. near, far: clipping planes.
+    Attributes:
+        eye: Position and viewing direction (any length) in the world; +z is up in the picture.
+        forward: As `eye`.
+        width: Rendered pixels.
+        height: As `width`.
+        fov: Vertical field of view in degrees.
+        near: Clipping planes.
+        far: As `near`.
     """
 
     eye: XYZ = (0.0, -0.16, 0.36)
@@ -90,10 +96,14 @@ class PhysicsSpec:
 class LimitSpec:
     """The limits of the controller; anything beyond is clipped and counted.
 
-    translation, rotation: largest change per action and axis. low, high: corners of the box the commanded
-    tool position stays in (its floor is raised to the finger clearance of the arm). None means no such limit;
-    without `low` nothing keeps the fingers off the table. ik_error, ik_turn_error: what may remain to the wanted
-    pose before the arm holds still instead of moving.
+    Attributes:
+        translation: Largest change per action and axis.
+        rotation: As `translation`.
+        low: Corners of the box the commanded tool position stays in (its floor is raised to the finger clearance
+            of the arm). None means no such limit; without `low` nothing keeps the fingers off the table.
+        high: As `low`.
+        ik_error: What may remain to the wanted pose before the arm holds still instead of moving.
+        ik_turn_error: As `ik_error`.
     """
 
     translation: float | None = 0.10
@@ -118,31 +128,45 @@ class LimitSpec:
 class SceneSpec:
     """The whole experiment but the question: places, robot, camera, light, physics and limits.
 
-    name: the preset it was made from. arm: `panda` or `widowx`; arm_urdf: a description to load instead of ours.
-    tile_left, tile_right: tile centres (x, y). tile_yaw: turn of both tiles about +z; at zero the top of a
-    picture points away from the robot. tile_side, tile_height: size of a tile.
-    cube_xy, cube_yaw: where the cube starts, give or take `start_jitter` per axis and `start_jitter_yaw`,
-    drawn uniformly from the seed of the episode. cube_side, cube_mass, cube_color (RGB in [0, 1]).
-    epsilon: radius of the outcome zones around the tile centres; None means tile_side / 2 + 0.01.
-    home: tool position at the start, the gripper pointing down but for `home_rpy` (roll, pitch, yaw about the
-    world axes). home_joints: the joint angles of that pose for `arm`; None to look for some. home_opening: of
-    the gripper at the start, 1 is open.
-    start_grasped: begin with the cube in hand. closing_steps: how it gets there; with 0 it is put in the middle of
-    the hand, otherwise it waits at `cube_xy` and `cube_z` (the height of its middle) until the hand has closed for
-    so many actions at rest, without gravity during the first, and counts as untouched from then on.
-    forced_closed: actions of an episode during which the gripper stays shut whatever is asked.
-    tile_mass: of each tile; 0 fixes them to the table. euler: how the rotation of an action is read, `zyx` as
-    roll, pitch, yaw about fixed axes or `xyz` in the opposite order.
-    scoring_side, box_margin, box_height: the box of the rule `box`, whatever size the tiles are drawn in. It
-    reaches scoring_side / 2 + box_margin from the middle of a tile along x and y, and up from box_height over it.
-    max_steps: actions per episode. early_stop: end when the cube was released and lay still for 5 actions.
-    moved: how far the cube must end from its start to count as moved.
-    rendering: `raw`, or `visual-matching` to lay robot, cube and tiles over a photo (`background`; None means
-    our own wooden table). picture_size: (width, height) handed to the policy, None for as rendered.
-    light_level: scales all light; a photo behind the scene gets darker and brighter with it.
+    Raises SceneError if the zones overlap, if the untouched cube would already lie in one, if the home pose is
+    outside the limits, or if a value makes no sense.
 
-    Raises SceneError if the zones overlap, if the untouched cube would already lie in one, if the home pose
-    is outside the limits, or if a value makes no sense.
+    Attributes:
+        name: The preset it was made from.
+        arm: `panda` or `widowx`.
+        arm_urdf: A description to load instead of ours.
+        tile_left: Tile centres (x, y).
+        tile_right: As `tile_left`.
+        tile_yaw: Turn of both tiles about +z; at zero the top of a picture points away from the robot.
+        tile_side: Size of a tile.
+        tile_height: As `tile_side`.
+        cube_xy: Where the cube starts, give or take `start_jitter` per axis and `start_jitter_yaw`, drawn
+            uniformly from the seed of the episode. cube_side, cube_mass, cube_color (RGB in [0, 1]).
+        cube_yaw: As `cube_xy`.
+        epsilon: Radius of the outcome zones around the tile centres; None means tile_side / 2 + 0.01.
+        home: Tool position at the start, the gripper pointing down but for `home_rpy` (roll, pitch, yaw about the
+            world axes).
+        home_joints: The joint angles of that pose for `arm`; None to look for some.
+        home_opening: Of the gripper at the start, 1 is open.
+        start_grasped: Begin with the cube in hand.
+        closing_steps: How it gets there; with 0 it is put in the middle of the hand, otherwise it waits at
+            `cube_xy` and `cube_z` (the height of its middle) until the hand has closed for so many actions at
+            rest, without gravity during the first, and counts as untouched from then on.
+        forced_closed: Actions of an episode during which the gripper stays shut whatever is asked.
+        tile_mass: Of each tile; 0 fixes them to the table.
+        euler: How the rotation of an action is read, `zyx` as roll, pitch, yaw about fixed axes or `xyz` in the
+            opposite order.
+        scoring_side: The box of the rule `box`, whatever size the tiles are drawn in. It reaches scoring_side / 2
+            + box_margin from the middle of a tile along x and y, and up from box_height over it.
+        box_margin: As `scoring_side`.
+        box_height: As `scoring_side`.
+        max_steps: Actions per episode.
+        early_stop: End when the cube was released and lay still for 5 actions.
+        moved: How far the cube must end from its start to count as moved.
+        rendering: `raw`, or `visual-matching` to lay robot, cube and tiles over a photo (`background`; None means
+            our own wooden table).
+        picture_size: (width, height) handed to the policy, None for as rendered.
+        light_level: Scales all light; a photo behind the scene gets darker and brighter with it.
     """
 
     name: str = "bridge"
@@ -195,7 +219,9 @@ class SceneSpec:
         """A named scene, with fields replaced: `bridge` (default), `frontal`, `vl-think` or `act2answer`.
 
         Another arm than the preset's starts from the same pose of its tool, with joint angles of its own.
-        Raises SceneError for an unknown name or field, and for a background that the rendering does not show.
+
+        Raises:
+            SceneError: For an unknown name or field, and for a background that the rendering does not show.
         """
         if name not in PRESETS:
             raise SceneError(f"no scene preset {name!r}; there are {', '.join(PRESETS)}.")
@@ -254,7 +280,9 @@ class SceneSpec:
         """The record as plain JSON values, with the outcome radius that is really used.
 
         A file is identified by the sha256 of its content, not by its path.
-        Raises SceneError if a file cannot be read.
+
+        Raises:
+            SceneError: If a file cannot be read.
         """
         plain = asdict(self) | {"epsilon": self.zone_radius}
         return {key: _content_sha256(value) if isinstance(value, Path) else value for key, value in plain.items()}
@@ -263,8 +291,12 @@ class SceneSpec:
     def from_json(cls, values: Mapping[str, Any], files: Mapping[str, Path] = MappingProxyType({})) -> Self:
         """The record that `to_json` wrote, as a run stores it.
 
-        files: by field, where the files lie that it names by their hash. Raises SceneError if one is not given or
-        holds something else, for one that it was made without, and for a field of another version.
+        Args:
+            files: By field, where the files lie that it names by their hash.
+
+        Raises:
+            SceneError: If one is not given or holds something else, for one that it was made without, and for a
+                field of another version.
         """
         parts = {"camera": CameraSpec, "light": LightSpec, "physics": PhysicsSpec, "limits": LimitSpec}
         unknown = sorted(set(values) - set(cls.__dataclass_fields__))

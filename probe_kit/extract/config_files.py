@@ -50,10 +50,13 @@ def read_config(
 ) -> Mapping[str, Any]:
     """Settings by part, from a file of `--print-config`, or from a run that its folder or `run.json` names.
 
-    typed: values of a command line by parameter; what they replace is not searched for. asks: whether the run is
-    one of `probe-kit ask`.
-    Raises UsageError for a file that holds neither, for a run without its settings, and for files of a run that
-    are gone.
+    Args:
+        typed: Values of a command line by parameter; what they replace is not searched for.
+        asks: Whether the run is one of `probe-kit ask`.
+
+    Raises:
+        UsageError: For a file that holds neither, for a run without its settings, and for files of a run that are
+            gone.
     """
     if path.is_dir() or path.name == RUN_FILE:
         return _of_run(path if path.is_dir() else path.parent, typed, asks)
@@ -107,8 +110,12 @@ def _typed_or_stored_source(run: "Run", typed: Mapping[str, Any]) -> dict[str, A
 def source_of_run(run: "Run", replaced: Collection[str], flags: Mapping[str, str]) -> dict[str, Any]:
     """The settings of a run's source as values, with its files where the run had them.
 
-    replaced: fields that are given anew. flags: options of a command that give fields.
-    Raises UsageError for a run without its settings, and for files that are gone.
+    Args:
+        replaced: Fields that are given anew.
+        flags: Options of a command that give fields.
+
+    Raises:
+        UsageError: For a run without its settings, and for files that are gone.
     """
     config = run.settings.get(CONFIG)
     if config is None:
@@ -161,7 +168,10 @@ MovedOptions = _moved_options()
 def moved_of(run: "Run", typed: Mapping[str, Any]) -> dict[str, Any]:
     """Return the parts of a run's source that typed parameters give anew, by field.
 
-    Other parameters are passed over. Raises UsageError for a part that only another kind of source has.
+    Other parameters are passed over.
+
+    Raises:
+        UsageError: For a part that only another kind of source has.
     """
     config = run.settings.get(CONFIG)
     options = {} if config is None else _options(kind_of(config["source"]))

@@ -57,10 +57,13 @@ _OF_THE_CHECKPOINT = ("dtype", "execute", "random_weights", "captured_calls")
 class Extraction:
     """A prepared extraction, ready to run: the source is open, the model is loaded and the plan is made.
 
-    source: as the model is shown it. card: the part of the identity that the loaded model decides. controller:
-    None if the model is loaded again by workers elsewhere. calibration: what chose the batch, None if it was not
-    requested or is left to workers. declared: whose sizes the streams have where no model was loaded and the run
-    has no name yet; empty where one was.
+    Attributes:
+        source: As the model is shown it.
+        card: The part of the identity that the loaded model decides. controller: None if the model is loaded again
+            by workers elsewhere.
+        calibration: What chose the batch, None if it was not requested or is left to workers.
+        declared: Whose sizes the streams have where no model was loaded and the run has no name yet; empty where
+            one was.
     """
 
     settings: Settings
@@ -87,7 +90,8 @@ class Extraction:
     def writer(self, location: Location) -> RunWriter:
         """A writer of the run at `location`, which it begins or continues.
 
-        Raises SettingsMismatchError if other settings are there.
+        Raises:
+            SettingsMismatchError: If other settings are there.
         """
         return RunWriter(location, self.plan, self.identity(), self.provenance(), run_label(self.settings))
 
@@ -109,12 +113,15 @@ class Extraction:
         """Play and commit every episode of the plan that is not committed yet, seal the run and open it.
 
         A run that lacks episodes of the plan grows by them. One that has more than these stays as it is.
-        progress: called with (episodes done, episodes planned, outcome of the last one); by default a bar in a
-        notebook, nothing elsewhere.
+
         Raises SettingsMismatchError or DiskSpaceError before anything is written, StoreError if `out` lies in an
         object store that cannot be used, as one that ignores conditional puts, EpisodesFailedError at the end if
         episodes were given up, and whatever is wrong with all episodes at once. Committed episodes stay; the same
         call resumes after them.
+
+        Args:
+            progress: Called with (episodes done, episodes planned, outcome of the last one); by default a bar in a
+                notebook, nothing elsewhere.
         """
         location = locate(out)
         if self.declared:
@@ -176,14 +183,18 @@ def load(
 ) -> Extraction:
     """Open the source, load the model and plan the rows.
 
-    rehearsed: whether the source was tried before. location: where it will be written, if that is known, so that
-    it is looked at before the model is loaded. model: the policy or answer model of these settings, if it is
-    loaded already; it may be one of your own, and several runs can share it. fetch: False makes the plan of the
-    streams that the model's family declares: without weights, network or GPU. A family that declares none is
-    loaded. check_cameras: called once they are known, before weights are loaded where the checkpoint's files say
-    it, and again of the loaded model.
     Raises UsageError for a policy of another family or with other weights than the settings name, and what these
     raise: UnknownModelError, UnknownCategoryError, SuiteError, RecordingError, OwnEnvironmentError, WeightsError …
+
+    Args:
+        rehearsed: Whether the source was tried before.
+        location: Where it will be written, if that is known, so that it is looked at before the model is loaded.
+        model: The policy or answer model of these settings, if it is loaded already; it may be one of your own,
+            and several runs can share it.
+        fetch: False makes the plan of the streams that the model's family declares: without weights, network or
+            GPU. A family that declares none is loaded.
+        check_cameras: Called once they are known, before weights are loaded where the checkpoint's files say it,
+            and again of the loaded model.
     """
     settings, source = open_checked(settings, location, model is not None, fetch)
     task = task_of(settings)
@@ -219,8 +230,9 @@ def open_checked(
 ) -> tuple[Settings, Source[Any]]:
     """The settings with what protocol and source decide, and the open source; all is checked that needs no model.
 
-    loaded: the model is there already, and may be one that no name leads to. fetch: see `Family.check`. Raises as
-    `load`.
+    Args:
+        loaded: The model is there already, and may be one that no name leads to.
+        fetch: See `Family.check`. Raises as `load`.
     """
     task = task_of(settings)
     check_meaningless(settings)
@@ -258,7 +270,11 @@ def check_meaningless(settings: Settings) -> None:
 def check_model(settings: Settings, fetch: bool = True) -> None:
     """Refuse a model, option, device or checkpoint that cannot be used; imports no torch.
 
-    fetch: see `Family.check`. Raises UnknownModelError and what `Family.check` raises.
+    Args:
+        fetch: See `Family.check`.
+
+    Raises:
+        UnknownModelError: And what `Family.check` raises.
     """
     if settings.machine.ray is not None and find_spec("ray") is None:
         raise MissingExtraError(f"--ray needs ray, which is not installed; `{install_command('ray')}`")
@@ -293,8 +309,10 @@ def _check_writable(location: Location) -> None:
 def _check_other_run(settings: Settings, source: Source[Any], location: Location) -> None:
     """Raise SettingsMismatchError for a place where a run lies that has other settings or cannot grow so.
 
-    Only what is known without the model is compared; the writer compares all of it. Raises RunDamagedError if what
-    lies there was changed.
+    Only what is known without the model is compared; the writer compares all of it.
+
+    Raises:
+        RunDamagedError: If what lies there was changed.
     """
     early = source.known_early()
     with location.explained_errors():
@@ -382,7 +400,8 @@ def play_episodes(
 ) -> None:
     """The work of a worker elsewhere: load the model, then play what is handed out of a run, which is held.
 
-    Raises SettingsMismatchError if this machine has other settings or gives other numbers than those before it.
+    Raises:
+        SettingsMismatchError: If this machine has other settings or gives other numbers than those before it.
     """
     settings, run = setup
     prepared = load(settings, rehearsed=True)
@@ -443,12 +462,15 @@ def prepare(
 ) -> Extraction:
     """Find the suite, load the model and plan the episodes.
 
-    out: where it will be written, if that is known; what is wrong there is then said before the model is loaded.
-    model: the policy or answer model of these settings, if it is loaded already; several runs can share it.
-    Workers load their own. fetch: False plans with the streams that the family declares, without weights, network
-    or GPU; such an extraction cannot be run. check_cameras: called with the cameras that get a picture, see
-    `load`.
-    Raises what these raise: UnknownModelError, UnknownCategoryError, SuiteError, WeightsError …
+    Args:
+        out: Where it will be written, if that is known; what is wrong there is then said before the model is
+            loaded.
+        model: The policy or answer model of these settings, if it is loaded already; several runs can share it.
+            Workers load their own.
+        fetch: False plans with the streams that the family declares, without weights, network or GPU; such an
+            extraction cannot be run.
+        check_cameras: Called with the cameras that get a picture, see `load`. Raises what these raise:
+            UnknownModelError, UnknownCategoryError, SuiteError, WeightsError …
     """
     location = None if out is None else locate(out)
     load_with = partial(load, location=location, model=model, fetch=fetch, check_cameras=check_cameras)
@@ -476,9 +498,9 @@ def prepare_asks(
 ) -> Iterator[Extraction]:
     """Several runs of one model, which is loaded once; each is prepared when its turn comes.
 
-    fetch: as of `prepare`.
-    What is wrong with any of them, as far as it is known without the model, is said before the first.
-    Raises what `prepare` raises.
+    Args:
+        fetch: As of `prepare`. What is wrong with any of them, as far as it is known without the model, is said
+            before the first. Raises what `prepare` raises.
     """
     for one_run, out in zip(settings, outs, strict=True):
         open_checked(one_run, None if out is None else locate(out), fetch=fetch)

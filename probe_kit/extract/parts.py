@@ -85,9 +85,12 @@ SCRIPTED: Mapping[str, str] = {
 class ModelSettings(Part):
     """The model that acts or answers, and its weights.
 
-    family: a name of `probe-kit models`, or a script. checkpoint: folder or hub id; None for the family's default.
-    options: what only some families have, such as `unnorm_key`. weights_seed: of an untrained network's weights.
-    dtype: of the weights; None for the checkpoint's.
+    Attributes:
+        family: A name of `probe-kit models`, or a script.
+        checkpoint: Folder or hub id; None for the family's default.
+        options: What only some families have, such as `unnorm_key`.
+        weights_seed: Of an untrained network's weights.
+        dtype: Of the weights; None for the checkpoint's.
     """
 
     family: Annotated[str, option_of(common.ModelName)]
@@ -113,9 +116,11 @@ class ModelSettings(Part):
 class Capture(Part):
     """The stored activations of a model that acts.
 
-    tokens: `pooled` stores pooled views only, `all` also every token. captured_calls: inferences captured per
-    episode, from the first on; `all` is as many as an episode can have, once the model is loaded. later_views:
-    `mean` stores of the inferences after the first the view `mean` alone, in bfloat16.
+    Attributes:
+        tokens: `pooled` stores pooled views only, `all` also every token.
+        captured_calls: Inferences captured per episode, from the first on; `all` is as many as an episode can
+            have, once the model is loaded. later_views: `mean` stores of the inferences after the first the view
+            `mean` alone, in bfloat16.
     """
 
     tokens: Annotated[
@@ -196,11 +201,13 @@ else:
 class ActTask(Part):
     """The task of a policy: to act, or to be captured only.
 
-    protocol: a published one, such as `act2answer`: what is not chosen is as it has it, see `protocols`. execute:
-    actions per inference; None for the policy's own. rotation: what reaches the controller as the rotation of an
-    action, see `ProtocolRow`; None for the protocol's, or its angles as they are. capture_only: capture the first
-    inference of every episode and do not act. edits: what is changed in the streams at every inference; vectors:
-    their directions and sources, by hash.
+    Attributes:
+        protocol: A published one, such as `act2answer`: what is not chosen is as it has it, see `protocols`.
+            execute: actions per inference; None for the policy's own.
+        rotation: What reaches the controller as the rotation of an action, see `ProtocolRow`; None for the
+            protocol's, or its angles as they are.
+        capture_only: Capture the first inference of every episode and do not act.
+        edits: What is changed in the streams at every inference; vectors: their directions and sources, by hash.
     """
 
     protocol: Annotated[
@@ -248,10 +255,14 @@ PromptTemplate = Annotated[Template, BeforeValidator(_template)]
 class AskTask(Part):
     """The task of a model that answers: prompt, picture and object.
 
-    protocol: a published one, whose scene takes the place of the default one; it decides nothing else of a
-    question. prompt: a template, or its name or file. picture: `frame` shows the first frame of the episode,
-    `side-by-side` its two pictures on grey, `none` nothing. query: the object that is asked for, see `QUERIES`.
-    Raises UsageError for an absent object with a prompt that takes no no.
+    Attributes:
+        protocol: A published one, whose scene takes the place of the default one; it decides nothing else of a
+            question.
+        prompt: A template, or its name or file.
+        picture: `frame` shows the first frame of the episode, `side-by-side` its two pictures on grey, `none`
+            nothing.
+        query: The object that is asked for, see `QUERIES`. Raises UsageError for an absent object with a prompt
+            that takes no no.
     """
 
     execute: ClassVar[None] = None
@@ -294,13 +305,16 @@ class AskTask(Part):
 class Machine(Part):
     """Settings that change no stored number: how fast a run comes, and the pictures that are stored for people.
 
-    frames: `ends` stores small copies of the first and last frame of every episode, `all` of every frame, `none`
-    none. env_workers: processes that simulate and draw; None for two per observation of a batch, 0 for this
-    process. workers: processes with a model each, one per GPU where there are several; 0 for this process. ray:
-    address of a Ray cluster, or `auto`; the workers then run there. inference_limit: seconds that one call of the
-    model may take in a worker, which is ended then; its episodes are tried once more and given up by name. None
-    for no limit. allow_mixed: continue a run whose episodes were made on another kind of device or with other
-    versions; the run is then marked as mixed wherever tables name it.
+    Attributes:
+        frames: `ends` stores small copies of the first and last frame of every episode, `all` of every frame,
+            `none` none.
+        env_workers: Processes that simulate and draw; None for two per observation of a batch, 0 for this process.
+        workers: Processes with a model each, one per GPU where there are several; 0 for this process. ray: address
+            of a Ray cluster, or `auto`; the workers then run there.
+        inference_limit: Seconds that one call of the model may take in a worker, which is ended then; its episodes
+            are tried once more and given up by name. None for no limit.
+        allow_mixed: Continue a run whose episodes were made on another kind of device or with other versions; the
+            run is then marked as mixed wherever tables name it.
     """
 
     device: common.Device = "cpu"
@@ -352,10 +366,12 @@ class Machine(Part):
 class ActMachine(Machine):
     """The same of a model that acts.
 
-    batch: observations per call of the model. With 1, bytes repeat exactly; with more, up to float rounding.
-    `auto` chooses batch and env_workers by a measurement of some seconds, see `calibration`; None is `auto` for a
-    policy on a GPU without a number of env_workers, and else 1. video: GIF of the first episode, of all, or none.
-    accept_units: play or show states that lie far outside the checkpoint's statistics.
+    Attributes:
+        batch: Observations per call of the model. With 1, bytes repeat exactly; with more, up to float rounding.
+            `auto` chooses batch and env_workers by a measurement of some seconds, see `calibration`; None is
+            `auto` for a policy on a GPU without a number of env_workers, and else 1.
+        video: GIF of the first episode, of all, or none.
+        accept_units: Play or show states that lie far outside the checkpoint's statistics.
     """
 
     batch: Annotated[

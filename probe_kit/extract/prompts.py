@@ -59,7 +59,9 @@ def phrases(suite: Suite, query: Query, seed: int = 0) -> dict[str, Phrase]:
     """Return the phrase that is asked for by item; the same in both layouts, and the same for the same seed.
 
     Other objects are those of the whole suite, so that a phrase does not depend on the number of items asked for.
-    Raises UsageError naming the first items for which the suite has no such phrase.
+
+    Raises:
+        UsageError: Naming the first items for which the suite has no such phrase.
     """
     if query == "target":
         return {item.item_id: Phrase.of(item) for item in suite.items}
@@ -135,7 +137,8 @@ _YES_OR_NO = re.compile(r"\byes or no\b", re.IGNORECASE)
 class Template:
     """A prompt with its places still open. Raises UsageError for places it cannot have.
 
-    name: what runs and tables call it.
+    Attributes:
+        name: What runs and tables call it.
     """
 
     name: str
@@ -217,7 +220,8 @@ TEMPLATES: Mapping[str, Template] = MappingProxyType(
 def find_template(name: str) -> Template:
     """A template of `TEMPLATES`, or the one in a text file, called after it.
 
-    Raises UsageError if it is neither, or if the file's places are not those of a prompt.
+    Raises:
+        UsageError: If it is neither, or if the file's places are not those of a prompt.
     """
     if name in TEMPLATES:
         return TEMPLATES[name]
@@ -246,7 +250,8 @@ MARGIN = 0.05
 def side_by_side(episode: Episode, shape: tuple[int, int]) -> NDArray[np.uint8]:
     """(H, W, 3) uint8 of `shape`: left and right picture of the episode, as large as fits and equally large.
 
-    Raises SuiteError for a picture that is missing or damaged.
+    Raises:
+        SuiteError: For a picture that is missing or damaged.
     """
     height, width = shape
     gap = round(MARGIN * width)

@@ -23,7 +23,9 @@ _OF_ACTING = ("execute", "rotation")
 def protocol_scene(protocol: str | None, name: str | None = None, **changes: Any) -> "SceneSpec":
     """The preset `name`, else the protocol's, else the default one, with fields replaced.
 
-    Raises UsageError for an unknown protocol, SceneError for an unknown preset or field.
+    Raises:
+        UsageError: For an unknown protocol.
+        SceneError: For an unknown preset or field.
     """
     from probe_kit.env import SceneSpec
 
@@ -90,7 +92,9 @@ def protocol_row(model: ModelSettings, protocol: str | None) -> ProtocolRow | No
     """The protocol's row of a model and checkpoint; None without a protocol, and for scripts.
 
     With another checkpoint than the protocol's, and with None, it is the row of the model's first.
-    Raises UsageError for a model that the protocol does not use.
+
+    Raises:
+        UsageError: For a model that the protocol does not use.
     """
     family = _family(model.family)
     if protocol is None or family is None:

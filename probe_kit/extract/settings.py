@@ -83,8 +83,10 @@ def _model_of(settings: "type[Settings]", part: str) -> Any:
 class Settings(Part):
     """Settings of a run of any kind; the defaults are the command line's.
 
-    label: the name of the run in tables and legends; None for the model and what sets it apart, see `run_label`.
-    asks: whether the model is asked, and does not act.
+    Attributes:
+        asks: Whether the model is asked, and does not act.
+        label: The name of the run in tables and legends; None for the model and what sets it apart, see
+            `run_label`.
     """
 
     asks: ClassVar[bool] = False
@@ -116,7 +118,10 @@ class Settings(Part):
     def __init__(self, model: Any = None, checkpoint: str | None = None, **values: Any) -> None:
         """Take parts, or fields of any part by their names. model: a family, or the part.
 
-        Raises UsageError and SceneError for values that cannot be used, TypeError for a name that is no field.
+        Raises:
+            UsageError: For values that cannot be used.
+            SceneError: For values that cannot be used.
+            TypeError: For a name that is no field.
         """
         fields = {} if checkpoint is None else {"checkpoint": checkpoint}
         super().__init__(**self._by_part(model, fields | values))
@@ -175,9 +180,13 @@ class Settings(Part):
     ) -> Self:
         """The settings of a command.
 
-        typed: the values that were typed, by parameter. file: settings by part, which typed ones replace.
-        further_fields: by name.
-        Raises UsageError for two sources, for options of another source, and what `__init__` raises.
+        Args:
+            typed: The values that were typed, by parameter.
+            file: Settings by part, which typed ones replace.
+            **further_fields: By name.
+
+        Raises:
+            UsageError: For two sources, for options of another source, and what `__init__` raises.
         """
         parts = [
             option for part in (*(_model_of(cls, part) for part in _PARTS), cls) for option in options_of(part)
@@ -298,7 +307,9 @@ class Settings(Part):
     def refuse(self, names: Iterable[str], why: str) -> None:
         """Raise UsageError for fields that were chosen and have no effect.
 
-        names: of fields, or NAME=VALUE where only that value has none. why: the remainder of the sentence.
+        Args:
+            names: Of fields, or NAME=VALUE where only that value has none.
+            why: The remainder of the sentence.
         """
         changed, wrong = self.changed_fields(), []
         offered = (option for part in _PARTS for option in options_of(type(getattr(self, part))))
@@ -360,7 +371,8 @@ class ExtractSettings(Settings):
     def followed(self) -> Self:
         """The settings with all that was not chosen as their protocol has it for the model.
 
-        Raises UsageError for a model that the protocol does not use.
+        Raises:
+            UsageError: For a model that the protocol does not use.
         """
         row, model, task = protocol_row(self.model, self.task.protocol), self.model, self.task
         if row is None:
@@ -418,10 +430,15 @@ class AskSettings(Settings):
     ) -> list[Self]:
         """Settings of one run per prompt and picture size, prompts outermost.
 
-        prompts: names or files of templates; None for those of the file, else those of the paper, or for the
-        instruction on a source without objects. picture_sizes: (width, height) in pixels, of a scene; None for the
-        file's, else 224 x 224. typed, file: see `of_command`.
-        Raises UsageError for two runs of one name, and what `of_command` raises.
+        Args:
+            prompts: Names or files of templates; None for those of the file, else those of the paper, or for the
+                instruction on a source without objects.
+            picture_sizes: (width, height) in pixels, of a scene; None for the file's, else 224 x 224.
+            typed: See `of_command`.
+            file: As `typed`.
+
+        Raises:
+            UsageError: For two runs of one name, and what `of_command` raises.
         """
         parameters = {option.parameter for kind in SOURCES for option in options_of(kind)}
         options = {name: value for name, value in typed.items() if name in parameters}
@@ -495,7 +512,8 @@ def _refuse(names: Iterable[str], source: type[SourceSettings]) -> NoReturn:
 def _with_scene(parts: Mapping[str, Any], fields: dict[str, Any]) -> Any:
     """The source of settings by part. fields: of a scene and its questions, by name.
 
-    Raises UsageError for such fields with another source.
+    Raises:
+        UsageError: For such fields with another source.
     """
     former = _fields_of("source", parts.get("source") or {})
     if former.get("kind", SCENE) != SCENE:

@@ -63,7 +63,8 @@ def space_of(streams: Sequence[StoredStream], episodes: int, settings: Settings)
 class PlannedSizes:
     """The sizes of a model that was not loaded. streams: as a run stores them. source: whose sizes these are.
 
-    outline: the model without numbers, where its configuration is here.
+    Attributes:
+        outline: The model without numbers, where its configuration is here.
     """
 
     streams: tuple[StoredStream, ...]
@@ -80,9 +81,12 @@ class PlannedSizes:
 def planned_sizes(settings: Settings, instructions: Sequence[str] = ()) -> PlannedSizes | None:
     """The streams of a model by its configuration, where that is here, else as its family declares them.
 
-    instructions: texts that it will read, for the number of tokens; else one of about ten words.
-    Returns None for a model that declares none. Reads no weights and asks no network. Raises what loading raises
-    for a checkpoint in a folder.
+    Args:
+        instructions: Texts that it will read, for the number of tokens; else one of about ten words.
+
+    Returns:
+        None for a model that declares none. Reads no weights and asks no network. Raises what loading raises for a
+        checkpoint in a folder.
     """
     from probe_kit.hooks.registry import get_family
 
@@ -148,10 +152,13 @@ def weights_needed(
 ) -> str:
     """Memory for the weights and the size of a download, in words; empty for a model that declares no size.
 
-    Of the checkpoint's configuration where it is here, else of the released size. dtype: None for both.
-    parameters: of a model that is loaded; None for one that is not. No network is asked: a download is counted
-    from the index of the weights in the cache, else estimated from the number of parameters, whose stored
-    precision is not known.
+    Of the checkpoint's configuration where it is here, else of the released size.
+
+    Args:
+        dtype: None for both.
+        parameters: Of a model that is loaded; None for one that is not. No network is asked: a download is counted
+            from the index of the weights in the cache, else estimated from the number of parameters, whose stored
+            precision is not known.
     """
     from probe_kit.hooks.registry import get_family
     from probe_kit.runs.run_folders import in_units

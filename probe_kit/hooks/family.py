@@ -60,39 +60,51 @@ SIZE = "size"
 class Family:
     """A model family by name.
 
-    default_checkpoint: hub id, or None for the embedded one. streams: layers and iterations in words, of a family
-    that declares none.
-    loader, outputs, full_size: `module:function`, imported only when used. loader(checkpoint, device, dtype,
-    random_weights) gives a Model, and takes `weights_seed` if its untrained networks can differ; outputs(loader,
-    folder, recorded arrays) gives the `Outputs` that a golden reference is compared with; full_size() gives the
-    network of the released size on the meta device; it takes the name of one where there are `sizes`.
-    stored_names: `module:constant`, how names of tensors in released files become those of the network, see
-    `probe_kit.models.checkpoint_files`.
-    options: what else the loader takes as keyword arguments. acts, reads: whether it is a Policy, an AnswerModel.
-    hub: what the default checkpoint is loaded from, hub ids with a file each whose presence tells; default its
-    config.json. packages: modules of an extra that it needs, with the name of that extra.
-    unstored: tensors of a checkpoint that the network does not have, by name or prefix ending in a dot;
-    `verify --keys` prints them.
-    source: name of the VLM whose network this policy grew from, if it is one of ours. source_weights: the
-    weights from which the default checkpoint, and those of protocols, grew. sizes: hub ids of the
-    released sizes by name, the default one first; `size` is then an option, instead of a checkpoint.
-    config_types: what `type` or `model_type` in the config.json of its checkpoints may be; empty if they have
-    none, and then only the loader knows one when it sees it. instead: for other such types that people may take
-    for one of them, what to do. needs_checkpoint: nothing is there by default. protocols: published protocols that
-    use the family, by name, with what they use it with. interventions: what of them its policy supports.
-    declared: streams of the released sizes, by name of the size, which is empty where there is one; a plan is made
-    of them where no weights are read. words: `module:function(checkpoint, instructions, **options)` that raises
-    InstructionError for what cannot be read, from the checkpoint's small files alone; see `check_instructions`.
-    units: `module:function(checkpoint, **options)` that says whose units the actions get, and where they stand,
-    from the small files; it raises UsageError where that has to be chosen. of_default: options that belong to the
-    default checkpoint, and to no other; they count where they are not given.
-    files: patterns of the files of a hub repository that are needed. parameters: count of the released sizes, by
-    name.
-    always_float32: whether weights stay in float32 whatever dtype is chosen.
-    not_acting: released checkpoints whose actions no arm here can execute, for plans without their configuration.
-    home: the scene it acts in, or is asked about, when none is named. vocabulary: module with `known_words` and
-    `words_in`, of a family whose default checkpoint knows few words; empty for one that reads any text.
-    Raises UsageError if an option is not declared as an `Option`.
+    Attributes:
+        default_checkpoint: Hub id, or None for the embedded one.
+        loader: `module:function`, imported only when used. loader(checkpoint, device, dtype, random_weights) gives
+            a Model, and takes `weights_seed` if its untrained networks can differ; outputs(loader, folder,
+            recorded arrays) gives the `Outputs` that a golden reference is compared with; full_size() gives the
+            network of the released size on the meta device; it takes the name of one where there are `sizes`.
+        streams: Layers and iterations in words, of a family that declares none.
+        outputs: As `loader`.
+        full_size: As `loader`.
+        stored_names: `module:constant`, how names of tensors in released files become those of the network, see
+            `probe_kit.models.checkpoint_files`.
+        options: What else the loader takes as keyword arguments.
+        acts: Whether it is a Policy, an AnswerModel.
+        reads: As `acts`.
+        unstored: Tensors of a checkpoint that the network does not have, by name or prefix ending in a dot;
+            `verify --keys` prints them.
+        hub: What the default checkpoint is loaded from, hub ids with a file each whose presence tells; default its
+            config.json.
+        packages: Modules of an extra that it needs, with the name of that extra.
+        config_types: What `type` or `model_type` in the config.json of its checkpoints may be; empty if they have
+            none, and then only the loader knows one when it sees it.
+        instead: For other such types that people may take for one of them, what to do.
+        needs_checkpoint: Nothing is there by default.
+        protocols: Published protocols that use the family, by name, with what they use it with.
+        source: Name of the VLM whose network this policy grew from, if it is one of ours.
+        source_weights: The weights from which the default checkpoint, and those of protocols, grew.
+        sizes: Hub ids of the released sizes by name, the default one first; `size` is then an option, instead of a
+            checkpoint.
+        interventions: What of them its policy supports.
+        declared: Streams of the released sizes, by name of the size, which is empty where there is one; a plan is
+            made of them where no weights are read.
+        words: `module:function(checkpoint, instructions, **options)` that raises InstructionError for what cannot
+            be read, from the checkpoint's small files alone; see `check_instructions`.
+        units: `module:function(checkpoint, **options)` that says whose units the actions get, and where they
+            stand, from the small files; it raises UsageError where that has to be chosen.
+        of_default: Options that belong to the default checkpoint, and to no other; they count where they are not
+            given.
+        files: Patterns of the files of a hub repository that are needed.
+        parameters: Count of the released sizes, by name.
+        always_float32: Whether weights stay in float32 whatever dtype is chosen.
+        not_acting: Released checkpoints whose actions no arm here can execute, for plans without their
+            configuration.
+        home: The scene it acts in, or is asked about, when none is named.
+        vocabulary: Module with `known_words` and `words_in`, of a family whose default checkpoint knows few words;
+            empty for one that reads any text. Raises UsageError if an option is not declared as an `Option`.
     """
 
     name: str
@@ -175,9 +187,13 @@ class Family:
     ) -> "Model":
         """Load a model; `checkpoint` None means the default one.
 
-        options: by name, as text or values. weights_seed: of an untrained network's weights.
-        Switches off torch's fused encoder in this process, because hooks would change its rounding.
-        Raises UsageError for an option it lacks, and for a device, dtype or seed that cannot be used.
+        Args:
+            options: By name, as text or values.
+            weights_seed: Of an untrained network's weights. Switches off torch's fused encoder in this process,
+                because hooks would change its rounding.
+
+        Raises:
+            UsageError: For an option it lacks, and for a device, dtype or seed that cannot be used.
         """
         loader_options = self.check(checkpoint, device, dtype, random_weights, options, weights_seed)
         location = self.location(checkpoint, loader_options.pop(SIZE, None))
@@ -230,9 +246,14 @@ class Family:
     ) -> dict[str, Any]:
         """Everything about `load` that can be wrong without weights, in a second instead of a minute.
 
-        fetch: download a checkpoint that is on the hub, and look for its weights; else only files that are here
-        are looked at, and no weights. Returns the options as the loader gets them. Raises UsageError,
-        MissingExtraError, CheckpointError or WeightsError as loading would.
+        Raises UsageError, MissingExtraError, CheckpointError or WeightsError as loading would.
+
+        Args:
+            fetch: Download a checkpoint that is on the hub, and look for its weights; else only files that are
+                here are looked at, and no weights.
+
+        Returns:
+            The options as the loader gets them.
         """
         loader_options = check_options(self.name, self.options, options)
         if weights_seed and not random_weights:
@@ -278,7 +299,8 @@ class Family:
     ) -> int | None:
         """Bytes of so many parameters; by default of the released size that `options` choose.
 
-        Returns None where that is not declared.
+        Returns:
+            None where that is not declared.
         """
         size = check_options(self.name, self.options, options).get(SIZE)
         count = parameters or self.parameters.get(size or next(iter(self.parameters), ""))
@@ -337,7 +359,8 @@ class Family:
     ) -> None:
         """Raise InstructionError for an instruction that the model cannot read, before its network is loaded.
 
-        fetch: download small files that are not here; without it, nothing is checked then.
+        Args:
+            fetch: Download small files that are not here; without it, nothing is checked then.
         """
         location, loader_options = self._located(checkpoint, options)
         if self.words is None or (not fetch and location is not None and is_on_hub(location)):
@@ -351,8 +374,11 @@ class Family:
     ) -> str:
         """The data set or robot whose units the actions get, and what says so; empty where the family has one way.
 
-        fetch: download small files that are not here; without it, nothing is said of a checkpoint on the hub.
-        Raises UsageError where several are there and none was chosen.
+        Args:
+            fetch: Download small files that are not here; without it, nothing is said of a checkpoint on the hub.
+
+        Raises:
+            UsageError: Where several are there and none was chosen.
         """
         location, loader_options = self._located(checkpoint, options)
         if self.units is None or location is None or (not fetch and is_on_hub(location)):

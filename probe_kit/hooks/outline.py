@@ -29,8 +29,10 @@ _OUTLINES: dict[tuple[object, ...], "Outline"] = {}
 class Outline:
     """A model on the meta device, with streams, roles and units but without numbers.
 
-    model: None where it could not be built. reason: why not. complete: whether its weights are here too, so that
-    no file of statistics can be missing.
+    Attributes:
+        model: None where it could not be built.
+        reason: Why not.
+        complete: Whether its weights are here too, so that no file of statistics can be missing.
     """
 
     model: "Model | None"
@@ -56,8 +58,11 @@ def outline_of(
 ) -> Outline:
     """The outline of the checkpoint at `location`, whose configuration lies in `folder`.
 
-    name: of the family. load: its loader. options: as the loader gets them. No network is asked and no weights are
-    read. Raises what loading raises for a checkpoint in a folder.
+    Args:
+        name: Of the family.
+        load: Its loader.
+        options: As the loader gets them. No network is asked and no weights are read. Raises what loading raises
+            for a checkpoint in a folder.
     """
     complete = is_complete(location)
     key = (name, location, dtype, repr(sorted(options.items())), complete, file_state(folder))

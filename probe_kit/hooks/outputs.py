@@ -25,12 +25,15 @@ _COMPARED = {"residual": "resid", "final_norm": "final_norm"}
 class Outputs:
     """The quantities that a family compares with a golden reference; see `Family.outputs`.
 
-    produced: how each is made, by name; a recorded one that is missing here is listed as not compared. inputs:
-    recorded names that went in, besides those that begin with `in_`. remade: inputs that the adapter makes too, by
-    the name in `produced`.
-    tolerance: of a quantity whose values are below one; larger values may differ by as much of the largest one.
-    tolerances: of single quantities. absolute: quantities whose tolerance is the same for larger values.
-    valid: per quantity a mask over its leading axes behind the first, where only some positions mean anything.
+    Attributes:
+        produced: How each is made, by name; a recorded one that is missing here is listed as not compared. inputs:
+            recorded names that went in, besides those that begin with `in_`.
+        tolerance: Of a quantity whose values are below one; larger values may differ by as much of the largest
+            one.
+        remade: Inputs that the adapter makes too, by the name in `produced`.
+        tolerances: Of single quantities.
+        absolute: Quantities whose tolerance is the same for larger values.
+        valid: Per quantity a mask over its leading axes behind the first, where only some positions mean anything.
     """
 
     produced: Mapping[str, Produce]
@@ -76,8 +79,12 @@ def watch[Result](
 ) -> tuple[Result, ActivationCache, dict[str, list[Any]]]:
     """Run an inference and capture `compared_sites` and the calls of modules.
 
-    modules: those whose outputs are listed. entered: those whose positional inputs and keywords are listed.
-    Returns what `run` returns, the activations, and the lists by the name of the module.
+    Args:
+        modules: Those whose outputs are listed.
+        entered: Those whose positional inputs and keywords are listed.
+
+    Returns:
+        What `run` returns, the activations, and the lists by the name of the module.
     """
     with ExitStack() as stack:
         calls = {name: outputs_of(module, stack) for name, module in (modules or {}).items()}
@@ -118,8 +125,11 @@ def stacked(activations: ActivationCache, stream: Stream, quantity: str = "resid
 def generation_outputs(model: Any, stream: str, activations: ActivationCache, decoded: Any) -> dict[str, Produce]:
     """Return the quantities of a decoder whose prompt and output tokens are two streams of one stack.
 
-    stream: of the output tokens. activations: with `compared_sites`. decoded: ids (B, N) and logits (B, N, V).
-    States are laid out as transformers counts them: the stream at every block, and normed at the end.
+    Args:
+        stream: Of the output tokens.
+        activations: With `compared_sites`.
+        decoded: Ids (B, N) and logits (B, N, V). States are laid out as transformers counts them: the stream at
+            every block, and normed at the end.
     """
 
     def column(name: str, iteration: int | None) -> Tensor:

@@ -110,7 +110,8 @@ def get_family(name: str) -> Family | None:
 def find_family(name: str, suggestions: tuple[str, ...] = ()) -> Family:
     """The family called `name`. suggestions: further names to suggest if there is none.
 
-    Raises UnknownModelError if there is none, or if it cannot be loaded.
+    Raises:
+        UnknownModelError: If there is none, or if it cannot be loaded.
     """
     if (family := _get(name)) is not None:
         return family
@@ -156,8 +157,10 @@ def load_model(
 ) -> "Model":
     """Load the model `name`, from `checkpoint` (folder or hub id) or the family's default.
 
-    options: what only some families have, such as `unnorm_key`; see `Family.options`.
     Raises UnknownModelError, UsageError, CheckpointError or WeightsError.
+
+    Args:
+        **options: What only some families have, such as `unnorm_key`; see `Family.options`.
     """
     return find_family(name).load(checkpoint, device, dtype, random_weights, options, weights_seed)
 

@@ -97,8 +97,11 @@ def _largest_error(ours: NDArray[Any], theirs: NDArray[Any], valid: NDArray[np.b
 def verify_reference(family: str, folder: Path) -> Verification:
     """Compare an adapter with `folder/reference.npz`, on the model in `folder/checkpoint`.
 
-    Raises UnknownModelError, UsageError for a folder without a reference or a family that compares nothing, and
-    whatever checking and loading raise.
+    Raises:
+        UnknownModelError: For a folder without a reference or a family that compares nothing, and whatever
+            checking and loading raise.
+        UsageError: For a folder without a reference or a family that compares nothing, and whatever checking and
+            loading raise.
     """
     declared, file = find_family(family), folder / REFERENCE_FILE
     if not file.is_file():
@@ -129,10 +132,11 @@ def _read_arrays(file: Path) -> dict[str, NDArray[Any]]:
 def verify_keys(family: str, file: Path) -> Verification:
     """Build the full-size model on the meta device and compare names, shapes and dtypes with a recorded list.
 
-    file: JSON, or gzipped JSON, with `keys`: {name: {"shape": [...], "dtype": "float32"}}, under the network's
-    names or those of released files. Keys that the family declares as `unstored` may be recorded; they are listed
-    as not compared. A name that stands for another one's tensor, such as tied output weights, may be absent. Of
-    several released sizes the one that the list differs least from is meant.
+    Args:
+        file: JSON, or gzipped JSON, with `keys`: {name: {"shape": [...], "dtype": "float32"}}, under the network's
+            names or those of released files. Keys that the family declares as `unstored` may be recorded; they are
+            listed as not compared. A name that stands for another one's tensor, such as tied output weights, may
+            be absent. Of several released sizes the one that the list differs least from is meant.
     """
     declared = find_family(family)
     declared.check_purpose("full_size")

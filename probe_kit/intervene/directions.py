@@ -53,10 +53,12 @@ EVERY_EPISODE = ""
 class Directions:
     """Directions of one site and role by name, each found without the episode that it is used on.
 
-    bases: by name and episode, (K, D) float32, orthonormal. halves: by episode, (K,) or (T, K), half the
-    differences of the class means along those that were asked for, of a mean over tokens or of the role's T
-    positions. vectors: by name (D,), of a file: the step in place of a half difference. control_names: of the
-    random ones beside the one that was asked for.
+    Attributes:
+        bases: By name and episode, (K, D) float32, orthonormal.
+        halves: By episode, (K,) or (T, K), half the differences of the class means along those that were asked
+            for, of a mean over tokens or of the role's T positions.
+        control_names: Of the random ones beside the one that was asked for.
+        vectors: By name (D,), of a file: the step in place of a half difference.
     """
 
     bases: Mapping[tuple[str, str], Vector]
@@ -109,12 +111,20 @@ def fit_directions_in_cells(
     """Return the meaning of a direction in every cell: of the run's columns, or of all its tokens.
 
     `mean-difference:K`: the K directions along which the differences of class means at all positions lie most, the
-    same for every token; from one clean inference per episode and place. patterns: the places as they were named;
-    those of a wildcard may be left out. direction: its name, see `check_direction`. controls: how many random ones
-    beside it. seed: of controls and folds. categories: of the run, None for all. vector: the direction of a file;
-    None for one that is found here. Raises UnknownSiteError for a place of several sites or one that is not
-    stored, NoDirectionError for a named place without a direction, UsageError where there are too few episodes to
-    learn from.
+    same for every token; from one clean inference per episode and place.
+
+    Args:
+        patterns: The places as they were named; those of a wildcard may be left out.
+        direction: Its name, see `check_direction`.
+        controls: How many random ones beside it.
+        seed: Of controls and folds.
+        categories: Of the run, None for all.
+        vector: The direction of a file; None for one that is found here.
+
+    Raises:
+        UnknownSiteError: For a place of several sites or one that is not stored.
+        NoDirectionError: For a named place without a direction.
+        UsageError: Where there are too few episodes to learn from.
     """
     if vector is not None:
         return {cell: _of_file(session, cell, vector, controls, seed) for cell in cells}
@@ -216,8 +226,10 @@ def fit_pooled_directions(
 ) -> Directions:
     """Directions of these categories, by default of all, from the pooled tokens of `role` at `site`.
 
-    Raises UsageError for an unknown direction, NoDirectionError for equal class means, UnknownSiteError for a site
-    or view that is not stored.
+    Raises:
+        UsageError: For an unknown direction.
+        NoDirectionError: For equal class means.
+        UnknownSiteError: For a site or view that is not stored.
     """
     if direction not in DIRECTIONS:
         raise UsageError(f"unknown direction {direction!r}; expected one of {', '.join(DIRECTIONS)}")
@@ -293,8 +305,11 @@ _Row = tuple[Pair, NDArray[np.float64]]
 class TokenFeatures:
     """The tokens of one category in one cell, of N episodes.
 
-    episodes, groups: (N,). is_left: (N,) whether the correct picture lies left. tokens: at position t the role's
-    t-th token, see `erasers.PaddedTokens`.
+    Attributes:
+        episodes: (N,).
+        groups: As `episodes`.
+        is_left: (N,) whether the correct picture lies left.
+        tokens: At position t the role's t-th token, see `erasers.PaddedTokens`.
     """
 
     episodes: tuple[str, ...]
@@ -308,8 +323,12 @@ def collect_token_features(
 ) -> Iterator[tuple[Cell, str, TokenFeatures]]:
     """Yield cell, category and the tokens there, from one clean inference per episode and place.
 
-    items: by id, all of their episodes. What is held at a time is of one place and category: 8 bytes per number,
-    episodes × tokens × width. Raises UnknownSiteError for a place of several sites.
+    Args:
+        items: By id, all of their episodes. What is held at a time is of one place and category: 8 bytes per
+            number, episodes × tokens × width.
+
+    Raises:
+        UnknownSiteError: For a place of several sites.
     """
     by_place: dict[SiteGroup, list[Cell]] = {}
     for cell in cells:

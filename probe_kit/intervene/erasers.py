@@ -85,10 +85,13 @@ class PaddedTokens:
 class Eraser:
     """x becomes x − Σ_k removed_k (read_k · (x − mean)), at every position of its own.
 
-    means: (T, D). removed, read: (T, K, D) or, the same for all positions, (1, K, D). fitted: (T,) positions at
-    which there was enough to learn from and a direction to find; the others are left as they are.
-    In float64: rounding to fewer digits leaves traces of the answer in a plane that is otherwise empty, where
-    ordinary least squares find it.
+    Attributes:
+        means: (T, D).
+        removed: (T, K, D) or, the same for all positions, (1, K, D).
+        read: As `removed`.
+        fitted: (T,) positions at which there was enough to learn from and a direction to find; the others are left
+            as they are. In float64: rounding to fewer digits leaves traces of the answer in a plane that is
+            otherwise empty, where ordinary least squares find it.
     """
 
     means: Array
@@ -111,8 +114,10 @@ class Eraser:
 def fit_eraser(tokens: PaddedTokens, is_left: NDArray[np.bool_], method: Method) -> Eraser:
     """Return the eraser of the answer from such tokens. is_left: (N,) the answer.
 
-    Raises NoDirectionError if no position has a direction, and UsageError if none has episodes enough of either
-    answer, or if there are fewer directions than the method's name says.
+    Raises:
+        NoDirectionError: If no position has a direction.
+        UsageError: If none has episodes enough of either answer, or if there are fewer directions than the
+            method's name says.
     """
     _check(tokens, is_left)
     centred, means = tokens.centred()
@@ -137,8 +142,10 @@ def fit_control(
 ) -> Eraser:
     """Return an eraser of no answer: as many random directions of the data's covariance, orthogonal to `eraser`.
 
-    For `leace` a label drawn at random, uncorrelated with the answer, is erased in the same way. Raises UsageError
-    if orthogonal to `eraser` no room is left for as many.
+    For `leace` a label drawn at random, uncorrelated with the answer, is erased in the same way.
+
+    Raises:
+        UsageError: If orthogonal to `eraser` no room is left for as many.
     """
     _check(tokens, is_left)
     centred, means = tokens.centred()
@@ -188,9 +195,12 @@ def ledoit_wolf(centred: Array) -> float:
 def leace_direction(centred: Array, label: Array, shrinkage: float | None = None) -> tuple[Array, Array]:
     """Return what LEACE removes of one label, and what it reads it by, both (D,): P = removed · readᵀ.
 
-    centred: (N, D). label: (N,), its mean 0. P = Σ_xz (Σ_xzᵀ Σ⁻¹ Σ_xz)⁻¹ Σ_xzᵀ Σ⁻¹ of the covariances: whatever
-    the shrinkage, nothing correlated with the label is left in the data it was fitted on; without any, no other
-    affine map that achieves this changes the data less. shrinkage: None for `ledoit_wolf`.
+    Args:
+        centred: (N, D).
+        label: (N,), its mean 0. P = Σ_xz (Σ_xzᵀ Σ⁻¹ Σ_xz)⁻¹ Σ_xzᵀ Σ⁻¹ of the covariances: whatever the shrinkage,
+            nothing correlated with the label is left in the data it was fitted on; without any, no other affine
+            map that achieves this changes the data less.
+        shrinkage: None for `ledoit_wolf`.
     """
     amount = ledoit_wolf(centred) if shrinkage is None else shrinkage
     count, width = centred.shape
@@ -288,7 +298,8 @@ def half_differences(tokens: PaddedTokens, is_left: NDArray[np.bool_], eraser: E
 def _shared(differences: Array, rank: int, size: float) -> Array:
     """(1, K, D): the directions along which differences (T, D) of positions lie most, the same for every token.
 
-    size: of the largest number whose differences these are.
+    Args:
+        size: Of the largest number whose differences these are.
     """
     _, values, axes = np.linalg.svd(differences, full_matrices=False)
     directions = axes[: min(rank, int((values > _TINY * max(values[0], size)).sum()))]

@@ -50,7 +50,8 @@ if TYPE_CHECKING:
 class StoredEvidence:
     """All that a run's stored interventions say of the answer, by category; each part is computed once.
 
-    classified: image swaps that count whatever else is stored of their categories. Raises RunDamagedError.
+    Attributes:
+        classified: Image swaps that count whatever else is stored of their categories. Raises RunDamagedError.
     """
 
     run: RunReader
@@ -138,8 +139,10 @@ def tie_at_site(
     Weights of a probe point away from what else varies, and may carry nothing of a copy that is read. That it is
     another code is said only where a direction of the class means carries nothing either.
 
-    layer: the same place at every role. A role that carries nothing alone can be one of several parts that decide
-    together. It is unread if all tokens of the layer carry nothing either, or another role carries the effect.
+    Args:
+        layer: The same place at every role. A role that carries nothing alone can be one of several parts that
+            decide together. It is unread if all tokens of the layer carry nothing either, or another role carries
+            the effect.
     """
     if any(map(_is_read_along, along)):
         return "read"
@@ -176,8 +179,9 @@ def _tie(rows: Sequence[PatchEffect], along: Sequence[PatchEffect], site: str, r
 def describe_tie(sites: Sites, is_joint: bool = False) -> str:
     """The tie of all sites together, in words; empty if that was not tested at enough of them.
 
-    is_joint: whether joint places found that the answer is read at several places together. What carries nothing
-    alone can then be one of them.
+    Args:
+        is_joint: Whether joint places found that the answer is read at several places together. What carries
+            nothing alone can then be one of them.
     """
     at = {
         tie: [f"{site} {role}" for (site, role), site_tie in sites.items() if site_tie == tie]
@@ -202,7 +206,8 @@ def stored_ties(
     So are sites at which a direction of the same means carries the effect: it is read out of other episodes. The
     first layer counts only where a direction was patched, because its tokens carry the effect by construction.
 
-    view: None for the first that was probed. Empty without probes, and for views that are no mean over a role.
+    Args:
+        view: None for the first that was probed. Empty without probes, and for views that are no mean over a role.
     """
     if results is None or (role := role_of_view(view or results.settings.views[0])) is None:
         return {}
@@ -248,8 +253,9 @@ def which_layer(
 
     The later parts say where it is read, and whether the probes' best site is read.
 
-    results: the newest probes, None without any. Of stored interchanges and joint places; what was not tested is
-    named with the command that tests it.
+    Args:
+        results: The newest probes, None without any. Of stored interchanges and joint places; what was not tested
+            is named with the command that tests it.
     """
     family = get_family(evidence.run.model)
     has_kv = family is not None and family.interventions.supports("kv")

@@ -91,8 +91,11 @@ def finding_of_cell(alone: SwapShare | None, needed: SwapShare | None, every: Sw
 class CellReading(NamedTuple):
     """One of several cells that are read in parallel.
 
-    alone: share with this cell alone patched; needed: what all cells lose without it. p, p_fwe: that it moves the
-    output alone, p_fwe against all cells.
+    Attributes:
+        alone: Share with this cell alone patched.
+        needed: What all cells lose without it.
+        p: That it moves the output alone, p_fwe against all cells.
+        p_fwe: As `p`.
     """
 
     alone: SwapShare | None
@@ -106,8 +109,14 @@ class CellReading(NamedTuple):
 class Exchange:
     """The outputs of E clean inferences and of their sources.
 
-    clean, source: (E,) numbers such as metres to the left. toward: (E,) ±1, where the source should move them.
-    groups, items: (E,). seed_text: groups are drawn with a seed made of it. flips_seed: of sign flips.
+    Attributes:
+        clean: (E,) numbers such as metres to the left.
+        source: As `clean`.
+        toward: (E,) ±1, where the source should move them.
+        groups: (E,).
+        items: As `groups`.
+        seed_text: Groups are drawn with a seed made of it.
+        flips_seed: Of sign flips.
     """
 
     clean: Values
@@ -162,8 +171,10 @@ class Exchange:
     def readings(self, every: Values, alone: Values, lost: Values) -> Iterator[CellReading]:
         """Yield what C cells do.
 
-        every: (E,) how far all cells together move the output. alone: (C, E) how far each does. lost: (C, E) what
-        all of them lose without it.
+        Args:
+            every: (E,) how far all cells together move the output.
+            alone: (C, E) how far each does.
+            lost: (C, E) what all of them lose without it.
         """
         share_of_every = self.share(every)
         _, p, p_fwe = self.test(alone)

@@ -21,9 +21,10 @@ COMMON = frozenset(
 class ListedIntervention:
     """One stored intervention.
 
-    state: `used` by verdicts, tables and figures, or of a kind that none of them reads; `other` if others say all
-    that it says, of more episodes or newly; `other episodes` if the run has others by now. parameters: the
-    settings of its kind alone, as stored.
+    Attributes:
+        state: `used` by verdicts, tables and figures, or of a kind that none of them reads; `other` if others say
+            all that it says, of more episodes or newly; `other episodes` if the run has others by now.
+        parameters: The settings of its kind alone, as stored.
     """
 
     key: str

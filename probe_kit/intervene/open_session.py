@@ -91,11 +91,18 @@ def open_session(
 ) -> ReplaySession:
     """Load the run's policy and set up its observations.
 
-    load: how the policy is found, if not by its name. choice: of pairs of a run without sides. table: pairs of the
-    user's own, by default those of the choice; the frames that it names are looked up before the policy is loaded.
-    Raises SettingsMismatchError if it is another one, SuiteError for another suite, SuiteNotFoundError for one
-    that is neither given nor can be drawn again, SceneError for a scene that needs a file which is not given,
-    UsageError for a table with a frame that the run lacks.
+    Args:
+        load: How the policy is found, if not by its name.
+        choice: Of pairs of a run without sides.
+        table: Pairs of the user's own, by default those of the choice; the frames that it names are looked up
+            before the policy is loaded.
+
+    Raises:
+        SettingsMismatchError: If it is another one.
+        SuiteError: For another suite.
+        SuiteNotFoundError: For one that is neither given nor can be drawn again.
+        SceneError: For a scene that needs a file which is not given.
+        UsageError: For a table with a frame that the run lacks.
     """
 
     def policy() -> "Policy":
@@ -124,10 +131,13 @@ def find_pairs(session: ReplaySession, category: str, items: int | None = None) 
     """Return the inferences of a category's episodes in a run, each paired with its source's.
 
     In the scene these are first inferences, and those before swapped images; the metric that fits is
-    `session.lateral_displacement`: metres, left positive. items: how many items, both layouts of each; None for
-    all. Every clean inference is repeated and compared with the action that the run executed. Raises
-    UnknownCategoryError for a category that the run does not have, OtherFramesError and CaptureChangedActionError
-    for pictures or actions that are not those of the run.
+    `session.lateral_displacement`: metres, left positive.
+
+    Args:
+        items: How many items, both layouts of each; None for all. Every clean inference is repeated and compared
+            with the action that the run executed. Raises UnknownCategoryError for a category that the run does not
+            have, OtherFramesError and CaptureChangedActionError for pictures or actions that are not those of the
+            run.
     """
     pairs = []
     for item in items_of(session.run, (category,), items):

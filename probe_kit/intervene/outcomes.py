@@ -60,8 +60,10 @@ def spread_of(clean: NDArray[np.float32]) -> Array:
 def directions_of(clean: Array, source: Array, weights: Array) -> tuple[Array, Array]:
     """Return (E, N) the directions that displacements are read along, and (E,) the sources' own displacements.
 
-    clean, source: (E, N). A displacement of x is (x − clean) · direction: its component toward the source, in root
-    mean squares of spreads. Zero where the source changes nothing.
+    Args:
+        clean: (E, N). A displacement of x is (x − clean) · direction: its component toward the source, in root
+            mean squares of spreads. Zero where the source changes nothing.
+        source: As `clean`.
     """
     apart = source - clean
     count = max(int((weights > 0).sum()), 1)
@@ -96,19 +98,30 @@ UNSTORED = ("seed_text", "chunks", "mass", "inferences", "patches")
 class ConditionOutcomes:
     """The numbers of K conditions in E episodes of a run.
 
-    conditions: names of the K, the clean one first. episodes, items, groups, categories, sides: (E,), `sides`
-    those of the correct picture. displacement: (K, E) metres from the middle, left positive; without sides toward
-    the source's action. max_action_change: (K, E) largest difference of any action from the clean one's. edit_log:
-    (K, E, 5), see `LOG_FIELDS`. replay_error: (E,) of the clean inference from the stored one; NaN where the run
-    does not say. episode_outcomes: (K, E) where the cube ended, correct, wrong or oob, for episodes that were
-    played to their end; then `displacement` is the cube's, and `max_action_change` and `replay_error` are of the
-    trajectory; None where nothing was executed. toward, size: (K, E) displacement toward the source's action and
-    size of the change, in spreads of clean actions; None where whole episodes were played. seed_text: of the run,
-    by which random draws are made.
+    While an intervention is made:
 
-    While an intervention is made: chunks: (K, E, N) all numbers of the actions of first inferences. mass: (N, B,
-    I, H, R) the attention of N inferences, inferences: (N, 2) their rows in the run's episodes and their calls;
-    None where attention was not recorded. patches: (N, B, P) of single patches; None where they are not known.
+    Attributes:
+        conditions: Names of the K, the clean one first.
+        episodes: (E,), `sides` those of the correct picture.
+        items: As `episodes`.
+        groups: As `episodes`.
+        categories: As `episodes`.
+        sides: As `episodes`.
+        displacement: (K, E) metres from the middle, left positive; without sides toward the source's action.
+        max_action_change: (K, E) largest difference of any action from the clean one's. edit_log: (K, E, 5), see
+            `LOG_FIELDS`.
+        replay_error: (E,) of the clean inference from the stored one; NaN where the run does not say.
+        episode_outcomes: (K, E) where the cube ended, correct, wrong or oob, for episodes that were played to
+            their end; then `displacement` is the cube's, and `max_action_change` and `replay_error` are of the
+            trajectory; None where nothing was executed.
+        toward: (K, E) displacement toward the source's action and size of the change, in spreads of clean actions;
+            None where whole episodes were played.
+        size: As `toward`.
+        seed_text: Of the run, by which random draws are made.
+        chunks: (K, E, N) all numbers of the actions of first inferences.
+        mass: (N, B, I, H, R) the attention of N inferences, inferences: (N, 2) their rows in the run's episodes
+            and their calls; None where attention was not recorded.
+        patches: (N, B, P) of single patches; None where they are not known.
     """
 
     conditions: tuple[str, ...]

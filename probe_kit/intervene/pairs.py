@@ -27,16 +27,24 @@ Chunk = NDArray[np.float32]
 class Pair:
     """Two inferences with the same seed.
 
-    clean: what is patched into. source: what activations are patched from; it must have as many tokens. toward:
-    +1 or −1, the direction of the metric in which the source should move the output. group: the unit that is
-    resampled and flipped, such as a couple of items; item: the unit that is averaged before; both may be empty
-    for pairs that are independent of each other.
+    Pairs of a run have more.
 
-    Pairs of a run have more. row, episode, category: of the run. side: of the correct picture; None without sides.
-    tiles: (H, W) where each tile is seen in the clean picture. stored: (n, D) actions of the clean inference that
-    the run has, None where it does not say. step: which inference of the episode it is, or the recorded frame.
-    donor: of frames without sides, the other frame of which the source has one input. donor_name: of that frame.
-    control: the clean one after a change of that input that means nothing.
+    Attributes:
+        clean: What is patched into.
+        source: What activations are patched from; it must have as many tokens. toward: +1 or −1, the direction of
+            the metric in which the source should move the output.
+        group: The unit that is resampled and flipped, such as a couple of items.
+        item: The unit that is averaged before; both may be empty for pairs that are independent of each other.
+        row: Of the run.
+        episode: As `row`.
+        category: As `row`.
+        side: Of the correct picture; None without sides.
+        donor: Of frames without sides, the other frame of which the source has one input.
+        donor_name: Of that frame.
+        control: The clean one after a change of that input that means nothing.
+        tiles: (H, W) where each tile is seen in the clean picture.
+        stored: (n, D) actions of the clean inference that the run has, None where it does not say.
+        step: Which inference of the episode it is, or the recorded frame.
     """
 
     clean: Given

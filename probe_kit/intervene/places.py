@@ -36,8 +36,10 @@ _PATTERN = re.compile(
 class PlaceName:
     """The parts of a place's name: `backbone.02`, `kv.01.values`, `backbone.02.heads.3`, `expert.03@0-4`.
 
-    quantity: empty where it is not named: the residual stream, of `kv` keys and values. head: of the quantity
-    `heads`. iterations: first and last one; None for all.
+    Attributes:
+        quantity: Empty where it is not named: the residual stream, of `kv` keys and values.
+        head: Of the quantity `heads`.
+        iterations: First and last one; None for all.
     """
 
     stream: str
@@ -83,8 +85,10 @@ class PlaceName:
 def list_places(names: Sequence[str], most: int | None = None) -> str:
     """Places, each with its role if it has one, in words: `backbone.01 to backbone.07 language, kv.02 image`.
 
-    Three or more of one kind in consecutive layers become one range. most: how many places and ranges are named,
-    by default all; the number of others follows.
+    Three or more of one kind in consecutive layers become one range.
+
+    Args:
+        most: How many places and ranges are named, by default all; the number of others follows.
     """
     ranges: list[list[tuple[PlaceName, str]]] = []
     for name in names:
@@ -107,7 +111,8 @@ def list_places(names: Sequence[str], most: int | None = None) -> str:
 class SiteGroup:
     """One quantity of a layer of a stream, over some of its iterations; of `kv` keys and values together.
 
-    head: which of the `heads` heads is meant, of sites of that quantity; None for all of them.
+    Attributes:
+        head: Which of the `heads` heads is meant, of sites of that quantity; None for all of them.
     """
 
     name: str
@@ -152,8 +157,11 @@ def resolve_sites(pattern: str, policy: "Model") -> list[SiteGroup]:
     `backbone.*` every layer, each a place; `backbone.02` one; `expert.03@0-4` a layer over iterations 0 to 4,
     changed at each of them; `expert.03` over all; `kv.02` what block 2 hands over to the acting stream, keys and
     values together. A quantity may follow the layer: `kv.02.values`, `backbone.02.mlp`, `backbone.02.heads` for
-    all heads of a block, `backbone.02.heads.3` for one, `backbone.*.heads.*` for each. Raises UnknownSiteError,
-    and UnsupportedInterventionError for `kv` of a family that has none.
+    all heads of a block, `backbone.02.heads.3` for one, `backbone.*.heads.*` for each.
+
+    Raises:
+        UnknownSiteError: For `kv` of a family that has none.
+        UnsupportedInterventionError: For `kv` of a family that has none.
     """
     match, streams = _PATTERN.fullmatch(pattern), policy.every_stream()
     if match is not None and match["stream"] == KV_STREAM:
@@ -229,7 +237,9 @@ def unread_places(
 ) -> tuple[str, ...]:
     """Return those of some places that lie at the end of an unread stream: an edit there changes no action.
 
-    streams: of the run or the policy, by name. interventions: declared by the family.
+    Args:
+        streams: Of the run or the policy, by name.
+        interventions: Declared by the family.
     """
     unread = []
     for name in names:

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 class ConditionContext:
     """One pair, with what its conditions share.
 
-    clean: (chunk, D) of the first condition, empty before that was played.
+    Attributes:
+        clean: (chunk, D) of the first condition, empty before that was played.
     """
 
     session: "ReplaySession"
@@ -56,9 +57,10 @@ class ConditionContext:
 class ConditionResult:
     """The actions (chunk, D) of one inference, and the log of its edits, if any.
 
-    mass: (B, I, H, R) the attention shares of it, if recorded; see `AttentionShares`. patches: (B, P) those on the
-    patches of the first camera's picture, means over iterations and heads. estimated: displacement that
-    an estimate adds to the chunk's, without an inference that makes it.
+    Attributes:
+        mass: (B, I, H, R) the attention shares of it, if recorded; see `AttentionShares`.
+        patches: (B, P) those on the patches of the first camera's picture, means over iterations and heads.
+        estimated: Displacement that an estimate adds to the chunk's, without an inference that makes it.
     """
 
     chunk: Chunk
@@ -72,8 +74,10 @@ class ConditionResult:
 class Condition:
     """One way of making an inference again.
 
-    name: tells it from the others of its intervention. places: names of those that it edits, by which it is known
-    whether anything reads them. details: what `Intervention.extra_files` reads of it.
+    Attributes:
+        name: Tells it from the others of its intervention.
+        places: Names of those that it edits, by which it is known whether anything reads them.
+        details: What `Intervention.extra_files` reads of it.
     """
 
     name: str
@@ -112,9 +116,10 @@ def patched_run(
 ) -> Condition:
     """Return the clean inference with activations of cells from the source's: one inference, however many cells.
 
-    cells: by category, and for all other categories under the empty name. source_sites: all sites at which the
-    source's inference is captured, once for all conditions. direction: the name of one of `bases`, empty to patch
-    tokens in full.
+    Args:
+        cells: By category, and for all other categories under the empty name.
+        source_sites: All sites at which the source's inference is captured, once for all conditions.
+        direction: The name of one of `bases`, empty to patch tokens in full.
     """
 
     def play(context: ConditionContext) -> ConditionResult:

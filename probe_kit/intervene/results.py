@@ -156,8 +156,9 @@ class InterventionResult(Measurement):
     def to_rich(self, details: bool = True) -> "Table":
         """The table for a terminal.
 
-        details: split it where it is wide, and say below it what each verdict rests on; else leave columns out by
-        name.
+        Args:
+            details: Split it where it is wide, and say below it what each verdict rests on; else leave columns out
+                by name.
         """
         table = self._kind.table(self.effects, self)
         if not details:
@@ -184,7 +185,9 @@ class InterventionResult(Measurement):
     def verdicts(self) -> dict[str, UseVerdict]:
         """The verdicts by category, from this and what else is stored when they are first asked for.
 
-        Empty without sides. Raises RunDamagedError.
+        Empty without sides.
+
+        Raises RunDamagedError.
         """
         if self.lacks_sides:
             return {}
@@ -208,7 +211,10 @@ class InterventionResult(Measurement):
 def load_effects(run: RunReader, key: str | None = None, kind: str | None = None) -> InterventionResult:
     """The stored intervention whose key begins with `key`, or the newest (of `kind`).
 
-    Raises NoInterventionsError, UsageError for a key that is not there, RunDamagedError if it was changed.
+    Raises:
+        NoInterventionsError: For a key that is not there.
+        UsageError: For a key that is not there.
+        RunDamagedError: If it was changed.
     """
     result = InterventionResult.of_stored(find_stored(run, key, kind))
     _ = result.outcomes, result.certificate  # read now, so that a changed file is refused here and not in a table
@@ -239,7 +245,10 @@ def save(
 ) -> str:
     """Write `interventions/<key>/`, all or nothing; what is there is kept. Return the key.
 
-    The effects are stored without verdicts, which later probes may change. extra_files: by name.
+    The effects are stored without verdicts, which later probes may change.
+
+    Args:
+        extra_files: By name.
     """
     key = key_of(settings)
     if is_stored(run.location, key):

@@ -43,8 +43,10 @@ def play_episodes(
     """Play every episode under every condition; the first one changes nothing and repeats the run.
 
     `max_action_change` is the largest difference of any number of the trajectory from the first condition's,
-    `replay_error` that of the first condition's from the stored one's. Raises CaptureChangedActionError if an
-    outcome is not the stored one.
+    `replay_error` that of the first condition's from the stored one's.
+
+    Raises:
+        CaptureChangedActionError: If an outcome is not the stored one.
     """
     assert isinstance(session, SceneSession), "only the scene is played again; other runs are refused before"
     ends = np.zeros((len(conditions), len(pairs)), "U7")
@@ -64,7 +66,8 @@ def play_episodes(
 def roll_out(session: SceneSession, pair: Pair, condition: Condition, swapping: bool = True) -> RolloutResult:
     """Play one episode under a condition that is in force at every inference.
 
-    swapping: whether the condition looks at swapped images; they are then drawn at every inference.
+    Args:
+        swapping: Whether the condition looks at swapped images; they are then drawn at every inference.
     """
     edit_logs: list[EditLog] = []
 
@@ -83,7 +86,10 @@ def evaluate_per_step(
     """Evaluate every condition along every episode; the first one, which edits nothing, is executed.
 
     `displacement` is where the hand began plus what the actions of all calls would add laterally, in metres from
-    the middle, left positive. Raises CaptureChangedActionError if an outcome is not the stored one.
+    the middle, left positive.
+
+    Raises:
+        CaptureChangedActionError: If an outcome is not the stored one.
     """
     assert isinstance(session, SceneSession), "only the scene is played again; other runs are refused before"
     outcomes = room_for(pairs, conditions)
@@ -160,7 +166,8 @@ def executed(session: SceneSession, past: Sequence[Chunk]) -> Chunk:
 def apart_from_stored(session: SceneSession, pair: Pair, clean: RolloutResult) -> float:
     """Return by how much the episode differs from the stored one; NaN where the run keeps no trajectory.
 
-    Raises CaptureChangedActionError for another outcome.
+    Raises:
+        CaptureChangedActionError: For another outcome.
     """
     stored = str(session.run.episodes.iloc[pair.row]["outcome"])
     if stored != clean.outcome:

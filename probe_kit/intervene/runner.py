@@ -45,12 +45,18 @@ def run_intervention(
 ) -> InterventionResult:
     """Intervene on a run's policy and store the result with the run; a stored result is loaded.
 
-    intervention: `ImageSwap()` by default. source: where policy and pictures are, by default the embedded suite
-    and the model's own checkpoint. load: how the policy is found, if not by its name. progress: called after every
-    item replayed; on_fit_progress: after every item inferred before that, where directions or erasers are fitted.
-    on_note: called before the replay with a sentence about edits that cannot change anything; `notes` has it too.
-    What was interrupted is continued. Raises UsageError for a run whose policy did not act, UnknownCategoryError,
-    and what `open_session` raises.
+    Args:
+        intervention: `ImageSwap()` by default.
+        source: Where policy and pictures are, by default the embedded suite and the model's own checkpoint.
+        load: How the policy is found, if not by its name.
+        progress: Called after every item replayed.
+        on_fit_progress: After every item inferred before that, where directions or erasers are fitted.
+        on_note: Called before the replay with a sentence about edits that cannot change anything; `notes` has it
+            too. What was interrupted is continued.
+
+    Raises:
+        UsageError: For a run whose policy did not act.
+        UnknownCategoryError: And what `open_session` raises.
     """
     intervention = intervention or ImageSwap()
     check_intervention(run, intervention)
@@ -178,7 +184,8 @@ def _replay_check(outcomes: ConditionOutcomes) -> dict[str, Any]:
 def _ledgers(outcomes: ConditionOutcomes) -> dict[str, dict[str, float]]:
     """Per condition that changed streams: fires, fires that moved nothing, and norms as means over fires.
 
-    Raises CaptureChangedActionError if coefficient 0 changed an action.
+    Raises:
+        CaptureChangedActionError: If coefficient 0 changed an action.
     """
     ledgers = {}
     for number, name in enumerate(outcomes.conditions):

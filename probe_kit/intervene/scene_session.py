@@ -38,7 +38,8 @@ _OTHER: Mapping[Layout, Layout] = {"original": "swapped", "swapped": "original"}
 class SceneSession(ReplaySession):
     """A policy and a scene.
 
-    items: of the run's suite, by id. counterparts: of those that have one, see `counterparts_of`.
+    Args:
+        items: Of the run's suite, by id. counterparts: of those that have one, see `counterparts_of`.
     """
 
     def __init__(self, run: Run, policy: "Policy", scene: SceneSpec, items: Mapping[str, Item]) -> None:
@@ -67,7 +68,8 @@ class SceneSession(ReplaySession):
     def pairs(self, item: str) -> list[Pair]:
         """Return the first inferences of an item's episodes, each with that of the other layout.
 
-        Raises OtherFramesError if a frame is not the one that the run began with.
+        Raises:
+            OtherFramesError: If a frame is not the one that the run began with.
         """
         episodes = self.run.episodes
         rows = np.flatnonzero((episodes["item_id"] == item).to_numpy())

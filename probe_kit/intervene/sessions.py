@@ -48,11 +48,16 @@ class Progress(Protocol):
 class ReplaySource:
     """The places of a run's policy, pictures and files; their hashes must be the run's.
 
-    suite: folder; None for that of the run, see `suite_of`. checkpoint, options, weights_seed: as for
-    `probe-kit extract`; by default those of the run, of a checkpoint its folder if it is still there. Options of
-    the run stay but for those that are named anew. device: of the model. moved: parts of the run's source that lie
-    elsewhere now, by field of its settings: `folder` and `table` of recordings and pictures, `environment` (and
-    `options`, beside those of the run), `scene.background`, `scene.arm_urdf`; by default where the run had them.
+    Attributes:
+        suite: Folder; None for that of the run, see `suite_of`.
+        checkpoint: As for `probe-kit extract`; by default those of the run, of a checkpoint its folder if it is
+            still there. Options of the run stay but for those that are named anew.
+        options: As `checkpoint`.
+        weights_seed: As `checkpoint`.
+        device: Of the model.
+        moved: Parts of the run's source that lie elsewhere now, by field of its settings: `folder` and `table` of
+            recordings and pictures, `environment` (and `options`, beside those of the run), `scene.background`,
+            `scene.arm_urdf`; by default where the run had them.
     """
 
     suite: Path | None = None
@@ -132,7 +137,8 @@ class ReplaySession(ABC):
     def replay_error(self, pair: Pair, chunk: Chunk) -> float:
         """Return by how much a clean inference differs from the stored actions; NaN where there are none.
 
-        Raises CaptureChangedActionError if it is another action altogether.
+        Raises:
+            CaptureChangedActionError: If it is another action altogether.
         """
         if pair.stored is None:
             return nan

@@ -21,8 +21,12 @@ PER_STEP: Readout = "per-step"
 class Choice:
     """The part of a run that an intervention is made on, as settings; see `kinds.base.Intervention`.
 
-    Fields are those of every intervention. kind, usual_vary: of the class. Apart from `Intervention`, because
-    sessions read it and interventions are built on sessions.
+    Fields are those of every intervention.
+
+    Attributes:
+        kind: Of the class. Apart from `Intervention`, because sessions read it and interventions are built on
+            sessions.
+        usual_vary: As `kind`.
     """
 
     kind: ClassVar[str]

@@ -47,8 +47,12 @@ TILES_APART = 0.31
 class Measurement:
     """One intervention of a run, stored or about to be: what effects, their table and their sentences are made of.
 
-    settings: what decided its numbers, see `settings_of`. read: a stored file by its name; raises RunDamagedError
-    if it was changed. files: their names. key: of its folder. created: ISO time (UTC), empty before it is stored.
+    Attributes:
+        settings: What decided its numbers, see `settings_of`.
+        read: A stored file by its name; raises RunDamagedError if it was changed.
+        files: Their names.
+        key: Of its folder.
+        created: ISO time (UTC), empty before it is stored.
     """
 
     run: RunReader = field(repr=False)
@@ -83,7 +87,8 @@ class Measurement:
     def outcomes(self) -> ConditionOutcomes:
         """The numbers of its conditions.
 
-        Raises RunDamagedError if they were changed, or have the names of another version of probe_kit.
+        Raises:
+            RunDamagedError: If they were changed, or have the names of another version of probe_kit.
         """
         stored = arrays_from_bytes(self.read(EPISODES))
         if problem := fields_problem(ConditionOutcomes, stored):
@@ -168,8 +173,11 @@ def read_interventions(run: Location) -> dict[str, Bundle]:
 def stored_interventions(run: RunReader, kind: str | None = None) -> list[Measurement]:
     """Return those of the episodes that the run has now, in the wording it is in, oldest first.
 
-    kind: only these. Raises RunDamagedError if any of the run was changed, lost its settings or has another
-    format.
+    Args:
+        kind: Only these.
+
+    Raises:
+        RunDamagedError: If any of the run was changed, lost its settings or has another format.
     """
     required = {
         "stamp": run.stamp, "run_settings": run.settings_sha256,
@@ -186,7 +194,9 @@ def stored_interventions(run: RunReader, kind: str | None = None) -> list[Measur
 def find_stored(run: RunReader, key: str | None = None, kind: str | None = None) -> Measurement:
     """The one whose key begins with `key`, or the newest of `kind`.
 
-    Raises NoInterventionsError if there is none, UsageError for a key that is not there or not the only one.
+    Raises:
+        NoInterventionsError: If there is none.
+        UsageError: For a key that is not there or not the only one.
     """
     candidates = stored_interventions(run, kind)
     if key is None:
@@ -223,7 +233,9 @@ class StoredResult:
 def stored_results(run: RunReader, kind: str) -> list[StoredResult]:
     """Return results by category as the run has them; of each what says most comes last.
 
-    Of what says as much the newest. Raises RunDamagedError.
+    Of what says as much the newest.
+
+    Raises RunDamagedError.
     """
     order = {name: at for at, name in enumerate(dict.fromkeys(run.episodes["category"].astype(str)))}
     results = []
@@ -245,7 +257,8 @@ def stored_results(run: RunReader, kind: str) -> list[StoredResult]:
 def preferred_by_category(run: RunReader, kind: str, readout: str | None = None) -> dict[str, StoredResult]:
     """Return by category, of all that is stored of a kind, the result that says most. Raises RunDamagedError.
 
-    readout: of those alone; None for any.
+    Args:
+        readout: Of those alone; None for any.
     """
     results = stored_results(run, kind)
     return {result.category: result for result in results if readout in (None, result.stored.readout)}
@@ -255,7 +268,9 @@ def preferred_by_category(run: RunReader, kind: str, readout: str | None = None)
 class PooledConditions:
     """Conditions that several interventions played on the same episodes of one category.
 
-    like: one of them. sources: by condition, of whom it is; without those in which nothing was changed.
+    Attributes:
+        like: One of them.
+        sources: By condition, of whom it is; without those in which nothing was changed.
     """
 
     like: StoredResult
@@ -280,7 +295,9 @@ class PooledConditions:
 def pool_conditions(results: Iterable[StoredResult], setting: Sequence[str] = ()) -> list[PooledConditions]:
     """Pool what was played on the same episodes, with the same actions where nothing was changed.
 
-    results: as `stored_results` orders them. setting: names of settings in which they must agree as well.
+    Args:
+        results: As `stored_results` orders them.
+        setting: Names of settings in which they must agree as well.
     """
     pooled: dict[tuple[object, ...], PooledConditions] = {}
     for result in results:

@@ -78,8 +78,9 @@ class PairTokens:
     def mask(self, stream: str, role: str) -> NDArray[np.bool_]:
         """Return (T,) the tokens of a stream that play `role`.
 
-        Raises EmptyRoleError if none does, UnsupportedInterventionError for a tile and a family that does not say
-        which token sees what.
+        Raises:
+            EmptyRoleError: If none does.
+            UnsupportedInterventionError: For a tile and a family that does not say which token sees what.
         """
         if (stream, role) not in self._masks:
             declared = self.model.role_names.get(self.model.tokens_of(stream), ())
@@ -129,8 +130,10 @@ def tokens_overlapping(
 ) -> NDArray[np.bool_]:
     """Return (tokens of the picture,) which of them come of patches that see any of some pixels (H, W).
 
-    Of the first camera's picture, in which the renderer says where tiles are. before: what `patch_embeddings`
-    gives of `observation`, if it is known.
+    Of the first camera's picture, in which the renderer says where tiles are.
+
+    Args:
+        before: What `patch_embeddings` gives of `observation`, if it is known.
     """
     if not pixels.any():
         return np.zeros(int(policy.patch_order().max()) + 1, bool)

@@ -56,12 +56,16 @@ UNTESTED = "whether the answer is used was not tested"
 class UseVerdict:
     """The verdict: is the answer used, where does it pass, and is what probes read what is used?
 
-    behaviour: of the image swap. reason: the numbers it rests on, or why there is none. reversed: the same, away
-    from the correct picture. side: of a behaviour that is one-sided. where: the answer passes or is
-    read, by interchanges; empty if none was stored. tie: between the readable copy and the behaviour; empty
-    without probes. readout: `first-chunk` or `per-step`, of all of these. lacks_control: whether *not used* is
-    missing nothing but another category of the run that is used. other: the behaviour by the other readout; None
-    if that is not stored.
+    Attributes:
+        behaviour: Of the image swap.
+        reason: The numbers it rests on, or why there is none.
+        reversed: The same, away from the correct picture.
+        side: Of a behaviour that is one-sided.
+        where: The answer passes or is read, by interchanges; empty if none was stored.
+        tie: Between the readable copy and the behaviour; empty without probes.
+        readout: `first-chunk` or `per-step`, of all of these.
+        lacks_control: Whether *not used* is missing nothing but another category of the run that is used.
+        other: The behaviour by the other readout; None if that is not stored.
     """
 
     behaviour: Behaviour
@@ -168,7 +172,9 @@ class UseVerdict:
     def clause(self, answer: str, readout: str = "") -> str:
         """The behaviour by its own readout, with the reason where it is not used.
 
-        answer: how the answer is called. readout: in words; empty for its own.
+        Args:
+            answer: How the answer is called.
+            readout: In words; empty for its own.
         """
         when = readout or _READOUTS[self.readout]
         against = ", against the correct picture" * self.reversed
@@ -247,8 +253,9 @@ class _Numbers(NamedTuple):
 def classify_behaviour(effect: ImageSwapEffect, control: str | None) -> UseVerdict:
     """The verdict of the image swap alone.
 
-    control: another category of the run that is used, which shows that use would have been seen; None if there is
-    none, and then nothing is *not used*.
+    Args:
+        control: Another category of the run that is used, which shows that use would have been seen; None if there
+            is none, and then nothing is *not used*.
     """
     for mirrored in (False, True):  # toward the correct picture, then the same rules against it
         numbers = _Numbers.of(effect, mirrored)
@@ -318,7 +325,8 @@ _WOULD_TELL = "groups would tell"
 def size_of_groups(texts: Iterable[str], counts: Iterable[tuple[int, int]]) -> str:
     """Return how many items a group holds where a text says how many groups would tell; else an empty text.
 
-    counts: items and groups of each category. Tables count items, which are what a user adds.
+    Args:
+        counts: Items and groups of each category. Tables count items, which are what a user adds.
     """
     sizes = sorted({round(items / groups, 1) for items, groups in counts if groups})
     if not sizes or not any(_WOULD_TELL in text for text in texts):
@@ -343,10 +351,13 @@ def _ends(limits: tuple[float, float]) -> str:
 class Places:
     """The findings inside the network, in one category.
 
-    located: places that carry half of the effect, see `localised_sites`; None if an interchange did not search for
-    them. carried: places and the directions along which half of it passes there. jointly: what joint places found,
-    in words; they tell the tokens apart where an interchange has those of a block together, and sets of places.
-    remainder: what of it these places leave out, in words.
+    Attributes:
+        located: Places that carry half of the effect, see `localised_sites`; None if an interchange did not search
+            for them.
+        carried: Places and the directions along which half of it passes there.
+        jointly: What joint places found, in words; they tell the tokens apart where an interchange has those of a
+            block together, and sets of places.
+        remainder: What of it these places leave out, in words.
     """
 
     located: tuple[str, ...] | None = None
@@ -374,10 +385,14 @@ def classify_use(
 ) -> UseVerdict:
     """The verdict of the image swap, with what probes and interventions inside the network say of it.
 
-    encoded: whether the answer can be read in the backbone, beyond chance and every control that was run; None
-    without probes. control: see `classify_behaviour`. places: None if nothing was tried inside. tie: see
-    `evidence.describe_tie`; empty if it was not tested. other: the behaviour by the other readout, see
-    `evidence.stored_other_readouts`; None if that is not stored.
+    Args:
+        encoded: Whether the answer can be read in the backbone, beyond chance and every control that was run; None
+            without probes.
+        control: See `classify_behaviour`.
+        places: None if nothing was tried inside.
+        tie: See `evidence.describe_tie`; empty if it was not tested.
+        other: The behaviour by the other readout, see `evidence.stored_other_readouts`; None if that is not
+            stored.
     """
     use = replace(classify_behaviour(effect, control), other=other)
     if all(verdict.behaviour in ("not used", "undecided") for verdict in use.by_readout):
@@ -423,8 +438,12 @@ def classify_all(
 ) -> dict[str, UseVerdict]:
     """Return the verdict of every category that was intervened on.
 
-    encoded, places, ties, other_readouts: by category; one that is not there was not probed, not looked for
-    inside, or measured by one readout alone.
+    Args:
+        encoded: By category; one that is not there was not probed, not looked for inside, or measured by one
+            readout alone.
+        places: As `encoded`.
+        ties: As `encoded`.
+        other_readouts: As `encoded`.
     """
     return {
         name: classify_use(
@@ -442,7 +461,10 @@ def classify_all(
 def encoded_in(results: "ProbeResults | None", view: str | None = None) -> dict[str, bool | None]:
     """Return by category whether the backbone's best site beats chance and every control that was run.
 
-    As `retention` has it. view: None for the first that was probed. Empty without probes.
+    As `retention` has it.
+
+    Args:
+        view: None for the first that was probed. Empty without probes.
     """
     if results is None:
         return {}

@@ -141,9 +141,10 @@ def build_empty[Network: nn.Module](
 ) -> Network:
     """Return the network of `make` in eval mode, with parameters of `dtype`; without memory where sizes suffice.
 
-    device: `meta` for parameters that have names and shapes but no memory, to be filled with
-    `load_weights(…, assign=True)`; `cpu` for uninitialised weights. The rotary frequencies, which no
-    checkpoint holds, are then to be computed, with `fill_decoder_rotary`, for Qwen's with `fill_rotary`.
+    Args:
+        device: `meta` for parameters that have names and shapes but no memory, to be filled with `load_weights(…,
+            assign=True)`; `cpu` for uninitialised weights. The rotary frequencies, which no checkpoint holds, are
+            then to be computed, with `fill_decoder_rotary`, for Qwen's with `fill_rotary`.
     """
     before = torch.get_default_dtype()
     torch.set_default_dtype(dtype)

@@ -35,7 +35,8 @@ PROCESSOR_FILE = "preprocessor_config.json"
 def processor_settings(folder: Path, needed: Sequence[str], optional: Sequence[str] = ()) -> dict[str, Any]:
     """The named values of the file in `folder`; `optional` ones only where they are set.
 
-    Raises CheckpointError if the file is missing, is not JSON or lacks a needed one.
+    Raises:
+        CheckpointError: If the file is missing, is not JSON or lacks a needed one.
     """
     file = folder / PROCESSOR_FILE
     if not file.is_file():
@@ -70,8 +71,15 @@ def load_pretrained(loader: Any, source: Path | str, **options: Any) -> Any:
     """Return `loader.from_pretrained(source, **options)` of a class of transformers.
 
     A configuration can name Python code in its `auto_map`; without `trust_remote_code=False`, transformers asks on
-    the terminal whether to run it. source: a folder or a hub id.
-    Raises CheckpointError where the object needs such code, OSError for missing files, ValueError for others.
+    the terminal whether to run it.
+
+    Args:
+        source: A folder or a hub id.
+
+    Raises:
+        CheckpointError: Where the object needs such code.
+        OSError: For missing files.
+        ValueError: For others.
     """
     try:
         return loader.from_pretrained(str(source), trust_remote_code=False, **options)
@@ -94,7 +102,8 @@ _SHOWN = 40
 def read_statistics(file: Path) -> dict[str, Any]:
     """Per data set `{"action": {"q01": …, "q99": …, "mask": …}}`; in the file `action` may be left out.
 
-    Raises CheckpointError for a file that is missing or holds something else.
+    Raises:
+        CheckpointError: For a file that is missing or holds something else.
     """
     values = read_json_object(file, CheckpointError, "Take the file that fine-tuning wrote")
     entries = values.get("norm_stats", values)
@@ -109,8 +118,13 @@ def stored_statistics(
     """The statistics that count for a checkpoint, and the name of their source, for messages.
 
     `dataset_statistics.json` of the first folder that has one stands alone: fine-tuning wrote it, and a
-    configuration still lists the data sets of the base. otherwise: those that count without the file, and `source`
-    where they stand. Raises CheckpointError for a file that cannot be read.
+    configuration still lists the data sets of the base.
+
+    Args:
+        otherwise: Those that count without the file, and `source` where they stand.
+
+    Raises:
+        CheckpointError: For a file that cannot be read.
     """
     for folder in folders:
         if (file := folder / STATISTICS_FILE).is_file():
@@ -121,8 +135,13 @@ def stored_statistics(
 def chosen_name(available: Collection[str], requested: str | None, option: str, source: str) -> str:
     """The data set, or robot, whose statistics are used: as chosen, or the only one.
 
-    option: of `-M`, for messages. source: the file that holds them. Raises UsageError for a name that is not
-    there, and for several without a choice: no file says whose units the actions get.
+    Args:
+        option: Of `-M`, for messages.
+        source: The file that holds them.
+
+    Raises:
+        UsageError: For a name that is not there, and for several without a choice: no file says whose units the
+            actions get.
     """
     names = sorted(available)
     listed = ", ".join(names[:_SHOWN]) + (f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else "")

@@ -20,7 +20,10 @@ class ConfigFile(BaseModel):
     """The content of a configuration file that describes a network, each field under the file's own name.
 
     null is as if a field were missing. Further fields of the file are not read.
-    model_types: what it may hold. network: for messages.
+
+    Attributes:
+        model_types: What it may hold.
+        network: For messages.
     """
 
     model_config = ConfigDict(
@@ -72,7 +75,8 @@ STORED_TYPE = Field(default=None, validation_alias=AliasChoices("torch_dtype", "
 def part(make: Callable[[dict[str, Any]], Any], model_type: str = "") -> BeforeValidator:
     """A part that transformers describes, from its values in the file; one that is made already is taken as it is.
 
-    model_type: what it has to be; empty for any.
+    Args:
+        model_type: What it has to be; empty for any.
     """
 
     def checked(values: Any) -> Any:

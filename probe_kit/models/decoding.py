@@ -59,7 +59,9 @@ def needed(mask: Tensor) -> Tensor | None:
 def last_logits(language_model: Any, embeddings: Tensor, mask: Tensor, cache: DynamicCache) -> Tensor:
     """(B, V) logits behind the last position, in one pass of a language model.
 
-    embeddings: (B, T, D) of what is new. mask: (B, past + T) bool, False at padding.
+    Args:
+        embeddings: (B, T, D) of what is new.
+        mask: (B, past + T) bool, False at padding.
     """
     output = language_model(
         inputs_embeds=embeddings,
@@ -77,7 +79,9 @@ def last_logits(language_model: Any, embeddings: Tensor, mask: Tensor, cache: Dy
 class Decoded:
     """Tokens behind a prompt: ids (B, N) int64, and the logits (B, N, V) that chose them.
 
-    mask: (B, S) bool of the prompt. cache: keys and values of the prompt and of all ids but the last.
+    Attributes:
+        mask: (B, S) bool of the prompt.
+        cache: Keys and values of the prompt and of all ids but the last.
     """
 
     ids: Tensor
@@ -111,8 +115,10 @@ class TokenNetwork(nn.Module):
     ) -> Decoded:
         """Exactly `steps` tokens behind the prompt, whatever they are.
 
-        mask: (B, S) bool, True at the end of every row. fed: (B, steps - 1) ids to feed back instead of those
-        chosen. The language model is called once with the prompt and `steps - 1` times with one token.
+        Args:
+            mask: (B, S) bool, True at the end of every row.
+            fed: (B, steps - 1) ids to feed back instead of those chosen. The language model is called once with
+                the prompt and `steps - 1` times with one token.
         """
         prompt, cache = mask, DynamicCache(config=self.language_model.config)
         ids: list[Tensor] = []

@@ -61,8 +61,10 @@ _OPTIONAL = ("do_resize", "do_rescale", "rescale_factor", "do_normalize", "resam
 class TiledPictures:
     """The processor of pictures into tiles.
 
-    settings: the part of the checkpoint's file that the processor reads. tiled: cut into a grid, as the released
-    processor does whatever its file says; False shows the whole picture as one tile.
+    Attributes:
+        settings: The part of the checkpoint's file that the processor reads.
+        tiled: Cut into a grid, as the released processor does whatever its file says; False shows the whole
+            picture as one tile.
     """
 
     settings: dict[str, Any]

@@ -86,8 +86,10 @@ class HeadConfig(ConfigFile):
 class InternVLAConfig(ConfigFile):
     """A checkpoint's configuration.
 
-    base: the vision-language model the run was made of, as its file names it. cot: the prompt around the
-    instruction, None for the instruction alone. picture: (width, height) the model resizes pictures to, if any.
+    Attributes:
+        base: The vision-language model the run was made of, as its file names it.
+        cot: The prompt around the instruction, None for the instruction alone.
+        picture: (width, height) the model resizes pictures to, if any.
     """
 
     network = "InternVLA-M1"
@@ -155,7 +157,8 @@ class InternVLAConfig(ConfigFile):
 def find_config(folder: Path) -> tuple[dict[str, Any], Path]:
     """The run's values and the folder they stand in: `folder` itself, or the one above its `checkpoints/`.
 
-    Raises CheckpointError if neither has a `config.yaml`, a `config.json` of a run, or `dims.json`.
+    Raises:
+        CheckpointError: If neither has a `config.yaml`, a `config.json` of a run, or `dims.json`.
     """
     for candidate in (folder, folder.parent):
         files = [candidate / name for name in (DIMS_FILE, RUN_FILE) if (candidate / name).is_file()]
@@ -436,7 +439,9 @@ class Schedule:
     def of(cls, steps: int, trained: int, name: str = "squaredcos_cap_v2") -> "Schedule":
         """`steps` of the `trained` ones at a whole distance.
 
-        Raises CheckpointError for another noise schedule, UsageError where no whole distance gives that number.
+        Raises:
+            CheckpointError: For another noise schedule.
+            UsageError: Where no whole distance gives that number.
         """
         if name != "squaredcos_cap_v2":
             raise CheckpointError(f"noise schedule {name!r} is not implemented here; only squaredcos_cap_v2 is")
@@ -514,8 +519,9 @@ class InternVLANetwork(nn.Module):
     def read(self, inputs: QwenInputs, views: Tensor) -> Tensor:
         """(B, Q, width of the queries): the condition of the actions.
 
-        views: (B x V, 3, H, W) for DINOv2. The queries read hidden states of the vision-language model, of which
-        the last is normed, with DINOv2's features behind each.
+        Args:
+            views: (B x V, 3, H, W) for DINOv2. The queries read hidden states of the vision-language model, of
+                which the last is normed, with DINOv2's features behind each.
         """
         keywords = inputs.keywords(self.vlm.model)
         states = self.vlm.model(**keywords, output_hidden_states=True, use_cache=False).hidden_states
@@ -528,8 +534,9 @@ class InternVLANetwork(nn.Module):
     def denoise(self, condition: Tensor, noise: Tensor, schedule: Schedule, scale: float) -> Tensor:
         """(B, A, action numbers) float32 normalised actions.
 
-        noise: of that shape, float32; the path is kept in float32 whatever the weights are. scale: of guidance;
-        above 1 the head runs 2 B rows, first those with the condition, then those without.
+        Args:
+            noise: Of that shape, float32; the path is kept in float32 whatever the weights are.
+            scale: Of guidance; above 1 the head runs 2 B rows, first those with the condition, then those without.
         """
         rows = condition
         if guided(scale):
@@ -577,7 +584,8 @@ _MEAN, _DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 def look(picture: NDArray[np.uint8], size: tuple[int, int] | None) -> NDArray[np.uint8]:
     """(height, width, 3) uint8 of (H, W, 3) uint8: squeezed to a square as the evaluation does it, by area.
 
-    size: (width, height) the checkpoint then resizes to itself, with PIL's default filter; None for none.
+    Args:
+        size: (width, height) the checkpoint then resizes to itself, with PIL's default filter; None for none.
     """
     squeezed = cv2.resize(picture, (SIDE, SIDE), interpolation=cv2.INTER_AREA)
     if size is None or size == (SIDE, SIDE):
@@ -601,7 +609,8 @@ def dino_pixels(picture: NDArray[np.uint8], side: int) -> Tensor:
 def prompt(instruction: str, cot: str | None) -> str:
     """The whole text, with one image slot.
 
-    cot: the text around the instruction, with {instruction} in it; None for the instruction alone.
+    Args:
+        cot: The text around the instruction, with {instruction} in it; None for the instruction alone.
     """
     text = instruction.lower() if cot is None else cot.replace(_SLOT, instruction.lower())
     return (

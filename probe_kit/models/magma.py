@@ -45,11 +45,15 @@ _PROJECTOR = re.compile(r"mlp(?P<layers>[1-9]\d?)x_gelu(_segtokv\d+)?")
 class VisionConfig(ConfigFile):
     """The trunk, its projector, and how crops are put together.
 
-    trunk: timm's name. head_width: of the contrastive head that the forward pass never reads. strategy: `crop`
-    runs the trunk on every crop, `global` on the whole picture that the crops make up. base: side of a crop in
-    pixels. crops: the most crops of one picture. width: of the language model, None where only that one says.
-    separators: whether the projector holds vectors for the begin and end of a picture, which the forward pass
-    never reads.
+    Attributes:
+        trunk: Timm's name.
+        head_width: Of the contrastive head that the forward pass never reads.
+        strategy: `crop` runs the trunk on every crop, `global` on the whole picture that the crops make up.
+        base: Side of a crop in pixels.
+        crops: The most crops of one picture.
+        width: Of the language model, None where only that one says.
+        separators: Whether the projector holds vectors for the begin and end of a picture, which the forward pass
+            never reads.
     """
 
     backbone: Literal["convnextxxlarge"] = Field(default="convnextxxlarge", validation_alias="vision_backbone")
@@ -78,9 +82,11 @@ class VisionConfig(ConfigFile):
 class MagmaConfig(ConfigFile):
     """A checkpoint's configuration.
 
-    text: transformers' configuration of the language model. image_token: the id that a picture replaces.
-    image_start_end: whether the prompt wraps a picture in two tokens. base_vocabulary: number of text ids before
-    the added tokens, None if only the tokenizer knows.
+    Attributes:
+        text: Transformers' configuration of the language model.
+        image_token: The id that a picture replaces.
+        image_start_end: Whether the prompt wraps a picture in two tokens.
+        base_vocabulary: Number of text ids before the added tokens, None if only the tokenizer knows.
     """
 
     model_types = ("magma",)
@@ -161,7 +167,9 @@ class PictureSettings:
         """Read `folder/preprocessor_config.json`, or where there is none the configuration.
 
         Recorded references hold the same fields in `action_config.json`.
-        Raises CheckpointError for a file that lacks a field.
+
+        Raises:
+            CheckpointError: For a file that lacks a field.
         """
         for name, section in (("preprocessor_config.json", None), ("action_config.json", "preprocessor")):
             if (folder / name).is_file():
@@ -449,7 +457,8 @@ class MagmaNetwork(TokenNetwork):
 def build_magma(config: MagmaConfig, dtype: torch.dtype, device: str = "meta") -> MagmaNetwork:
     """The network in eval mode; see `build_empty`.
 
-    Raises CheckpointError if the parts do not fit together.
+    Raises:
+        CheckpointError: If the parts do not fit together.
     """
     network = build_empty(lambda: MagmaNetwork(config), dtype, device)
     fill_decoder_rotary(network.language_model.model)
@@ -508,7 +517,8 @@ def picture_question(text: str, image_start_end: bool) -> str:
 def conversation(question: str, user_first: bool = False) -> tuple[Message, ...]:
     """The system's and the user's turn.
 
-    user_first: in the order in which Act2Answer's release puts them when it asks for several actions at once.
+    Args:
+        user_first: In the order in which Act2Answer's release puts them when it asks for several actions at once.
     """
     turns = (Message("system", SYSTEM), Message("user", question))
     return turns[::-1] if user_first else turns
@@ -517,8 +527,10 @@ def conversation(question: str, user_first: bool = False) -> tuple[Message, ...]
 def chat_text(messages: Sequence[Message], template: str | None = None, beginning: str = BEGINNING) -> str:
     """The text of a conversation, open for the assistant's turn.
 
-    template: the checkpoint's own, in Jinja; without one the frames of Llama 3. beginning: the tokenizer's first
-    token, which is written out here; the released tokenizer adds another in front, as for the original.
+    Args:
+        template: The checkpoint's own, in Jinja; without one the frames of Llama 3.
+        beginning: The tokenizer's first token, which is written out here; the released tokenizer adds another in
+            front, as for the original.
     """
     if template is not None:
         rendered, _ = render_jinja_template(

@@ -30,9 +30,12 @@ from probe_kit.models.config_file import ConfigFile, Count, part
 class VisionConfig(ConfigFile):
     """The vision tower, of which only what every released checkpoint has is implemented.
 
-    patch: pixels of a patch's side. stride: patches of a visual word's side. side: pixels of a side of the square
-    from whose table position embeddings are interpolated. window: pixels of a side of the windows in whose order
-    the authors' code goes through the patches; it changes no number but in the last bits.
+    Attributes:
+        patch: Pixels of a patch's side.
+        stride: Patches of a visual word's side.
+        side: Pixels of a side of the square from whose table position embeddings are interpolated.
+        window: Pixels of a side of the windows in whose order the authors' code goes through the patches; it
+            changes no number but in the last bits.
     """
 
     width: Count = Field(validation_alias="hidden_size")

@@ -70,8 +70,10 @@ _OPTIONAL = ("do_resize", "do_rescale", "rescale_factor", "do_normalize", "resam
 class SquarePictures:
     """The processor of pictures into squares.
 
-    settings: the part of the checkpoint's file that the processor reads. crop: what is looked at, as shares of the
-    picture: top, left, height, width; None for all of it. It is `CROP` in the file, which the processor skips.
+    Attributes:
+        settings: The part of the checkpoint's file that the processor reads.
+        crop: What is looked at, as shares of the picture: top, left, height, width; None for all of it. It is
+            `CROP` in the file, which the processor skips.
     """
 
     settings: dict[str, Any]

@@ -116,9 +116,10 @@ def build_resized[Policy: nn.Module](
 ) -> Policy:
     """One of lerobot's policies on PaliGemma in eval mode with uninitialised weights.
 
-    size: None for the released dimensions (Gemma 2B, an expert of 300M, SigLIP So400m).
-    device: `meta` serves to look at names and shapes. A policy that will act is built on the CPU, because the
-    embedding scale and the rotary frequencies are buffers no checkpoint holds.
+    Args:
+        size: None for the released dimensions (Gemma 2B, an expert of 300M, SigLIP So400m).
+        device: `meta` serves to look at names and shapes. A policy that will act is built on the CPU, because the
+            embedding scale and the rotary frequencies are buffers no checkpoint holds.
     """
     config.device = building_device(device)
     with resized(sys.modules[policy.__module__], size, config), torch.device(config.device):

@@ -109,11 +109,15 @@ class TowerConfig(ConfigFile):
 class PrismaticConfig(ConfigFile):
     """A checkpoint's configuration.
 
-    towers: one, or two whose patch features are joined (`fused`). text: transformers' configuration of the
-    language model. padded: rows of the embedding without a text id.
-    empty_token: the id that ends every OpenVLA prompt. dtype: as stored, None if the file does not say.
-    statistics: per data set, what un-normalises its actions. tokenizer_id: hub id of the tokenizer's files, of a
-    training run, whose folder has none; None for checkpoints that come with theirs.
+    Attributes:
+        towers: One, or two whose patch features are joined (`fused`).
+        text: Transformers' configuration of the language model.
+        padded: Rows of the embedding without a text id.
+        empty_token: The id that ends every OpenVLA prompt.
+        dtype: As stored, None if the file does not say.
+        statistics: Per data set, what un-normalises its actions.
+        tokenizer_id: Hub id of the tokenizer's files, of a training run, whose folder has none; None for
+            checkpoints that come with theirs.
     """
 
     model_types = ("prismatic", "openvla")
@@ -342,7 +346,9 @@ class PrismaticNetwork(TokenNetwork):
     def forward(self, ids: Tensor, mask: Tensor, pixel_values: Tensor | None) -> Any:
         """transformers' output of one pass, with logits (B, S, V) and all hidden states.
 
-        ids: (B, T). mask: (B, T) bool, False at padding, which may stand anywhere behind the first token.
+        Args:
+            ids: (B, T).
+            mask: (B, T) bool, False at padding, which may stand anywhere behind the first token.
         """
         return self.whole_pass(*self.embed(ids, mask, pixel_values))
 
@@ -351,8 +357,10 @@ class PrismaticNetwork(TokenNetwork):
     ) -> Decoded:
         """Exactly `steps` tokens behind the prompt; see `decode_behind`.
 
-        ids, mask: as for `forward`, with a token, not padding, at the end of every row. choose: the next ids; the
-        likeliest by default.
+        Args:
+            ids: As for `forward`, with a token, not padding, at the end of every row.
+            mask: As `ids`.
+            choose: The next ids; the likeliest by default.
         """
         return self.decode_behind(*self.embed(ids, mask, pixel_values), steps, choose)
 
@@ -409,7 +417,8 @@ class PictureSettings:
     def of(cls, config: PrismaticConfig, folder: Path) -> "PictureSettings":
         """Read `folder/preprocessor_config.json`, or where there is none the settings of timm's towers.
 
-        Raises CheckpointError for what is not known here.
+        Raises:
+            CheckpointError: For what is not known here.
         """
         file = folder / "preprocessor_config.json"
         settings = cls._from_file(file) if file.is_file() else cls._from_timm(config)
@@ -535,7 +544,8 @@ _MODES = {"bicubic": InterpolationMode.BICUBIC, "bilinear": InterpolationMode.BI
 def prepare_tensor(picture: NDArray[np.uint8], settings: PictureSettings) -> NDArray[np.float32]:
     """(3 per tower, S, S) float32 from (H, W, 3) uint8: bfloat16 up to the end, antialiased, normalised there.
 
-    Raises CheckpointError for a checkpoint that does not squeeze its pictures.
+    Raises:
+        CheckpointError: For a checkpoint that does not squeeze its pictures.
     """
     if settings.strategy != "resize-naive":
         raise CheckpointError(

@@ -137,9 +137,12 @@ IMAGE = "<|vision_start|><|image_pad|><|vision_end|>"
 class QwenInputs:
     """A batch of prompts with their pictures.
 
-    ids: (B, P) int64. mask: (B, P) int64, 0 at padding. pixel_values: (N, channels x time x patch x patch)
-    float32. grid: (I, 3) int64, per picture its patches over time, height and width.
-    image_token: the id that stands for a picture's tokens.
+    Attributes:
+        ids: (B, P) int64.
+        mask: (B, P) int64, 0 at padding.
+        pixel_values: (N, channels x time x patch x patch) float32.
+        grid: (I, 3) int64, per picture its patches over time, height and width.
+        image_token: The id that stands for a picture's tokens.
     """
 
     ids: Tensor
@@ -161,8 +164,9 @@ class QwenInputs:
     def positions(self, model: Any) -> Tensor:
         """(3, B, P) positions over time, height and width, as the native class counts them.
 
-        model: transformers' `Qwen…VLModel`. Padding counts 1, as in the transformers of these models' authors;
-        nothing reads it.
+        Args:
+            model: Transformers' `Qwen…VLModel`. Padding counts 1, as in the transformers of these models' authors;
+                nothing reads it.
         """
         counted, _ = model.get_rope_index(
             self.ids, mm_token_type_ids=self._kinds(), image_grid_thw=self.grid, attention_mask=self.mask
@@ -189,8 +193,12 @@ class QwenInputs:
 def image_slots(ids: Sequence[int], image_token: int, counts: Sequence[int]) -> list[int]:
     """Ids of a prompt in which the k-th image token is repeated `counts[k]` times.
 
-    ids: of a prompt with one image token per picture. Raises CheckpointError where their number differs: the
-    tokenizer then does not know the token, or is another model's.
+    Args:
+        ids: Of a prompt with one image token per picture.
+
+    Raises:
+        CheckpointError: Where their number differs: the tokenizer then does not know the token, or is another
+            model's.
     """
     slots = [position for position, number in enumerate(ids) if number == image_token]
     if len(slots) != len(counts):
@@ -211,7 +219,10 @@ def pack_inputs(
 ) -> QwenInputs:
     """Prompts of ids as one batch; padding stands behind each row.
 
-    pixel_values, grid: of all pictures, in the order of the rows. padding: an id that pads; it is masked.
+    Args:
+        pixel_values: Of all pictures, in the order of the rows.
+        grid: As `pixel_values`.
+        padding: An id that pads; it is masked.
     """
     longest = max(map(len, rows))
     ids = torch.full((len(rows), longest), padding)
@@ -233,10 +244,13 @@ _LONGEST_RATIO = 200
 class QwenPictures:
     """The processor of pictures into patches.
 
-    settings: the part of the checkpoint's file that transformers' Qwen image processor reads, with the smallest
-    and the largest number of pixels as `size`. patch, merge: pixels per patch side, patches per token side.
-    fast: which of the two processors the model's authors ran: the one on torchvision, or the one on PIL and numpy.
-    They differ in a picture's last bits, and by a few grey levels where they resize.
+    Attributes:
+        settings: The part of the checkpoint's file that transformers' Qwen image processor reads, with the
+            smallest and the largest number of pixels as `size`.
+        patch: Pixels per patch side, patches per token side.
+        merge: As `patch`.
+        fast: Which of the two processors the model's authors ran: the one on torchvision, or the one on PIL and
+            numpy. They differ in a picture's last bits, and by a few grey levels where they resize.
     """
 
     settings: dict[str, Any]
@@ -250,8 +264,13 @@ class QwenPictures:
     ) -> "QwenPictures":
         """Read `preprocessor_config.json`.
 
-        patch, temporal, merge: what the network was built with. Raises CheckpointError if the file is missing,
-        lacks a number, or was made for another network.
+        Args:
+            patch: What the network was built with.
+            temporal: As `patch`.
+            merge: As `patch`.
+
+        Raises:
+            CheckpointError: If the file is missing, lacks a number, or was made for another network.
         """
         values = processor_settings(folder, _NEEDED, (*_OPTIONAL, "size", "min_pixels", "max_pixels"))
         file = folder / PROCESSOR_FILE
@@ -275,7 +294,8 @@ class QwenPictures:
     def patches(self, pictures: list[NDArray[np.uint8]]) -> tuple[Tensor, Tensor]:
         """(N, channels x time x patch x patch) float32 and grid (I, 3) int64 of (H, W, 3) uint8 pictures.
 
-        Raises ObservationError for a picture two hundred times as long as wide.
+        Raises:
+            ObservationError: For a picture two hundred times as long as wide.
         """
         for picture in pictures:
             if max(picture.shape[:2]) > _LONGEST_RATIO * min(picture.shape[:2]):

@@ -42,11 +42,18 @@ _DEPTH = ("vision_zoe_config", "ego3d_patch_reso")
 class SpatialVLAConfig(ConfigFile):
     """A checkpoint's configuration.
 
-    text, vision, depth: transformers' configurations of Gemma-2, SigLIP and ZoeDepth; depth is None for a model
-    that sees none. image_token: the id whose positions the picture takes. first_action, actions: the ids that name
-    actions; they end the vocabulary. own_action_embeddings: whether those ids have a table of embeddings to
-    themselves. projected: the width of a patch for the language model. points: 3-D points per patch and direction.
-    frequencies: of their code.
+    Attributes:
+        text: Transformers' configurations of Gemma-2, SigLIP and ZoeDepth; depth is None for a model that sees
+            none.
+        vision: As `text`.
+        depth: As `text`.
+        projected: The width of a patch for the language model.
+        image_token: The id whose positions the picture takes.
+        first_action: The ids that name actions; they end the vocabulary.
+        actions: As `first_action`.
+        own_action_embeddings: Whether those ids have a table of embeddings to themselves.
+        points: 3-D points per patch and direction.
+        frequencies: Of their code.
     """
 
     model_types = (MODEL_TYPE,)
@@ -120,8 +127,11 @@ DEPTH_SIDE = 384
 class Depth:
     """The depth of pictures by ZoeDepth, float32.
 
-    metres: (B, 1, S, S). raw: (B, H, W) as predicted, with the margin. domains: (B, 2) logits for indoor and
-    outdoor scenes, which choose the head that measures; None for a ZoeDepth of one head.
+    Attributes:
+        metres: (B, 1, S, S).
+        raw: (B, H, W) as predicted, with the margin.
+        domains: (B, 2) logits for indoor and outdoor scenes, which choose the head that measures; None for a
+            ZoeDepth of one head.
     """
 
     metres: Tensor
@@ -139,8 +149,9 @@ def depth_input(pictures: Tensor) -> Tensor:
 def estimate_depth(network: Any, pictures: Tensor, vote: bool = False) -> Depth:
     """Depth of (B, 3, S, S) float32 pictures in [0, 1]; `network` is a `ZoeDepthForDepthEstimation`.
 
-    vote: let the batch choose one head for all its pictures, as the original does. Without it every picture has
-    the head it would have alone, so that a row does not depend on the others in its batch.
+    Args:
+        vote: Let the batch choose one head for all its pictures, as the original does. Without it every picture
+            has the head it would have alone, so that a row does not depend on the others in its batch.
     """
     side, dtype = pictures.shape[-1], next(network.parameters()).dtype
     pixels = depth_input(pictures).to(dtype)
@@ -187,7 +198,9 @@ def point_places(side: int, patch: int, points: int) -> Tensor:
 def back_project(metres: Tensor, intrinsics: Tensor, patch: int, points: int) -> Tensor:
     """(B, P, 3R²) metres in the camera's frame: per patch, x, y, z of its points, row by row.
 
-    metres: (B, 1, S, S) depth. intrinsics: (3, 3) or (B, 3, 3) for a picture of side S.
+    Args:
+        metres: (B, 1, S, S) depth.
+        intrinsics: (3, 3) or (B, 3, 3) for a picture of side S.
     """
     side = metres.shape[-1]
     along = side // patch
@@ -248,8 +261,11 @@ class Projector(nn.Module):
 class Sight:
     """The stages of looking at pictures; depth and what follows from it is None without depth.
 
-    tower: (B, P, vision width) SigLIP's normed patches. points: (B, P, 3R²) metres in the camera's frame.
-    positions: (B, P, vision width) their embedding. features: (B, P, D) as the language model reads them.
+    Attributes:
+        tower: (B, P, vision width) SigLIP's normed patches.
+        points: (B, P, 3R²) metres in the camera's frame.
+        positions: (B, P, vision width) their embedding.
+        features: (B, P, D) as the language model reads them.
     """
 
     tower: Tensor
@@ -292,8 +308,9 @@ class SpatialVLANetwork(TokenNetwork):
     def look(self, pictures: Tensor, intrinsics: Tensor, vote: bool = False) -> Sight:
         """The features of (B, 3, S, S) float32 pictures in [0, 1], stage by stage.
 
-        intrinsics: (3, 3) or (B, 3, 3) of cameras that take pictures of side S. vote: see `estimate_depth`.
-        Pictures, depth and points are float32 whatever the weights are.
+        Args:
+            intrinsics: (3, 3) or (B, 3, 3) of cameras that take pictures of side S.
+            vote: See `estimate_depth`. Pictures, depth and points are float32 whatever the weights are.
         """
         dtype = self.multi_modal_projector.linear.weight.dtype
         tower: Tensor = self.vision_tower(((pictures - 0.5) / 0.5).to(dtype)).last_hidden_state
@@ -309,8 +326,10 @@ class SpatialVLANetwork(TokenNetwork):
         """(B, T, D) embeddings of ids (B, T), with `features` (B, P, D) at the picture's positions.
 
         Gemma-2 multiplies its embeddings by √D inside the table; the original divides features by as much before
-        it multiplies them, so they stay as they are. Raises UsageError if the ids have room for another number of
-        patches.
+        it multiplies them, so they stay as they are.
+
+        Raises:
+            UsageError: If the ids have room for another number of patches.
         """
         embeddings: Tensor = self.language_model.get_input_embeddings()(ids)
         if features is None:
@@ -325,9 +344,14 @@ class SpatialVLANetwork(TokenNetwork):
     def forward(self, embeddings: Tensor, mask: Tensor, past: DynamicCache | None = None, keep: int = 0) -> Any:
         """transformers' output of one pass, with all hidden states if there is no `past`.
 
-        embeddings: (B, T, D) of what is new; mask: (B, past + T) bool, False at padding. Everything given sees
-        everything given and everything past, in both directions; padding is seen by nothing. keep: for how many of
-        the last positions logits are made, 0 for all. Raises UsageError for an attention without the soft cap.
+        Args:
+            embeddings: (B, T, D) of what is new.
+            mask: (B, past + T) bool, False at padding. Everything given sees everything given and everything past,
+                in both directions; padding is seen by nothing.
+            keep: For how many of the last positions logits are made, 0 for all.
+
+        Raises:
+            UsageError: For an attention without the soft cap.
         """
         if (used := self.language_model.config._attn_implementation) != EAGER:
             raise UsageError(
@@ -361,8 +385,10 @@ class SpatialVLANetwork(TokenNetwork):
     ) -> Decoded:
         """Exactly `steps` greedy tokens behind the prompt; see `decode_behind`.
 
-        ids, mask: (B, T), with a token, not padding, at the end of every row. slots: per step the only ids that
-        may be chosen.
+        Args:
+            ids: (B, T), with a token, not padding, at the end of every row.
+            mask: As `ids`.
+            slots: Per step the only ids that may be chosen.
         """
         turns = iter(slots or ())
         choose = greedy if slots is None else lambda logits: _best(logits, next(turns))
@@ -391,7 +417,8 @@ def _additive(mask: Tensor, embeddings: Tensor) -> Tensor | None:
 def build_spatialvla(config: SpatialVLAConfig, dtype: torch.dtype, device: str = "meta") -> SpatialVLANetwork:
     """The network in eval mode; see `build_empty`. `embed_actions` comes after the weights.
 
-    Raises WeightsError if a part of transformers has a constant that would stay without memory.
+    Raises:
+        WeightsError: If a part of transformers has a constant that would stay without memory.
     """
     network = build_empty(lambda: SpatialVLANetwork(config), dtype, device)
     if not builds_sizes_only():
@@ -480,8 +507,12 @@ Colour = tuple[float, float, float]
 class PictureSettings:
     """The preparation of pictures.
 
-    side: in pixels, of the square they are squeezed into. resampling: PIL's number. scale: what the bytes are
-    multiplied with. mean, deviation: of a normalisation, None for the released models, which normalise inside.
+    Attributes:
+        side: In pixels, of the square they are squeezed into.
+        resampling: PIL's number.
+        scale: What the bytes are multiplied with.
+        mean: Of a normalisation, None for the released models, which normalise inside.
+        deviation: As `mean`.
     """
 
     side: int
@@ -494,7 +525,8 @@ class PictureSettings:
     def of(cls, config: SpatialVLAConfig, folder: Path) -> "PictureSettings":
         """Read `folder/preprocessor_config.json`, or where there is none take the released models' settings.
 
-        Raises CheckpointError for what contradicts the model or is not known here.
+        Raises:
+            CheckpointError: For what contradicts the model or is not known here.
         """
         file = folder / PREPROCESSOR_FILE
         values = load_json(file) if file.is_file() else None
@@ -560,7 +592,8 @@ def is_camera(matrix: NDArray[np.floating[Any]]) -> bool:
 def known_cameras(values: Mapping[str, Any], source: str) -> dict[str, Intrinsics]:
     """The cameras of the data sets that `intrinsic_config` of a `processor_config.json` names.
 
-    Raises CheckpointError for a matrix that is not a camera's.
+    Raises:
+        CheckpointError: For a matrix that is not a camera's.
     """
     cameras = {}
     for key, entry in values.get("intrinsic_config", {}).items():

@@ -28,8 +28,10 @@ Ids = NDArray[np.int64]
 class ActionBins:
     """The ids that name actions, and what they mean.
 
-    first: the lowest id. edges: of theta, phi, r, roll, pitch, yaw. spherical: False for a checkpoint whose three
-    movement axes are Cartesian.
+    Attributes:
+        first: The lowest id.
+        edges: Of theta, phi, r, roll, pitch, yaw.
+        spherical: False for a checkpoint whose three movement axes are Cartesian.
     """
 
     first: int
@@ -40,9 +42,13 @@ class ActionBins:
     def of(cls, values: Mapping[str, Any], first: int, actions: int, source: str) -> "ActionBins":
         """Read the content of a `processor_config.json`.
 
-        first, actions: the ids the model has for actions. Edges come from `bin_policy`, where that is missing from
-        the Gaussians in `gs_params`, or are even if `action_config` says that the distribution is uniform.
-        Raises CheckpointError naming `source` for what is missing or contradicts itself or the model.
+        Args:
+            first: The ids the model has for actions. Edges come from `bin_policy`, where that is missing from the
+                Gaussians in `gs_params`, or are even if `action_config` says that the distribution is uniform.
+            actions: As `first`.
+
+        Raises:
+            CheckpointError: Naming `source` for what is missing or contradicts itself or the model.
         """
         settings = values.get("action_config") or {}
         counts = settings.get("num_bins") or {}

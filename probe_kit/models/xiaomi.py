@@ -49,8 +49,10 @@ class FlowConfig(ConfigFile):
 class XiaomiConfig(ConfigFile):
     """A checkpoint's configuration.
 
-    vlm: transformers' configuration of Qwen3-VL. state_length: positions the state takes. state_dim, action_dim:
-    numbers per position. action_length: of a chunk where no robot's statistics say otherwise.
+    Attributes:
+        vlm: Transformers' configuration of Qwen3-VL.
+        state_length: Positions the state takes. state_dim, action_dim: numbers per position.
+        action_length: Of a chunk where no robot's statistics say otherwise.
     """
 
     model_types = (MODEL_TYPE,)
@@ -216,8 +218,10 @@ _THOUSANDTHS = 1000
 class Prompt:
     """The parts of the prompt that the flow transformer keeps.
 
-    caches: per layer it reads, keys and values. mask: (B, P) bool. ends: (3, B, 1) int64, the last position along
-    time, height and width.
+    Attributes:
+        caches: Per layer it reads, keys and values.
+        mask: (B, P) bool.
+        ends: (3, B, 1) int64, the last position along time, height and width.
     """
 
     caches: list[Cache]
@@ -252,7 +256,8 @@ class XiaomiNetwork(nn.Module):
     def velocity(self, prompt: Prompt, state: Tensor, actions: Tensor, moment: Tensor) -> Tensor:
         """(B, A, action numbers): where the actions of (B, A, action numbers) move at moment (B,) in [0, 1].
 
-        state: (B, states, state numbers).
+        Args:
+            state: (B, states, state numbers).
         """
         states, moving = self.state_projector(state), self.action_projector(actions)
         stream = torch.cat([self.sink.weight.expand(len(moving), -1, -1), states, moving], dim=1)
@@ -269,9 +274,10 @@ class XiaomiNetwork(nn.Module):
     ) -> Tensor:
         """(B, A, action numbers) float32 normalised actions: Euler steps from noise at moment 0 to moment 1.
 
-        used: (B, A, action numbers), 1 where the robot has the number; it masks what the network reads of the
-        moving actions, not what it puts out. noise: (B, A, action numbers) float32. The path is summed in float32
-        whatever the weights are.
+        Args:
+            used: (B, A, action numbers), 1 where the robot has the number; it masks what the network reads of the
+                moving actions, not what it puts out.
+            noise: (B, A, action numbers) float32. The path is summed in float32 whatever the weights are.
         """
         prompt = self.read(inputs)
         dtype = self.sink.weight.dtype
@@ -339,9 +345,13 @@ class ActionUnits:
 def read_units(folder: Path, robot: str | None, numbers: int) -> ActionUnits:
     """Statistics of one robot from `preprocessor_config.json`; without a name, of the only one.
 
-    robot: a name of the file, or the beginning of just one. numbers: per action, as config.json has it.
-    Raises CheckpointError where there are none or they do not fit, UsageError for an unknown robot, and for
-    several without a choice.
+    Args:
+        robot: A name of the file, or the beginning of just one.
+        numbers: Per action, as config.json has it.
+
+    Raises:
+        CheckpointError: Where there are none or they do not fit.
+        UsageError: For an unknown robot, and for several without a choice.
     """
     file = folder / STATISTICS_FILE
     by_robot: Mapping[str, Any] = (load_json(file) if file.is_file() else {}).get("action_config") or {}
@@ -372,8 +382,11 @@ def _choose(robot: str | None, by_robot: Mapping[str, Any], source: str) -> str:
 class Robot:
     """A robot's way of showing its scene and writing its state.
 
-    heading: what its camera is called in the prompt. width, height: of its picture, in pixels.
-    state: from the observation's eight numbers to its own.
+    Attributes:
+        heading: What its camera is called in the prompt.
+        width: Of its picture, in pixels.
+        height: As `width`.
+        state: From the observation's eight numbers to its own.
     """
 
     name: str
@@ -403,7 +416,8 @@ _ROBOTS = (
 def robot_of(name: str) -> Robot:
     """The robot whose statistics are called `name`, such as bridge_delta.
 
-    Raises UsageError for robots with other cameras and other states than Act2Answer's arm can have.
+    Raises:
+        UsageError: For robots with other cameras and other states than Act2Answer's arm can have.
     """
     for robot in _ROBOTS:
         if name.startswith(robot.name):

@@ -43,7 +43,8 @@ MANY_BY_CLAUSE = 0.05
 def read_by_clause(episodes: "pd.DataFrame", text: "pd.Series[str]") -> tuple[float, float | None]:
     """The share of answers that were found among other words, and the accuracy with these as unparsable.
 
-    text: outcomes of the answers in text. The accuracy is None where the share is `MANY_BY_CLAUSE` or less.
+    Args:
+        text: Outcomes of the answers in text. The accuracy is None where the share is `MANY_BY_CLAUSE` or less.
     """
     in_clause = episodes["parse_tier"] == "clause"
     share = float(in_clause.mean())
@@ -53,8 +54,9 @@ def read_by_clause(episodes: "pd.DataFrame", text: "pd.Series[str]") -> tuple[fl
 class ScoredAnswers:
     """A VLM run, read by one of its scores; everything else is the run's own.
 
-    with_side_words: keep items in whose name a side stands, such as "no left turn sign": answers and
-    names of these are not distinguishable.
+    Args:
+        with_side_words: Keep items in whose name a side stands, such as "no left turn sign": answers and names of
+            these are not distinguishable.
     """
 
     def __init__(self, run: RunReader, score: str = "text", with_side_words: bool = False) -> None:
@@ -78,7 +80,8 @@ class ScoredAnswers:
 def scored(run: RunReader, score: str, with_side_words: bool = False) -> RunReader:
     """A VLM run by a score, in place of any that it was read by; a policy run as it is.
 
-    Raises UsageError for an unknown score.
+    Raises:
+        UsageError: For an unknown score.
     """
     if score not in SCORES:
         raise UsageError(f"score is {score!r}; expected one of {', '.join(SCORES)}")
@@ -113,9 +116,13 @@ class Regime(StrEnum):
 class PairedItems:
     """Items that ran in both layouts, by how many of the two were right.
 
-    both, exactly_one, none: numbers of items. both_wrong: items wrong twice, part of `none`.
-    p: exact one-sided p of groups with more of `both` against groups with more of `both_wrong`. A side bias of any
-    strength makes them equally likely, and items that share a picture count once.
+    Attributes:
+        both: Numbers of items.
+        exactly_one: As `both`.
+        none: As `both`.
+        both_wrong: Items wrong twice, part of `none`.
+        p: Exact one-sided p of groups with more of `both` against groups with more of `both_wrong`. A side bias of
+            any strength makes them equally likely, and items that share a picture count once.
     """
 
     both: int
@@ -129,17 +136,27 @@ class PairedItems:
 class SuccessRate:
     """Outcomes of the episodes of one category (or of any table of episodes); rates are shares, 0 to 1.
 
-    n_groups: independent groups of items. ci: 95 % interval of `sr`, groups of items as the unit
-    (`Share.interval`). sr_original, sr_swapped: per layout, and layout_mean their mean. sr_left, sr_right: per
-    side of the correct picture. share_wrong, share_outside: ended on the other picture, or on neither.
-    share_never_moved: share that ended where it started, a failed grasp; part of share_outside, None if it was not
-    recorded. share_invalid_action: share of
-    inferences that put out no action, None for a policy that cannot tell. chance_margin_episodes: half-width of
-    the band around 0.5 that guessing explains, for N = episodes (the paper's); chance_margin_items: the same for
-    N = items; chance_margin: for as many items as count, fewer where items of a group answer alike, and what
-    `regime` is judged by. reason: why that regime, or why there is no rate. side_preference: share placed left
-    among episodes placed in a zone. normalised_score: only of a mean over categories. A rate over no episodes is
-    None, and so is every rate of a model that did not act.
+    Attributes:
+        n_groups: Independent groups of items.
+        ci: 95 % interval of `sr`, groups of items as the unit (`Share.interval`).
+        sr_original: Per layout, and layout_mean their mean.
+        sr_swapped: As `sr_original`.
+        sr_left: Per side of the correct picture.
+        sr_right: As `sr_left`.
+        share_wrong: Ended on the other picture, or on neither.
+        share_outside: As `share_wrong`.
+        share_never_moved: Share that ended where it started, a failed grasp; part of share_outside, None if it was
+            not recorded.
+        share_invalid_action: Share of inferences that put out no action, None for a policy that cannot tell.
+        chance_margin_episodes: Half-width of the band around 0.5 that guessing explains, for N = episodes (the
+            paper's).
+        chance_margin_items: The same for N = items.
+        chance_margin: For as many items as count, fewer where items of a group answer alike, and what `regime` is
+            judged by.
+        reason: Why that regime, or why there is no rate.
+        side_preference: Share placed left among episodes placed in a zone.
+        normalised_score: Only of a mean over categories. A rate over no episodes is None, and so is every rate of
+            a model that did not act.
     """
 
     n_episodes: int
@@ -231,10 +248,14 @@ def group_names(episodes: "pd.DataFrame", seed_text: str) -> "NDArray[np.str_]":
 def success_rate(episodes: "pd.DataFrame") -> SuccessRate:
     """Success rate and its companions for a table of episodes.
 
-    episodes: columns `item_id`, `layout`, `side_correct`, `outcome` (`correct`, `wrong`, `oob`), `side_placed`,
-    and `group_id` where items share pictures; `share_correct` and so on where the last steps of an episode were
-    averaged, which items' pairs take no notice of. Raises UsageError for a table that is
-    empty or of several wordings, and for episodes in which the model did not act.
+    Args:
+        episodes: Columns `item_id`, `layout`, `side_correct`, `outcome` (`correct`, `wrong`, `oob`),
+            `side_placed`, and `group_id` where items share pictures; `share_correct` and so on where the last
+            steps of an episode were averaged, which items' pairs take no notice of.
+
+    Raises:
+        UsageError: For a table that is empty or of several wordings, and for episodes in which the model did not
+            act.
     """
     check_several_wordings(episodes)
     _check_acted(episodes)
@@ -305,8 +326,12 @@ def independent_items(episodes: "pd.DataFrame") -> float:
 def sensitivity(episodes: "pd.DataFrame", radii: Sequence[float] = SENSITIVITY_RADII) -> dict[float, float]:
     """Success rate by zone radius ε in metres, from where the cube ended: no episode runs again.
 
-    episodes: columns `distance_correct` and `distance_wrong`, metres; missing where the simulator broke, which
-    is no success. Empty for a table without these columns. Raises SceneError for a radius with overlapping zones.
+    Args:
+        episodes: Columns `distance_correct` and `distance_wrong`, metres; missing where the simulator broke, which
+            is no success. Empty for a table without these columns.
+
+    Raises:
+        SceneError: For a radius with overlapping zones.
     """
     columns = ["distance_correct", "distance_wrong"]
     if not set(columns) <= set(episodes):
@@ -350,8 +375,12 @@ _MARKS: Sequence[Callable[[RunReader, int], str]] = (
 def distinct_labels(runs: Sequence[RunReader], names: Mapping[str, str] | None = None) -> dict[str, str]:
     """Return the label of each run by its location, so that no two full names are equal.
 
-    names: labels by location instead of the runs' own. Runs of one name get the hash of their settings, where that
-    is the same their folders, and else a number. Raises UsageError for a label of a run that is none of these.
+    Args:
+        names: Labels by location instead of the runs' own. Runs of one name get the hash of their settings, where
+            that is the same their folders, and else a number.
+
+    Raises:
+        UsageError: For a label of a run that is none of these.
     """
     labels = {str(run.location): run.label for run in runs}
     if unknown := sorted((names or {}).keys() - labels.keys()):
@@ -411,8 +440,9 @@ def mixed_settings(
 ) -> list[str]:
     """A sentence if the probes of several runs were not fitted alike, and one for labels that are not the answer.
 
-    results: by the location of the run and the target. views: those that are shown, if not all are; then it does
-    not matter which others there are.
+    Args:
+        results: By the location of the run and the target.
+        views: Those that are shown, if not all are; then it does not matter which others there are.
     """
     differences = []
     for name, value in _COMPARED.items():
@@ -444,15 +474,23 @@ def mixed_settings(
 class OutcomeRuleScores:
     """The outcome rule, and what it gives away.
 
-    rule, rule_words: by which all outcomes of the row are. last_steps: control steps at the end that it judged.
-    n_answered, share_answered: episodes that ended in a zone; sr_answered: success among them. n_grasped,
-    sr_grasped: the same of episodes in which both fingers ever touched the cube. share_unmoved_answers: share of
-    answers whose cube never left its start. sr_idle: what a policy that does nothing would score; idle_side: the
-    picture in whose zone the untouched cube then lies, `none`, or `both` where it differs between episodes.
-    share_both_zones: share of episodes whose cube counts for both pictures, which is called correct. sr_by_rule:
-    by every rule, at the last step. sr_by_epsilon: by zone radius in metres, for the rule `disc`. behaviour:
-    shares of episodes by what hand and cube did. What is about answers is there for every run with a success rate;
-    the rest is None or empty where the run keeps no trajectories.
+    Attributes:
+        rule: By which all outcomes of the row are.
+        rule_words: As `rule`.
+        last_steps: Control steps at the end that it judged.
+        n_answered: Episodes that ended in a zone.
+        share_answered: As `n_answered`.
+        sr_answered: Success among them. n_grasped,
+        sr_grasped: The same of episodes in which both fingers ever touched the cube.
+        share_unmoved_answers: Share of answers whose cube never left its start.
+        sr_idle: What a policy that does nothing would score.
+        idle_side: The picture in whose zone the untouched cube then lies, `none`, or `both` where it differs
+            between episodes.
+        share_both_zones: Share of episodes whose cube counts for both pictures, which is called correct.
+            sr_by_rule: by every rule, at the last step.
+        sr_by_epsilon: By zone radius in metres, for the rule `disc`. behaviour: shares of episodes by what hand
+            and cube did. What is about answers is there for every run with a success rate; the rest is None or
+            empty where the run keeps no trajectories.
     """
 
     rule: str = DEFAULT_RULE
@@ -478,9 +516,14 @@ class OutcomeRuleScores:
 class TableRun:
     """A run as a table reads it: by a score, by an outcome rule, and under a name that no other run has.
 
-    run: by its score, if it was asked. judged: with its outcomes by the rule; as `run` where there is nothing to
-    judge by. label: its name without marks. group: the one it belongs to, of several. words: the rule in words.
-    verdicts: by rule a row per episode; behaviour: a row per episode. Both are None without trajectories.
+    Attributes:
+        run: By its score, if it was asked.
+        judged: With its outcomes by the rule; as `run` where there is nothing to judge by.
+        label: Its name without marks.
+        group: The one it belongs to, of several.
+        words: The rule in words.
+        verdicts: By rule a row per episode.
+        behaviour: A row per episode. Both are None without trajectories.
     """
 
     run: RunReader
@@ -506,8 +549,9 @@ class TableRun:
     ) -> Self:
         """Judge every episode by every rule, where the run keeps trajectories; answers in words have no rule.
 
-        with_behaviour: False reads no trajectory for the rule whose outcomes are stored. label: by default that of
-        the run.
+        Args:
+            with_behaviour: False reads no trajectory for the rule whose outcomes are stored.
+            label: By default that of the run.
         """
         label = run.label if label is None else label
         if run.ask is not None:

@@ -386,8 +386,11 @@ def _show_steps(table: "RetentionTable", training: Mapping[str, int], style: str
 def _check_only(values: Mapping[str, object], allowed: Collection[str], option: str, table: str) -> None:
     """Raise UsageError for an option of `retention` that differs from its default and does not go with a table.
 
-    values: the value of every parameter. allowed: what goes with it. option: the one that asks for the table.
-    table: what it is called.
+    Args:
+        values: The value of every parameter.
+        allowed: What goes with it.
+        option: The one that asks for the table.
+        table: What it is called.
     """
     are_set = {
         f"--{'format' if name == 'style' else name.replace('_', '-')}": values[name] != parameter.default
@@ -448,7 +451,8 @@ def _groups(texts: Sequence[str]) -> dict[str, tuple[str, ...]]:
 def save_all(exhibits: "Sequence[ReportFigure]", folder: Path, details: bool = False) -> None:
     """Draw the main figures into a folder, and say where each is and how many are left out.
 
-    details: draw every figure.
+    Args:
+        details: Draw every figure.
     """
     from probe_kit.retention.displays import save_figures
 
@@ -479,9 +483,15 @@ def show_stages(
     """Compare what a VLM answers, a policy encodes and a policy does, question by question.
 
     Answered: the VLM answers right. Encoded: a probe of the policy reads the answer, above chance and controls.
-    Acted: the cube ends on the correct picture. runs: the VLM's, then the policy's; both need the same first
-    frames. views: at most one, of the policy run's probes; None for the first. key: of its probe results.
-    Raises UsageError for other runs or views, and what `match_runs` raises.
+    Acted: the cube ends on the correct picture.
+
+    Args:
+        runs: The VLM's, then the policy's; both need the same first frames.
+        views: At most one, of the policy run's probes; None for the first.
+        key: Of its probe results.
+
+    Raises:
+        UsageError: For other runs or views, and what `match_runs` raises.
     """
     from probe_kit.retention.behaviour import scored
     from probe_kit.retention.columns.tables import known_used_tables

@@ -43,8 +43,10 @@ def limits(interval: Interval) -> Limits:
 class StreamScores:
     """Cross-fitted scores of K streams of one category and view.
 
-    names: `action` and `backbone` in this order, as far as they were probed. fit: their scores, on the same
-    groups. at_most: of a side, by name, an upper limit of the best site's accuracy, see `sufficiency.at_most`.
+    Attributes:
+        names: `action` and `backbone` in this order, as far as they were probed.
+        fit: Their scores, on the same groups.
+        at_most: Of a side, by name, an upper limit of the best site's accuracy, see `sufficiency.at_most`.
     """
 
     names: tuple[str, ...]
@@ -87,8 +89,12 @@ class StreamScores:
 def score_streams(curve: ProbeCurve, rows: Mapping[str, NDArray[np.intp]], seed_text: str) -> StreamScores | None:
     """The scores of streams by their rows of a curve; None without any.
 
-    seed_text: of the run; scores on equal groups of one are paired. Raises TooFewGroupsError for fewer than 5
-    groups, UnbalancedEpisodesError for a fold trained on one side only.
+    Args:
+        seed_text: Of the run; scores on equal groups of one are paired.
+
+    Raises:
+        TooFewGroupsError: For fewer than 5 groups.
+        UnbalancedEpisodesError: For a fold trained on one side only.
     """
     if not rows:
         return None
@@ -155,7 +161,9 @@ class Rate:
 class PooledScores:
     """Scores of one or more runs in one category.
 
-    accuracies: of the chosen sites, in the order of `names`. fit: the runs' mean on common groups, None on others.
+    Attributes:
+        accuracies: Of the chosen sites, in the order of `names`.
+        fit: The runs' mean on common groups, None on others.
     """
 
     names: tuple[str, ...]
@@ -235,9 +243,11 @@ NO_SCORES = "n/a (too few groups of items, or a fold with one side only)"
 class Peak:
     """The best site of a stream: its held-out score and family-wise p.
 
-    score: of a side the accuracy, else the metric. It is too high by the luck of being chosen; `StreamScores`
-    holds the score without it. chance: one half, else the mean score of the label permutations at the site; NaN
-    without any. ties: how many other sites of the stream are as accurate; `site` is the first of them all.
+    Attributes:
+        score: Of a side the accuracy, else the metric. It is too high by the luck of being chosen; `StreamScores`
+            holds the score without it.
+        ties: How many other sites of the stream are as accurate; `site` is the first of them all.
+        chance: One half, else the mean score of the label permutations at the site; NaN without any.
     """
 
     site: Site
@@ -251,11 +261,13 @@ class Peak:
 class RetentionEstimate:
     """Retention of two streams.
 
-    value: cross-fitted score of the action's best site over that of the backbone's, both above one half (see
-    `probe_kit.statistics.crossfit`); NaN where the backbone's is 0, or no score is defined. interval: 95 %,
-    Fieller's; without limits where the backbone is not known well enough to divide by. published: the ratio of the
-    peaks, as the paper has it. defined: whether the backbone's best site is above chance (family-wise) and better
-    than every control that was run; `note` else says what is missing.
+    Attributes:
+        value: Cross-fitted score of the action's best site over that of the backbone's, both above one half (see
+            `probe_kit.statistics.crossfit`); NaN where the backbone's is 0, or no score is defined.
+        interval: 95 %, Fieller's; without limits where the backbone is not known well enough to divide by.
+        published: The ratio of the peaks, as the paper has it.
+        defined: Whether the backbone's best site is above chance (family-wise) and better than every control that
+            was run; `note` else says what is missing.
     """
 
     value: float
@@ -269,7 +281,10 @@ class RetentionEstimate:
 class Retention(RetentionEstimate):
     """Retention of one target in one category and view.
 
-    backbone, action: the best sites. streams: the scores; None with too few groups of items.
+    Attributes:
+        backbone: The best sites.
+        action: As `backbone`.
+        streams: The scores; None with too few groups of items.
     """
 
     backbone: Peak
@@ -280,8 +295,10 @@ class Retention(RetentionEstimate):
 def best_site(curve: ProbeCurve, stream: str, iterations: Iterations = "all") -> Peak | None:
     """Return the best site of `stream`, the first one on ties; None if the curve has no such stream.
 
-    Of a side the most accurate one counts, else the largest score above the site's own chance. Raises UsageError
-    if the stream has no such iteration.
+    Of a side the most accurate one counts, else the largest score above the site's own chance.
+
+    Raises:
+        UsageError: If the stream has no such iteration.
     """
     rows = stream_rows(curve, stream, iterations)
     if rows.size == 0:
@@ -298,7 +315,8 @@ def best_site(curve: ProbeCurve, stream: str, iterations: Iterations = "all") ->
 def stream_peaks(curve: ProbeCurve, iterations: Iterations = "all") -> dict[str, Peak]:
     """The best sites of `backbone` and of the stream the action is made in, `action`, as far as they were probed.
 
-    Raises UsageError if the action's stream has no such iteration.
+    Raises:
+        UsageError: If the action's stream has no such iteration.
     """
     peaks = {}
     if curve.backbone_stream is not None:
@@ -327,9 +345,12 @@ def measure_retention(
 ) -> Retention | None:
     """Retention of `curve`, or None if it lacks the backbone or the stream the action is made in.
 
-    seed_text: of the run; scores on equal groups of one are paired. exceeds: what the backbone's best site is
-    better than, as `Controls.exceeds` says; chance alone by default. Raises UsageError if the
-    action's stream has no such iteration.
+    Args:
+        seed_text: Of the run; scores on equal groups of one are paired.
+        exceeds: What the backbone's best site is better than, as `Controls.exceeds` says; chance alone by default.
+
+    Raises:
+        UsageError: If the action's stream has no such iteration.
     """
     peaks = stream_peaks(curve, iterations)
     if len(peaks) < 2:
@@ -346,7 +367,9 @@ def estimate_retention(
 ) -> RetentionEstimate:
     """Retention of the best sites `action` and `backbone`, with the streams' scores.
 
-    exceeds: what the backbone's best site is better than. absent_below: see `verdict`.
+    Args:
+        exceeds: What the backbone's best site is better than.
+        absent_below: See `verdict`.
     """
     if streams is None:
         published = _published(peaks[ACTION].score, peaks[BACKBONE].score)

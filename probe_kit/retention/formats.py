@@ -35,7 +35,9 @@ def frame_of(rows: Sequence[RetentionRow] | Sequence[Difference]) -> "pd.DataFra
 def part_frame(rows: Sequence[RetentionRow], part: str, by_view: bool = True) -> "pd.DataFrame":
     """One part of every row, keyed by `run`, `category` and, of what depends on probes, `view`.
 
-    part: its name in `RetentionRow`. by_view: whether it depends on the view; else every category stands once.
+    Args:
+        part: Its name in `RetentionRow`.
+        by_view: Whether it depends on the view; else every category stands once.
     """
     of_views = [row for row in rows if row.view is not None] if by_view else once_per_category(rows)
     return _frame([_key(row, by_view) | _flat(getattr(_defined(row), part)) for row in of_views])
@@ -219,7 +221,10 @@ def paper_table(rows: Sequence[RetentionRow], means: Sequence[RetentionRow], out
     Keys are `run`, `model`, `view`, `category` (`mean` for the category mean), `episodes`, `sr`, `margin` (Δ over
     episodes), `regime`, `normalised_score` (of means), `backbone`, `action` (maxima over sites) and `retention`.
 
-    rows, means: of a retention table, one mean per run and view. outcome_rule: how episodes were judged, in words.
+    Args:
+        rows: Of a retention table, one mean per run and view.
+        means: As `rows`.
+        outcome_rule: How episodes were judged, in words.
     """
     numbers = []
     for mean in means:

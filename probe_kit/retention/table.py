@@ -57,15 +57,19 @@ if TYPE_CHECKING:
 class RetentionTable:
     """Rows per run, category and view, and per run and view their category mean.
 
-    Runs are never averaged with each other, so no mean mixes suites. differences: between runs, or groups of runs.
-    unpaired: which runs of several have none, or leave items out, and why, a sentence each.
-    results: the probes that the rows were made of, by location of the run and target; figures and reports of the
-    table draw these. Rows of targets that are no side have no mean, as their metrics differ.
-    wordings: of runs that were asked in several, every two against each other.
-    iterations: flow-matching iterations of the expert, or positions of action tokens, that take part.
-    notes: what a reader must know, a sentence each:
-    which runs have no probes, and which settings the rows mix. vlm_vla: VLM − VLA, if that was requested. runs: as
-    the rows read them, VLM runs first.
+    Runs are never averaged with each other, so no mean mixes suites.
+
+    Attributes:
+        differences: Between runs, or groups of runs.
+        results: The probes that the rows were made of, by location of the run and target; figures and reports of
+            the table draw these. Rows of targets that are no side have no mean, as their metrics differ.
+        iterations: Flow-matching iterations of the expert, or positions of action tokens, that take part.
+        notes: What a reader must know, a sentence each: which runs have no probes, and which settings the rows
+            mix.
+        wordings: Of runs that were asked in several, every two against each other.
+        vlm_vla: VLM − VLA, if that was requested.
+        unpaired: Which runs of several have none, or leave items out, and why, a sentence each.
+        runs: As the rows read them, VLM runs first.
     """
 
     rows: list[RetentionRow]
@@ -220,7 +224,8 @@ class RetentionTable:
     def to_text(self, style: str, details: Collection[Section] | Literal["all"] = ()) -> str:
         """Return the summary, a sentence per category and the tables of some sections in a format of text.
 
-        details: as of `to_rich`.
+        Args:
+            details: As of `to_rich`.
         """
         sentences = [f"{category.name}  {category.finding}" for run in self.summary for category in run.categories]
         return render(style, [self.summary_table, *self._details(details)], sentences, self.notes)
@@ -238,7 +243,8 @@ class RetentionTable:
     def to_latex(self, details: Collection[Section] | Literal["all"] = ()) -> str:
         """Return the summary in LaTeX with booktabs rules, each table with a caption, a label and a line's width.
 
-        details: sections whose tables stand below it, as of `to_rich`; all of them by "all".
+        Args:
+            details: Sections whose tables stand below it, as of `to_rich`; all of them by "all".
         """
         tables = [self.summary_table, *self._details(details)]
         return render("latex", tables, notes=(*self.unpaired, *self.notes))
@@ -282,7 +288,9 @@ class RetentionTable:
     def to_rich(self, details: Collection[Section] | Literal["all"] = (), with_next_step: bool = True) -> "Group":
         """The summary for a rich console: one table, a sentence per category, and one line what to do next.
 
-        details: sections that are shown above it, see `probe_kit.retention.choices.Section`; all of them by "all".
+        Args:
+            details: Sections that are shown above it, see `probe_kit.retention.choices.Section`; all of them by
+                "all".
         """
         from rich.console import Group
         from rich.text import Text
@@ -329,29 +337,42 @@ def retention_table(
 ) -> RetentionTable:
     """Return success rates, best sites of probes and retention of several runs, per category and view.
 
-    runs: a list, of which the first is compared with every other on the same questions (see `compare_runs`), or
-    lists by the name of a group, such as `{"vqa": [a], "no vqa": [b, c]}`; groups are compared with each other.
-    against: the run or group that every other is compared with instead, by its name. views: those that were probed
-    by default. iterations: which expert iterations take part. keys: which stored probe results of each run to use,
-    in order, the newest by default, and none for "". epsilons: zone radii in metres at which SR is scored again,
-    for the rule `disc`. rule: by which episodes are judged, a name of `probe_kit.env.scoring.RULES`;
-    last_steps: control steps at their end that count. absent_below: accuracy below which a stream without signal
-    is called absent. A run that keeps no trajectories has no success rate by another rule than `disc`. A run
-    without activations or probes shows success rates only. score: by which VLM runs are read, `text`, `logits` or
-    `order-balanced`; they stand first. with_side_words: count their items in whose name a side stands. vlm_vla:
-    compare every VLM run with every acting one, see `compare_with_vlms`, or pairs of these by their locations.
-    labels: names of runs in tables and figures by their location, instead of their own. pairs: by location, the
-    runs that are compared, each the first minus the second, instead of every other with the first; all of them are
-    one family of tests. origins: of groups, what the models grew from by the location of their runs; models of one
-    origin count as one. By default checkpoints of one training do. categories: rows of these alone, and means over
-    them; probes are those of the
-    whole runs. with_behaviour: False leaves empty what the rule `disc` does not need (other rules and behaviour),
-    so that no trajectory is read. target: columns of labels, whose retention it is instead of that of a side; of
-    these runs, views, iterations, keys, family and labels alone count. family: `table` corrects p for all targets
-    by Holm's method, per run, category, view and stream. Raises UnknownSiteError for a view that was not probed,
-    UsageError for an unknown key or a number of keys that is not that of the runs, for a run that is given twice,
-    for `against` or `pairs` where they are none of the runs, for a side as target, and for labels that differ
-    between runs; NoProbesError for a run without probes of a target; SceneError for overlapping zones.
+    Args:
+        runs: A list, of which the first is compared with every other on the same questions (see `compare_runs`),
+            or lists by the name of a group, such as `{"vqa": [a], "no vqa": [b, c]}`; groups are compared with
+            each other.
+        views: Those that were probed by default.
+        target: Columns of labels, whose retention it is instead of that of a side; of these runs, views,
+            iterations, keys, family and labels alone count.
+        family: `table` corrects p for all targets by Holm's method, per run, category, view and stream.
+        iterations: Which expert iterations take part.
+        keys: Which stored probe results of each run to use, in order, the newest by default, and none for "".
+        epsilons: Zone radii in metres at which SR is scored again, for the rule `disc`.
+        score: By which VLM runs are read, `text`, `logits` or `order-balanced`; they stand first.
+        with_side_words: Count their items in whose name a side stands. vlm_vla: compare every VLM run with every
+            acting one, see `compare_with_vlms`, or pairs of these by their locations.
+        rule: By which episodes are judged, a name of `probe_kit.env.scoring.RULES`.
+        last_steps: Control steps at their end that count.
+        absent_below: Accuracy below which a stream without signal is called absent. A run that keeps no
+            trajectories has no success rate by another rule than `disc`. A run without activations or probes shows
+            success rates only.
+        against: The run or group that every other is compared with instead, by its name.
+        labels: Names of runs in tables and figures by their location, instead of their own.
+        pairs: By location, the runs that are compared, each the first minus the second, instead of every other
+            with the first; all of them are one family of tests.
+        origins: Of groups, what the models grew from by the location of their runs; models of one origin count as
+            one. By default checkpoints of one training do.
+        categories: Rows of these alone, and means over them; probes are those of the whole runs.
+        with_behaviour: False leaves empty what the rule `disc` does not need (other rules and behaviour), so that
+            no trajectory is read.
+
+    Raises:
+        UnknownSiteError: For a view that was not probed.
+        UsageError: For an unknown key or a number of keys that is not that of the runs, for a run that is given
+            twice, for `against` or `pairs` where they are none of the runs, for a side as target, and for labels
+            that differ between runs.
+        NoProbesError: For a run without probes of a target.
+        SceneError: For overlapping zones.
     """
     targets = [target] if isinstance(target, str) else target
     if targets is not None and (isinstance(runs, Mapping) or against or pairs or vlm_vla):
@@ -444,7 +465,8 @@ def _of_sides(
 ) -> tuple[list[Member], list[str | None]]:
     """Return runs, read by a score, and their keys, those of VLM runs first.
 
-    Raises UsageError for a run without sides, or one that is given twice.
+    Raises:
+        UsageError: For a run without sides, or one that is given twice.
     """
     for _, run in members:
         check_sides(run, "a retention table")
@@ -513,9 +535,13 @@ def _read_sides(runs: Sequence[TableRun], keys: Sequence[str | None]) -> tuple[P
 def _read_labels(runs: Sequence[TableRun], targets: Sequence[str], keys: Sequence[str | None]) -> ProbesOfRows:
     """Return the stored probes of every target in every run.
 
-    keys: which ones of each run, the newest by default; with one target only. Raises NoProbesError for a run
-    without probes of a target, UsageError for a side, a target given twice, a key of another target, and several
-    runs whose labels differ.
+    Args:
+        keys: Which ones of each run, the newest by default; with one target only.
+
+    Raises:
+        NoProbesError: For a run without probes of a target.
+        UsageError: For a side, a target given twice, a key of another target, and several runs whose labels
+            differ.
     """
     if not runs or not targets:
         raise UsageError("retention of a label needs at least one run and one target")

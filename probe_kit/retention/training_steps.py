@@ -39,7 +39,8 @@ _COLUMNS = {
 def training_step(run: RunReader) -> int:
     """Return the training step of the run's checkpoint, from the last folder of its path.
 
-    Raises UsageError for a run whose checkpoint is unknown or names no step.
+    Raises:
+        UsageError: For a run whose checkpoint is unknown or names no step.
     """
     checkpoint = checkpoint_of(run)
     if (training := split_checkpoint(checkpoint)) is not None:
@@ -54,8 +55,9 @@ def training_step(run: RunReader) -> int:
 def read_steps(text: str | None, runs: Sequence[RunReader]) -> dict[str, int]:
     """Return the training step of every run by its location; text: comma-separated numbers, None for the folders'.
 
-    Raises UsageError for another text, a number of steps that is not that of the runs, runs of one step, or VLM
-    runs, which have no retention.
+    Raises:
+        UsageError: For another text, a number of steps that is not that of the runs, runs of one step, or VLM
+            runs, which have no retention.
     """
     if vlms := [str(run.location) for run in runs if run.ask is not None]:
         raise UsageError(f"--compare steps is for policy runs; {vlms[0]} is a VLM run. Leave it out")
@@ -82,9 +84,10 @@ def read_steps(text: str | None, runs: Sequence[RunReader]) -> dict[str, int]:
 def step_table(table: RetentionTable, steps: Mapping[str, int]) -> Table:
     """Return success, backbone, action, retention and drift by category and training step.
 
-    table: of runs in the order of their steps, the first of which all others are compared with. steps: by
-    location. Keys of a row's numbers: `category`, `step`, `run`, `view`, `sr`, `backbone`, `action`, `retention`,
-    `drift` (of the backbone) and, for each of them, its limits under the name with `_ci`.
+    Args:
+        table: Of runs in the order of their steps, the first of which all others are compared with.
+        steps: By location. Keys of a row's numbers: `category`, `step`, `run`, `view`, `sr`, `backbone`, `action`,
+            `retention`, `drift` (of the backbone) and, for each of them, its limits under the name with `_ci`.
     """
     first: dict[str, str | None] = {}  # the first view of each run, which its rows are of
     rows = [row for row in table.all_rows if first.setdefault(row.run.location, row.view) == row.view]

@@ -21,9 +21,12 @@ Matrix = NDArray[np.float64]
 class ActionErrors:
     """Predicted minus recorded actions, in the units of the data set.
 
-    run: of recordings. names: (D,) of the numbers of an action. errors: (E, C, S, D) by row, inference and step of
-    the chunk, NaN where nothing was recorded. deviations: (D,) standard deviations of the recorded actions at the
-    shown frames. In these deviations, the mean recorded action has an error of 1.
+    Attributes:
+        run: Of recordings.
+        names: (D,) of the numbers of an action.
+        errors: (E, C, S, D) by row, inference and step of the chunk, NaN where nothing was recorded.
+        deviations: (D,) standard deviations of the recorded actions at the shown frames. In these deviations, the
+            mean recorded action has an error of 1.
     """
 
     run: RunReader
@@ -101,8 +104,9 @@ class ActionErrors:
 def compare_actions(run: RunReader) -> ActionErrors:
     """The predicted actions of a run on recordings beside the recorded ones.
 
-    Raises UsageError for another run, or where the two are not the same numbers: another count, changes beside
-    positions, or values outside the statistics of the checkpoint.
+    Raises:
+        UsageError: For another run, or where the two are not the same numbers: another count, changes beside
+            positions, or values outside the statistics of the checkpoint.
     """
     if not run.recorded:
         raise UsageError(f"{run.location} has no recorded actions: it is not of recordings")

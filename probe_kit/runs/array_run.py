@@ -27,12 +27,15 @@ if TYPE_CHECKING:
 class ArrayRun:
     """A run over features in memory, for activations that were not recorded by probe_kit.
 
-    path: folder for the probe results. episodes: one row per episode, with at least `episode_id`, `item_id`,
-    `category`, `group_id`, `layout`, `side_correct`, `outcome` and `side_placed`.
-    features: (E, D) per site and view, rows in the order of `episodes`. token_features: per site and role (None
-    for all tokens), (E, T, D) values and (E, T) mask. A site needs a pooled view too. control_features: (E, D) by
-    name, of controls of a label that never saw the model.
-    Raises UsageError if an array has another number of rows or dimensions.
+    Attributes:
+        path: Folder for the probe results.
+        episodes: One row per episode, with at least `episode_id`, `item_id`, `category`, `group_id`, `layout`,
+            `side_correct`, `outcome` and `side_placed`.
+        features: (E, D) per site and view, rows in the order of `episodes`.
+        token_features: Per site and role (None for all tokens), (E, T, D) values and (E, T) mask. A site needs a
+            pooled view too.
+        control_features: (E, D) by name, of controls of a label that never saw the model. Raises UsageError if an
+            array has another number of rows or dimensions.
     """
 
     path: Path

@@ -22,11 +22,13 @@ _SPARE = 1 << 20
 class ArrayStore(Store):
     """The objects below `folder` that are known by their sums; whatever else lies there does not exist for it.
 
-    sums: by key; an object that is written is known from then on. advice: what to do if the object of a key is
-    wrong. A wrong or missing object raises RunDamagedError. Of a shard, only the parts that are read are checked.
-
     written: the sums of what was written through it. shards: number of inner chunks in every object of a sharded
     array, by the array's path, to be filled in before it is written.
+
+    Args:
+        sums: By key; an object that is written is known from then on.
+        advice: What to do if the object of a key is wrong. A wrong or missing object raises RunDamagedError. Of a
+            shard, only the parts that are read are checked.
     """
 
     supports_writes = supports_deletes = supports_listing = True

@@ -133,7 +133,8 @@ def codecs(name: str, typesize: int) -> list[BytesBytesCodec]:
 def open_array(store: Store, name: str) -> zarr.Array[Any]:
     """Open one array for reading; a missing chunk is an error, never a fill value.
 
-    Raises RunDamagedError for codecs, and for sizes, that probe_kit never writes.
+    Raises:
+        RunDamagedError: For codecs, and for sizes, that probe_kit never writes.
     """
     with bounded_codecs():
         array = zarr.open_array(store, path=name, mode="r", zarr_format=3, config={"read_missing_chunks": False})
@@ -231,7 +232,8 @@ _DAMAGE = (ChunkNotFoundError, ValueError, RuntimeError)
 class Rows:
     """An array with one row per planned episode, seen through the committed ones.
 
-    numbers: the plan's number of every committed episode, in order.
+    Attributes:
+        numbers: The plan's number of every committed episode, in order.
     """
 
     array: "zarr.Array[Any]"
@@ -251,7 +253,8 @@ class Rows:
     def between(self, start: int, stop: int) -> Iterator[NDArray[Any]]:
         """All of the episodes from `start` up to `stop`, in order; several are read at a time.
 
-        Raises RunDamagedError at a damaged one.
+        Raises:
+            RunDamagedError: At a damaged one.
         """
         per_row = math.prod(self.array.shape[1:]) * self.array.dtype.itemsize
         size = max(1, _BLOCK_BYTES // max(1, per_row))

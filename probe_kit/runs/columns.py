@@ -53,7 +53,8 @@ class Seal(Record):
 class Columns:
     """The sealed columns of a run.
 
-    sums: of every object in their folder. advice: what to do if they are damaged.
+    Args:
+        sums: Of every object in their folder. advice: what to do if they are damaged.
     """
 
     def __init__(self, location: Location, folder: str, sums: Mapping[str, Sum]) -> None:
@@ -99,8 +100,9 @@ class Columns:
 def find_columns(root: Root, commits: Mapping[int, Commit]) -> Columns | None:
     """The columns of a run if they were sealed from exactly these commits.
 
-    Raises RunDamagedError if what was noted of them when they were sealed was changed, or names commits that are
-    gone or others, or if a part of the columns is gone.
+    Raises:
+        RunDamagedError: If what was noted of them when they were sealed was changed, or names commits that are
+            gone or others, or if a part of the columns is gone.
     """
     location, stamp = root.location, stamp_of(commits)
     seal = next((seal for seal in _read_seals(root, commits) if seal.stamp == stamp), None)

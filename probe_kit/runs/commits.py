@@ -31,11 +31,16 @@ Span = Annotated[tuple[str, int, int], Field(strict=False)]
 class Commit(Record):
     """One finished episode.
 
-    plan: hash of the record that planned it. outcome: columns of `Run.episodes`. roles: spans of tokens per
-    captured inference and stream. control_steps: of every inference. provenance: name of the record in
-    `provenance/`. objects, pictures: by key in `data.zarr` and in the run. lens_margins: the logit lens of an
-    answer by letter, left minus right per layer. frames: number of frames in its picture, where it holds all of
-    the episode.
+    Attributes:
+        plan: Hash of the record that planned it.
+        outcome: Columns of `Run.episodes`.
+        roles: Spans of tokens per captured inference and stream.
+        control_steps: Of every inference.
+        provenance: Name of the record in `provenance/`.
+        objects: By key in `data.zarr` and in the run.
+        pictures: As `objects`.
+        lens_margins: The logit lens of an answer by letter, left minus right per layer.
+        frames: Number of frames in its picture, where it holds all of the episode.
     """
 
     kind: ClassVar[str] = "commit"
@@ -88,9 +93,12 @@ def numbered(location: Location, folder: str) -> Iterator[tuple[int, str, bytes]
 def read_commits(root: Root, checked: Mapping[int, Commit] | None = None) -> dict[int, Commit]:
     """All commits by episode number, each checked, and against the sizes of the objects it names.
 
-    checked: commits that were read and checked before; these are not read again.
-    Raises RunDamagedError naming the first commit that was changed or belongs elsewhere, or the first object that
-    is missing or has another size.
+    Args:
+        checked: Commits that were read and checked before; these are not read again.
+
+    Raises:
+        RunDamagedError: Naming the first commit that was changed or belongs elsewhere, or the first object that is
+            missing or has another size.
     """
     unread = _unread(root.location, checked) if checked else numbered(root.location, COMMITS)
     commits = {number: read_commit(root, number, key, raw) for number, key, raw in unread}
@@ -249,8 +257,9 @@ _Count = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 class Seconds:
     """Wall-clock seconds that one episode took.
 
-    inference: of the model's calls; of a call for several observations, its share. simulation: of setting up,
-    simulating and drawing.
+    Attributes:
+        inference: Of the model's calls; of a call for several observations, its share.
+        simulation: Of setting up, simulating and drawing.
     """
 
     inference: float = 0.0
@@ -289,7 +298,8 @@ def write_seconds(root: Root, number: int, seconds: Seconds) -> None:
 def read_seconds(root: Root, commits: Mapping[int, Commit]) -> dict[int, Seconds]:
     """Read the seconds by episode number, NaN where none are stored at all.
 
-    Raises RunDamagedError for a record that was changed, or is missing among others.
+    Raises:
+        RunDamagedError: For a record that was changed, or is missing among others.
     """
     stored = {}
     for number, key, raw in numbered(root.location, TIMES):

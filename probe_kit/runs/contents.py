@@ -38,8 +38,10 @@ from probe_kit.runs.store import Location, locate
 class StoredObject:
     """An object with a known hash.
 
-    owner: the episode it belongs to, for messages. advice: the remedy if it is damaged. optional: whether it may
-    be missing, as in a copy without activations.
+    Attributes:
+        advice: The remedy if it is damaged.
+        owner: The episode it belongs to, for messages.
+        optional: Whether it may be missing, as in a copy without activations.
     """
 
     key: str
@@ -122,7 +124,8 @@ def stray_keys(
 ) -> list[str]:
     """Keys of all objects that no record leads to, such as copies made by hand; nothing reads them.
 
-    objects: those of `stored_objects`.
+    Args:
+        objects: Those of `stored_objects`.
     """
     expected = {*record_keys(root, commits, columns), *(stored.key for stored in objects)}
     return [key for key in root.location.keys("") if key not in expected and not _expected(key)]
@@ -154,11 +157,17 @@ def copy_run(
 
     The copy holds plan, outcomes, trajectories, probes, interventions and certificates, byte for byte: every table
     can be made of it. Its identity, stamp and settings are those of the run. `column` and `tokens` raise
-    ActivationsLeftOutError, and nothing can be added to it. pictures: copy frames and videos too. directions: copy
-    the weights of probes, without which `ProbeResults.direction` raises RunDamagedError. trajectories: copy what
-    happened step by step, without which only the rule `disc` judges the last step.
-    The copy appears whole or not at all. Raises UsageError if anything lies at `out`, DiskSpaceError, and what
-    `open_run` raises.
+    ActivationsLeftOutError, and nothing can be added to it.
+
+    Args:
+        pictures: Copy frames and videos too.
+        directions: Copy the weights of probes, without which `ProbeResults.direction` raises RunDamagedError.
+        trajectories: Copy what happened step by step, without which only the rule `disc` judges the last step. The
+            copy appears whole or not at all.
+
+    Raises:
+        UsageError: If anything lies at `out`.
+        DiskSpaceError: And what `open_run` raises.
     """
     run, target = open_run(path, allow_partial), locate(out)
     # `root.arrays` has the inputs of recordings besides the streams: states and small pictures are left out too.

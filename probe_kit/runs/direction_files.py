@@ -33,8 +33,12 @@ _SITE_KEYS = ("site", "hook_name")
 class FileDirection:
     """Vectors of a file in the raw space of a site.
 
-    name: as conditions are called, with a hash of the vectors. vectors: (K, D) float64. site, role, weights: empty
-    where the file does not say. weights: hash of those that it was found in.
+    Attributes:
+        name: As conditions are called, with a hash of the vectors.
+        vectors: (K, D) float64.
+        site: Empty where the file does not say.
+        role: As `site`.
+        weights: As `site`. Hash of those that it was found in.
     """
 
     name: str

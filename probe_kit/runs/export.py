@@ -49,18 +49,22 @@ def export_run(
     """Write the run at `path` to `out`, whole or not at all, with sha256 of every file; returns `out`.
 
     h5: `<stream>/pooled`, `<stream>/later`, `<stream>/tokens`, and a dataset per column under `episodes`.
-    safetensors: the same with a dot, the last two true bfloat16; episodes in the metadata.
-    Axes of both are (episode, call, [iteration,] layer, view or token, feature).
-    lerobot: a LeRobotDataset, of a run with `--frames all`.
+    safetensors: the same with a dot, the last two true bfloat16; episodes in the metadata. Axes of both are
+    (episode, call, [iteration,] layer, view or token, feature). lerobot: a LeRobotDataset, of a run with `--frames
+    all`.
 
-    Three formats hold the vectors that `sites` and `view` choose, see `choose`.
-    parquet: a row per vector with episode, group, inference, frame, site, view, role and token.
-    directions: a vector per category, view and site, see `write_class_means`; a .safetensors or .npz.
-    sae: a folder with a memory map (N, D) per site in a drawn order, an index, and the scale of every site.
-    Default are all sites, and all pooled views in Parquet, `mean` in matrices. dtype, seed: of `sae` alone.
+    Three formats hold the vectors that `sites` and `view` choose, see `choose`. parquet: a row per vector with
+    episode, group, inference, frame, site, view, role and token. directions: a vector per category, view and site,
+    see `write_class_means`; a .safetensors or .npz. sae: a folder with a memory map (N, D) per site in a drawn
+    order, an index, and the scale of every site. Default are all sites, and all pooled views in Parquet, `mean` in
+    matrices.
 
     Raises UsageError for another format, an option that a format does not have, or a file that exists;
     UnknownSiteError, MissingExtraError, RunDamagedError, DiskSpaceError.
+
+    Args:
+        dtype: Of `sae` alone.
+        seed: As `dtype`.
     """
     check_format(style)
     if style not in OF_VECTORS and (sites is not None or view is not None):
@@ -269,6 +273,7 @@ def write_lerobot(run: Run, folder: Path) -> None:
 
     `observation.state` is the measured tool, x, y, z, roll, pitch, yaw in metres and radians, and the opening of
     the gripper; `action` is the commanded action. The frame behind the last action is left out.
+
     Raises UsageError for a run without all frames, NoTrajectoryError, MissingExtraError, and RunDamagedError.
     """
     for needed in ("datasets", "av"):
@@ -311,7 +316,8 @@ def _features(shape: tuple[int, ...]) -> dict[str, Any]:
 def _filmed_episodes(run: Run) -> Iterator[tuple[dict[str, Any], SmallFrames]]:
     """The row and the frames of every episode: one before the first action, one behind each.
 
-    Raises UsageError before the first if an episode was played without `--frames all`, or its frames were deleted.
+    Raises:
+        UsageError: Before the first if an episode was played without `--frames all`, or its frames were deleted.
     """
     rows = run.episodes.to_dict("records")
     for commit in run.commits():

@@ -46,8 +46,11 @@ class StreamChoice:
 class Block:
     """n vectors of every site of a choice, at one captured inference of one episode.
 
-    position: the episode's place in `Run.episodes`. tokens: (n,) positions, `POOLED` for pooled views. roles: (n,)
-    of the tokens; empty for `mean` and `last`, whose tokens play several. values: (S, n, D) float32.
+    Attributes:
+        position: The episode's place in `Run.episodes`.
+        tokens: (n,) positions, `POOLED` for pooled views.
+        roles: (n,) of the tokens; empty for `mean` and `last`, whose tokens play several.
+        values: (S, n, D) float32.
     """
 
     choice: StreamChoice
@@ -62,9 +65,13 @@ class Block:
 def choose(run: Run, sites: Sequence[str] | None, view: str | None) -> tuple[StreamChoice, ...]:
     """The part of a run that is asked for.
 
-    sites: names, their beginnings (`backbone`, `expert.03`) or patterns (`expert.*@9`); None for all. view: a
-    pooled view, `tokens` or `tokens:ROLE`; None for all pooled views. Streams without the view are left out unless
-    they are named. Raises UnknownSiteError for a site or view that is not stored.
+    Args:
+        sites: Names, their beginnings (`backbone`, `expert.03`) or patterns (`expert.*@9`); None for all.
+        view: A pooled view, `tokens` or `tokens:ROLE`; None for all pooled views. Streams without the view are
+            left out unless they are named.
+
+    Raises:
+        UnknownSiteError: For a site or view that is not stored.
     """
     for pattern in sites or ():
         if not any(_matches(site, [pattern]) for stream in run.streams for site in run.sites(stream)):
@@ -301,9 +308,12 @@ def write_sae(
 ) -> None:
     """`<stream>/<site>.npy` (N, D) in one drawn order per stream, `<stream>/index.parquet`, and `scales.json`.
 
-    dtype: the bits of bfloat16 are stored as uint16, because numpy has no such type. `scale` is the factor by
-    which the mean squared norm of the rows of a site becomes D; stored rows are not multiplied by it.
-    Raises UsageError for a value that float16 cannot hold.
+    Args:
+        dtype: The bits of bfloat16 are stored as uint16, because numpy has no such type. `scale` is the factor by
+            which the mean squared norm of the rows of a site becomes D; stored rows are not multiplied by it.
+
+    Raises:
+        UsageError: For a value that float16 cannot hold.
     """
     require("pyarrow.parquet", "export")
     folder.mkdir()
@@ -327,7 +337,8 @@ def _write_matrices(
 ) -> tuple[NDArray[np.int32], list[str], dict[Site, Path]]:
     """Fill a file per site in one pass over the run. order: (N,) row of every vector.
 
-    Returns (4, N) position, inference, token and role of every row, as in `Block`, names of the roles, and files.
+    Returns:
+        (4, N) position, inference, token and role of every row, as in `Block`, names of the roles, and files.
     """
     count = count_vectors(run, choice)
     files = {site: folder / f"{site}.npy" for site in choice.sites}

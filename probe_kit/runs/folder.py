@@ -29,7 +29,8 @@ Far above what runs have. They keep a file that was made up, such as a sparse on
 def check_size(key: str, size: int, where: object, most: int | None = None) -> None:
     """Raise RunDamagedError, before it is read, for an object that is larger than any that probe_kit writes.
 
-    most: bytes that it may have, where that is known.
+    Args:
+        most: Bytes that it may have, where that is known.
     """
     if most is None:
         most = MOST_RECORD_BYTES if key.endswith(".json") else MOST_OBJECT_BYTES

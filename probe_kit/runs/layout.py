@@ -117,7 +117,9 @@ _Names = Annotated[tuple[str, ...], AfterValidator(check_distinct)]
 class StoredStream:
     """The storage of one stream, also as `run.json` has it.
 
-    tokens: sequence length T as the model packs it; views: the pooled views V, in storage order.
+    Attributes:
+        tokens: Sequence length T as the model packs it.
+        views: The pooled views V, in storage order.
     """
 
     name: str

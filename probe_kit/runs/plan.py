@@ -34,10 +34,14 @@ _NUMBER, _CONTENT = "episode", "content_blake2b"
 class Row:
     """One row of a plan, whatever its source: an episode of a scene, a stretch of a recording, a picture.
 
-    index: its number in the run, where its objects lie. In a run that grew, numbers are not in the plan's order.
-    columns: the row as flat columns, of which every source has `episode_id`, `item_id`, `category`, `group_id`,
-    `instruction` and `policy_seed`. content: what the source's player plays. frames: recorded frames that the
-    inferences see; None where every inference sees what the actions before it led to.
+    Attributes:
+        index: Its number in the run, where its objects lie. In a run that grew, numbers are not in the plan's
+            order.
+        columns: The row as flat columns, of which every source has `episode_id`, `item_id`, `category`,
+            `group_id`, `instruction` and `policy_seed`.
+        content: What the source's player plays.
+        frames: Recorded frames that the inferences see; None where every inference sees what the actions before it
+            led to.
     """
 
     index: int
@@ -82,10 +86,13 @@ class Row:
 class Plan:
     """All rows of a run in order, and how their streams are stored.
 
-    bytes: of their activations. identity: the part of a run's identity that says where observations come from.
-    selection: what was selected, as it stands among a run's settings; no part of its identity. name_parts: what
-    the default name of a run depends on beside its identity. suite_parent: of a suite that was selected of another
-    one, the hash of that. decoder: what makes pictures of stored videos here, with its version.
+    Attributes:
+        bytes: Of their activations.
+        identity: The part of a run's identity that says where observations come from.
+        selection: What was selected, as it stands among a run's settings; no part of its identity.
+        name_parts: What the default name of a run depends on beside its identity.
+        suite_parent: Of a suite that was selected of another one, the hash of that.
+        decoder: What makes pictures of stored videos here, with its version.
     """
 
     episodes: tuple[Row, ...]
@@ -207,8 +214,12 @@ class PlanRecord(Record):
 class StoredPlan:
     """All plan records of a run together.
 
-    rows: the episodes in order. selection, suite_parent, tokens: of the newest record, see `PlanRecord`. extents:
-    planned episodes after each record. hashes: of the records, which the commits of their episodes name.
+    Attributes:
+        rows: The episodes in order.
+        selection: Of the newest record, see `PlanRecord`. extents: planned episodes after each record.
+        suite_parent: As `selection`.
+        tokens: As `selection`.
+        hashes: Of the records, which the commits of their episodes name.
     """
 
     rows: Sequence[RowColumns] = ()
@@ -236,8 +247,12 @@ def count_plans(location: Location) -> int:
 def read_plans(location: Location, run: str, columns: Iterable[str]) -> StoredPlan:
     """All plan records together; without any rows for a run that has none yet.
 
-    run: its identity. columns: those that every row has.
-    Raises RunDamagedError if a record is missing, was changed, or belongs elsewhere.
+    Args:
+        run: Its identity.
+        columns: Those that every row has.
+
+    Raises:
+        RunDamagedError: If a record is missing, was changed, or belongs elsewhere.
     """
     plan, by_number = StoredPlan(), dict[int, RowColumns]()
     for number in count():
@@ -295,7 +310,8 @@ def further_rows(
 ) -> list[RowColumns]:
     """The rows of a plan that the stored one lacks; none if the stored one holds them all.
 
-    Raises SettingsMismatchError if both plan one episode differently, or if each has some that the other lacks.
+    Raises:
+        SettingsMismatchError: If both plan one episode differently, or if each has some that the other lacks.
     """
     was, now = ({row["episode_id"]: row for row in rows} for rows in (stored, requested))
     for name in was.keys() & now.keys():

@@ -191,7 +191,8 @@ def write_certificate(root: Root, parts: Mapping[str, Any], provenance: Provenan
 def read_certificate(root: Root) -> tuple[dict[str, Any], list[dict[str, Any]]]:
     """Contents of the first process's record, and of the records of all.
 
-    Raises RunDamagedError if one is missing, was changed, or is another run's.
+    Raises:
+        RunDamagedError: If one is missing, was changed, or is another run's.
     """
     first = Certificate.read(root.location, CERTIFICATE_FILE, RESTORE, run=root.identity).content
     records = []

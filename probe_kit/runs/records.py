@@ -38,8 +38,9 @@ RESTORE = "Restore it from a copy, or extract the run again"
 class Sum(NamedTuple):
     """Length in bytes of an object, and the blake2b of them as 64 hex digits.
 
-    blocks: of a shard, 16 hex digits per inner chunk in the order of its index, then those of the index; so
-    that a part can be checked without reading the others. Empty for everything else.
+    Attributes:
+        blocks: Of a shard, 16 hex digits per inner chunk in the order of its index, then those of the index; so
+            that a part can be checked without reading the others. Empty for everything else.
     """
 
     length: int
@@ -110,8 +111,10 @@ class Record(BaseModel):
     def parse(cls, raw: bytes, name: str, advice: str, /, **expected: object) -> Self:
         """The record in these bytes. Raises RunDamagedError if it was changed, or belongs elsewhere.
 
-        name, advice: the place and the remedy, for the message. expected: values by part, such as the run's
-        identity.
+        Args:
+            name: The place and the remedy, for the message.
+            advice: As `name`.
+            **expected: Values by part, such as the run's identity.
         """
         content = read_record(raw, name, advice)
         carried = content.pop(HASH)
@@ -191,7 +194,9 @@ def as_record(content: Mapping[str, Any]) -> bytes:
 def read_record(raw: bytes, name: str, advice: str) -> dict[str, Any]:
     """The content of a record, with its hash. Raises RunDamagedError unless the hash is that of the values.
 
-    name, advice: the place and the remedy, for the message.
+    Args:
+        name: The place and the remedy, for the message.
+        advice: As `name`.
     """
     content = read_plain(raw, name, advice)
     carried = content.pop(HASH, None)

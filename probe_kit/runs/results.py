@@ -75,8 +75,10 @@ class Times(Record):
 class Bundle:
     """One bundle, its head checked; files are checked when they are read.
 
-    head: settings of the producer. times: times of its events by name (UTC, ISO 8601). files: by the name
-    asked for, the name that counts now and the sum of it.
+    Attributes:
+        head: Settings of the producer.
+        times: Times of its events by name (UTC, ISO 8601).
+        files: By the name asked for, the name that counts now and the sum of it.
     """
 
     location: Location
@@ -162,8 +164,10 @@ def write_bundle(
 ) -> None:
     """Store a bundle, or change one: files that are not given stay as they are.
 
-    head, times: replace the former ones; of the head without the parts that are kept here (`key`, `run`, `files`).
-    What killed processes left in its folder is removed.
+    Args:
+        head: Replace the former ones; of the head without the parts that are kept here (`key`, `run`, `files`).
+            What killed processes left in its folder is removed.
+        times: As `head`.
     """
     with location.tended(f"{home}/{key}"):
         folder, run = f"{home}/{key}", _identity(location)
@@ -239,7 +243,8 @@ def unfinished_bundles(location: Location, home: str) -> dict[str, int]:
 def complete_key(key: str, stored: Collection[str], location: Location, kind: str) -> str:
     """The stored key that `key` is, or begins. kind: what is stored, in the plural, for messages.
 
-    Raises UsageError if there is none, or if there are several.
+    Raises:
+        UsageError: If there is none, or if there are several.
     """
     matching = [name for name in stored if name == key] or [
         name for name in stored if key and name.startswith(key)
@@ -294,7 +299,9 @@ _HEX = 2 * DIGEST_BYTES
 class Pieces:
     """The content of `<home>/.<key>.partial/` until the bundle `key` is complete.
 
-    stamp: hash of the commits that the work reads. redo: what to do about a damaged piece, for the message.
+    Attributes:
+        stamp: Hash of the commits that the work reads.
+        redo: What to do about a damaged piece, for the message.
     """
 
     run: Location
@@ -310,9 +317,13 @@ class Pieces:
     def read(self, name: str, record: type) -> dict[str, NDArray[Any]] | None:
         """The arrays of one piece, or None if the work did not get that far.
 
-        record: the dataclass whose fields they are; of several records, each has its name and a slash in front.
-        Raises RunDamagedError if they were changed, are another piece's or of other commits, or have the fields of
-        another version of probe_kit.
+        Args:
+            record: The dataclass whose fields they are; of several records, each has its name and a slash in
+                front.
+
+        Raises:
+            RunDamagedError: If they were changed, are another piece's or of other commits, or have the fields of
+                another version of probe_kit.
         """
         try:
             stored = self.run.read(self._key(name))

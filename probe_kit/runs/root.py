@@ -109,8 +109,9 @@ class Card(Record):
 class LeftOut(Record):
     """`left-out.json`, only in a copy without activations, where objects are missing on purpose.
 
-    arrays: those of `data.zarr` whose objects were not copied; also `directions.npz` where the weights of probes
-    were not. Commits still hold the hash of every object.
+    Attributes:
+        arrays: Those of `data.zarr` whose objects were not copied; also `directions.npz` where the weights of
+            probes were not. Commits still hold the hash of every object.
     """
 
     kind: ClassVar[str] = "note of what was left out"
@@ -216,7 +217,8 @@ class Root:
     def streams(self) -> Mapping[str, StoredStream]:
         """The storage of every stream, by name.
 
-        Raises RunDamagedError if the plan lacks the number of tokens of one.
+        Raises:
+            RunDamagedError: If the plan lacks the number of tokens of one.
         """
         tokens = self.stored_plan.tokens
         selected = self.own_streams if self.own_settings["tokens"] != "all" else ()
@@ -275,7 +277,9 @@ def new_card(settings: Mapping[str, Any], streams: Iterable[StoredStream], objec
 def read_root(location: Location) -> Root:
     """The root of the run that lies at `location`.
 
-    Raises RunNotFoundError if there is no run, RunDamagedError if `run.json` was changed or has another schema.
+    Raises:
+        RunNotFoundError: If there is no run.
+        RunDamagedError: If `run.json` was changed or has another schema.
     """
     root = find_root(location)
     if root is None:
@@ -331,8 +335,13 @@ class Label(Record):
 def label_run(path: Path | str | Location, label: str) -> None:
     """Give the run at `path` another label; nothing else of it changes.
 
-    label: 1 to 200 printable characters. Raises UsageError for another label, RunNotFoundError if there is no run,
-    RunDamagedError if `run.json` was changed.
+    Args:
+        label: 1 to 200 printable characters.
+
+    Raises:
+        UsageError: For another label.
+        RunNotFoundError: If there is no run.
+        RunDamagedError: If `run.json` was changed.
     """
     root = read_root(locate(path))
     check_label(label)

@@ -86,9 +86,14 @@ class NotSealedWarning(UserWarning):
 def open_run(path: Path | str | Location, allow_partial: bool = False) -> "Run":
     """Open the run in folder `path`, or at a URL such as `s3://bucket/prefix/run` (extra `remote`).
 
-    allow_partial: open it also if episodes of the plan are missing or failed; `episodes` then lists fewer.
-    Raises RunNotFoundError if it is none, RunIncompleteError if it is unfinished, RunDamagedError if its schema
-    is another one, a committed object is missing, or plan, metadata or any record is not what was written.
+    Args:
+        allow_partial: Open it also if episodes of the plan are missing or failed; `episodes` then lists fewer.
+
+    Raises:
+        RunNotFoundError: If it is none.
+        RunIncompleteError: If it is unfinished.
+        RunDamagedError: If its schema is another one, a committed object is missing, or plan, metadata or any
+            record is not what was written.
     """
     run = read_run(locate(path))
     # At the opening, so that damage is met before hours of work, and not in the middle of a table.
@@ -117,9 +122,11 @@ def read_run(location: Location) -> "Run":
 class Run:
     """A stored run. Rows of every array follow `episodes`, which lists the committed ones in plan order.
 
-    rule, last_steps: by which outcomes are given, see `under`; `disc` at the last step is what was stored.
-    wording: the only one whose episodes are shown, None for all; see `in_wording`. item_ids: the only items whose
-    episodes are shown, None for all; see `only`.
+    Attributes:
+        rule: By which outcomes are given, see `under`; `disc` at the last step is what was stored. wording: the
+            only one whose episodes are shown, None for all; see `in_wording`. item_ids: the only items whose
+            episodes are shown, None for all; see `only`.
+        last_steps: As `rule`.
     """
 
     rule: str = DEFAULT_RULE
@@ -197,7 +204,10 @@ class Run:
     def label(self) -> str:
         """The name of the run in tables and legends: the model and what sets it apart, or as it was named.
 
-        It may be changed, see `label_run`. Raises RunDamagedError if its record is missing or was changed.
+        It may be changed, see `label_run`.
+
+        Raises:
+            RunDamagedError: If its record is missing or was changed.
         """
         return read_label(self.root)
 
@@ -256,7 +266,8 @@ class Run:
     def inputs(self) -> StoredInputs | None:
         """State, actions and small pictures of every shown frame; None for a run of scenes.
 
-        Raises ActivationsLeftOutError in a copy without activations.
+        Raises:
+            ActivationsLeftOutError: In a copy without activations.
         """
         source = stored_inputs_of(self.settings)
         if not source:
@@ -325,7 +336,8 @@ class Run:
     def provenances(self) -> dict[str, Provenance]:
         """Device and versions that committed episodes were made with, by the name commits call them.
 
-        Raises RunDamagedError if a commit names one that is not there.
+        Raises:
+            RunDamagedError: If a commit names one that is not there.
         """
         stored = read_provenances(self.root)
         names = sorted({commit.provenance for commit in self.commits()})
@@ -347,8 +359,11 @@ class Run:
     def in_wording(self, wording: str | None = None) -> "Run":
         """The same run with the episodes of one wording only, as probes and success rates take it.
 
-        wording: None for the first; a run in the items' own words is returned as it is. Raises UsageError for a
-        wording that was not asked.
+        Args:
+            wording: None for the first; a run in the items' own words is returned as it is.
+
+        Raises:
+            UsageError: For a wording that was not asked.
         """
         if wording is None and not self.wordings:
             return self
@@ -370,9 +385,15 @@ class Run:
 
         A run of more items thereby serves where fewer are wanted: seeds depend on the run's seed and the item
         alone. Probes are fitted to the episodes that are shown, and stored with the run under a key of their own.
-        categories: slugs, all by default. items: per category, all by default.
-        Raises UnknownCategoryError for a category the run lacks, and UsageError for a number that is not positive,
-        exceeds what a category has, or would separate role-exchanged twins.
+
+        Args:
+            categories: Slugs, all by default.
+            items: Per category, all by default.
+
+        Raises:
+            UnknownCategoryError: For a category the run lacks.
+            UsageError: For a number that is not positive, exceeds what a category has, or would separate
+                role-exchanged twins.
         """
         if categories is None and items is None:
             return self
@@ -531,16 +552,24 @@ class Run:
     def trajectory(self, episode: str | int) -> "Trajectory":
         """Return the trajectory of one episode, frame by frame; `.to_xarray()` labels it.
 
-        episode: its id, such as `color-0001:o`, or its row in `episodes`. Raises NoTrajectoryError if the run
-        keeps none, UsageError for an unknown episode, RunDamagedError if stored bytes are missing or changed.
+        Args:
+            episode: Its id, such as `color-0001:o`, or its row in `episodes`.
+
+        Raises:
+            NoTrajectoryError: If the run keeps none.
+            UsageError: For an unknown episode.
+            RunDamagedError: If stored bytes are missing or changed.
         """
         return self.trajectories[self._position(episode)]
 
     def judged(self, rule: str, last_steps: int = 1) -> pd.DataFrame:
         """A row per episode with the fields of `Judgement`: what an outcome rule says of it.
 
-        rule: a name of `probe_kit.env.scoring.RULES`. last_steps: control steps at the end that count; the
-        released evaluation averages over 11. Raises UsageError for an unknown rule, NoTrajectoryError.
+        Raises UsageError for an unknown rule, NoTrajectoryError.
+
+        Args:
+            rule: A name of `probe_kit.env.scoring.RULES`.
+            last_steps: Control steps at the end that count; the released evaluation averages over 11.
         """
         if last_steps == 1:
             return self._watched[0][check_rule(rule)].copy()
@@ -559,7 +588,8 @@ class Run:
     def behaviour(self) -> pd.DataFrame:
         """A row per episode: its id, then what hand and cube did, see `probe_kit.env.scoring.Behaviour`.
 
-        Raises NoTrajectoryError if the run keeps no trajectories.
+        Raises:
+            NoTrajectoryError: If the run keeps no trajectories.
         """
         return (
             self._watched[1].assign(episode_id=self.episodes["episode_id"]).set_index("episode_id").reset_index()
@@ -684,7 +714,8 @@ class Run:
     def rows(self, stream: str, kind: ArrayKind = "pooled") -> Rows:
         """The stored rows of the committed episodes: all that was captured in one episode at a time.
 
-        Raises ActivationsLeftOutError in a copy without activations.
+        Raises:
+            ActivationsLeftOutError: In a copy without activations.
         """
         if f"{stream}/{kind}" in self.root.left_out:
             self.root.refuse_left_out(f"there are no {kind} of {stream}")
@@ -750,7 +781,9 @@ class Run:
         """(E, T, D) float32 values and (E, T) bool mask of one site; the mask chooses `role`, or all but padding.
 
         Values outside the mask are zero. For large runs use `iter_token_blocks`, which holds one block.
-        Raises UnknownSiteError if the run was extracted without `--tokens all`, or never had that role.
+
+        Raises:
+            UnknownSiteError: If the run was extracted without `--tokens all`, or never had that role.
         """
         mask = self.token_mask(site, role, call)
         values = np.zeros((*mask.shape, self.stored(site.stream).width), np.float32)

@@ -19,7 +19,10 @@ def is_run(folder: Path) -> bool:
 def runs_in(folder: Path, deep: bool = True) -> list[Path]:
     """Return the runs below `folder`, finished or not, in the order of their paths; empty without any.
 
-    A run holds no other. deep: at any depth, else directly below, which is quick in a large folder.
+    A run holds no other.
+
+    Args:
+        deep: At any depth, else directly below, which is quick in a large folder.
     """
     if not deep:
         return [path.parent for path in sorted(folder.glob(f"*/{RUN_FILE}"))] if folder.is_dir() else []

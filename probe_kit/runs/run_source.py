@@ -24,11 +24,13 @@ OF_SCENE = "scene."
 class Origin:
     """Files and choices of one process that played episodes of a run; none is part of the run's identity.
 
-    files: absolute, by field of the source's settings, such as `suite`, `folder` or `scene.background`.
-    checkpoint: absolute folder, hub id, or a word of the family; empty if unknown. options: of the family, as they
-    were passed, files and folders absolute. random_weights: whether random weights were requested, which a file
-    that calls its weights random is not. weights_seed: of requested random weights. repositories: commits of
-    further repositories of the hub, by name, which a repetition reads again.
+    Attributes:
+        files: Absolute, by field of the source's settings, such as `suite`, `folder` or `scene.background`.
+        checkpoint: Absolute folder, hub id, or a word of the family; empty if unknown.
+        options: Of the family, as they were passed, files and folders absolute.
+        random_weights: Whether random weights were requested, which a file that calls its weights random is not.
+        weights_seed: Of requested random weights.
+        repositories: Commits of further repositories of the hub, by name, which a repetition reads again.
     """
 
     files: Mapping[str, str] = field(default_factory=dict)
@@ -66,8 +68,11 @@ class Origin:
 class RunSource:
     """The observations that a run is made of.
 
-    kind: of the source's settings, such as `scene` or `lerobot`; `arrays` for a run that probe_kit did not play.
-    name: with what identifies it, such as `NAME@VERSION#HASH` of a suite. words: what the run did with it.
+    Attributes:
+        kind: Of the source's settings, such as `scene` or `lerobot`; `arrays` for a run that probe_kit did not
+            play.
+        name: With what identifies it, such as `NAME@VERSION#HASH` of a suite.
+        words: What the run did with it.
     """
 
     kind: str
@@ -99,8 +104,14 @@ def select_items(
 ) -> list[str]:
     """Ids of the first items of some categories, in the order of the plan.
 
-    items: as `Run.items`. categories: slugs, all by default. where: the run, for messages.
-    Raises UnknownCategoryError and UsageError, see `Run.only`.
+    Args:
+        items: As `Run.items`.
+        categories: Slugs, all by default.
+        where: The run, for messages.
+
+    Raises:
+        UnknownCategoryError: See `Run.only`.
+        UsageError: See `Run.only`.
     """
     categories_of_run = list(dict.fromkeys(items["category"].astype(str)))
     selected = categories_of_run if categories is None else check_categories(categories, categories_of_run)

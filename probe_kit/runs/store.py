@@ -328,7 +328,9 @@ def begin(location: Location, objects: Mapping[str, bytes], last: str) -> None:
 def locate(where: str | Path | Location) -> Location:
     """The location at a folder or a URL such as `s3://bucket/prefix/run`.
 
-    Raises MissingExtraError for a URL without the extra `remote`, and UsageError for one of another kind.
+    Raises:
+        MissingExtraError: For a URL without the extra `remote`.
+        UsageError: For one of another kind.
     """
     if isinstance(where, Location):
         return where

@@ -38,8 +38,9 @@ _CODING: dict[FrameChoice, dict[str, int]] = {
 class FrameSheet:
     """The stored picture of an episode. content: the WebP.
 
-    count: how many frames it holds, one before the first action and one behind each. None in a picture of the
-    first and last frame.
+    Attributes:
+        count: How many frames it holds, one before the first action and one behind each. None in a picture of the
+            first and last frame.
     """
 
     content: bytes
@@ -50,8 +51,9 @@ class FrameSheet:
 class EpisodeFrames:
     """The frames of an episode as a reader is shown them. content: one WebP of `count` frames.
 
-    kind: the first and the last one, one before the first action and one behind each, or one per inference.
-    cameras: how many pictures stand side by side in a frame, from the first camera on.
+    Attributes:
+        kind: The first and the last one, one before the first action and one behind each, or one per inference.
+        cameras: How many pictures stand side by side in a frame, from the first camera on.
     """
 
     content: bytes
@@ -68,7 +70,8 @@ class EpisodeFrames:
 def episode_frames(run: RunReader, position: int) -> EpisodeFrames | None:
     """Return the stored picture of the episode in a row, else one of what its inferences saw; None without either.
 
-    Raises RunDamagedError for a picture that was changed.
+    Raises:
+        RunDamagedError: For a picture that was changed.
     """
     row, inputs = run.episodes.iloc[position], run.inputs
     sheet = read_sheet(run.location, int(row.get("episode", position)))
@@ -117,7 +120,8 @@ def decode_frames(content: bytes, count: int) -> SmallFrames:
 def read_thumbnail(run: Path | Location, number: int) -> bytes | None:
     """A WebP of episode `number`, first frame left and last frame right; None if the run keeps none.
 
-    Raises RunDamagedError as `read_sheet`.
+    Raises:
+        RunDamagedError: As `read_sheet`.
     """
     sheet = read_sheet(run, number)
     if sheet is None or sheet.count is None:
@@ -129,8 +133,10 @@ def read_thumbnail(run: Path | Location, number: int) -> bytes | None:
 def read_sheet(run: Path | Location, number: int) -> FrameSheet | None:
     """The picture of episode `number` as it is stored; None if the run keeps none.
 
-    Raises RunDamagedError if it is not the one that was stored when the episode was committed, or is lost alone.
     Pictures of arrays that are no run are bound to nothing.
+
+    Raises:
+        RunDamagedError: If it is not the one that was stored when the episode was committed, or is lost alone.
     """
     location, key = locate(run), thumbnail_key(number)
     commit, name = None, f"{location}/{commit_key(number)}"

@@ -37,8 +37,10 @@ def create_trajectories(store: Store, frames: int, codec: str) -> None:
 class Trajectories:
     """The trajectories of the committed episodes of a run, in their order.
 
-    rows: of the array `trajectory`. steps: how many actions every committed episode had. where: the run's name.
-    Raises RunDamagedError if other channels are stored than those that are read today.
+    Args:
+        rows: Of the array `trajectory`.
+        steps: How many actions every committed episode had.
+        where: The run's name. Raises RunDamagedError if other channels are stored than those that are read today.
     """
 
     def __init__(self, rows: Rows, steps: Sequence[int], where: str) -> None:
@@ -105,7 +107,9 @@ def watch(
     """`Judgement` by rule, at the last step, and `Behaviour` of all episodes.
 
     In one reading of the trajectories, which takes longer than every judgement of them.
-    scene: `SceneSpec.to_json()`.
+
+    Args:
+        scene: `SceneSpec.to_json()`.
     """
     default = SceneSpec()  # scenes without these fields have the default ones
     half = scene.get("scoring_side", default.scoring_side) / 2 + scene.get("box_margin", default.box_margin)

@@ -158,9 +158,14 @@ _RESULT_READERS = (
 class Audit:
     """The result of a verification.
 
-    committed, planned: episodes. problems: one sentence each. sealed: whether columns belong to these commits.
-    deep: whether every byte was read, not only sizes. strays: objects that belong to no part of the run and that
-    nothing reads, such as copies made by hand. left_out: arrays that the run, a copy, was made without.
+    Attributes:
+        committed: episodes.
+        planned: As `committed`.
+        sealed: Whether columns belong to these commits.
+        deep: Whether every byte was read, not only sizes.
+        problems: One sentence each.
+        strays: Objects that belong to no part of the run and that nothing reads, such as copies made by hand.
+        left_out: Arrays that the run, a copy, was made without.
     """
 
     path: str
@@ -189,7 +194,9 @@ def verify_run(path: Path | str | Location, deep: bool = False) -> Audit:
 
     Records, the sizes of all objects, and their owners; with `deep` every byte, columns against rows, and every
     reader of the run and of its stored results. Problems are collected, not raised.
-    Raises RunNotFoundError if there is no run at `path`.
+
+    Raises:
+        RunNotFoundError: If there is no run at `path`.
     """
     location = locate(path)
     while True:

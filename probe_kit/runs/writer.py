@@ -102,13 +102,16 @@ def flat_settings(value: Any, prefix: str = "") -> dict[str, Any]:
 class EpisodeRecord:
     """All that is stored of one episode.
 
-    arrays: by kind (`pooled`, `tokens`, `later`) and stream, each shaped like its row in the store.
-    roles: per captured inference and stream, the spans of roles. trajectory: (T + 1, C) float32 frames.
-    instruction_ids: the instruction as the policy was delivered it. pictures: encoded, by key in the run. frames:
-    how many one of them holds, if it holds all of the episode.
-    control_steps: of every inference, how many actions of the episode came before it; rising. seconds: what the
-    episode took, which no hash of the run covers. inputs: what was shown of recordings, by kind. lens_margins: of
-    an answer by letter, left minus right at every layer.
+    Attributes:
+        arrays: By kind (`pooled`, `tokens`, `later`) and stream, each shaped like its row in the store.
+        roles: Per captured inference and stream, the spans of roles.
+        trajectory: (T + 1, C) float32 frames.
+        instruction_ids: The instruction as the policy was delivered it.
+        pictures: Encoded, by key in the run. frames: how many one of them holds, if it holds all of the episode.
+        control_steps: Of every inference, how many actions of the episode came before it; rising.
+        seconds: What the episode took, which no hash of the run covers.
+        inputs: What was shown of recordings, by kind.
+        lens_margins: Of an answer by letter, left minus right at every layer.
     """
 
     planned: Row
@@ -128,12 +131,15 @@ class EpisodeRecord:
 class RunWriter:
     """Creates a run, continues the one that is there, or lets it grow; any number of processes may do so at once.
 
-    plan: episodes to play. Those that the run lacks are appended to its plan; `self.plan` has the run's numbers.
-    settings: without what a selection decides. provenance: of this process, by default of one that computes on
-    the CPU. label: what tables call a run that begins here, by default the model's name; one that is there keeps
-    its own, see `label_run`.
-    Raises SettingsMismatchError if the location holds a run with other settings, episodes that `plan` lacks while
-    it lacks others, or anything else, and RunDamagedError if what it holds was changed.
+    Args:
+        plan: Episodes to play. Those that the run lacks are appended to its plan; `self.plan` has the run's
+            numbers.
+        settings: Without what a selection decides.
+        provenance: Of this process, by default of one that computes on the CPU.
+        label: What tables call a run that begins here, by default the model's name; one that is there keeps its
+            own, see `label_run`. Raises SettingsMismatchError if the location holds a run with other settings,
+            episodes that `plan` lacks while it lacks others, or anything else, and RunDamagedError if what it
+            holds was changed.
     """
 
     def __init__(
@@ -255,8 +261,9 @@ class RunWriter:
     def begin(self, allow_mixed: bool = False) -> None:
         """Say in the run who is going to play in it.
 
-        Raises SettingsMismatchError if episodes were played where numbers come out otherwise, unless that is
-        allowed.
+        Raises:
+            SettingsMismatchError: If episodes were played where numbers come out otherwise, unless that is
+                allowed.
         """
         if not allow_mixed:
             stored = read_provenances(self.root).values()

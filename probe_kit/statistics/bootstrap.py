@@ -30,8 +30,13 @@ def group_bootstrap(
 ) -> tuple[Matrix, Matrix]:
     """95 % interval of the mean over episodes, with whole groups resampled.
 
-    values: (E, S), a score per episode in each of S columns, within `bounds`. groups: (E,). Returns low and high,
-    (S,) each. Where groups agree, or all but a few, resampling claims more certainty than there is; see `widened`.
+    Args:
+        values: (E, S), a score per episode in each of S columns, within `bounds`.
+        groups: (E,).
+
+    Returns:
+        Low and high, (S,) each. Where groups agree, or all but a few, resampling claims more certainty than there
+        is; see `widened`.
     """
     value, each = values.mean(axis=0), group_means(values, groups)
     wide = widened(bootstrap_means(values, groups, seed, draws), value, each, seed, bounds)
@@ -79,8 +84,9 @@ def widened(draws: Matrix, value: Matrix, each: Matrix, seed: int, bounds: Bound
     the other kind, and the interval would be narrower than where all sixteen do. Now one group that is otherwise
     moves both quantiles that are compared, and so the outer one, toward it.
 
-    each: (G, S) means of the groups. Draws keep their order, so that those of two runs on the same groups stay
-    paired; equal ones are ordered by `seed`.
+    Args:
+        each: (G, S) means of the groups. Draws keep their order, so that those of two runs on the same groups stay
+            paired; equal ones are ordered by `seed`.
     """
     mixed = np.random.default_rng(derive_seed("unseen", seed)).permutation(len(draws))
     order = mixed[np.argsort(draws[mixed].round(12), axis=0, kind="stable")]  # equal up to the rounding of sums
@@ -98,9 +104,11 @@ def unseen(
 ) -> Matrix:
     """(draws, S) quantiles, from least to largest, of a mean that unobserved groups could have.
 
-    value: (S,) the mean. each: (G, S) those of the groups. Groups that were not seen may lie at either bound, with
-    half of the chance each; where what is most common lies at a bound only the other one is left, and has all of
-    it: of groups that all agree there it is Clopper and Pearson's interval.
+    Args:
+        value: (S,) the mean.
+        each: (G, S) those of the groups. Groups that were not seen may lie at either bound, with half of the
+            chance each; where what is most common lies at a bound only the other one is left, and has all of it:
+            of groups that all agree there it is Clopper and Pearson's interval.
     """
     tails = np.linspace(0, 1, draws, dtype=np.float64)[:, None]
     low, high = np.minimum(bounds[0], value), np.maximum(bounds[1], value)
@@ -114,10 +122,11 @@ def unseen(
 def reach(each: NDArray[np.floating], tail: float | Matrix = SIGNIFICANCE / 2) -> Matrix:
     """(…, S) which share of groups may be otherwise, and not have been seen, with chance `tail` for either side.
 
-    each: (G, S) means of the groups. Where at most one is otherwise than most, it is a share of which nothing is
-    seen with chance 2 · tail, at 0.025 about 3 / G. (One that is otherwise says that there are such, and not what
-    others are like.) Of more the next one may as well be like any of them: with k only one in k is like nothing
-    seen.
+    Args:
+        each: (G, S) means of the groups. Where at most one is otherwise than most, it is a share of which nothing
+            is seen with chance 2 · tail, at 0.025 about 3 / G. (One that is otherwise says that there are such,
+            and not what others are like.) Of more the next one may as well be like any of them: with k only one in
+            k is like nothing seen.
     """
     chance = np.minimum(2 * tail * np.maximum(unlike(each), 1), 1.0)
     share: Matrix = 1 - chance ** (1 / len(each))
@@ -145,8 +154,9 @@ def _commonest(each: NDArray[np.floating]) -> tuple[Matrix, Matrix]:
 def units_seed(names: ArrayLike, seed_text: str) -> int:
     """The seed by which groups or items of these names are drawn, wherever an interval is made of them.
 
-    seed_text: of the suite whose groups they are, see `suite.Suite.seed_text`.
-    One number then has one interval, in whatever table it stands; and runs on the same units are paired.
+    Args:
+        seed_text: Of the suite whose groups they are, see `suite.Suite.seed_text`. One number then has one
+            interval, in whatever table it stands; and runs on the same units are paired.
     """
     return derive_seed("units", 0, seed_text, *np.unique(np.asarray(names)).tolist())
 
@@ -167,9 +177,10 @@ def student_interval(
 ) -> tuple[float, float]:
     """95 % interval of the mean over episodes, by Student's t with whole groups as the unit.
 
-    values: (E,) measured, within `bounds`, at which the interval ends. groups: (E,). Of shares, which many groups
-    have alike, `group_bootstrap` is the better one; it is taken, with `seed`, where all groups agree. A single
-    group carries no information about others.
+    Args:
+        values: (E,) measured, within `bounds`, at which the interval ends.
+        groups: (E,). Of shares, which many groups have alike, `group_bootstrap` is the better one; it is taken,
+            with `seed`, where all groups agree. A single group carries no information about others.
     """
     if np.unique(np.asarray(groups)).size == 1:
         return bounds
@@ -185,7 +196,8 @@ def unbounded_student_interval(
 ) -> tuple[float, float]:
     """The same of (E,) values without bounds: of no width where all groups agree, infinite for a single group.
 
-    tail: chance that the mean lies beyond one limit. With SIGNIFICANCE, each limit alone is a one-sided test.
+    Args:
+        tail: Chance that the mean lies beyond one limit. With SIGNIFICANCE, each limit alone is a one-sided test.
     """
     names, group_of = np.unique(np.asarray(groups), return_inverse=True)
     if names.size == 1:
@@ -201,12 +213,14 @@ def explained_interval(
 ) -> tuple[float, float]:
     """Return an approximate 95 % interval of R², with whole groups as the unit; up to 1.
 
-    scores: (n,), their mean is R²; see `explained_scores`. deviations: (n,) squared deviations of the labels from
-    the mean that R² compares with, in any unit. R² is 1 − q with q = A / B, A the sum of squared errors and B that
-    of the deviations. The variance of q is that of the ratio of two sums over groups (Cochran, “Sampling
-    techniques”, 1977, section 6.13), v = Σ (a − q b)² · G / (G − 1) / B². The limits are 1 − q exp(± t √v / q),
-    symmetric in log q. widening: factor of the standard error, SHARED_TRAINING for held-out scores of several
-    folds. Minus infinity to 1 for a single group.
+    Args:
+        scores: (n,), their mean is R²; see `explained_scores`.
+        deviations: (n,) squared deviations of the labels from the mean that R² compares with, in any unit. R² is 1
+            − q with q = A / B, A the sum of squared errors and B that of the deviations. The variance of q is that
+            of the ratio of two sums over groups (Cochran, “Sampling techniques”, 1977, section 6.13), v = Σ (a − q
+            b)² · G / (G − 1) / B². The limits are 1 − q exp(± t √v / q), symmetric in log q.
+        widening: Factor of the standard error, SHARED_TRAINING for held-out scores of several folds. Minus
+            infinity to 1 for a single group.
     """
     names, group_of = np.unique(np.asarray(groups), return_inverse=True)
     if names.size == 1:
@@ -226,7 +240,9 @@ def explained_interval(
 def _student_reach(residuals: NDArray[np.floating], count: int, tail: float = SIGNIFICANCE / 2) -> float:
     """Student's quantile times the standard error of a mean over `count` episodes of G groups.
 
-    residuals: (G,) sums over the episodes of a group of the values without their mean. tail: beyond the quantile.
+    Args:
+        residuals: (G,) sums over the episodes of a group of the values without their mean.
+        tail: Beyond the quantile.
     """
     from scipy.special import stdtrit  # type: ignore[import-untyped]
 

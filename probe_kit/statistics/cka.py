@@ -19,11 +19,14 @@ FEWEST = 4
 
 def unbiased_cka(first: Matrix, second: Matrix) -> float:
     """Linear CKA of features (E, D) and (E, D') of the same episodes: 1 up to turning and scaling, 0 on average
+
     where they are independent, whatever D.
 
-    HSIC = (tr KL + 1ᵀK1 · 1ᵀL1 / ((E − 1)(E − 2)) − 2 · 1ᵀKL1 / (E − 2)) / (E (E − 3)), with K and L the
-    products of the features, whose diagonal is 0. NaN where one set does not vary. Raises UsageError for fewer
-    than FEWEST episodes, or another number of episodes.
+    HSIC = (tr KL + 1ᵀK1 · 1ᵀL1 / ((E − 1)(E − 2)) − 2 · 1ᵀKL1 / (E − 2)) / (E (E − 3)), with K and L the products
+    of the features, whose diagonal is 0. NaN where one set does not vary.
+
+    Raises:
+        UsageError: For fewer than FEWEST episodes, or another number of episodes.
     """
     count = len(first)
     if count != len(second) or count < FEWEST:

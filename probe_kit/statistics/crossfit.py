@@ -29,7 +29,9 @@ CHANCE = 0.5
 class GroupSums:
     """Weighted correct decisions per group of items, the unit of every resampling.
 
-    sums: (S, G) per site and group. sizes: (G,) weights of the groups, which add up to the number of episodes.
+    Attributes:
+        sums: (S, G) per site and group.
+        sizes: (G,) weights of the groups, which add up to the number of episodes.
     """
 
     sums: Matrix
@@ -61,9 +63,12 @@ def balanced_sums(
 ) -> GroupSums:
     """Weighted correct decisions per site and group, in the order of the groups' names.
 
-    decisions: (S, E) out-of-fold logits for True. labels: (E,) side of every episode. fold_of: (E,) outer fold.
-    groups: (E,) names. An episode of a side with n of E episodes weighs E / (2 n). In a complete run every weight
-    is 1 and no decision is shifted. Raises as `remove_fold_priors` does.
+    Args:
+        decisions: (S, E) out-of-fold logits for True.
+        labels: (E,) side of every episode.
+        fold_of: (E,) outer fold.
+        groups: (E,) names. An episode of a side with n of E episodes weighs E / (2 n). In a complete run every
+            weight is 1 and no decision is shifted. Raises as `remove_fold_priors` does.
     """
     right = (remove_fold_priors(decisions, labels, fold_of) > 0) == labels
     count = int(labels.sum())
@@ -78,9 +83,15 @@ def remove_fold_priors(decisions: Matrix, labels: NDArray[np.bool_], fold_of: Ar
     """(S, E) out-of-fold logits without what each fold's probe learned from the shares of the sides.
 
     The intercept of a probe that was trained on n episodes of True and m of False holds ln(n / m), and more of its
-    decisions hang on that the less it knows otherwise. labels: (E,) bool. fold_of: (E,) outer fold that tests an
-    episode; all others trained its probe. Raises UsageError for a shape that does not fit, fewer than two folds,
-    or NaN, and UnbalancedEpisodesError where a fold was trained on one side alone.
+    decisions hang on that the less it knows otherwise.
+
+    Args:
+        labels: (E,) bool.
+        fold_of: (E,) outer fold that tests an episode; all others trained its probe.
+
+    Raises:
+        UsageError: For a shape that does not fit, fewer than two folds, or NaN.
+        UnbalancedEpisodesError: Where a fold was trained on one side alone.
     """
     folds = np.asarray(fold_of)
     if decisions.ndim != 2 or not decisions.shape[1] == labels.size == folds.size:
@@ -125,9 +136,11 @@ _EQUAL = 1e-9
 class StreamScores:
     """The sites of one stream, on G groups in F outer folds.
 
-    scores: what a site scores in every group, held out by the outer folds. guide: (S, F, G) what sites are chosen
-    by, the larger the better: quality of a group's predictions in the inner folds of an outer fold, 0 for the
-    groups that the outer fold tests. fold_of: (G,) outer fold that tests a group, a position along F.
+    Attributes:
+        scores: What a site scores in every group, held out by the outer folds.
+        guide: (S, F, G) what sites are chosen by, the larger the better: quality of a group's predictions in the
+            inner folds of an outer fold, 0 for the groups that the outer fold tests.
+        fold_of: (G,) outer fold that tests a group, a position along F.
     """
 
     scores: GroupSums
@@ -146,9 +159,11 @@ class StreamScores:
         """Sites at (S,) layers and (S,) iterations, in any order. inner: (S, F, G) qualities, see `guide`.
 
         A stream that runs once is chosen by its qualities. With several iterations the guide is half a site's
-        quality and half that of its surroundings, smoothed along layers and iterations. Raises UsageError for
-        another number of places than of sites, no site, qualities of other folds or groups, and a quality of a
-        group in the fold that tests it.
+        quality and half that of its surroundings, smoothed along layers and iterations.
+
+        Raises:
+            UsageError: For another number of places than of sites, no site, qualities of other folds or groups,
+                and a quality of a group in the fold that tests it.
         """
         at, folds = np.asarray(layers), np.asarray(fold_of, np.intp)
         steps = np.zeros_like(at) if iterations is None else np.asarray(iterations)
@@ -179,9 +194,13 @@ class StreamScores:
 class CrossFit:
     """Cross-fitted scores of K streams on the same groups.
 
-    above: (K,) mean held-out accuracy of the chosen sites, above chance. peaks: (K,) accuracy of the site that
-    is best on all groups, scored on them too. influence: (K, G) how much a score grows by a group, through its own
-    score and through the choice of sites. n_episodes: E. groups: their G names. suite: what the names are from.
+    Attributes:
+        above: (K,) mean held-out accuracy of the chosen sites, above chance.
+        peaks: (K,) accuracy of the site that is best on all groups, scored on them too.
+        influence: (K, G) how much a score grows by a group, through its own score and through the choice of sites.
+        n_episodes: E.
+        groups: Their G names.
+        suite: What the names are from.
     """
 
     above: Matrix
@@ -230,10 +249,15 @@ def crossfit(
 ) -> CrossFit:
     """Score each stream by the sites that its inner folds choose, on the outer folds.
 
-    streams: on the same groups, in the order of the names `groups`. suite: what the names are from; runs on equal
-    groups of one suite are paired. chance: 0 for sums from which the chance of every site is subtracted already.
-    Sites that are equally good share the choice, so that their order does not matter. Raises TooFewGroupsError for
-    fewer than 5 groups, and UsageError for NaN or streams on other groups.
+    Args:
+        streams: On the same groups, in the order of the names `groups`.
+        suite: What the names are from; runs on equal groups of one suite are paired.
+        chance: 0 for sums from which the chance of every site is subtracted already. Sites that are equally good
+            share the choice, so that their order does not matter.
+
+    Raises:
+        TooFewGroupsError: For fewer than 5 groups.
+        UsageError: For NaN or streams on other groups.
     """
     _check(streams, groups)
     scored = [_scored(stream) for stream in streams]

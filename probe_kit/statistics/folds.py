@@ -42,9 +42,13 @@ class Fold:
 def grouped_folds(labels: ArrayLike, groups: ArrayLike, n_folds: int, seed: int) -> list[Fold]:
     """`n_folds` folds in which no group is split and every fold has nearly the same class shares.
 
-    labels: (E,) class of every episode. groups: (E,) group of every episode; the layouts of an item, and all
-    items that share a picture, are one group. Same arguments, same folds.
-    Raises TooFewGroupsError if there are fewer groups than folds or a training side holds a single class.
+    Args:
+        labels: (E,) class of every episode.
+        groups: (E,) group of every episode; the layouts of an item, and all items that share a picture, are one
+            group. Same arguments, same folds.
+
+    Raises:
+        TooFewGroupsError: If there are fewer groups than folds or a training side holds a single class.
     """
     fold_of = assign_folds(labels, groups, n_folds, seed)
     classes = np.unique(np.asarray(labels))
@@ -61,8 +65,13 @@ def grouped_folds(labels: ArrayLike, groups: ArrayLike, n_folds: int, seed: int)
 def stratified_folds(strata: ArrayLike, groups: ArrayLike, n_folds: int, seed: int) -> list[Fold]:
     """Return `n_folds` folds of whole groups, balanced by stratum and size.
 
-    strata, groups: (E,). Folds that do not depend on labels keep p-values exact where groups exchange labels. A
-    training side may hold a single class. Raises TooFewGroupsError if there are fewer groups than folds.
+    Args:
+        strata: (E,). Folds that do not depend on labels keep p-values exact where groups exchange labels. A
+            training side may hold a single class.
+        groups: As `strata`.
+
+    Raises:
+        TooFewGroupsError: If there are fewer groups than folds.
     """
     return split_by_fold(assign_folds(strata, groups, n_folds, seed), range(n_folds))
 
@@ -95,8 +104,12 @@ def sums_by_group(values: NDArray[np.floating], groups: ArrayLike) -> NDArray[np
 def fold_units(episodes: "pd.DataFrame", unit: FoldUnit) -> NDArray[np.str_]:
     """(E,) name of what folds must not separate: the group, or all groups about the same two concepts.
 
-    episodes: column `group_id`, and for concepts `target_concept` and `distractor_concept`, whose order does not
-    matter. Raises UsageError for an unknown unit or a missing column.
+    Args:
+        episodes: Column `group_id`, and for concepts `target_concept` and `distractor_concept`, whose order does
+            not matter.
+
+    Raises:
+        UsageError: For an unknown unit or a missing column.
     """
     groups = episodes["group_id"].to_numpy(dtype=str)
     if unit == "groups":
@@ -130,7 +143,10 @@ def assign_folds(labels: ArrayLike, groups: ArrayLike, n_folds: int, seed: int) 
     """The fold of every episode, (E,) values 0 … n_folds − 1.
 
     Groups are placed one by one, the largest first and equals in an order drawn from `seed`, each where its
-    classes are scarcest so far. Raises TooFewGroupsError if there are fewer groups than folds.
+    classes are scarcest so far.
+
+    Raises:
+        TooFewGroupsError: If there are fewer groups than folds.
     """
     names, group_of = np.unique(np.asarray(groups), return_inverse=True)
     if names.size < n_folds:

@@ -44,8 +44,9 @@ def fieller_interval(
 ) -> Interval:
     """All ratios θ for which numerator − θ · denominator lies within `quantile` standard errors of zero.
 
-    covariance: (2, 2) of (numerator, denominator). When the denominator may be zero no ratio can be excluded on
-    one side at least, and the interval is unbounded.
+    Args:
+        covariance: (2, 2) of (numerator, denominator). When the denominator may be zero no ratio can be excluded
+            on one side at least, and the interval is unbounded.
     """
     cut = quantile**2
     square = denominator**2 - cut * covariance[1, 1]
@@ -67,9 +68,13 @@ def difference_interval(
 ) -> Interval:
     """Interval of `first` − `second`, at the level of the two intervals.
 
-    correlation: of the two estimates; 0 where they share no group. With a, b the values, l, u their limits and ρ
-    the correlation: low = a − b − √((a − l_a)² + (u_b − b)² − 2 ρ (a − l_a)(u_b − b)), high with the other limits.
-    No limits where either has none. Raises UsageError for a correlation outside −1 … 1.
+    Args:
+        correlation: Of the two estimates; 0 where they share no group. With a, b the values, l, u their limits and
+            ρ the correlation: low = a − b − √((a − l_a)² + (u_b − b)² − 2 ρ (a − l_a)(u_b − b)), high with the
+            other limits. No limits where either has none.
+
+    Raises:
+        UsageError: For a correlation outside −1 … 1.
     """
     if not -1 <= correlation <= 1:
         raise UsageError(f"a correlation of {correlation}; expected a number from -1 to 1")
@@ -84,8 +89,10 @@ def difference_interval(
 def mean_interval(values: Sequence[float], limits: Sequence[Interval]) -> Interval:
     """Interval of the mean of independent estimates, at the level of their intervals.
 
-    low = mean − √(Σ (value − its low)²) / n, high alike. No limits where one of them has none. Raises UsageError
-    without estimates.
+    low = mean − √(Σ (value − its low)²) / n, high alike. No limits where one of them has none.
+
+    Raises:
+        UsageError: Without estimates.
     """
     if not values:
         raise UsageError("the mean of no estimates; expected at least one")
@@ -133,7 +140,10 @@ TAIL = SIGNIFICANCE / 2
 class Share:
     """A share of episodes, such as a success rate.
 
-    groups: (G,) names of the groups of items, sorted. sums, sizes: (G,) hits and episodes of each group.
+    Attributes:
+        groups: (G,) names of the groups of items, sorted.
+        sums: (G,) hits and episodes of each group.
+        sizes: As `sums`.
     """
 
     groups: NDArray[np.str_]
@@ -144,8 +154,12 @@ class Share:
     def of(cls, values: ArrayLike, groups: ArrayLike, weights: ArrayLike | None = None) -> "Share":
         """The mean of (E,) values from 0 to 1 over the episodes of (E,) groups.
 
-        weights: (E,) how much of an episode counts, such as whether it has an answer; each 1 by default. Groups
-        without weight are left out. Raises UsageError for no episode, or a value that is NaN or outside 0 … 1.
+        Args:
+            weights: (E,) how much of an episode counts, such as whether it has an answer; each 1 by default.
+                Groups without weight are left out.
+
+        Raises:
+            UsageError: For no episode, or a value that is NaN or outside 0 … 1.
         """
         each = np.asarray(values, np.float64)
         if weights is not None:
@@ -274,12 +288,16 @@ def share_interval(
 ) -> tuple[Matrix, Matrix]:
     """Clopper and Pearson's limits with as many episodes as count (Korn and Graubard 1998), for arrays of shares.
 
-    share, variance: the estimates and their variances with groups as the unit. n_episodes: E of them. df: degrees
-    of freedom of the variance. tail: chance of either side. With
-    n = min(s (1 − s) / v, E) · (t(1 − tail, E − 1) / t(1 − tail, df))² the limits are
-    Beta⁻¹(tail; s n, n − s n + 1) and Beta⁻¹(1 − tail; s n + 1, n − s n). Where nothing varies, n is `n_groups`,
-    whatever their sizes: G groups that are alike with chance p all agree with chance p^G. No share is better known
-    than there. Without this rule a share near 1 of unequal groups with few errors is covered in 88 %.
+    Args:
+        share: The estimates and their variances with groups as the unit.
+        variance: As `share`.
+        n_episodes: E of them.
+        df: Degrees of freedom of the variance.
+        tail: Chance of either side. With n = min(s (1 − s) / v, E) · (t(1 − tail, E − 1) / t(1 − tail, df))² the
+            limits are Beta⁻¹(tail; s n, n − s n + 1) and Beta⁻¹(1 − tail; s n + 1, n − s n). Where nothing varies,
+            n is `n_groups`, whatever their sizes: G groups that are alike with chance p all agree with chance p^G.
+            No share is better known than there. Without this rule a share near 1 of unequal groups with few errors
+            is covered in 88 %.
     """
     from scipy.special import betaincinv, stdtrit  # type: ignore[import-untyped]
 
@@ -299,11 +317,16 @@ def wilson_interval(
 ) -> tuple[Matrix, Matrix]:
     """Return Wilson's limits (1927) with the effective number of episodes, for arrays of accuracies.
 
-    share, variance: the estimates s and their variances v with groups as the unit. n_groups: G, of unequal groups
-    G* (`effective_groups`). n_episodes: E of them. df: degrees of freedom of the variance. tail: chance of either
-    side. n is the number of `effective_episodes`, at least G. With t the quantile of Student's distribution the
-    limits are (s + t²/2n ± t √(s (1 − s)/n + t²/4n²)) / (1 + t²/n). Where all groups agree the variance knows
-    nothing of other groups: n is G, and t is the normal quantile. No accuracy is better known than there.
+    Args:
+        share: The estimates s and their variances v with groups as the unit.
+        variance: As `share`.
+        n_groups: G, of unequal groups G* (`effective_groups`).
+        n_episodes: E of them.
+        df: Degrees of freedom of the variance.
+        tail: Chance of either side. n is the number of `effective_episodes`, at least G. With t the quantile of
+            Student's distribution the limits are (s + t²/2n ± t √(s (1 − s)/n + t²/4n²)) / (1 + t²/n). Where all
+            groups agree the variance knows nothing of other groups: n is G, and t is the normal quantile. No
+            accuracy is better known than there.
     """
     from scipy.special import stdtrit
 

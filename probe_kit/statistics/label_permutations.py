@@ -20,7 +20,9 @@ from probe_kit.statistics.significance import SIGNIFICANCE
 def flip_items(labels: NDArray[np.bool_], items: ArrayLike, count: int, seed: int) -> NDArray[np.bool_]:
     """`count` label permutations (E, count) in which the labels of a random half of the items are all flipped.
 
-    labels: (E,). items: (E,) item of every episode. Right for the correct side, which a suite draws freely.
+    Args:
+        labels: (E,).
+        items: (E,) item of every episode. Right for the correct side, which a suite draws freely.
     """
     names, item_of = np.unique(np.asarray(items), return_inverse=True)
     flips = np.random.default_rng(seed).random((names.size, count)) < 0.5
@@ -35,11 +37,13 @@ ENUMERATED_BELOW = 12
 def flip_groups(labels: NDArray[np.bool_], groups: ArrayLike, count: int, seed: int) -> NDArray[np.bool_]:
     """About `count` permutations (E, P) that flip all labels of some groups and keep the size of both classes.
 
-    labels: (E,). groups: (E,) group of every episode. A group with as many episodes of either class is flipped or
-    not, freely; the others exchange their signs among those with the same surplus. Right for the correct side,
-    which a suite draws freely. With fewer than ENUMERATED_BELOW groups these are all permutations but the real
-    one, in an order drawn from `seed`, and none that only mirrors another: a probe of mirrored labels is as
-    accurate.
+    Args:
+        labels: (E,).
+        groups: (E,) group of every episode. A group with as many episodes of either class is flipped or not,
+            freely; the others exchange their signs among those with the same surplus. Right for the correct side,
+            which a suite draws freely. With fewer than ENUMERATED_BELOW groups these are all permutations but the
+            real one, in an order drawn from `seed`, and none that only mirrors another: a probe of mirrored labels
+            is as accurate.
     """
     names, group_of = np.unique(np.asarray(groups), return_inverse=True)
     surplus = 2 * np.bincount(group_of[labels], minlength=names.size) - np.bincount(group_of)
@@ -80,8 +84,12 @@ def exchange_groups(
 ) -> NDArray[np.bool_]:
     """`count` label permutations (E, count) in which groups exchange their labels, layout by layout.
 
-    labels, groups, items, layouts: (E,). Only groups whose items are present in the same layouts are exchanged.
-    Keeps the share of every class, and so any side preference: right for the chosen side.
+    Args:
+        labels: (E,). Only groups whose items are present in the same layouts are exchanged. Keeps the share of
+            every class, and so any side preference: right for the chosen side.
+        groups: As `labels`.
+        items: As `labels`.
+        layouts: As `labels`.
     """
     generator = np.random.default_rng(seed)
     exchanged = np.repeat(labels[:, None], count, axis=1)
@@ -122,9 +130,11 @@ def exchange_blocks(
 ) -> Positions:
     """(n, P) the sample whose label each of n samples has in P exchanges of groups, never the real labelling.
 
-    blocks: by group, its samples in an order that corresponds between groups; together 0 … n − 1. kinds: by group,
-    what it must have in common with the groups with which it exchanges, so also the number of samples. With up to
-    six groups, or whenever there are no more than `count` exchanges, these are all; else `count` different ones.
+    Args:
+        blocks: By group, its samples in an order that corresponds between groups; together 0 … n − 1.
+        kinds: By group, what it must have in common with the groups with which it exchanges, so also the number of
+            samples. With up to six groups, or whenever there are no more than `count` exchanges, these are all;
+            else `count` different ones.
     """
     size = sum(len(block) for block in blocks.values())
     families = _families(blocks, kinds)
@@ -187,7 +197,8 @@ def smallest_p(permutations: int) -> float:
 def permutations_for(tests: int = 1) -> int:
     """Fewest label permutations with which p can be below the level: 19 give 1/20, which is not.
 
-    tests: the number that p is corrected for.
+    Args:
+        tests: The number that p is corrected for.
     """
     return floor(tests / SIGNIFICANCE + 1e-9)  # 0.05 is not exact in binary
 
@@ -195,8 +206,10 @@ def permutations_for(tests: int = 1) -> int:
 def shortage(least_p: float, permutations: int, tests: int = 1) -> Literal["", "permutations", "groups"]:
     """Return what is too few for any p below the level; empty where there is enough.
 
-    least_p: the smallest p that is possible. permutations: the number that was asked for; where so many would
-    give a smaller p, the groups are too few. tests: the number that p is corrected for.
+    Args:
+        least_p: The smallest p that is possible.
+        permutations: The number that was asked for; where so many would give a smaller p, the groups are too few.
+        tests: The number that p is corrected for.
     """
     if round(tests * least_p, 12) < SIGNIFICANCE:
         return ""

@@ -30,9 +30,15 @@ def exchange_p(first: Sequence[float], second: Sequence[float], seed: int = 0) -
     """p of two groups of models having equal distributions, their labels exchanged in all ways.
 
     The statistic is the difference of the means. A small p may also come from unequal spreads, where the sizes
-    differ too; see `is_exchangeable`. first, second: one value per model. 3 + 3 models cannot be below 0.1. seed:
-    of the draws where there are more ways than `MOST_EXACT`. Raises UsageError for an empty group or a value that
-    is not finite.
+    differ too; see `is_exchangeable`.
+
+    Args:
+        first: One value per model. 3 + 3 models cannot be below 0.1. seed: of the draws where there are more ways
+            than `MOST_EXACT`.
+        second: As `first`.
+
+    Raises:
+        UsageError: For an empty group or a value that is not finite.
     """
     values, size = _values(first, second), len(first)
     ways = comb(values.size, size)
@@ -65,9 +71,14 @@ def welch_interval(first: Sequence[float], second: Sequence[float], largest: flo
     """95 % interval of the first group's mean minus the second's, by Welch's t over models.
 
     A group of one model has no spread of its own, and is given that of the other one (Student's t). No limits
-    where both have one model, or where no model differs from its group. largest: the difference that no two means
-    can exceed, 1 for rates; limits beyond it are cut there, and where both are, there are none. Raises UsageError
-    as `exchange_p` does.
+    where both have one model, or where no model differs from its group.
+
+    Args:
+        largest: The difference that no two means can exceed, 1 for rates; limits beyond it are cut there, and
+            where both are, there are none.
+
+    Raises:
+        UsageError: As `exchange_p` does.
     """
     from scipy.special import stdtrit  # type: ignore[import-untyped]
 

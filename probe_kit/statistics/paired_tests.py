@@ -33,10 +33,13 @@ def better_than_reference(
 ) -> Matrix:
     """Family-wise p (S,) of every site against one control: is its mean score higher?
 
-    correct: (S, E) scores, such as whether a decision is right. reference: (E,) what the control scores in each
-    episode. groups: (E,). If a site is no better, a group is as likely to favour it as to oppose it: the signs of
-    the groups' differences are drawn anew, the same for all sites, and the largest of them counts. widening:
-    factor of the drawn differences; SHARED_PROBE for R², whose groups share a probe and so are not independent.
+    Args:
+        correct: (S, E) scores, such as whether a decision is right.
+        reference: (E,) what the control scores in each episode.
+        groups: (E,). If a site is no better, a group is as likely to favour it as to oppose it: the signs of the
+            groups' differences are drawn anew, the same for all sites, and the largest of them counts. widening:
+            factor of the drawn differences; SHARED_PROBE for R², whose groups share a probe and so are not
+            independent.
     """
     gain = _group_sums(correct - reference, groups)
     signs = np.where(np.random.default_rng(seed).random((gain.shape[1], EXCHANGES)) < 0.5, -1.0, 1.0)
@@ -52,9 +55,11 @@ def better_than_best(
 ) -> Matrix:
     """Family-wise p (S,) of every site against the best of another model's: is its mean score higher?
 
-    correct: (S, E) scores, such as whether a decision is right. references: (S', E) on the same episodes. groups:
-    (E,). If the models are alike, a group's scores could as well have come from either: whole groups change
-    places, and both best sites are chosen anew. widening: as in `better_than_reference`.
+    Args:
+        correct: (S, E) scores, such as whether a decision is right.
+        references: (S', E) on the same episodes. groups: (E,). If the models are alike, a group's scores could as
+            well have come from either: whole groups change places, and both best sites are chosen anew.
+        widening: As in `better_than_reference`.
     """
     sums, reference_sums = _group_sums(correct, groups), _group_sums(references, groups)
     stays = (np.random.default_rng(seed).random((sums.shape[1], EXCHANGES)) < 0.5).astype(float)
@@ -125,7 +130,10 @@ def greater_p(effects: NDArray[np.float64]) -> float:
 def paired_greater_p(values: NDArray[np.float64], items: ArrayLike, groups: ArrayLike) -> float:
     """The same by item and by group, the larger of the two: items that share pictures are not independent.
 
-    values: (E,) effect per episode. items, groups: (E,).
+    Args:
+        values: (E,) effect per episode.
+        items: (E,).
+        groups: As `items`.
     """
     return max(greater_p(unit_means(values, units)) for units in (items, groups))
 
@@ -149,7 +157,8 @@ def mcnemar_p(first: Right, second: Right) -> float:
 def flip_p(first: Right, second: Right, groups: ArrayLike) -> float:
     """Exact two-sided p of the same, where the items of a group are one toss: all their differences turn together.
 
-    groups: (N,).
+    Args:
+        groups: (N,).
     """
     return flip_gains_p(first.astype(np.int64) - second, groups)
 
@@ -157,8 +166,9 @@ def flip_p(first: Right, second: Right, groups: ArrayLike) -> float:
 def flip_gains_p(gains: NDArray[np.int64], groups: ArrayLike) -> float:
     """Exact two-sided p that (N,) gains, in whole units, have no direction; those of a group turn together.
 
-    groups: (N,). The distribution of the sum of gains over all flips of signs is added up group by group, so that
-    no draw is needed for any number of groups.
+    Args:
+        groups: (N,). The distribution of the sum of gains over all flips of signs is added up group by group, so
+            that no draw is needed for any number of groups.
     """
     names, group_of = np.unique(np.asarray(groups), return_inverse=True)
     totals_of = np.zeros(names.size, np.int64)
@@ -228,8 +238,10 @@ def corrected[Row](
 ) -> list[float | None]:
     """The corrected p of every row, in order; None where it has none.
 
-    summary: whether a row is over several categories; such rows are a family of their own. test: what a row
-    tests; several rows of one test, such as the views of one success rate, count once. By default each its own.
+    Args:
+        summary: Whether a row is over several categories; such rows are a family of their own.
+        test: What a row tests; several rows of one test, such as the views of one success rate, count once. By
+            default each its own.
     """
     tests = list(range(len(rows))) if test is None else [test(row) for row in rows]
     corrected_of: dict[Hashable, float | None] = {}
@@ -254,9 +266,15 @@ def max_t(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
     """One-sided tests of S effects that are positive in the mean, together.
 
-    values: (S, E) effect per episode. items, groups: (E,); an item's episodes are averaged, and the items of a
-    group change signs together. seed: of the draws. Returns (S,) each: T = mean / (standard error + FLOOR), its p,
-    and its p against the largest T of all S under the same signs (family-wise).
+    Args:
+        values: (S, E) effect per episode.
+        items: (E,); an item's episodes are averaged, and the items of a group change signs together.
+        groups: As `items`.
+        seed: Of the draws.
+
+    Returns:
+        (S,) each: T = mean / (standard error + FLOOR), its p, and its p against the largest T of all S under the
+        same signs (family-wise).
     """
     names, first = np.unique(np.asarray(items), return_index=True)
     means = unit_means(values, items)
@@ -277,9 +295,11 @@ def max_t(
 def least_column_p(values: NDArray[np.float64], groups: ArrayLike, seed: int) -> float:
     """Chance that the first of K exchangeable columns lies so far below the others in the mean, one-sided.
 
-    values: (E, K), K at least 2. groups: (E,). The place of the first column is drawn anew, the same in all rows
-    of a group: any column may be the first where none differs. With two columns it is a test by signs. seed: of
-    the draws. The level is exact, because the observed places are one of them.
+    Args:
+        values: (E, K), K at least 2.
+        groups: (E,). The place of the first column is drawn anew, the same in all rows of a group: any column may
+            be the first where none differs. With two columns it is a test by signs.
+        seed: Of the draws. The level is exact, because the observed places are one of them.
     """
     names, group_of = np.unique(np.asarray(groups), return_inverse=True)
     columns = values.shape[1]

@@ -39,7 +39,10 @@ class Scores:
 
         Degrees of freedom are (Σ v)² / Σ (v² / df), with v the sum of a category's variances (Satterthwaite, “An
         approximate distribution of estimates of variance components”, Biometrics Bulletin 2, 1946): a category
-        that varies more than all others is known no better for them. Raises UsageError without categories.
+        that varies more than all others is known no better for them.
+
+        Raises:
+            UsageError: Without categories.
         """
         if not parts:
             raise UsageError("the mean of no categories; expected at least one")
@@ -109,8 +112,10 @@ def retention(scores: Scores) -> Ratio:
 def retention_difference(first: Scores, second: Scores, between: Matrix | None = None) -> Ratio:
     """Retention of the first minus that of the second, of two runs or two means, with MOVER's limits.
 
-    between: (2, 2) covariance of the first's (expert, backbone) with the second's, where both are of the same
-    groups (`CrossFit.covariance_with`; of means the sum over categories divided by n²). None for other groups.
+    Args:
+        between: (2, 2) covariance of the first's (expert, backbone) with the second's, where both are of the same
+            groups (`CrossFit.covariance_with`; of means the sum over categories divided by n²). None for other
+            groups.
     """
     a, b = retention(first), retention(second)
     correlation = 0.0 if between is None else _correlation(first, second, between)

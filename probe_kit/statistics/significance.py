@@ -12,7 +12,10 @@ SIGNIFICANCE = 0.05
 def detectable(items: int, power: float = 0.8) -> float:
     """Accuracy at which a baseline is flagged as above chance in a share `power` of suites with so many items.
 
-    One-sided at 0.05, an item as one trial: its two layouts are one question. Raises UsageError without items.
+    One-sided at 0.05, an item as one trial: its two layouts are one question.
+
+    Raises:
+        UsageError: Without items.
     """
     if items < 1:
         raise UsageError(f"{items} items show nothing; expected at least one")
@@ -30,7 +33,10 @@ def chance_margin(n: float, alpha: float = SIGNIFICANCE) -> float:
 def items_for_width(width: float) -> int:
     """Items per category for which a 95 % interval of a rate near one half is at most `width` wide.
 
-    Items that share a picture and are answered alike count as fewer. Raises UsageError for no width.
+    Items that share a picture and are answered alike count as fewer.
+
+    Raises:
+        UsageError: For no width.
     """
     if not 0 < width < 1:
         raise UsageError(f"an interval {width} wide; expected a share between 0 and 1")

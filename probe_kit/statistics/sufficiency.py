@@ -35,7 +35,10 @@ def at_most(sites: GroupSums) -> float:
     """The highest of all sites' own one-sided 95 % upper limits of accuracy (Korn and Graubard).
 
     The truly best site is one of them, and below its own limit in 95 % of experiments. So the number is an upper
-    limit of the best site's accuracy, whatever the number of sites. Raises TooFewGroupsError for one group.
+    limit of the best site's accuracy, whatever the number of sites.
+
+    Raises:
+        TooFewGroupsError: For one group.
     """
     if sites.n_groups < 2:
         raise TooFewGroupsError(
@@ -51,9 +54,10 @@ def at_most(sites: GroupSums) -> float:
 def findable(sites: GroupSums, threshold: float) -> float:
     """The least accuracy of a site that a share `POWER` of such experiments finds above chance.
 
-    threshold: what the best site of a stream must exceed, see `permuted_threshold`. The accuracy b solves
-    b − threshold = z √(b (1 − b) / n), with n the median of the sites' effective episodes, min(s (1 − s) / v, E),
-    and z the quantile of `POWER`. Infinite without a threshold.
+    Args:
+        threshold: What the best site of a stream must exceed, see `permuted_threshold`. The accuracy b solves b −
+            threshold = z √(b (1 − b) / n), with n the median of the sites' effective episodes, min(s (1 − s) / v,
+            E), and z the quantile of `POWER`. Infinite without a threshold.
     """
     if not threshold < 1:
         return inf
@@ -74,7 +78,9 @@ def permuted_threshold(null: Matrix) -> float:
 def is_absent(most: float, least: float, absent_below: float = ABSENT_BELOW) -> bool:
     """Whether the best site is below a bound at most, and the experiment would have found it at the bound.
 
-    most: as `at_most` gives it. least: as `findable` gives it.
+    Args:
+        most: As `at_most` gives it.
+        least: As `findable` gives it.
     """
     return most < absent_below and least <= absent_below
 
@@ -82,8 +88,9 @@ def is_absent(most: float, least: float, absent_below: float = ABSENT_BELOW) -> 
 def verdict(signal: bool, most: float, least: float, absent_below: float = ABSENT_BELOW) -> Verdict:
     """Return the verdict: `shown`, `absent` as `is_absent` says, else `not shown`.
 
-    signal: above chance family-wise and better than every control that was run. What is absent is an accuracy that
-    a linear probe of so many items has: with more items a probe may have more.
+    Args:
+        signal: Above chance family-wise and better than every control that was run. What is absent is an accuracy
+            that a linear probe of so many items has: with more items a probe may have more.
     """
     if signal:
         return "shown"
@@ -103,7 +110,9 @@ SMALLEST_EFFECT_OF_INTEREST = 0.25
 def probe_command(run: object, groups: Mapping[Any, int]) -> str:
     """Return the command that fits probes of the categories with groups enough for them; empty without any.
 
-    run: its location. groups: number of independent groups by category.
+    Args:
+        run: Its location.
+        groups: Number of independent groups by category.
     """
     enough = [name for name, count in groups.items() if count >= GROUPS_FOR_PROBES]
     if not enough:
@@ -136,9 +145,11 @@ def groups_for_not_used() -> int:
 def groups_to_decide(groups: int, effects: Sequence[tuple[float, float, float]]) -> float:
     """Return about how many groups tell *used* from *not used*, if the effects stay as these groups measured them.
 
-    effects: each measure, the width of its interval, and the size below which it does not matter. *Not used* takes
-    all of them below, use takes one of them above. A width is taken to fall with the root of the number of groups.
-    Without any interval: the fewest with which something can be *not used*. Infinite for an effect at its bound.
+    Args:
+        effects: Each measure, the width of its interval, and the size below which it does not matter. *Not used*
+            takes all of them below, use takes one of them above. A width is taken to fall with the root of the
+            number of groups. Without any interval: the fewest with which something can be *not used*. Infinite for
+            an effect at its bound.
     """
     if all(isinf(width) for _, width, _ in effects):
         return max(groups_for_not_used(), groups + 1)
@@ -154,7 +165,10 @@ def groups_to_decide(groups: int, effects: Sequence[tuple[float, float, float]])
 def items_for_absence(items: int, groups: int, episodes: int) -> int:
     """Return the fewest items with which a stream that knows nothing can be called absent, at best.
 
-    items, groups, episodes: of what is measured. More groups are taken to be of the same size.
+    Args:
+        items: Of what is measured. More groups are taken to be of the same size.
+        groups: As `items`.
+        episodes: As `items`.
     """
     return ceil(groups_for_absence(round(episodes / groups)) * items / groups)
 

@@ -70,8 +70,12 @@ class PackedRun(_Part):
 class Pack(_Part):
     """The content of `pack.json`.
 
-    study: its name. runs: by name, such as `base/plain`. missing: runs and tables that are not there, each with
-    the reason. left_out: kinds of files that were not packed. version: of probe_kit.
+    Attributes:
+        study: Its name.
+        version: Of probe_kit.
+        runs: By name, such as `base/plain`.
+        missing: Runs and tables that are not there, each with the reason.
+        left_out: Kinds of files that were not packed.
     """
 
     study: str
@@ -106,8 +110,9 @@ class Pack(_Part):
 def open_archive(name: str | Path) -> Path | None:
     """The folder of an archive, unpacked for this process if it is a zip file; None for what is no archive.
 
-    Raises RunDamagedError where a file is missing, was added, or has other bytes than were packed, and for a link
-    or a zip file beyond the bounds.
+    Raises:
+        RunDamagedError: Where a file is missing, was added, or has other bytes than were packed, and for a link or
+            a zip file beyond the bounds.
     """
     path = Path(name)
     if path.is_dir():

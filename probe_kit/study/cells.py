@@ -28,9 +28,12 @@ from probe_kit.suite.categories import in_order
 class PlannedSuite:
     """A suite as far as a plan needs it.
 
-    identity: `name@version`; when a run grows, items are compared by content. items: by category. folder: None for
-    the embedded suite. source: where the numbers of items are from. contents: hash of every item's content by its
-    id, of a suite in a folder; empty for others.
+    Attributes:
+        identity: `name@version`; when a run grows, items are compared by content.
+        items: By category.
+        folder: None for the embedded suite.
+        source: Where the numbers of items are from.
+        contents: Hash of every item's content by its id, of a suite in a folder; empty for others.
     """
 
     identity: str
@@ -118,9 +121,13 @@ def joined(selections: Iterable[Selection]) -> Selection:
 class Cell:
     """A run of the study. settings: what it is played with, without its selection.
 
-    model, way: names in the file; way is the condition or the ask. selections: of the blocks that use the run, by
-    their names. unavailable: why it is not played, empty if it is. suite: of all cells. packed_key: in an archive,
-    the key of the run that was packed.
+    Attributes:
+        model: Names in the file; way is the condition or the ask.
+        way: As `model`.
+        selections: Of the blocks that use the run, by their names.
+        suite: Of all cells.
+        unavailable: Why it is not played, empty if it is.
+        packed_key: In an archive, the key of the run that was packed.
     """
 
     model: str
@@ -247,9 +254,12 @@ NOT_TRIED_AGAIN: tuple[Stage, ...] = ("playing", "episodes")
 class Failure(Record):
     """Why runs of a model, or probes of a run, were not made.
 
-    stage: `checking` before anything was loaded, `playing` for the whole model, `episodes` for single ones that
-    were given up, `probes`, or `waiting` for a run that is not whole. run: as the plan names it. error: class of
-    the error. when: UTC, ISO 8601.
+    Attributes:
+        stage: `checking` before anything was loaded, `playing` for the whole model, `episodes` for single ones
+            that were given up, `probes`, or `waiting` for a run that is not whole.
+        run: As the plan names it.
+        error: Class of the error.
+        when: UTC, ISO 8601.
     """
 
     kind: ClassVar[str] = "record of a failure"

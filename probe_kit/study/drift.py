@@ -137,8 +137,11 @@ VERDICTS: Mapping[Verdict, str] = {
 class SiteDrift:
     """One site of one category: accuracies of transferred probes, there and back, and likeness.
 
-    cosine, weighted, ceiling: of the probes' directions, see `_cosines`; None where a side has no signal.
-    lens: accuracy of the logit lens at this layer, before and after; None unless both runs answer by letter.
+    Attributes:
+        cosine: Of the probes' directions, see `_cosines`; None where a side has no signal.
+        weighted: As `cosine`.
+        ceiling: As `cosine`.
+        lens: Accuracy of the logit lens at this layer, before and after; None unless both runs answer by letter.
     """
 
     site: Site
@@ -159,8 +162,11 @@ class SiteDrift:
 class CategoryDrift:
     """One category of two runs; `before` and `after` are their rows of the retention table.
 
-    difference: after minus before. sites: of the backbone, empty where frames or words differ; best: the position
-    of the one at which the first run's own probes are best. why_alone: why nothing is transferred, empty if it is.
+    Attributes:
+        difference: After minus before.
+        sites: Of the backbone, empty where frames or words differ.
+        best: The position of the one at which the first run's own probes are best.
+        why_alone: Why nothing is transferred, empty if it is.
     """
 
     category: str
@@ -203,10 +209,16 @@ def measure_drift(
     """Drift of every category that both runs were probed in, in one view.
 
     Probes are the stored ones of the first captured inference. Frames and words must be the same for a transfer:
-    otherwise only own accuracies are given. labels: names of the runs by location. probes: of both runs, the
-    newest stored ones where None.
-    Raises NoProbesError, UnknownSiteError for a view that was not probed, and UsageError where the backbones have
-    no site of one name and width in common.
+    otherwise only own accuracies are given.
+
+    Args:
+        labels: Names of the runs by location.
+        probes: Of both runs, the newest stored ones where None.
+
+    Raises:
+        NoProbesError: For a view that was not probed.
+        UnknownSiteError: For a view that was not probed.
+        UsageError: Where the backbones have no site of one name and width in common.
     """
     first, second = (
         (run, load_results(run) if results is None else results)

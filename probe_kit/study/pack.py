@@ -60,8 +60,14 @@ def pack_study(study: LoadedStudy, out: Path, partial: bool = False, extras: Col
     """Write the archive of a study to `out`: a zip file if it ends in `.zip`, else a folder.
 
     Every table of the file can be printed from it alone. Other outcome rules than `disc` need trajectories.
-    partial: leave out runs and tables that are missing; `pack.json` names them and the reason. extras: see EXTRAS.
-    Raises UsageError where anything lies at `out`, and RunIncompleteError for missing runs.
+
+    Args:
+        partial: Leave out runs and tables that are missing; `pack.json` names them and the reason.
+        extras: See EXTRAS.
+
+    Raises:
+        UsageError: Where anything lies at `out`.
+        RunIncompleteError: For missing runs.
     """
     if out.exists():
         raise UsageError(f"{out} exists; choose another --out or remove it")
@@ -145,10 +151,15 @@ def write_data_set(
 ) -> Pack:
     """Write the data set of a study to `folder`, whole or not at all.
 
-    partial: leave out what is missing. licence: as the hub spells it, such as `cc-by-4.0`; named in the card.
-    again: accept a folder that holds this very data set, such as after an upload that failed.
-    Raises UsageError where anything else lies there, DiskSpaceError, MissingExtraError without pyarrow, and what
-    `pack_study` raises.
+    Args:
+        partial: Leave out what is missing.
+        licence: As the hub spells it, such as `cc-by-4.0`; named in the card.
+        again: Accept a folder that holds this very data set, such as after an upload that failed.
+
+    Raises:
+        UsageError: Where anything else lies there.
+        DiskSpaceError: Without pyarrow, and what `pack_study` raises.
+        MissingExtraError: Without pyarrow, and what `pack_study` raises.
     """
     require("pyarrow.parquet", "export")
     if folder.exists() and not again:
@@ -267,10 +278,14 @@ def publish_data_set(
 ) -> str:
     """Upload a folder of `write_data_set` as a data set; returns the address of the commit or pull request.
 
-    repository: `owner/name`, created if it is not there. The commit is tagged with the version of its content, a
-    pull request is not. The token is the hub's own: HF_TOKEN, or that of `hf auth login`. Files that are there
-    already are not sent again. pause: seconds before the second try, doubled each time.
-    Raises StoreError where the hub refuses, or cannot be reached in TRIES tries.
+    Args:
+        repository: `owner/name`, created if it is not there. The commit is tagged with the version of its content,
+            a pull request is not. The token is the hub's own: HF_TOKEN, or that of `hf auth login`. Files that are
+            there already are not sent again.
+        pause: Seconds before the second try, doubled each time.
+
+    Raises:
+        StoreError: Where the hub refuses, or cannot be reached in TRIES tries.
     """
     from huggingface_hub import DiscussionWithDetails, HfApi
 

@@ -130,9 +130,13 @@ _MOST_CHANGES = 3
 class PlannedCell:
     """A cell with what lies at its location. stored: episodes of its selection. why: the state in words.
 
-    failure: of the last time it was played. waits_for: failure of another run of its model. probes: by table of
-    the file, why they are to be fitted; empty for stored ones. sealed: whether nothing is left to do after its
-    last episode. seconds: mean of a stored episode. streams: of what is stored.
+    Attributes:
+        failure: Of the last time it was played.
+        waits_for: Failure of another run of its model.
+        probes: By table of the file, why they are to be fitted; empty for stored ones.
+        sealed: Whether nothing is left to do after its last episode.
+        seconds: Mean of a stored episode.
+        streams: Of what is stored.
     """
 
     cell: Cell
@@ -311,8 +315,12 @@ class StudyPlan:
 def plan_study(study: LoadedStudy, only: str | None = None) -> StudyPlan:
     """Compare a study with what is stored. Loads no model and writes nothing.
 
-    only: a block or a model, whose runs alone are planned; all by default. Raises UsageError for another name, and
-    RunDamagedError for the record of a failure that was changed.
+    Args:
+        only: A block or a model, whose runs alone are planned; all by default.
+
+    Raises:
+        UsageError: For another name.
+        RunDamagedError: For the record of a failure that was changed.
     """
     names = [*study.study.models, *(block.name for block in study.study.runs)]
     if only is not None and only not in names:

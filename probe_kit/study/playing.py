@@ -49,7 +49,8 @@ _SECONDS_PER_INFERENCE = 0.1
 class RunTask:
     """A run to be played or asked. run: as the plan names it. location: an address for any working directory.
 
-    stored: episodes that were stored when the task was made.
+    Attributes:
+        stored: Episodes that were stored when the task was made.
     """
 
     run: str
@@ -106,10 +107,18 @@ def conduct_study(
     Every run is checked, and every scene built, before the first one is played. A model that fails stops itself
     alone: episodes that are committed stay, and the next call resumes after them. What failed while it was played
     is not tried again until its settings change, or with `retry_failed`.
-    report: called with every event as it happens. slots: processes, each with one model at a time; 0 for this
-    process. ray: address of a Ray cluster that plays instead, or `auto`. env_workers: processes that simulate, as
-    in `ExtractSettings`.
-    Raises DiskSpaceError and StoreError, MissingExtraError without Ray, and UsageError if no cluster answers.
+
+    Args:
+        report: Called with every event as it happens.
+        slots: Processes, each with one model at a time; 0 for this process.
+        ray: Address of a Ray cluster that plays instead, or `auto`.
+        env_workers: Processes that simulate, as in `ExtractSettings`.
+
+    Raises:
+        DiskSpaceError: Without Ray.
+        StoreError: Without Ray.
+        MissingExtraError: Without Ray.
+        UsageError: If no cluster answers.
     """
     if ray is not None:
         require("ray", "ray")
@@ -193,8 +202,11 @@ def _problem(planned: PlannedCell, rehearsed: list[SceneSpec], ray: str | None) 
 def play_model(task: ModelTask, report: Report) -> None:
     """Load the model and make its runs one after another; what fails is reported, and committed episodes stay.
 
-    Episodes that are given up end their run alone; anything else ends the model. Raises DiskSpaceError and
-    StoreError, which concern all runs.
+    Episodes that are given up end their run alone; anything else ends the model.
+
+    Raises:
+        DiskSpaceError: Which concern all runs.
+        StoreError: Which concern all runs.
     """
     loaded: dict[bool, Any] = {}  # as policy and as VLM, on first use
     for run in task.runs:
@@ -233,8 +245,13 @@ def play_models(tasks: Sequence[ModelTask], report: Report, slots: int = 0, ray:
     The longest goes first. A model whose worker is lost resumes after what is stored; it fails once it was lost
     `MOST_LOSSES` times without an episode in between. With GPUs each process has one of its own; further processes
     play models that need none. Ray finds room for each model; its nodes see the runs.
-    Raises DiskSpaceError and StoreError of any worker, WorkerDiedError if workers die before they begin,
-    MissingExtraError without Ray, and UsageError if no cluster answers.
+
+    Raises:
+        DiskSpaceError: Of any worker.
+        StoreError: Of any worker.
+        WorkerDiedError: If workers die before they begin.
+        MissingExtraError: Without Ray.
+        UsageError: If no cluster answers.
     """
     tasks = sorted(tasks, key=lambda task: -task.size)  # begun last, the longest would be waited for alone
     if ray is None and not slots:
@@ -294,8 +311,10 @@ def fit_probes(plan: StudyPlan, progress: ProbeProgress | None = None, jobs: int
     """Fit the probes of a study file that a plan does not find stored. Returns what could not be fitted.
 
     A failure of stage `waiting` says that a run is not whole yet; others are stored with the study.
-    progress: called with the run's name, sites done, sites in all and the last one. jobs: processes, as in
-    `train_probes`.
+
+    Args:
+        progress: Called with the run's name, sites done, sites in all and the last one.
+        jobs: Processes, as in `train_probes`.
     """
     stored, failures = Failures(plan.study.study.folder), list[Failure]()
     fitted = {

@@ -118,7 +118,10 @@ def score_table(
 ) -> Table:
     """The normalised score of every system with its interval: 0 for guessing, 100 for perfection.
 
-    title, source, elsewhere: a further column of numbers that were not measured here, by location of the run.
+    Args:
+        title: A further column of numbers that were not measured here, by location of the run.
+        source: As `title`.
+        elsewhere: As `title`.
     """
     means = [row for row in once_per_category(table.means) if row.success.sr is not None]
     other_scores = {} if elsewhere is None else elsewhere

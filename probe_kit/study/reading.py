@@ -33,7 +33,8 @@ _NAME_PATTERN = "'^[a-z0-9][a-z0-9._-]{0,59}$'"
 class LoadedStudy:
     """A study file without mistakes. file: where it lies. cells: the runs that it needs.
 
-    pack: the record of the archive that it was read from, whose runs hold no activations; else None.
+    Attributes:
+        pack: The record of the archive that it was read from, whose runs hold no activations; else None.
     """
 
     file: Path
@@ -76,9 +77,14 @@ def load_study(name: str | Path) -> LoadedStudy:
     """Read a study file and expand it; loads no model, draws no picture and needs no network.
 
     Paths in the file are relative to the working directory, as on the command line.
-    name: a path, the name of a study of the package, or an archive of `pack_study`, as a folder or zip file.
-    Raises UsageError if there is none, StudyFileError, which lists all mistakes with their paths, and
-    RunDamagedError for an archive that was changed.
+
+    Args:
+        name: A path, the name of a study of the package, or an archive of `pack_study`, as a folder or zip file.
+
+    Raises:
+        UsageError: If there is none.
+        StudyFileError: Which lists all mistakes with their paths.
+        RunDamagedError: For an archive that was changed.
     """
     archive = open_archive(name)
     file = find_study(str(name)) if archive is None else archive / STUDY_FILE

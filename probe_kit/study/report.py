@@ -33,8 +33,13 @@ def make_figures(study: LoadedStudy, name: str, partial_runs: bool = False) -> l
     """The figures of one name, from stored runs alone; nothing is drawn yet.
 
     A figure of the kind `dose` is one per run that was steered; others are one of all runs.
-    partial_runs: accept runs that are missing or unfinished. Raises UsageError for an unknown name, or where no
-    run has what the figure shows, and RunIncompleteError for runs that are missing.
+
+    Args:
+        partial_runs: Accept runs that are missing or unfinished.
+
+    Raises:
+        UsageError: For an unknown name, or where no run has what the figure shows.
+        RunIncompleteError: For runs that are missing.
     """
     if name not in study.study.figures:
         raise UsageError(unknown("figure", name, list(study.study.figures)))
@@ -100,7 +105,8 @@ def _doses(name: str, runs: StoredRuns) -> list[ReportFigure]:
 def draw_overview(table: RetentionTable) -> "Figure":
     """Bars of the normalised score, a panel per domain on one scale, a bar per system.
 
-    Raises UsageError where no model acted or answered.
+    Raises:
+        UsageError: Where no model acted or answered.
     """
     scores = domain_scores(table)
     if not scores:
@@ -137,8 +143,11 @@ class StudyReport:
 def write_study_report(study: LoadedStudy, path: Path | str, partial: bool = False) -> StudyReport:
     """Write the report of a study as one HTML file, whole or not at all.
 
-    partial: leave out what is missing; the page names it with the reason.
-    Raises UsageError where no run is stored, and what `make_table` and `make_figures` raise.
+    Args:
+        partial: Leave out what is missing; the page names it with the reason.
+
+    Raises:
+        UsageError: Where no run is stored, and what `make_table` and `make_figures` raise.
     """
     report = study_report(study, partial)
     write_whole(Path(path), report.html)

@@ -153,8 +153,11 @@ class _Table(BaseModel):
 class SuiteTable(_Table):
     """The suite of all runs.
 
-    path: its folder; the embedded suite by default. categories, items: of all blocks that name none.
-    counts: items per category of a suite that is not here yet, for the plan; later it must hold so many.
+    Attributes:
+        path: Its folder; the embedded suite by default.
+        categories: Of all blocks that name none.
+        items: As `categories`.
+        counts: Items per category of a suite that is not here yet, for the plan; later it must hold so many.
     """
 
     path: Text | None = None
@@ -166,9 +169,17 @@ class SuiteTable(_Table):
 class ModelTable(_Table, ModelSettings):
     """One model: the part `model` of the settings of a run, and its place in the study.
 
-    label: what tables call it. groups: it belongs to. vlm: the VLM of its backbone. finetuned_from: what it was
-    trained from. untrained: its network with random weights. unavailable: why it is not played; it is named in
-    plans and tables. protocol, scene, execute, batch: as in `probe-kit extract`.
+    Attributes:
+        label: What tables call it.
+        groups: It belongs to.
+        vlm: The VLM of its backbone.
+        finetuned_from: What it was trained from.
+        untrained: Its network with random weights.
+        protocol: As in `probe-kit extract`.
+        scene: As `protocol`.
+        execute: As `protocol`.
+        batch: As `protocol`.
+        unavailable: Why it is not played; it is named in plans and tables.
     """
 
     label: Text | None = None
@@ -285,7 +296,8 @@ class ElsewhereTable(_Table):
 class TableTable(_Table):
     """A table to print. runs: blocks it is made of; comparison, drift: by name, where its kind shows one.
 
-    elsewhere: of a table of kind `score`, a column of numbers from elsewhere.
+    Attributes:
+        elsewhere: Of a table of kind `score`, a column of numbers from elsewhere.
     """
 
     kind: TableKind
@@ -308,7 +320,9 @@ class FigureTable(_Table):
 class Study(_Table):
     """A whole study file.
 
-    out: folder or URL of runs; default `runs/NAME`. scene: of every model that names none, and of VLMs too.
+    Attributes:
+        out: Folder or URL of runs; default `runs/NAME`.
+        scene: Of every model that names none, and of VLMs too.
     """
 
     version: Annotated[Literal[1], BeforeValidator(_whole_number)] = Field(alias="schema")

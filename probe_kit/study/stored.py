@@ -141,7 +141,9 @@ def check_same_weights(runs: Sequence[tuple[Cell, "Run"]]) -> None:
 class StoredRun:
     """A run of the study, and its cell.
 
-    run: the items that a table prints. probed: those that the file's probes are fitted to.
+    Attributes:
+        run: The items that a table prints.
+        probed: Those that the file's probes are fitted to.
     """
 
     cell: Cell
@@ -158,9 +160,11 @@ class StoredRun:
 class StoredRuns:
     """The runs that a table is made of, in the order of the file.
 
-    missing: of the others, why they are not in the table. unfinished: episodes that `study run` would still play
-    of both, in words; only of partial tables. labels: by location the model's label, with condition or ask and
-    seed where a model has several runs, stored or not.
+    Attributes:
+        missing: Of the others, why they are not in the table.
+        unfinished: Episodes that `study run` would still play of both, in words; only of partial tables.
+        labels: By location the model's label, with condition or ask and seed where a model has several runs,
+            stored or not.
     """
 
     runs: tuple[StoredRun, ...]
@@ -178,10 +182,16 @@ def stored_runs(
 ) -> StoredRuns:
     """Open the stored runs of a study.
 
-    select: returns what of a cell is printed; None leaves it out. subject: what is made of them, for messages.
-    partial: accept runs that are missing or unfinished; they are named. categories: slugs, all by default.
-    Raises RunIncompleteError for a run that is missing, unfinished or damaged, unless `partial`, UsageError for
-    no stored run, SettingsMismatchError for a run of another cell.
+    Args:
+        select: Returns what of a cell is printed; None leaves it out.
+        subject: What is made of them, for messages.
+        partial: Accept runs that are missing or unfinished; they are named.
+        categories: Slugs, all by default.
+
+    Raises:
+        RunIncompleteError: For a run that is missing, unfinished or damaged, unless `partial`.
+        UsageError: For no stored run.
+        SettingsMismatchError: For a run of another cell.
     """
     runs, missing, unfinished, models = list[StoredRun](), list[str](), list[str](), list[str]()
     for cell in study.cells:
@@ -254,8 +264,9 @@ def open_matching(study: LoadedStudy, cell: Cell, partial: bool) -> "Run":
 def open_stored(study: LoadedStudy, cell: Cell, partial: bool = False) -> "Run":
     """Open the run of a cell as `open_matching` does, checked to hold all items of its blocks.
 
-    partial: accept missing episodes. Raises what `open_matching` raises, and RunIncompleteError for a run of fewer
-    items.
+    Args:
+        partial: Accept missing episodes. Raises what `open_matching` raises, and RunIncompleteError for a run of
+            fewer items.
     """
     run = open_matching(study, cell, partial)
     planned = run.items["category"].value_counts().to_dict()
@@ -297,9 +308,12 @@ def part_of(run: "Run", cell: Cell, selection: Selection, categories: Sequence[s
 def probe_key(study: LoadedStudy, stored: StoredRun, run: "Run", partial: bool) -> str:
     """Return the key of the probes that the file's tables fit to a run; empty for none.
 
-    run: the part of what is stored that is printed. Probes that were fitted otherwise, by hand or for a former
-    state of the file, give no number.
-    Raises RunIncompleteError for a run without the probes of the file, unless `partial`.
+    Args:
+        run: The part of what is stored that is printed. Probes that were fitted otherwise, by hand or for a former
+            state of the file, give no number.
+
+    Raises:
+        RunIncompleteError: For a run without the probes of the file, unless `partial`.
     """
     tables = {
         name: table
@@ -351,7 +365,10 @@ def _label(study: LoadedStudy, cell: Cell, several: bool) -> str:
 def stored_runs_by_name(name: str) -> "list[Run] | None":
     """Return the stored runs of a study file, or of a study of the package; None for a name of neither.
 
-    Runs that are missing are named on the terminal. Raises UsageError if none is stored, and as `load_study` does.
+    Runs that are missing are named on the terminal.
+
+    Raises:
+        UsageError: If none is stored, and as `load_study` does.
     """
     if not (name.endswith(".toml") or (name in shipped_studies() and not Path(name).exists())):
         return None

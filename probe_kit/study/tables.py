@@ -261,8 +261,12 @@ _OF_PROBED_RUNS: Mapping[str, Callable[[RetentionTable], Table]] = {
 def make_table(study: LoadedStudy, name: str, partial: bool = False) -> Table:
     """Make a table of a study file from stored runs alone: no model and no simulator.
 
-    partial: accept runs that are missing or unfinished; the note names them. Raises UsageError for an unknown
-    name, RunIncompleteError for runs that are missing, and what `open_run` raises.
+    Args:
+        partial: Accept runs that are missing or unfinished; the note names them.
+
+    Raises:
+        UsageError: For an unknown name.
+        RunIncompleteError: For runs that are missing, and what `open_run` raises.
     """
     if name not in study.study.tables:
         raise UsageError(unknown("table", name, list(study.study.tables)))

@@ -121,11 +121,16 @@ def build_suite(
 ) -> Suite:
     """The embedded suite, drawn and written to `folder`.
 
-    categories: slugs, all embedded ones by default. Which others are built changes no item of a category, and
-    fewer items per category are the beginning of more. items_per_category: one number, or a number for each of
-    `categories`. progress: called with items done and items in all.
-    Raises UnknownCategoryError, UsageError for a number of items that is not a positive even one or that a
-    category lacks, and SuiteError if `folder` holds anything but this very suite.
+    Args:
+        categories: Slugs, all embedded ones by default. Which others are built changes no item of a category, and
+            fewer items per category are the beginning of more.
+        items_per_category: One number, or a number for each of `categories`.
+        progress: Called with items done and items in all.
+
+    Raises:
+        UnknownCategoryError: For a number of items that is not a positive even one or that a category lacks.
+        UsageError: For a number of items that is not a positive even one or that a category lacks.
+        SuiteError: If `folder` holds anything but this very suite.
     """
     folder = Path(folder)
     options = _options(categories, items_per_category, seed)

@@ -69,7 +69,8 @@ def in_order(slugs: Iterable[str]) -> tuple[str, ...]:
 def check_categories(names: Sequence[str], available: Sequence[str]) -> tuple[str, ...]:
     """The names as given, if all are available.
 
-    Raises UnknownCategoryError naming the first one that is not, its nearest match, and what there is.
+    Raises:
+        UnknownCategoryError: Naming the first one that is not, its nearest match, and what there is.
     """
     for name in names:
         if name not in available:

@@ -51,10 +51,13 @@ def other_side(side: Side) -> Side:
 class Item:
     """One question: an imperative instruction, a correct and a wrong picture.
 
-    `left` and `right` refer to the *original* layout; the swapped layout is derived, never stored.
-    `side_word` marks a sign whose name holds a side word, such as "no left turn sign".
-    `wordings`: what else the item can be asked in, by name, see `WORDINGS`; no part of the item's identity.
-    `folder` is what the file names are relative to on this machine; it takes no part in the item's identity.
+    `left` and `right` refer to the *original* layout; the swapped layout is derived, never stored. `side_word`
+    marks a sign whose name holds a side word, such as "no left turn sign".
+
+    Attributes:
+        wordings: What else the item can be asked in, by name, see `WORDINGS`; no part of the item's identity.
+            `folder` is what the file names are relative to on this machine; it takes no part in the item's
+            identity.
     """
 
     item_id: str
@@ -140,7 +143,8 @@ class Item:
 class Episode:
     """One rollout of an item in one layout.
 
-    wording: the name of the wording that `item.instruction` is in, None where only its own was asked for.
+    Attributes:
+        wording: The name of the wording that `item.instruction` is in, None where only its own was asked for.
     """
 
     item: Item
@@ -256,8 +260,9 @@ def ties(item: Item) -> tuple[str, ...]:
 def with_groups(items: Sequence[Item], groups: Mapping[str, str] | None = None) -> tuple[Item, ...]:
     """The items with `group_id` set to their connected component over shared ties.
 
-    groups: by item id, a group that a user gave; it ties as a shared picture does. A group is called by a hash of
-    its members' ids, so the name does not depend on the order of the items.
+    Args:
+        groups: By item id, a group that a user gave; it ties as a shared picture does. A group is called by a hash
+            of its members' ids, so the name does not depend on the order of the items.
     """
     forest = _Forest()
     for item in items:

@@ -46,10 +46,14 @@ MOST_ITEMS = 100_000
 def save_suite(suite: Suite, pictures: Mapping[str, bytes], stats: Mapping[str, Any], folder: Path) -> Suite:
     """The suite as loaded from `folder`.
 
-    pictures: PNG bytes by file name. stats: per category, how many candidates each stage left.
-    The folder appears complete or not at all. If it is there already and holds this very suite, it is left
-    alone; that is also how the slower of two processes building at once ends.
-    Raises SuiteError if the folder holds anything else.
+    Args:
+        pictures: PNG bytes by file name.
+        stats: Per category, how many candidates each stage left. The folder appears complete or not at all. If it
+            is there already and holds this very suite, it is left alone; that is also how the slower of two
+            processes building at once ends.
+
+    Raises:
+        SuiteError: If the folder holds anything else.
     """
     if not _is_taken(folder):
         with draft_of(folder) as draft:
@@ -128,7 +132,9 @@ def _licenses(items: Iterable[Item]) -> str:
 def load_suite(folder: Path | str) -> Suite:
     """The suite in `folder`, with every file found to be what was written.
 
-    Raises UsageError if there is no suite, and SuiteError listing everything that is wrong with it.
+    Raises:
+        UsageError: If there is no suite.
+        SuiteError: Listing everything that is wrong with it.
     """
     folder = Path(folder).absolute()
     suite, findings = read_suite(folder)
@@ -144,7 +150,8 @@ def load_suite(folder: Path | str) -> Suite:
 def read_suite(folder: Path) -> tuple[Suite | None, list[Finding]]:
     """The suite as far as it can be read, None if its card cannot, and every error found on the way.
 
-    Raises UsageError if there is no suite.
+    Raises:
+        UsageError: If there is no suite.
     """
     card = _read_card(folder)
     if isinstance(card, list):

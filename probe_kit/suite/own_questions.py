@@ -40,10 +40,13 @@ class Terms:
 class PicturePair:
     """Two pictures that lie side by side, and what each of them is called.
 
-    category: one of the paper's or any name of your own, such as `ripe-fruit`; the row of a table in which the
-    questions are counted.
-    phrase, other_phrase: complete "Put the cube on the …", such as `fox` or `open door`.
-    picture, other_picture: files that Pillow reads; they are padded to a white square of 224 to 512 pixels.
+    Attributes:
+        category: One of the paper's or any name of your own, such as `ripe-fruit`; the row of a table in which the
+            questions are counted.
+        phrase: Complete "Put the cube on the …", such as `fox` or `open door`.
+        picture: Files that Pillow reads; they are padded to a white square of 224 to 512 pixels.
+        other_phrase: As `phrase`.
+        other_picture: As `picture`.
     """
 
     category: str
@@ -57,10 +60,14 @@ class PicturePair:
 class Row:
     """One line of the table.
 
-    line: its number in the file, from 1. instruction: the imperative. correct, wrong: files, beside the table.
-    group: rows of one group are never in training and test at once; empty where pictures alone decide. object:
-    what the correct picture is called, part of the instruction. other_object: what the wrong one is called; empty
-    for what its twin calls it, or else for its file's name.
+    Attributes:
+        line: Its number in the file, from 1.
+        instruction: The imperative.
+        correct: Files, beside the table.
+        wrong: As `correct`.
+        group: Rows of one group are never in training and test at once; empty where pictures alone decide. object:
+            what the correct picture is called, part of the instruction.
+        other_object: What the wrong one is called; empty for what its twin calls it, or else for its file's name.
     """
 
     line: int
@@ -122,7 +129,8 @@ class _Questions:
     ) -> Suite:  # fmt: skip
         """Write the suite. groups, places: by item id, the group that a user gave and where he wrote the question.
 
-        Raises SuiteError for a broken rule of the format, before anything is written.
+        Raises:
+            SuiteError: For a broken rule of the format, before anything is written.
         """
         suite = new_suite(self._name, self._version, with_groups(self.items, groups), options)
         findings = [
@@ -153,14 +161,21 @@ def suite_from_pictures(
 ) -> Suite:
     """A suite in `folder` in which every pair is asked for both ways: neither pictures nor words alone tell.
 
-    The first picture lies left and right in turn. license: an SPDX name, or whatever says what others may do with
-    the pictures. Pairs that share a file share a group, and folds never separate them.
-    Raises UsageError for no pair, a pair asked twice or an impossible category name, and SuiteError for a picture
-    that cannot be read, for questions that break a rule of the format, or if `folder` holds anything else. Nothing
-    is written then.
+    The first picture lies left and right in turn.
 
-    pair = PicturePair("living-world", "fox", Path("fox.jpg"), "hare", Path("hare.jpg"))
-    suite = suite_from_pictures("suites/mine", [pair], name="mine", license="CC-BY-4.0", attribution="me")
+    Nothing is written then.
+
+    pair = PicturePair("living-world", "fox", Path("fox.jpg"), "hare", Path("hare.jpg")) suite =
+    suite_from_pictures("suites/mine", [pair], name="mine", license="CC-BY-4.0", attribution="me")
+
+    Args:
+        license: An SPDX name, or whatever says what others may do with the pictures. Pairs that share a file share
+            a group, and folds never separate them.
+
+    Raises:
+        UsageError: For no pair, a pair asked twice or an impossible category name.
+        SuiteError: For a picture that cannot be read, for questions that break a rule of the format, or if
+            `folder` holds anything else.
     """
     if not pairs:
         raise UsageError("no pair of pictures given; expected at least one PicturePair")
@@ -200,10 +215,18 @@ def suite_from_csv(
     """The suite in `folder` that asks what the rows of `table` say; the answer lies left and right in turn.
 
     Columns `instruction`, `correct` and `wrong` are needed; `group`, `category` (otherwise `category`), `object`
-    (otherwise what follows "on the" in the instruction) and `other_object` may be there. name: of the suite; None
-    for the table's. Two rows over the same two pictures that ask the other way round are twins.
-    Raises UsageError naming the line for a table that cannot be used, and SuiteError for a picture that cannot be
-    read, questions that break a rule, or a `folder` that holds anything else. Nothing is written then.
+    (otherwise what follows "on the" in the instruction) and `other_object` may be there.
+
+    Nothing is written then.
+
+    Args:
+        name: Of the suite; None for the table's. Two rows over the same two pictures that ask the other way round
+            are twins.
+
+    Raises:
+        UsageError: Naming the line for a table that cannot be used.
+        SuiteError: For a picture that cannot be read, questions that break a rule, or a `folder` that holds
+            anything else.
     """
     table = Path(table)
     rows = read_rows(table, category)

@@ -81,7 +81,11 @@ def picture_size(encoded: bytes) -> tuple[int, int] | None:
 def load_picture(path: Path, pixels: str | None = None) -> Image.Image:
     """A square RGB picture, upright, on white; the shorter side is padded with white.
 
-    pixels: the hash its pixels must have. Raises SuiteError as `decode_picture` does, and for other pixels.
+    Args:
+        pixels: The hash its pixels must have.
+
+    Raises:
+        SuiteError: As `decode_picture` does, and for other pixels.
     """
     picture = decode_picture(path)
     if pixels is not None and (other := pixels_sha256(picture)) != pixels:
@@ -94,7 +98,8 @@ def load_picture(path: Path, pixels: str | None = None) -> Image.Image:
 def decode_picture(path: Path) -> Image.Image:
     """The RGB picture in a file, as `decode_bytes` has it.
 
-    Raises SuiteError naming the file if it is missing or cannot be decoded.
+    Raises:
+        SuiteError: Naming the file if it is missing or cannot be decoded.
     """
     try:
         encoded = read_regular(path)
@@ -116,10 +121,12 @@ def decode_bytes(
 
     The orientation of EXIF is applied, and transparency becomes white. Palettes and grey become RGB. CMYK becomes
     RGB by Pillow's formula, without a colour profile.
-    name: what the picture is, at the beginning of messages. upright: False for textures, whose orientation
-    belongs to their mesh. largest: pixels of the longer side.
-    Raises `error` for another format, damaged or incomplete bytes, a larger picture, several frames, and more than
-    8 bits per channel.
+
+    Args:
+        name: What the picture is, at the beginning of messages.
+        upright: False for textures, whose orientation belongs to their mesh.
+        largest: Pixels of the longer side. Raises `error` for another format, damaged or incomplete bytes, a
+            larger picture, several frames, and more than 8 bits per channel.
     """
     if refused := _refused_format(encoded):
         raise error(
@@ -141,8 +148,9 @@ def decode_bytes(
 def rgb_of(image: Image.Image, name: str, remedy: str) -> Image.Image:
     """The RGB pixels of a picture that another library opened: transparency becomes white.
 
-    Raises SuiteError for a format outside `FORMATS`, a picture that is too large or has several frames, more than
-    8 bits per channel, and damaged bytes.
+    Raises:
+        SuiteError: For a format outside `FORMATS`, a picture that is too large or has several frames, more than 8
+            bits per channel, and damaged bytes.
     """
     if image.format not in (None, *FORMATS):
         raise SuiteError(f"{name} is {image.format}; expected one of {', '.join(FORMATS)}. {remedy}")
@@ -250,7 +258,8 @@ _SAME_COLOUR = 24.0  # levels, mean over channels, in every one of 8 × 8 blocks
 class Look:
     """Pixels, brightness and, as one shape comes in several colours, colour.
 
-    colours: (8, 8, 3) float64, the mean colour of every block, 0 to 255.
+    Attributes:
+        colours: (8, 8, 3) float64, the mean colour of every block, 0 to 255.
     """
 
     pixels_sha256: str

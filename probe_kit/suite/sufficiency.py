@@ -40,7 +40,9 @@ MARGIN = 0.1
 class Sufficiency:
     """One thing that items are to be enough for.
 
-    enough: whether it is, None where it is a matter of degree. words: why, and how many items are enough.
+    Attributes:
+        enough: Whether it is, None where it is a matter of degree.
+        words: Why, and how many items are enough.
     """
 
     name: str
@@ -97,7 +99,9 @@ class Smallest:
 def sufficiencies(suite: Suite, scored: bool, probed: bool) -> Iterator[Sufficiency]:
     """Yield the uses for which the smallest category of `suite` has enough items, or too few.
 
-    scored: whether there will be success rates. probed: whether there will be activations.
+    Args:
+        scored: Whether there will be success rates.
+        probed: Whether there will be activations.
     """
     smallest = Smallest.of(suite)
     if scored:

@@ -56,7 +56,8 @@ def missing_categories(items: Iterable[Item]) -> list[str]:
 class Suite:
     """Items with a name, a version and a content hash; `card` is what `suite.json` says about them.
 
-    selected_from: the suite that `select` chose these items from, None for a whole suite.
+    Attributes:
+        selected_from: The suite that `select` chose these items from, None for a whole suite.
     """
 
     name: str
@@ -128,8 +129,10 @@ class Suite:
     def select(self, categories: Sequence[str] | None = None, items_per_category: int | None = None) -> "Suite":
         """The first items of some categories, as a suite with its own hash and this one as its parent.
 
-        Raises UnknownCategoryError for a category the suite lacks, and UsageError for a number that is not
-        positive, exceeds what a category has, or would separate role-exchanged twins.
+        Raises:
+            UnknownCategoryError: For a category the suite lacks.
+            UsageError: For a number that is not positive, exceeds what a category has, or would separate
+                role-exchanged twins.
         """
         selected = self.categories if categories is None else check_categories(categories, self.categories)
         if not selected:
@@ -176,7 +179,8 @@ def new_suite(
 ) -> Suite:
     """A suite in memory, ready to be saved; `options` are what it was built or converted with.
 
-    extra: what else its card shall say. The card holds no date: the same options give the same bytes.
+    Args:
+        extra: What else its card shall say. The card holds no date: the same options give the same bytes.
     """
     card = {
         "name": name,
@@ -219,7 +223,9 @@ _LARGEST, _SMALLEST = 512, 224  # pixels of a stored picture's side
 class Picture:
     """An encoded picture with all that an item records about it.
 
-    original_pixels: hash of the pixels that it was made from. operation: what was done to them before.
+    Attributes:
+        original_pixels: Hash of the pixels that it was made from.
+        operation: What was done to them before.
     """
 
     image_id: str
@@ -250,8 +256,10 @@ def squared_picture(image_id: str, image: Image.Image, operation: str = "none") 
 def make_item(item_id: str, category: str, side: Side, pictures: tuple[Picture, Picture], **fields: Any) -> Item:
     """An item whose group is not known yet.
 
-    side: where the correct one of `pictures`, left and right, lies. fields: all others of an `Item` that are not
-    those of most items. Texts are composed (Unicode's form NFC).
+    Args:
+        side: Where the correct one of `pictures`, left and right, lies.
+        **fields: All others of an `Item` that are not those of most items. Texts are composed (Unicode's form
+            NFC).
     """
     left, right = pictures
     record = {

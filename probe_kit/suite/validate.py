@@ -224,7 +224,10 @@ Rows = npt.NDArray[np.intp]
 class Baseline:
     """The accuracy of one baseline on the correct side in one category.
 
-    interval: 95 %, groups as the unit. limit: what it may not exceed. grouping: what folds kept together.
+    Attributes:
+        interval: 95 %, groups as the unit.
+        limit: What it may not exceed.
+        grouping: What folds kept together.
     """
 
     category: str
@@ -390,7 +393,9 @@ def _forest(features: Array, correct: Labels, train: Rows, test: Rows, seed: int
 class Report:
     """The findings on a suite: violated rules, warnings, and baselines.
 
-    suite: its identity, or its folder if the card cannot be read. baselines: None if they were not run.
+    Attributes:
+        suite: Its identity, or its folder if the card cannot be read.
+        baselines: None if they were not run.
     """
 
     suite: str
@@ -445,8 +450,13 @@ def validate_suite(
 ) -> Report:
     """A report on the suite in `folder`.
 
-    baselines: also runs the leakage gates and stores them in the suite's `baselines.json`; not on a suite with
-    errors. progress: called with categories done and categories in all. Raises UsageError if there is no suite.
+    Args:
+        baselines: Also runs the leakage gates and stores them in the suite's `baselines.json`; not on a suite with
+            errors.
+        progress: Called with categories done and categories in all.
+
+    Raises:
+        UsageError: If there is no suite.
     """
     folder = Path(folder).absolute()
     suite, findings = read_suite(folder)

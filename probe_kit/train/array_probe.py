@@ -40,8 +40,9 @@ _OF_RUNS = (
 class ArrayProbes:
     """Probes of plain arrays. names: of the S sites, in order. results: as `train_probes` gives them.
 
-    order: (N,) the row of X that each sample of `results` is. classes: values of y in the order of their codes,
-    empty for quantities.
+    Attributes:
+        order: (N,) the row of X that each sample of `results` is.
+        classes: Values of y in the order of their codes, empty for quantities.
     """
 
     names: tuple[str, ...]
@@ -114,18 +115,26 @@ def probe(
 ) -> ArrayProbes:
     """Probe arrays: at which site can `y` be decoded, beyond chance and beyond controls?
 
-    X: (N, D) features of one site, (S, N, D) of several, or a dictionary from names to (N, D). y: (N,) labels: two
-    values, classes as texts, or quantities. groups: (N,) what folds, intervals and label permutations keep
-    together, such as a subject or a picture; by default every sample is a group. task: `binary`, `classes` or
-    `continuous`, where the values leave a doubt. controls: features (N, D) by name that never saw the model; a
-    signal must exceed each of them. untrained: the same sites of an untrained network; a signal must exceed the
-    best of them. strata: (N,) within which label permutations exchange groups. ordered: whether the samples of
-    every group come in an order that corresponds between groups, such as time; permutations then keep it.
-    permutations, seed, jobs: as in `train_probes`, which does the work.
-
     The score is balanced accuracy or R² of held-out groups, with nested folds. Nothing is stored.
-    Raises UsageError for arrays that do not fit together, hold NaN or infinity, or for labels without a task, and
-    TooFewGroupsError for fewer than five groups with each class.
+
+    Args:
+        X: (N, D) features of one site, (S, N, D) of several, or a dictionary from names to (N, D).
+        y: (N,) labels: two values, classes as texts, or quantities.
+        groups: (N,) what folds, intervals and label permutations keep together, such as a subject or a picture; by
+            default every sample is a group.
+        task: `binary`, `classes` or `continuous`, where the values leave a doubt.
+        controls: Features (N, D) by name that never saw the model; a signal must exceed each of them.
+        untrained: The same sites of an untrained network; a signal must exceed the best of them.
+        strata: (N,) within which label permutations exchange groups.
+        ordered: Whether the samples of every group come in an order that corresponds between groups, such as time;
+            permutations then keep it.
+        permutations: As in `train_probes`, which does the work.
+        seed: As `permutations`.
+        jobs: As `permutations`.
+
+    Raises:
+        UsageError: For arrays that do not fit together, hold NaN or infinity, or for labels without a task.
+        TooFewGroupsError: For fewer than five groups with each class.
     """
     import pandas as pd
 

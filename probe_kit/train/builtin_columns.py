@@ -31,7 +31,8 @@ PHASES = ("before grasp", "holding", "after release")
 class BuiltinColumn:
     """A built-in column. episodes: (n,) ids. inferences: (n,), None for one label per episode. cells: (n,).
 
-    task: None where the values decide it.
+    Attributes:
+        task: None where the values decide it.
     """
 
     task: Task | None
@@ -126,8 +127,9 @@ class BuiltinColumns:
     def read(self, name: str) -> BuiltinColumn:
         """Return a column by its name, for every episode or captured inference that the run has.
 
-        Raises UsageError for another name and for a run of which nothing such is stored; NoTrajectoryError without
-        trajectories.
+        Raises:
+            UsageError: For another name and for a run of which nothing such is stored.
+            NoTrajectoryError: Without trajectories.
         """
         run = self._run
         if name.startswith(SIM) and name.removeprefix(SIM) in SIM_COLUMNS:
@@ -297,8 +299,11 @@ def _inferences(run: RunReader) -> Iterator[tuple[str, int]]:
 def frames_of_inferences(run: RunReader) -> Iterator[tuple[Any, int, list[int]]]:
     """Trajectory, row and frames of the captured inferences of every episode.
 
-    The frame of an inference is its control step: the state after so many actions. Raises UsageError for a run
-    that stores no control steps, NoTrajectoryError for one without trajectories.
+    The frame of an inference is its control step: the state after so many actions.
+
+    Raises:
+        UsageError: For a run that stores no control steps.
+        NoTrajectoryError: For one without trajectories.
     """
     if not hasattr(run, "trajectories") or not hasattr(run, "control_steps"):
         raise UsageError(f"{run.location} has no trajectories; `sim.*` and the state need them")

@@ -198,7 +198,8 @@ def small_pictures(pixels: NDArray[np.uint8], side: int) -> Features:
 def step_features(samples: TargetSamples, places: NDArray[np.intp] | None = None) -> Features:
     """(n, at most 50): which part of the window an inference is in, one-hot.
 
-    places: (n,) of recorded frames in the order of their numbers, which take the place of inferences.
+    Args:
+        places: (n,) of recorded frames in the order of their numbers, which take the place of inferences.
     """
     steps, count = samples.steps, samples.window
     if places is not None:
@@ -211,7 +212,8 @@ def step_features(samples: TargetSamples, places: NDArray[np.intp] | None = None
 def state_features(run: RunReader, samples: TargetSamples) -> Features:
     """(n, 7): position and angles of the hand and the opening of the gripper at the step of every inference.
 
-    Raises UsageError for a run without trajectories or control steps.
+    Raises:
+        UsageError: For a run without trajectories or control steps.
     """
     of_row: dict[int, list[int]] = {}
     for position, row in enumerate(samples.rows.tolist()):

@@ -70,9 +70,13 @@ def prepare_controls(
 ) -> PreparedControls:
     """Return the controls `names` that `stored` does not have yet, before anything is probed.
 
-    names: None for those that are run by default; of them what is not possible is left out, with a warning where
-    pictures are missing. folder: of the run's suite, see `suite_of`. Raises UsageError for a control that was
-    asked for and is unknown or not possible, and what `suite_of` raises.
+    Args:
+        names: None for those that are run by default; of them what is not possible is left out, with a warning
+            where pictures are missing.
+        folder: Of the run's suite, see `suite_of`.
+
+    Raises:
+        UsageError: For a control that was asked for and is unknown or not possible, and what `suite_of` raises.
     """
     array_features = run.control_features
     available = (*array_features, *(name for name in CONTROLS if name not in array_features))
@@ -182,7 +186,8 @@ def _compared(
 ) -> Iterator[ControlComparison]:
     """Yield every site of a stream against the mean of a control's scores, or the best untrained site.
 
-    references: (S', E) scores of the control's S' sites on the E samples.
+    Args:
+        references: (S', E) scores of the control's S' sites on the E samples.
     """
     curve, settings = results.curves[key], results.settings
     rows = curve.stream(stream)
@@ -211,7 +216,8 @@ _SHOWN = (DATASET, "suite", "scene", "seed")
 def check_same_source(run: RunReader, untrained: RunReader, samples: TargetSamples, is_side: bool) -> None:
     """Raise UsageError for the run itself; of a target that is no side also for other frames or missing episodes.
 
-    samples: of the run.
+    Args:
+        samples: Of the run.
     """
     if run.location.address == untrained.location.address:
         raise UsageError(
@@ -243,8 +249,10 @@ def check_untrained(
 ) -> None:
     """Raise UsageError unless `untrained` is another run of the same episodes, instructions, frames and labels.
 
-    samples, untrained_samples: of the two runs. Of a target that is no side also for inferences after the first of
-    a network that acted: the frames it was shown then follow from its own actions.
+    Args:
+        samples: Of the two runs. Of a target that is no side also for inferences after the first of a network that
+            acted: the frames it was shown then follow from its own actions.
+        untrained_samples: As `samples`.
     """
     identities, untrained_identities = (
         _identities(*pair) for pair in ((run, samples), (untrained, untrained_samples))
@@ -302,7 +310,8 @@ def _identity(run: RunReader, name: str) -> Any:
 def add_untrained(results: ProbeResults, untrained: ProbeResults) -> ProbeResults:
     """Return `results` compared with the same probes of an untrained network, in place of any other one.
 
-    Raises UsageError for other episodes, and for a stream that the untrained network lacks.
+    Raises:
+        UsageError: For other episodes, and for a stream that the untrained network lacks.
     """
     gains: list[UntrainedScore] = []
     scores: list[ControlScore] = []

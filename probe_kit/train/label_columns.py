@@ -35,8 +35,12 @@ SOURCE, FRAME = "source_episode", "frame"
 def read_table(table: "Path | str | pd.DataFrame", requested: Sequence[str]) -> LabelTable:
     """The key columns and the columns `requested` of a table. requested: those that it lacks are left out.
 
-    table: a CSV file (see `open_table`), a Parquet file (`.parquet`), or a DataFrame. Raises UsageError for a file
-    that is no such table, or has no column `episode_id`; MissingExtraError for Parquet without pyarrow.
+    Args:
+        table: A CSV file (see `open_table`), a Parquet file (`.parquet`), or a DataFrame.
+
+    Raises:
+        UsageError: For a file that is no such table, or has no column `episode_id`.
+        MissingExtraError: For Parquet without pyarrow.
     """
     if not isinstance(table, str | Path):
         frame = table.reset_index() if any(name is not None for name in table.index.names) else table
@@ -117,7 +121,8 @@ def _of_cells(cells: dict[str, list[Any]], names: tuple[str, ...], count: int, s
 def _plain(cell: Any, table: LabelTable, row: int, column: str) -> Cell:
     """A cell of a frame or Parquet file as a Python type; whatever means "missing" is None. Dates are texts.
 
-    Raises UsageError for other objects, such as lists.
+    Raises:
+        UsageError: For other objects, such as lists.
     """
     import pandas as pd
 
@@ -153,8 +158,9 @@ LARGEST = 1e100
 class LabelValues:
     """A column of labels, coded for its task.
 
-    classes: names of the classes in order, empty for a continuous label. values: (n,) float64, the number of the
-    class or the quantity; NaN where the cell is empty.
+    Attributes:
+        classes: Names of the classes in order, empty for a continuous label.
+        values: (n,) float64, the number of the class or the quantity; NaN where the cell is empty.
     """
 
     task: Task
@@ -177,8 +183,10 @@ class LabelValues:
 def code_labels(cells: Sequence[Cell], task: Task | None, target: str) -> LabelValues:
     """Code the cells of one kind of the column `target` for `task`, or for the only task that fits.
 
-    Booleans and two values are binary, other texts classes, other numbers continuous. Raises UsageError if the
-    column is empty or constant, cannot have this task, or could have two.
+    Booleans and two values are binary, other texts classes, other numbers continuous.
+
+    Raises:
+        UsageError: If the column is empty or constant, cannot have this task, or could have two.
     """
     if task is not None and task not in TASKS:
         raise UsageError(f"task {task!r}; expected one of {', '.join(TASKS)}")

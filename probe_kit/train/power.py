@@ -35,10 +35,13 @@ _NUMBERS = 200_000
 class Power:
     """Share of experiments in which a signal of `above` over chance is seen, family-wise, with so many items.
 
-    chance: against label permutations. random_features, untrained: against a control that is right half of the
-    time; it takes more if the control is better than that. absent: share of experiments in which a stream
-    without any signal is called absent. spread: standard error of the four, the largest, measured over `SEEDS`
-    seeds.
+    Attributes:
+        chance: Against label permutations.
+        random_features: Against a control that is right half of the time; it takes more if the control is better
+            than that.
+        untrained: As `random_features`.
+        absent: Share of experiments in which a stream without any signal is called absent.
+        spread: Standard error of the four, the largest, measured over `SEEDS` seeds.
     """
 
     items: int
@@ -58,8 +61,10 @@ class Power:
 def simulate(items: int, above: float, sites: int = 19, draws: int = 400, seed: int = 0) -> Power:
     """Power by simulated correctness of `draws` experiments.
 
-    A third of the sites carry the signal, at least one. Raises UsageError for fewer than 10 items, no site, fewer
-    than `SEEDS` draws, or an impossible signal.
+    A third of the sites carry the signal, at least one.
+
+    Raises:
+        UsageError: For fewer than 10 items, no site, fewer than `SEEDS` draws, or an impossible signal.
     """
     if items < FEWEST_ITEMS:
         raise UsageError(
@@ -84,7 +89,9 @@ def items_needed(
     """The power of the fewest items at which all three tests reach `power`; None if `MOST_ITEMS` are too few.
 
     The second value is the resolution: so many items fewer were tried, and reach it less often; see `fewest`.
-    Raises UsageError as `simulate` does.
+
+    Raises:
+        UsageError: As `simulate` does.
     """
     tried: dict[int, Power] = {}
 

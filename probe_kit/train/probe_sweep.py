@@ -50,10 +50,15 @@ def probe_columns(
 ) -> Iterator[tuple[Key, Probed]]:
     """The probes of every column by category, as they are done; who probes them changes no number.
 
-    jobs: columns at once, 1 by default. device: where torch solves them; numpy does without one. ray: address of
-    a cluster that solves them, `auto` for the one this process belongs to or a new one on this machine; `jobs` is
-    then by default as many as it has cores. Raises MissingExtraError if Ray is asked for and not installed,
-    WorkerDiedError if workers die with the same column or before they begin, and what a worker raises.
+    Args:
+        jobs: Columns at once, 1 by default.
+        device: Where torch solves them; numpy does without one.
+        ray: Address of a cluster that solves them, `auto` for the one this process belongs to or a new one on this
+            machine; `jobs` is then by default as many as it has cores.
+
+    Raises:
+        MissingExtraError: If Ray is asked for and not installed.
+        WorkerDiedError: If workers die with the same column or before they begin, and what a worker raises.
     """
     if ray is None and (jobs or 1) == 1:
         for key, samples in columns:
@@ -131,37 +136,50 @@ def train_probes(
 ) -> ProbeResults:
     """Probe every site of every stream for `target`, per category and view, and store the results in the run.
 
-    target: a side, such as `side.correct`, a built-in column, such as `sim.tool_y`, or a `Target` of a table of
-    one's own. categories: each one by itself, by default of a side; `all` pools every episode, by default of every
-    other target. views: pooled ones, and `tokens` or `tokens:ROLE`, where every token is a sample and the decision
-    about a sample the mean of its tokens'. permutations: label permutations behind the p-values, of which token
-    views, many times as dear, take the first `token_permutations`. call: which captured inference, counted from 0,
-    a label of whole episodes is decoded from; episodes that ended before it are left out. window: with a label for
-    every inference, how many of each episode take part; by default as many as 90 % of the episodes reach.
-    align_to: where windows begin: at the first inference at which this target is true. folds: `concepts` also
-    keeps items about the same two concepts together. incomplete: `drop` leaves out items of which an episode is
-    missing.
+    With the same settings and episodes the stored results are returned, whatever jobs and device; an interrupted
+    sweep continues after the last finished site; controls are added to what is stored. Nothing is stored before
+    all of it is fitted: where this raises, `load_results` finds what it found before.
 
-    controls: features that never see the model, see `CONTROLS`; () for none. By default of a side
-    `random-features` and `pixels`, of other targets all that the run allows but `action` and `position`; where
-    pictures cannot be found a warning says that they were left out. suite: folder of the run's suite; the embedded
-    one is found or drawn again without it. untrained: a run of the same episodes, usually by random weights, to
-    compare with. What is no better than `random-features` and the untrained network is no signal, whatever its
-    p-value.
+    Args:
+        categories: Each one by itself, by default of a side; `all` pools every episode, by default of every other
+            target.
+        views: Pooled ones, and `tokens` or `tokens:ROLE`, where every token is a sample and the decision about a
+            sample the mean of its tokens'.
+        target: A side, such as `side.correct`, a built-in column, such as `sim.tool_y`, or a `Target` of a table
+            of one's own.
+        window: With a label for every inference, how many of each episode take part; by default as many as 90 % of
+            the episodes reach.
+        align_to: Where windows begin: at the first inference at which this target is true.
+        call: Which captured inference, counted from 0, a label of whole episodes is decoded from; episodes that
+            ended before it are left out.
+        permutations: Label permutations behind the p-values, of which token views, many times as dear, take the
+            first `token_permutations`.
+        folds: `concepts` also keeps items about the same two concepts together.
+        incomplete: `drop` leaves out items of which an episode is missing.
+        controls: Features that never see the model, see `CONTROLS`; () for none. By default of a side
+            `random-features` and `pixels`, of other targets all that the run allows but `action` and `position`;
+            where pictures cannot be found a warning says that they were left out.
+        suite: Folder of the run's suite; the embedded one is found or drawn again without it.
+        untrained: A run of the same episodes, usually by random weights, to compare with. What is no better than
+            `random-features` and the untrained network is no signal, whatever its p-value.
+        jobs: Processes that probe, this one alone by default; with more than one, a script needs `if __name__ ==
+            "__main__":`.
+        device: Where torch solves logistic probes, such as `cuda`; numpy without one.
+        ray: Address of a Ray cluster that probes, `auto` for the one this process belongs to or a new one on this
+            machine; `jobs` is then how many sites at once, by default as many as it has cores.
+        progress: By default a bar in a notebook, nothing elsewhere.
 
-    jobs: processes that probe, this one alone by default; with more than one, a script needs `if __name__ ==
-    "__main__":`. device: where torch solves logistic probes, such as `cuda`; numpy without one. ray: address of a
-    Ray cluster that probes, `auto` for the one this process belongs to or a new one on this machine; `jobs` is
-    then how many sites at once, by default as many as it has cores. progress: by default a bar in a notebook,
-    nothing elsewhere.
-
-    With the same settings and episodes the stored results are returned, whatever jobs and device; an
-    interrupted sweep continues after the last finished site; controls are added to what is stored. Nothing is
-    stored before all of it is fitted: where this raises, `load_results` finds what it found before.
-    Raises RunIncompleteError for a run without episodes, NoProbesError for one without activations,
-    UnknownCategoryError, UnknownSiteError for a view no stream has, TooFewGroupsError, UnbalancedEpisodesError,
-    ProbeNotConvergedError, UsageError, SuiteError for another suite, and SuiteNotFoundError for a control that was
-    asked for and whose pictures cannot be found.
+    Raises:
+        RunIncompleteError: For a run without episodes.
+        NoProbesError: For one without activations.
+        UnknownCategoryError: For a view no stream has.
+        UnknownSiteError: For a view no stream has.
+        TooFewGroupsError: For another suite.
+        UnbalancedEpisodesError: For another suite.
+        ProbeNotConvergedError: For another suite.
+        UsageError: For another suite.
+        SuiteError: For another suite.
+        SuiteNotFoundError: For a control that was asked for and whose pictures cannot be found.
     """
     check_options(views, permutations, token_permutations, jobs, device, ray)
     options: dict[str, Any] = {
@@ -239,7 +257,10 @@ def probe_settings(
 ) -> ProbeSettings:
     """Return the settings of the probes that `train_probes` fits with these options, others at their default.
 
-    Their key is that of the stored results. Nothing is fitted. Raises NoProbesError for a run without activations.
+    Their key is that of the stored results. Nothing is fitted.
+
+    Raises:
+        NoProbesError: For a run without activations.
     """
     return Sweep.of(run, target, None, views=views, permutations=permutations, seed=seed).settings
 

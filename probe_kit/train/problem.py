@@ -44,9 +44,12 @@ LEAST_MOVABLE = 0.5
 class Problem:
     """The samples, labels, folds and label permutations that all sites of a category share.
 
-    positions: (E,) places of the category's samples among those of the target. labels: (E,) bool of a side (true:
-    left), else coded. permuted_labels: (E, P). token_permutations: how many of them are fitted where every token
-    is a sample. classes: their names, empty for a quantity.
+    Attributes:
+        classes: Their names, empty for a quantity.
+        positions: (E,) places of the category's samples among those of the target.
+        labels: (E,) bool of a side (true: left), else coded.
+        permuted_labels: (E, P).
+        token_permutations: How many of them are fitted where every token is a sample.
     """
 
     task: Task
@@ -249,8 +252,11 @@ def _block_folds_and_permutations(
     """Groups exchange their labels as blocks.
 
     Folds know strata and sizes of groups, not labels: only so is every exchange of labels as likely as the real
-    ones. Raises TooFewGroupsError for fewer than five groups, a class in fewer than five, and a fold that is
-    trained on one value.
+    ones.
+
+    Raises:
+        TooFewGroupsError: For fewer than five groups, a class in fewer than five, and a fold that is trained on
+            one value.
     """
     name = f"label {target.name!r}" + (f", category {category!r}" if category != EVERYWHERE else "")
     classes = target.coded.classes

@@ -19,11 +19,13 @@ _GIVE = "Give the folder of that suite (--suite, suite=…)"
 def suite_of(run: RunReader, folder: Path | None = None) -> "Suite":
     """The run's suite, in a folder that may hold more than the run's items.
 
-    folder: where it lies. Without one it is the suite of the folder that the run was extracted with, if that still
-    holds it; else the run's part of the embedded suite is found in the cache or drawn again, the same items
-    whatever else the cache holds. Raises SuiteError for another suite in `folder` or a damaged one; without a
-    folder SuiteNotFoundError if the run's suite is neither in its folder nor the embedded one, or drawn
-    differently here.
+    Raises SuiteError for another suite in `folder` or a damaged one; without a folder SuiteNotFoundError if the
+    run's suite is neither in its folder nor the embedded one, or drawn differently here.
+
+    Args:
+        folder: Where it lies. Without one it is the suite of the folder that the run was extracted with, if that
+            still holds it; else the run's part of the embedded suite is found in the cache or drawn again, the
+            same items whatever else the cache holds.
     """
     if folder is not None:
         return _in_folder(run, folder)

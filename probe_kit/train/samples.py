@@ -23,9 +23,12 @@ TOKENS = "tokens"
 class Samples:
     """Features of M samples that belong to E episodes.
 
-    features: (M, D), the samples of an episode in consecutive rows; tokens are not copied when some are chosen.
-    counts: (E,) samples per episode.
-    means: (E, D) an episode's mean sample. A linear probe decides on it as it decides, on average, on the samples.
+    Attributes:
+        features: (M, D), the samples of an episode in consecutive rows; tokens are not copied when some are
+            chosen.
+        counts: (E,) samples per episode.
+        means: (E, D) an episode's mean sample. A linear probe decides on it as it decides, on average, on the
+            samples.
     """
 
     features: Features
@@ -128,7 +131,8 @@ def read_samples(
 ) -> Samples:
     """Return the samples of one site, in order: episode `rows` (n,) of the run at captured `inferences` (n,).
 
-    Raises NonFiniteActivationError naming the first broken one.
+    Raises:
+        NonFiniteActivationError: Naming the first broken one.
     """
     parts, order = [], []
     for call in np.unique(inferences).tolist():

@@ -48,14 +48,20 @@ class Target:
 
     Made by `Target.read` from a table, or by `Target.of_run` from what a run stores.
 
-    name: of the column or side. null: how label permutations are drawn, see `Null`.
-    coded: task, classes and values. episodes: (n,) ids. inferences: (n,) captured inference of every label, None
-    where a label is of a whole episode. group_by: column whose values folds, intervals and nulls keep together;
-    None for the groups of the run. exchange_within: column within which label permutations exchange groups; None
-    for everywhere. groups, strata: (n,) those columns, None where the run has them. table: where errors point to.
-    of_source: whether episodes and inferences are numbers of episodes and frames of a data set; see `on`.
-    unseen: how many labels name a frame or episode that the run of `on` does not show.
-    builtin: whether probe_kit computed the column.
+    Attributes:
+        name: Of the column or side.
+        coded: Task, classes and values.
+        episodes: (n,) ids.
+        inferences: (n,) captured inference of every label, None where a label is of a whole episode.
+        table: Where errors point to.
+        group_by: Column whose values folds, intervals and nulls keep together; None for the groups of the run.
+        exchange_within: Column within which label permutations exchange groups; None for everywhere.
+        groups: (n,) those columns, None where the run has them.
+        strata: As `groups`.
+        of_source: Whether episodes and inferences are numbers of episodes and frames of a data set; see `on`.
+        unseen: How many labels name a frame or episode that the run of `on` does not show.
+        builtin: Whether probe_kit computed the column.
+        null: How label permutations are drawn, see `Null`.
     """
 
     name: str
@@ -83,12 +89,18 @@ class Target:
     ) -> "Target":
         """Return the column `name` of a table: a CSV or Parquet file, or a DataFrame.
 
-        Key columns are `episode_id` and, for labels that change within an episode, `inference`, counted from 0.
-        Of recordings they may be `source_episode` and `frame`, by the numbers of the data set. Empty cells are
-        left out. task: binary, classes or continuous; None where the values leave no doubt.
-        group_by, exchange_within: columns of the table or of the run's episodes.
-        Raises UsageError, naming file and line, for a missing or mixed column, a key used twice, an integer beyond
-        2^53, an infinite number, a control character, or a task that the values cannot have.
+        Key columns are `episode_id` and, for labels that change within an episode, `inference`, counted from 0. Of
+        recordings they may be `source_episode` and `frame`, by the numbers of the data set. Empty cells are left
+        out.
+
+        Args:
+            task: Binary, classes or continuous; None where the values leave no doubt.
+            group_by: Columns of the table or of the run's episodes.
+            exchange_within: As `group_by`.
+
+        Raises:
+            UsageError: Naming file and line, for a missing or mixed column, a key used twice, an integer beyond
+                2^53, an infinite number, a control character, or a task that the values cannot have.
         """
         group_columns = [column for column in (group_by, exchange_within) if column is not None]
         label_table = read_table(table, [name, *group_columns])
@@ -126,8 +138,11 @@ class Target:
     def on(self, run: RunReader) -> "Target":
         """Return these labels with the keys of a run, without those of frames or episodes that it does not show.
 
-        Labels that have its keys already are returned as they are. Raises UsageError for a run of scenes, for
-        frames or episodes that were never recorded, and if the run shows none of the frames.
+        Labels that have its keys already are returned as they are.
+
+        Raises:
+            UsageError: For a run of scenes, for frames or episodes that were never recorded, and if the run shows
+                none of the frames.
         """
         if not self.of_source:
             return self
@@ -168,8 +183,13 @@ class Target:
     ) -> "Target":
         """Return a side or built-in column of a run, such as `sim.tool_y`; `probe-kit targets RUN` lists them.
 
-        task: the column's own by default. seed: of the target `side.shuffled`. Raises UsageError for another name,
-        for a run that lacks what the column needs; NoTrajectoryError for `sim.*` of a run without trajectories.
+        Args:
+            task: The column's own by default.
+            seed: Of the target `side.shuffled`.
+
+        Raises:
+            UsageError: For another name, for a run that lacks what the column needs.
+            NoTrajectoryError: For `sim.*` of a run without trajectories.
         """
         if name in SIDES:
             return _side(run, name, seed, task, group_by, exchange_within)
@@ -194,7 +214,8 @@ class Target:
     def equal_to(self, value: str) -> "Target":
         """Return whether labels are the class `value`, as a binary label, such as an event where windows begin.
 
-        Raises UsageError for a value that is no class.
+        Raises:
+            UsageError: For a value that is no class.
         """
         classes = self.coded.classes
         if value not in classes:
@@ -280,8 +301,9 @@ def _side(
 ) -> Target:
     """Return the side of the correct picture, the chosen one, or the correct one flipped for half of the items.
 
-    Raises UsageError for a run without sides, for options of other targets, and for `side.chosen` of a run that
-    did not act.
+    Raises:
+        UsageError: For a run without sides, for options of other targets, and for `side.chosen` of a run that did
+            not act.
     """
     check_sides(run, f"a probe of the side ({name})")
     options = {"task": task, "group_by": group_by, "exchange_within": exchange_within}
@@ -367,7 +389,8 @@ def _once(
 ) -> list[int]:
     """The rows of a table, one per key: rows that are equal in all `columns` count once.
 
-    Raises UsageError for two rows with one key and other values.
+    Raises:
+        UsageError: For two rows with one key and other values.
     """
     first: dict[tuple[str, int], int] = {}
     for row, episode in enumerate(episodes):

@@ -68,8 +68,10 @@ CONSTANT = "one value"
 class ListedTarget(NamedTuple):
     """A target in words. per: `episode` or `inference`. values: classes or range, or why the run has none.
 
-    task: `CONSTANT` of a single value. options: of the command that trains probes on it, None where `train`
-    refuses every one; `refused` is then why.
+    Attributes:
+        task: `CONSTANT` of a single value.
+        options: Of the command that trains probes on it, None where `train` refuses every one; `refused` is then
+            why.
     """
 
     target: str

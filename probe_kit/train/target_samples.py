@@ -25,10 +25,14 @@ _TRUE_OR_FALSE = (("False", "True"), ("no", "yes"), ("0", "1"))
 class TargetSamples:
     """n samples with a label, episode by episode and inference by inference.
 
-    rows: (n,) positions in the run's episodes. inferences: (n,) captured inference. values: (n,) coded labels.
-    groups, strata: (n,) names of the group and of where it exchanges. window: inferences per episode. left_out:
-    how many of what have no part in the probes, by reason. aligned: (n,) place in a window that begins at an
-    event, None where windows begin at the first inference.
+    Attributes:
+        rows: (n,) positions in the run's episodes.
+        inferences: (n,) captured inference.
+        values: (n,) coded labels.
+        groups: (n,) names of the group and of where it exchanges.
+        strata: As `groups`.
+        window: Inferences per episode. left_out: how many of what have no part in the probes, by reason.
+        aligned: (n,) place in a window that begins at an event, None where windows begin at the first inference.
     """
 
     rows: NDArray[np.intp]
@@ -62,13 +66,18 @@ def target_samples(
 ) -> TargetSamples:
     """Return the samples of `run` that `target` names.
 
-    categories: only their episodes; None for all. call: the captured inference that a label of whole episodes
-    is decoded from. window: for labels of single inferences how many of each episode, from the first on; None for
-    the most that 90 % of the episodes reach. Episodes that end before are left out. align_to: true or false by
-    inference; windows begin at the first inference where it is true, and episodes without one are left out.
-    incomplete: `drop` leaves out items of which a layout is missing.
-    Raises UsageError for keys that the run does not have, for groups that split an episode or items, and for an
-    event that is not true or false by inference.
+    Args:
+        categories: Only their episodes; None for all.
+        call: The captured inference that a label of whole episodes is decoded from.
+        window: For labels of single inferences how many of each episode, from the first on; None for the most that
+            90 % of the episodes reach. Episodes that end before are left out.
+        align_to: True or false by inference; windows begin at the first inference where it is true, and episodes
+            without one are left out.
+        incomplete: `drop` leaves out items of which a layout is missing.
+
+    Raises:
+        UsageError: For keys that the run does not have, for groups that split an episode or items, and for an
+            event that is not true or false by inference.
     """
     target = target.on(run)
     if target.per_step and call:
@@ -179,7 +188,8 @@ def _window(counts: NDArray[np.intp], most: int, requested: int | None) -> int:
 def _label_grid(run: RunReader, target: Target) -> NDArray[np.float64]:
     """(E, C) labels by episode and inference, or (E, 1) by episode; NaN where there are none.
 
-    Raises UsageError for an episode or inference that the run does not have.
+    Raises:
+        UsageError: For an episode or inference that the run does not have.
     """
     row_of = {name: row for row, name in enumerate(run.episodes[EPISODE].astype(str))}
     planned = set(run.planned_ids)

@@ -48,8 +48,10 @@ Matrix = NDArray[np.float64]
 class TransferCurve:
     """All S sites of one view on the m samples of the other run.
 
-    fitted: probes as they were fitted. recentred: the same probes after the other run's features were moved to the
-    mean of the first. refitted: (S, m) held-out scores of probes of the other run itself.
+    Attributes:
+        fitted: Probes as they were fitted.
+        recentred: The same probes after the other run's features were moved to the mean of the first.
+        refitted: (S, m) held-out scores of probes of the other run itself.
     """
 
     fitted: ProbeCurve
@@ -61,9 +63,17 @@ class TransferCurve:
 class TransferResults:
     """Probes of one label, fitted on one run (`model`) and scored on another (`other_model`).
 
-    definition: hash of the label's definition, equal in both. classes: of the other run's labels. labels: (m,)
-    coded. episodes, groups: (m,) names. inferences: (m,). curves: by view. smallest_p: no p can be lower.
-    trained_on: number of samples and groups of the first run. left_out: of the other run, by reason.
+    Attributes:
+        definition: Hash of the label's definition, equal in both.
+        classes: Of the other run's labels.
+        labels: (m,) coded.
+        episodes: (m,) names.
+        inferences: (m,).
+        groups: As `episodes`.
+        curves: By view.
+        smallest_p: No p can be lower.
+        trained_on: Number of samples and groups of the first run.
+        left_out: Of the other run, by reason.
     """
 
     model: str
@@ -168,11 +178,17 @@ def transfer_probes(
     `other` that `run` has too are left out, see `shared_groups`. The null permutes the labels of `other`. Besides:
     the same probe after the features of `other` are moved to the mean of `run`, and the cross-validated score of
     `other` itself on the same samples.
-    target, other_target: of either run, of one `Target.definition`; other_target: by default the same side or
-    built-in column. categories: pooled, by default all. across_weights: allow two networks; sites and widths must
-    still be equal. Others: as in `train_probes`, for both runs.
-    Raises SettingsMismatchError for other weights, sites or definitions, TooFewGroupsError where too few
-    groups are not shared, and what `train_probes` raises.
+
+    Args:
+        target: Of either run, of one `Target.definition`.
+        other_target: As `target`. By default the same side or built-in column.
+        categories: Pooled, by default all.
+        across_weights: Allow two networks; sites and widths must still be equal. Others: as in `train_probes`, for
+            both runs.
+
+    Raises:
+        SettingsMismatchError: For other weights, sites or definitions.
+        TooFewGroupsError: Where too few groups are not shared, and what `train_probes` raises.
     """
     check_options(views, permutations, token_permutations)
     options: dict[str, Any] = {"views": views, "seed": seed, "call": call}

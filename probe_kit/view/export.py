@@ -39,10 +39,17 @@ def write_viewer(
 ) -> Path:
     """Write the viewer of `runs` to `folder`, whole or not at all, and return its `index.html`.
 
-    The same runs give the same bytes. frames: with the pictures of the episodes. categories: whose episodes and
-    maps are written, all by default. probes_of: a run of the same model whose probes are shown where a run has
-    none. Raises UsageError without runs, for a folder that holds anything but a former export, or for probes of
-    another model, and UnknownCategoryError for a category that no run has.
+    The same runs give the same bytes.
+
+    Args:
+        frames: With the pictures of the episodes.
+        categories: Whose episodes and maps are written, all by default.
+        probes_of: A run of the same model whose probes are shown where a run has none.
+
+    Raises:
+        UsageError: Without runs, for a folder that holds anything but a former export, or for probes of another
+            model.
+        UnknownCategoryError: For a category that no run has.
     """
     folder = Path(folder)
     _check_folder(folder)

@@ -277,7 +277,10 @@ def site_map_payload(viewed: ViewedRun, category: str) -> dict[str, Any]:
     """Scores by site, spelt as in the tables; log-odds (S, E) packed, toward the correct side.
 
     `rows`: the place of each of the E episodes among those of the run. `refitted`: the same scores of probes that
-    were fitted to later inferences, by inference. Raises KeyError for a category without probes.
+    were fitted to later inferences, by inference.
+
+    Raises:
+        KeyError: For a category without probes.
     """
     results, curve = viewed.results, viewed.curve(category)
     if results is None or curve is None:

@@ -235,7 +235,8 @@ def _opened(port: int) -> socket.socket:
 class ViewerServer:
     """A server on loopback whose socket is open from the first moment.
 
-    port: 0 for any free one. Raises UsageError if it cannot be opened, for example because it is in use.
+    Args:
+        port: 0 for any free one. Raises UsageError if it cannot be opened, for example because it is in use.
     """
 
     def __init__(self, catalogue: Catalogue, port: int = 0) -> None:

@@ -44,9 +44,12 @@ class FrozenProbes:
     """The probes of one category in one view, and the log-odds that they give to episodes of `run`.
 
     An episode takes the probe of the fold that tests its item. One whose item no fold tests takes the mean of the
-    folds' log-odds, and is then not held out in the sense of the scores. results: of `run`, or of another run of
-    the same model. readings: None for probes of `run` itself, whose stored log-odds are taken.
-    Of another run the first log-odds that were computed so far, by number of the episode.
+    folds' log-odds, and is then not held out in the sense of the scores.
+
+    Args:
+        results: Of `run`, or of another run of the same model.
+        readings: None for probes of `run` itself, whose stored log-odds are taken. Of another run the first
+            log-odds that were computed so far, by number of the episode.
     """
 
     def __init__(
@@ -174,8 +177,9 @@ _UNSAFE = re.compile(r"[^A-Za-z0-9._-]+")
 class ViewedRun:
     """A run, opened in one wording. key: its name in addresses and folders, unique among the runs of a page.
 
-    lender: a run of the same model whose probes are shown where this one has none. readings: first log-odds by
-    category and number of the episode that these probes gave so far.
+    Attributes:
+        lender: A run of the same model whose probes are shown where this one has none.
+        readings: First log-odds by category and number of the episode that these probes gave so far.
     """
 
     key: str
@@ -316,8 +320,12 @@ class ViewedRun:
 def view_runs(runs: Sequence[Run], probes_of: Run | None = None) -> list[ViewedRun]:
     """The runs as the viewer shows them: of several wordings the first, as in `retention_table`.
 
-    probes_of: a run whose probes are shown where a run of the same model has none. Raises UsageError without runs,
-    if one is given twice, or if `probes_of` has no probes or is of another model than all runs without probes.
+    Args:
+        probes_of: A run whose probes are shown where a run of the same model has none.
+
+    Raises:
+        UsageError: Without runs, if one is given twice, or if `probes_of` has no probes or is of another model
+            than all runs without probes.
     """
     if not runs:
         raise UsageError("the viewer needs at least one run")

@@ -33,10 +33,14 @@ Followed = Literal["not at all", "random", "always"]
 
 @dataclass(frozen=True)
 class Acts:
-    """first: the share of frames where an episode begins. turned: the share whose actions go to a random
-    side, independent of the episode, so that the state does not reveal it.
+    """The frames and actions of one stage of training.
 
-    followed: where the actions of `LEFT_OPEN` go: they are not trained, go to a random side, or to the asked one.
+    Attributes:
+        first: The share of frames where an episode begins.
+        turned: The share whose actions go to a random side, independent of the episode, so that the state does
+            not reveal it.
+        followed: Where the actions of `LEFT_OPEN` go: they are not trained, go to a random side, or to the asked
+            one.
     """
 
     first: float

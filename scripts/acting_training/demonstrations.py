@@ -37,10 +37,13 @@ RESTING_STRIDE = 3
 class Demonstrations(Recorded):
     """Every kept frame of every episode, as the policy sees it.
 
-    pictures: (F, 96, 96, 3) uint8. tiles: (F, 2, 96, 96) uint8, share of a pixel that shows the left and the
-    right tile, times 255. states: (F, 8) float32. chunks: (F, 2, chunk, 7) float32, what leads from this frame
-    to the left and to the right tile. side: (F,) int8, 0 left, 1 right, where the episode went. first: (F,) bool,
-    whether an episode begins.
+    Attributes:
+        pictures: (F, 96, 96, 3) uint8.
+        tiles: (F, 2, 96, 96) uint8, share of a pixel that shows the left and the right tile, times 255.
+        states: (F, 8) float32.
+        chunks: (F, 2, chunk, 7) float32, what leads from this frame to the left and to the right tile.
+        side: (F,) int8, 0 left, 1 right, where the episode went.
+        first: (F,) bool, whether an episode begins.
     """
 
     pictures: NDArray[np.uint8]

@@ -16,7 +16,10 @@ Pixels = NDArray[np.float32]
 class Pair:
     """Two pictures and what they are called; of each, the asked one comes first.
 
-    bank: of the category. pictures: couple and member. phrases: of the two.
+    Attributes:
+        bank: Of the category.
+        pictures: Couple and member.
+        phrases: Of the two.
     """
 
     bank: PictureBank

@@ -21,8 +21,11 @@ from probe_kit.models.embedded.tiny import IMAGE_SIDE
 class Brush:
     """The tile of one side.
 
-    rows, columns: the box of the policy's picture that holds the tile. cover: (h, w) float32 share of each
-    pixel of the box that the tile covers when nothing hides it. warp: (h·w, texels) sparse.
+    Attributes:
+        rows: Of the box of the policy's picture that holds the tile.
+        columns: Of the same box.
+        cover: (h, w) float32 share of each pixel of the box that the tile covers when nothing hides it.
+        warp: (h·w, texels) sparse.
     """
 
     rows: slice
@@ -50,7 +53,11 @@ def brush_of(
 ) -> Brush:
     """The brush of the tile that `mask` shows in a picture of it with `ramp` on it.
 
-    crop: top, left, height, width of what the model looks at. seen: that crop, resized as the model does.
+    Args:
+        picture: (H, W, 3) of the scene with `ramp` on the tile.
+        mask: (H, W), True where the tile is seen.
+        crop: Top, left, height, width of what the model looks at.
+        seen: That crop, resized as the model does.
     """
     shade = np.median(picture[mask][:, 2]) / 255
     place = np.clip(np.rint(picture[mask][:, :2] / shade), 0, TEXTURE_PIXELS - 1).astype(int)

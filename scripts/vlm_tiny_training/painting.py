@@ -18,8 +18,10 @@ from vlm_tiny_training.window import seen
 class Place(Protocol):
     """Where one picture goes.
 
-    rows, columns: the box that holds it. cover: (h, w) float32 share of each pixel of the box that it covers when
-    nothing hides it.
+    Attributes:
+        rows: Of the box that holds it.
+        columns: Of the same box.
+        cover: (h, w) float32 share of each pixel of the box that it covers when nothing hides it.
     """
 
     rows: slice

@@ -27,8 +27,9 @@ Painted = Mapping[str, tuple[NDArray[np.uint8], NDArray[np.uint8]]]
 class PictureBank:
     """The tiles of one category's couples.
 
-    painted: per surface and side, (N, 2, h, w, 3) uint8; the second axis is the couple's own left and right.
-    phrases: (N, 2), what each tile is called.
+    Attributes:
+        painted: Per surface and side, (N, 2, h, w, 3) uint8; the second axis is the couple's own left and right.
+        phrases: (N, 2), what each tile is called.
     """
 
     category: str
@@ -46,7 +47,8 @@ class PictureBank:
     ) -> Self:
         """The first `count` couples of the suite's generators at `seed`.
 
-        Raises ValueError if a picture is one of an embedded suite's, on which the models will be evaluated.
+        Raises:
+            ValueError: If a picture is one of an embedded suite's, on which the models will be evaluated.
         """
         painted: dict[str, tuple[list[NDArray[np.uint8]], list[NDArray[np.uint8]]]]
         painted = {name: ([], []) for name in surfaces}

@@ -304,7 +304,10 @@ class AnswerController(ModelController["AnswerModel", "Prompt"]):
         """The first form in which the sides differ in their first token; None where options are letters or yes.
 
         One question about a blank picture is asked: what is wrong with prompt and options is said before any
-        episode. Raises UsageError as `AnswerModel.read` does.
+        episode.
+
+        Raises:
+            UsageError: As `AnswerModel.read` does.
         """
         questions = self._blank_questions(blank)[:1]
         self.model.read(questions)

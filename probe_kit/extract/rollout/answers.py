@@ -90,7 +90,8 @@ _VERB = re.compile(
 class Mentions:
     """The sides and letters of a text, and those that it denies. Letters are `A` and `B`, sides those of `Named`.
 
-    has_unclear_right: whether a `right` is truth or a side.
+    Attributes:
+        has_unclear_right: Whether a `right` is truth or a side.
     """
 
     letters: set[str] = field(default_factory=set)
@@ -321,7 +322,8 @@ def likeliest(logits: Mapping[Said, float]) -> Said:
 class Choice:
     """Logits of the admissible answers, by what each says, in one or two orders of the sides.
 
-    passes: as read with left named first and, where the prompt can be turned round, with right named first.
+    Attributes:
+        passes: As read with left named first and, where the prompt can be turned round, with right named first.
     """
 
     passes: Sequence[Mapping[Said, float]]
@@ -361,9 +363,14 @@ def letter_margins(
 ) -> list[float]:
     """The logit lens: the letter for left minus that for right, by the model's own norm and head, at every layer.
 
-    residuals: (L, D) float32 of the position that chooses the letter. letters: (2,) token ids, left and right.
-    margin: the same of the model's own answer, which the last layer must give but for rounding. One layer at a
-    time, so that no batch changes a number. Raises CaptureError if the last layer gives another margin.
+    Args:
+        residuals: (L, D) float32 of the position that chooses the letter.
+        letters: (2,) token ids, left and right.
+        margin: The same of the model's own answer, which the last layer must give but for rounding. One layer at a
+            time, so that no batch changes a number.
+
+    Raises:
+        CaptureError: If the last layer gives another margin.
     """
     import torch
 

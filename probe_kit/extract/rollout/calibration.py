@@ -40,9 +40,13 @@ TURNS = 3
 class Calibration:
     """A measurement, and the batch that it led to.
 
-    inference: seconds of one call of the model, by batch. turn: seconds in which one simulator carries out the
-    actions of one inference and draws the next picture, its share of setting up an episode included.
-    batch, env_workers: chosen. waits: share of the time in which the model is expected to wait for simulators.
+    Attributes:
+        inference: Seconds of one call of the model, by batch.
+        turn: Seconds in which one simulator carries out the actions of one inference and draws the next picture,
+            its share of setting up an episode included.
+        batch: chosen.
+        env_workers: As `batch`.
+        waits: Share of the time in which the model is expected to wait for simulators.
     """
 
     inference: Mapping[int, float]
@@ -70,7 +74,10 @@ def calibrated(
 ) -> tuple[ExtractSettings, Calibration]:
     """`settings` with a batch and simulating processes chosen for this machine, and what led to them.
 
-    Takes BUDGET_S or a little more. Raises UsageError for settings that choose either by themselves.
+    Takes BUDGET_S or a little more.
+
+    Raises:
+        UsageError: For settings that choose either by themselves.
     """
     if settings.machine.env_workers is not None:
         raise UsageError("--batch auto chooses batch and simulating processes: leave out --env-workers")

@@ -26,14 +26,15 @@ if TYPE_CHECKING:
 class EpisodeBuffers:
     """Everything captured in one episode, shaped like its rows in the store.
 
-    pooled: (S, *lead, V, D) float32 per stream, NaN where nothing was captured.
-    tokens: (S, *lead, T, D) uint16 bits of bfloat16 per stream, zero where there is no token; empty if only
-    views are stored.
-    later: (S - 1, *lead, D) uint16 bits of bfloat16 per stream, the view `mean` of the inferences after the first;
-    empty unless they keep that view alone, and pooled then holds the first one.
-    roles: per captured inference and stream, the spans of roles.
-    lens_margins: of a question that is answered by letter, see `letter_margins`; None for all else.
-    pinned: page-locked memory, into which a GPU copies while it computes on.
+    pooled: (S, *lead, V, D) float32 per stream, NaN where nothing was captured. tokens: (S, *lead, T, D) uint16
+    bits of bfloat16 per stream, zero where there is no token; empty if only views are stored. later: (S - 1,
+    *lead, D) uint16 bits of bfloat16 per stream, the view `mean` of the inferences after the first; empty unless
+    they keep that view alone, and pooled then holds the first one. roles: per captured inference and stream, the
+    spans of roles. lens_margins: of a question that is answered by letter, see `letter_margins`; None for all
+    else.
+
+    Args:
+        pinned: Page-locked memory, into which a GPU copies while it computes on.
     """
 
     def __init__(
@@ -124,8 +125,10 @@ class EpisodeBuffers:
 def copy_aside(source: "Tensor", target: "Tensor") -> Any:
     """Copy to host memory while the device computes; returns the event of its completion, None on a CPU.
 
-    target: contiguous, and page-locked where the source lies on a GPU. The copy goes through a stream of its own,
-    which begins when the source is computed; the source's memory is not used again before the copy is through.
+    Args:
+        target: Contiguous, and page-locked where the source lies on a GPU. The copy goes through a stream of its
+            own, which begins when the source is computed; the source's memory is not used again before the copy is
+            through.
     """
     import torch
 
@@ -170,8 +173,10 @@ RolesByStream = Mapping[str, "Sequence[Roles]"]
 class Capturer:
     """Hands the activations of an inference to the buffers of its episodes.
 
-    streams: what is stored. outputs: what comes out of an inference, in a word. fires: counts of the last capture.
-    check: hashes of the first outputs with and without hooks.
+    Args:
+        streams: What is stored.
+        outputs: What comes out of an inference, in a word. fires: counts of the last capture. check: hashes of the
+            first outputs with and without hooks.
     """
 
     def __init__(self, model: "Model", streams: Sequence[StoredStream], with_tokens: bool, outputs: str) -> None:
@@ -189,8 +194,12 @@ class Capturer:
     ) -> Result:
         """Return the result of `infer`, whose activations are kept for the rows that have buffers.
 
-        output_of: the numbers that a capture must not change. around: what is done to the model at every
-        inference. Raises CaptureChangedActionError as `_prove_harmless` does, and what `capture` raises.
+        Args:
+            output_of: The numbers that a capture must not change.
+            around: What is done to the model at every inference.
+
+        Raises:
+            CaptureChangedActionError: As `_prove_harmless` does, and what `capture` raises.
         """
         from probe_kit.hooks import capture
         from probe_kit.hooks.contract.roles import prepare_pool
@@ -274,7 +283,8 @@ def stored_streams(
 ) -> list[StoredStream]:
     """The streams of a model at the longest of these sequences, with a view per role.
 
-    role_names: per stream, those that are viewed; by default all that the model declares.
+    Args:
+        role_names: Per stream, those that are viewed; by default all that the model declares.
     """
     names = model.role_names if role_names is None else role_names
     return [

@@ -56,10 +56,12 @@ def check_inputs[Question](
 ) -> dict[str, Reach]:
     """Return, by input, how far a change of it came.
 
-    infer: one inference, always with the same seed. variants: by input, observations or prompts that differ from
-    the clean one in it alone; the first that the model takes is used, and none leaves the input untested.
-    last: the last residual before the output; None where no site may be captured. around: what the run does to
-    the model at every inference.
+    Args:
+        infer: One inference, always with the same seed.
+        variants: By input, observations or prompts that differ from the clean one in it alone; the first that the
+            model takes is used, and none leaves the input untested.
+        last: The last residual before the output; None where no site may be captured.
+        around: What the run does to the model at every inference.
     """
     if not variants:
         return {}
@@ -111,7 +113,10 @@ def varied(
 ) -> dict[str, Iterator[Observation]]:
     """Return, by input, observations that differ from a clean one in it alone, the best first.
 
-    texts: other instructions. ids: the tokens of a text, None if unknown. absent: inputs that the model has not.
+    Args:
+        texts: Other instructions.
+        ids: The tokens of a text, None if unknown.
+        absent: Inputs that the model has not.
     """
     variants = {PICTURE: _without_picture(clean), INSTRUCTION: _with_other_words(clean, texts, ids)}
     return {name: observations for name, observations in variants.items() if name not in absent}
@@ -172,8 +177,10 @@ def executed_actions(
 ) -> NDArray[np.float32]:
     """(n, 7) float32: what is executed after the newest of an episode's chunks (chunk, 7), oldest first.
 
-    execute: actions of its head. exponent: of `ensemble`, which makes one action of all chunks; None to take the
-    head. rotation: see `ProtocolRow.rotation`.
+    Args:
+        execute: Actions of its head.
+        exponent: Of `ensemble`, which makes one action of all chunks; None to take the head.
+        rotation: See `ProtocolRow.rotation`.
     """
     actions = chunks[-1][:execute] if exponent is None else ensemble(chunks, exponent)[None]
     return actions if rotation == PLAIN else with_rotation_vectors(actions)
@@ -209,7 +216,9 @@ def ensemble(chunks: Sequence[NDArray[np.float32]], exponent: float) -> NDArray[
 def count_lost_words(pack: Callable[[str], Sequence[int] | None], instruction: str) -> int:
     """Count the words at the end of an instruction that do not reach the network, because its prompt is cut.
 
-    pack: the ids that the network is delivered, None if unknown. A word is lost if they stay the same without it.
+    Args:
+        pack: The ids that the network is delivered, None if unknown. A word is lost if they stay the same without
+            it.
     """
     ids, words = pack(instruction), instruction.split()
     lost = 0
@@ -236,8 +245,10 @@ def count_lost_words(pack: Callable[[str], Sequence[int] | None], instruction: s
 class Turn:
     """One inference that is due.
 
-    call: how many inferences of the row came before. buffers: where the activations of the first calls go. past:
-    chunks of the inferences before, oldest first, which the controller keeps where a policy averages them.
+    Attributes:
+        call: How many inferences of the row came before.
+        buffers: Where the activations of the first calls go. past: chunks of the inferences before, oldest first,
+            which the controller keeps where a policy averages them.
     """
 
     observation: Observation
@@ -255,8 +266,10 @@ class Turn:
 class Inference:
     """The result of one inference.
 
-    actions: (n, D) float32 to execute, n >= 1; None ends the episode. flagged: whether it put out no valid action;
-    None if that is unknown. columns: of the episode's outcome.
+    Attributes:
+        actions: (n, D) float32 to execute, n >= 1; None ends the episode.
+        flagged: Whether it put out no valid action; None if that is unknown.
+        columns: Of the episode's outcome.
     """
 
     actions: NDArray[np.float32] | None
@@ -267,9 +280,12 @@ class Inference:
 class Controller(ABC):
     """A task: act, capture or ask.
 
-    script: for the player, None if the controller infers. execute: actions per inference, 0 for none. threads: of
-    its network, None for torch's choice. on_gpu: whether activations come from a GPU. identity: the part of a
-    run's identity that the loaded model decides.
+    Attributes:
+        identity: The part of a run's identity that the loaded model decides.
+        script: For the player, None if the controller infers.
+        execute: Actions per inference, 0 for none.
+        threads: Of its network, None for torch's choice.
+        on_gpu: Whether activations come from a GPU.
     """
 
     identity: dict[str, Any]
@@ -310,7 +326,8 @@ class ScriptedController(Controller):
 class ModelController[Loaded: "Model", Question](Controller):
     """A model that infers: its capture, its part of a run's identity, and what it certifies.
 
-    outputs: of an inference, in a word.
+    Attributes:
+        outputs: Of an inference, in a word.
     """
 
     outputs: ClassVar[str]

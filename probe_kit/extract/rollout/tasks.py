@@ -54,7 +54,8 @@ def load_of[Loaded: "Model"](load_by_name: Callable[..., Loaded], settings: Sett
 def fitted[Chosen: Settings](card: "ModelCard", settings: Chosen, source: Source[Any]) -> Chosen:
     """Return the settings with those of a source that was fitted to a model.
 
-    Raises UsageError if the model takes smaller batches, or needs what the source does not show.
+    Raises:
+        UsageError: If the model takes smaller batches, or needs what the source does not show.
     """
     # `auto` is measured after this check, and by `largest_batch` never exceeds the card.
     batch = settings.machine.batch if isinstance(settings.machine.batch, int) else 1
@@ -81,7 +82,8 @@ _CAPTURE_REFUSES = ("captured_calls", "execute", "rotation", "video")
 class _Task:
     """The parts of a task that only one of them has.
 
-    names_all_items: whether it needs the whole suite besides the chosen items, for the names of other objects.
+    Attributes:
+        names_all_items: Whether it needs the whole suite besides the chosen items, for the names of other objects.
     """
 
     names_all_items: ClassVar[bool] = False
@@ -286,7 +288,8 @@ class Ask(_Task):
     def rows(self, settings: AskSettings, source: Source[Any]) -> tuple[Row, ...]:
         """Return the rows with what a question asks for, where that is not the object of the instruction.
 
-        Raises UsageError for items without such a phrase.
+        Raises:
+            UsageError: For items without such a phrase.
         """
         rows = source.rows(settings.seed)
         if settings.task.query == "target" or source.suite is None:

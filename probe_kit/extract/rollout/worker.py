@@ -47,10 +47,14 @@ from probe_kit.runs.writer import RunWriter
 class Playing:
     """An episode on its player.
 
-    ahead: whether the player began it by itself, when the one before it ended. observation: the one that waits
-    for an inference, None while the player simulates. control_steps: actions before each inference so far. steps:
-    actions so far. seconds: of inference. flagged: inferences without a valid action, None where the policy cannot
-    tell. past: the chunks so far, for policies that average them. columns: of the outcome.
+    Attributes:
+        ahead: Whether the player began it by itself, when the one before it ended.
+        observation: The one that waits for an inference, None while the player simulates.
+        control_steps: Actions before each inference so far. steps: actions so far.
+        seconds: Of inference.
+        flagged: Inferences without a valid action, None where the policy cannot tell.
+        past: The chunks so far, for policies that average them.
+        columns: Of the outcome.
     """
 
     planned: Row
@@ -99,8 +103,10 @@ class EpisodeSlot:
 class EpisodeLoop:
     """Plays episode after episode on two groups of players.
 
-    free: empty buffers. next_episode: what to play next, None for nothing. All slots of a group take their turn in
-    one call of the policy; a slot whose episode ends begins the next one at once.
+    Args:
+        free: Empty buffers.
+        next_episode: What to play next, None for nothing. All slots of a group take their turn in one call of the
+            policy; a slot whose episode ends begins the next one at once.
     """
 
     def __init__(

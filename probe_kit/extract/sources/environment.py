@@ -25,8 +25,11 @@ SUCCESS = "success"
 class EnvEpisode:
     """One episode that an environment can play.
 
-    id: the same in every selection. seed: decides everything that is random. instruction: what the model reads.
-    group: episodes of one group share a scene; folds and nulls keep it together. None for a group of its own.
+    Attributes:
+        id: The same in every selection.
+        seed: Decides everything that is random.
+        instruction: What the model reads.
+        group: Episodes of one group share a scene; folds and nulls keep it together. None for a group of its own.
     """
 
     id: str
@@ -39,8 +42,10 @@ class EnvEpisode:
 class Step:
     """The state of an environment after an action.
 
-    done: whether the episode is over. facts: numbers or truth values by name, which become labels of the next
-    inference; every step of every episode has the same names. `success` becomes the outcome.
+    Attributes:
+        done: Whether the episode is over.
+        facts: Numbers or truth values by name, which become labels of the next inference; every step of every
+            episode has the same names. `success` becomes the outcome.
     """
 
     observation: Observation
@@ -51,8 +56,9 @@ class Step:
 class OwnEnvironment(Protocol):
     """An environment that `extract --env MODULE:CLASS` plays; equal seeds give equal episodes.
 
-    revision: what its numbers depend on, such as versions; part of a run's identity. action_names: of the numbers
-    of an action, in the units of the checkpoint that plays it.
+    Attributes:
+        revision: What its numbers depend on, such as versions; part of a run's identity.
+        action_names: Of the numbers of an action, in the units of the checkpoint that plays it.
     """
 
     revision: str
@@ -85,11 +91,13 @@ EnvOptions = Annotated[
 class EnvSource(SourceSettings):
     """An environment of the user's own in place of a scene.
 
-    environment: MODULE:CLASS of the contract `OwnEnvironment`, `lerobot:TYPE` for a configuration of lerobot, or
-    the name of an entry point of the group `probe_kit.environments`. options: keyword arguments of the class.
-    episodes: indices among its episodes; None for all. max_steps: actions after which an episode ends. pixels:
-    whether pictures at 32 × 32 are stored for controls.
-    Raises UsageError for what no environment can have.
+    Attributes:
+        environment: MODULE:CLASS of the contract `OwnEnvironment`, `lerobot:TYPE` for a configuration of lerobot,
+            or the name of an entry point of the group `probe_kit.environments`.
+        options: Keyword arguments of the class.
+        episodes: Indices among its episodes; None for all.
+        max_steps: Actions after which an episode ends. pixels: whether pictures at 32 × 32 are stored for
+            controls. Raises UsageError for what no environment can have.
     """
 
     kind: Literal["env"] = "env"

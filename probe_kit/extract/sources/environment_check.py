@@ -152,8 +152,12 @@ _CHECKS: Sequence[tuple[str, str, Callable[[_Trial], None]]] = (
 def check_environment(source: EnvSource | str) -> Iterator[EnvironmentCheck]:
     """The promises of the contract, each tried on the first two episodes; an error is a failure.
 
-    source: an `EnvSource`, or MODULE:CLASS. Raises UsageError if there is no such class, and MissingExtraError
-    naming a simulator that is not installed.
+    Args:
+        source: An `EnvSource`, or MODULE:CLASS.
+
+    Raises:
+        UsageError: If there is no such class.
+        MissingExtraError: Naming a simulator that is not installed.
     """
     trial = _Trial(EnvSource(source) if isinstance(source, str) else source)
     for name, sentence, check in _CHECKS:

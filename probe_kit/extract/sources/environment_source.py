@@ -69,7 +69,9 @@ def naming_environment(name: str, doing: str) -> Iterator[None]:
 def factory_of(name: str) -> Callable[..., Any]:
     """The class or function that `name` leads to.
 
-    Raises UsageError, and OwnEnvironmentError for an import that fails.
+    Raises:
+        UsageError: For an import that fails.
+        OwnEnvironmentError: For an import that fails.
     """
     module, colon, attribute = name.partition(":")
     if module == LEROBOT and colon:
@@ -184,7 +186,9 @@ def started(environment: OwnEnvironment, episode: EnvEpisode, where: str) -> Ste
 def checked_step(answer: object, episode: EnvEpisode, where: str) -> Step:
     """A step with pictures, state and facts as the contract has them, in copies of its own.
 
-    An environment may write into its arrays afterwards. Raises OwnEnvironmentError.
+    An environment may write into its arrays afterwards.
+
+    Raises OwnEnvironmentError.
     """
     if not isinstance(answer, Step) or not isinstance(answer.observation, Observation):
         kind = type(answer.observation if isinstance(answer, Step) else answer).__name__
@@ -317,8 +321,10 @@ class EnvironmentSource(Source[EnvSource]):
     def check(self, policy: "Policy", accept_units: bool) -> "tuple[Self, Policy]":
         """Set up the first chosen episodes, let the policy predict once, and execute one action of the first.
 
-        Raises OwnEnvironmentError for cameras, states or actions that do not fit, UnitsError for states far
-        outside the checkpoint's statistics, and CheckpointError for a policy whose predictions are no actions.
+        Raises:
+            OwnEnvironmentError: For cameras, states or actions that do not fit.
+            UnitsError: For states far outside the checkpoint's statistics.
+            CheckpointError: For a policy whose predictions are no actions.
         """
         if policy.predicts_relative:
             raise CheckpointError(
@@ -468,7 +474,8 @@ class EnvironmentSource(Source[EnvSource]):
 class EnvironmentPlayer(InputsPlayer):
     """Plays the episodes of one environment, and keeps what labels and controls are made of.
 
-    facts: names, in stored order.
+    Args:
+        facts: Names, in stored order.
     """
 
     def __init__(self, settings: EnvSource, facts: Sequence[str], played: Played) -> None:

@@ -52,7 +52,10 @@ def content_of(observation: Observation, vary: str) -> bytes:
 def hardly_changed(clean: Observation, vary: str, spread: NDArray[np.floating]) -> Observation:
     """Return the clean observation after a change of one input that means nothing.
 
-    The full stop, a JPEG round trip, a hundredth of the state's spread. spread: (D,) of the state.
+    The full stop, a JPEG round trip, a hundredth of the state's spread.
+
+    Args:
+        spread: (D,) of the state.
     """
     if vary == INSTRUCTION:
         return replace(clean, instruction=with_other_stop(clean.instruction))
@@ -115,12 +118,21 @@ NEAREST = 8
 class Frame:
     """One observation that a policy gets, alone; its pictures are read when they are needed.
 
-    group: the unit that is resampled, such as an episode, or a couple of items. seed: of the inference.
-    instruction, state: of the observation. observe: reads it, given the frame. other_words: the same instruction
-    in other words; empty where the source has none.
+    Of a run:
 
-    Of a run: row: in its episodes. number: of the recorded frame; 0 of an environment. item, episode, category: of
-    the row. stored: (n, D) actions that the run has of it, None without any.
+    Attributes:
+        group: The unit that is resampled, such as an episode, or a couple of items.
+        seed: Of the inference.
+        instruction: Of the observation.
+        state: As `instruction`.
+        observe: Reads it, given the frame.
+        other_words: The same instruction in other words; empty where the source has none.
+        row: In its episodes.
+        number: Of the recorded frame; 0 of an environment.
+        item: Of the row.
+        episode: As `item`.
+        category: As `item`.
+        stored: (n, D) actions that the run has of it, None without any.
     """
 
     name: str
@@ -156,7 +168,10 @@ def draw_donors(
 
     A donor is of another group, and holds another value of the input. That of a picture is one of the `NEAREST`
     frames by state, in spreads of every number, and of all that are equally near. Frames without any donor are
-    left out. of: the frames that get donors; None for all.
+    left out.
+
+    Args:
+        of: The frames that get donors; None for all.
     """
     groups = np.array([frame.group for frame in frames])
     states = np.stack([np.asarray(frame.state, np.float64) for frame in frames])

@@ -27,10 +27,12 @@ PER_TASK = 20
 class LeRobotEnvironment:
     """The environments of one `EnvConfig` of lerobot: every task, with a number of seeds each.
 
-    kind: lerobot's name, such as `libero`, `pusht`, `aloha` or `metaworld`. per_task: episodes of a task.
-    instruction: what the model reads where the environment has no text. options: fields of the configuration, as
-    text or values. Raises UsageError for an unknown name or field, and for one whose code is fetched from the hub;
-    MissingExtraError without the simulator.
+    Args:
+        kind: Lerobot's name, such as `libero`, `pusht`, `aloha` or `metaworld`.
+        per_task: Episodes of a task.
+        instruction: What the model reads where the environment has no text. options: fields of the configuration,
+            as text or values. Raises UsageError for an unknown name or field, and for one whose code is fetched
+            from the hub; MissingExtraError without the simulator.
     """
 
     def __init__(

@@ -145,8 +145,10 @@ class LeRobotFolder(LeRobotMeta):
 def open_lerobot(source: LeRobotSource) -> LeRobotFolder:
     """The data set of `source`, which is downloaded if it is one of the hub; only its `meta` then.
 
-    Raises RecordingError for another format or missing files, UsageError for a hub data set without network or at
-    a revision that is none, MissingExtraError without the extra of recordings.
+    Raises:
+        RecordingError: For another format or missing files.
+        UsageError: For a hub data set without network or at a revision that is none.
+        MissingExtraError: Without the extra of recordings.
     """
     if source.is_local:
         return LeRobotFolder.read(Path(source.folder).expanduser().resolve())
@@ -223,7 +225,8 @@ _EPISODE, _INDEX = "episode_index", "index"
 class _DataFile:
     """One Parquet file of data. first: of each of its episodes, the row of the first frame.
 
-    latest: by columns the rows that were read last, whole row groups, and the number of the first of them.
+    Attributes:
+        latest: By columns the rows that were read last, whole row groups, and the number of the first of them.
     """
 
     path: Path
@@ -251,7 +254,8 @@ class LeRobotFrames:
     def numbers(self, episode: int, features: Sequence[str]) -> dict[str, NDArray[np.float64]]:
         """(T, D) of every feature, of one number (T, 1); an empty cell is NaN.
 
-        Raises RecordingError if the frames are not a grid, or a feature has other numbers than meta says.
+        Raises:
+            RecordingError: If the frames are not a grid, or a feature has other numbers than meta says.
         """
         columns = list(dict.fromkeys((*features, "frame_index", "timestamp")))
         table = self._rows(episode, columns)

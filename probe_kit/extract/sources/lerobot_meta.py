@@ -143,8 +143,11 @@ class EpisodeMeta:
 class LeRobotMeta:
     """The content of `meta`.
 
-    opened: the files of the data set by their hashes. tasks: (number, text) of each line. repo, revision: of the
-    hub, or None.
+    Attributes:
+        opened: The files of the data set by their hashes.
+        tasks: (number, text) of each line.
+        repo: Of the hub, or None.
+        revision: As `repo`.
     """
 
     path: Path
@@ -159,8 +162,9 @@ class LeRobotMeta:
     def read(cls, root: Path, repo: str | None = None, revision: str | None = None) -> Self:
         """The meta of the data set in `root`.
 
-        Raises RecordingError for another format, a missing file, and where two parts contradict each other;
-        MissingExtraError without the libraries that read it.
+        Raises:
+            RecordingError: For another format, a missing file, and where two parts contradict each other.
+            MissingExtraError: Without the libraries that read it.
         """
         files = HashedFiles(root)
         info = _read_info(root, files)

@@ -49,9 +49,12 @@ _option = partial(typer.Option, rich_help_panel="Pictures")
 class PictureFolder(SourceSettings):
     """Pictures in place of a scene: the model predicts once about each, and nothing moves.
 
-    folder: of the pictures. table: a CSV file with the columns `picture` (a file in the folder) and `instruction`;
-    `id` and `group` name a line and what folds keep together; every other column holds numbers, truth values or
-    texts, and becomes a label. pixels: whether pictures at 32 × 32 are stored for controls.
+    Attributes:
+        folder: Of the pictures.
+        table: A CSV file with the columns `picture` (a file in the folder) and `instruction`; `id` and `group`
+            name a line and what folds keep together; every other column holds numbers, truth values or texts, and
+            becomes a label.
+        pixels: Whether pictures at 32 × 32 are stored for controls.
     """
 
     kind: Literal["pictures"] = "pictures"
@@ -185,7 +188,8 @@ class PictureSource(Source[PictureFolder]):
     def check(self, policy: "Policy", accept_units: bool) -> "tuple[Self, Policy]":
         """Show the policy its first camera, and let it predict once about nothing.
 
-        Raises RecordingError for a policy that reads a state of another width than zeros can stand for.
+        Raises:
+            RecordingError: For a policy that reads a state of another width than zeros can stand for.
         """
         del accept_units
         if policy.state_numbers not in (None, ARM_NUMBERS):
@@ -292,7 +296,9 @@ def _coded(
     """The columns that become labels as numbers, and the names that a run stores of them.
 
     NaN where the cell is empty; true and false as 1 and 0; of texts the position in alphabetical order.
-    Raises UsageError for a cell that breaks a rule of labels.
+
+    Raises:
+        UsageError: For a cell that breaks a rule of labels.
     """
     read = LabelTable.of_lines(table, lines, names)
     values: list[list[float]] = []

@@ -90,8 +90,10 @@ SIDE = 32
 class Ending:
     """The end of an episode: its record as flat columns, a frame per action if it was filmed, its small frames.
 
-    trajectory: (T + 1, C) float32; see `probe_kit.env.scoring`. seconds: that the player worked on the
-    episode, by the wall clock. inputs: (n, …) by kind what was shown in n inferences, of sources without a scene.
+    Attributes:
+        trajectory: (T + 1, C) float32; see `probe_kit.env.scoring`.
+        seconds: That the player worked on the episode, by the wall clock.
+        inputs: (n, …) by kind what was shown in n inferences, of sources without a scene.
     """
 
     outcome: dict[str, Any]
@@ -194,7 +196,8 @@ class LocalPlayer:
     def ask(self, method: str, *arguments: Any, then: Request | None = None) -> None:
         """Start `begin`, `advance` or `dismiss`.
 
-        then: what to start at once where that ends the episode, and only there; its answer is the next one.
+        Args:
+            then: What to start at once where that ends the episode, and only there; its answer is the next one.
         """
         self._request, self._then = (method, arguments), then
 

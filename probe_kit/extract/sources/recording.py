@@ -110,12 +110,15 @@ def _turns(value: Any) -> Any:
 class LeRobotSource(SourceSettings):
     """Frames of a LeRobotDataset in place of a scene.
 
-    folder: the data set's folder, or USER/NAME@COMMIT of the hub. episodes: indices; None for all. every: of each
-    episode, frame 0 and each so many frames on. cameras: feature of the data set by camera of the model; empty
-    where both have one, or the names are equal. rotations: degrees by camera of the model, counterclockwise.
-    instruction: what the model reads in place of the task of a frame. pixels: whether pictures at 32 × 32 are
-    stored for controls.
-    Raises UsageError for what no data set can have.
+    Attributes:
+        folder: The data set's folder, or USER/NAME@COMMIT of the hub.
+        episodes: Indices; None for all.
+        every: Of each episode, frame 0 and each so many frames on.
+        cameras: Feature of the data set by camera of the model; empty where both have one, or the names are equal.
+        rotations: Degrees by camera of the model, counterclockwise.
+        instruction: What the model reads in place of the task of a frame.
+        pixels: Whether pictures at 32 × 32 are stored for controls. Raises UsageError for what no data set can
+            have.
     """
 
     kind: Literal["lerobot"] = "lerobot"

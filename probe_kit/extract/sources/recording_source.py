@@ -57,7 +57,10 @@ class RecordingSource(Source[LeRobotSource]):
 
     prediction: (chunk, D) of the policy that was checked. unusual: (D,) share of the chosen frames whose number of
     the state is unusual; empty where the policy normalises none. other_actions: why recorded actions are not what
-    the policy predicts; None if they are. stretch: most frames of a row.
+    the policy predicts; None if they are.
+
+    Args:
+        stretch: Most frames of a row.
     """
 
     executes = False
@@ -209,8 +212,10 @@ class RecordingSource(Source[LeRobotSource]):
     def check(self, policy: "Policy", accept_units: bool) -> "tuple[Self, Policy]":
         """Map the cameras, read all numbers of the chosen episodes, and let the policy predict once about nothing.
 
-        Raises RecordingError for cameras, states or files that do not fit, UnitsError for states far outside the
-        checkpoint's statistics, and CheckpointError for a checkpoint without statistics.
+        Raises:
+            RecordingError: For cameras, states or files that do not fit.
+            UnitsError: For states far outside the checkpoint's statistics.
+            CheckpointError: For a checkpoint without statistics.
         """
         card = policy.card
         raise_together(self.early_checks(card.cameras, policy.state_numbers, card.checkpoint))
@@ -418,7 +423,8 @@ class RecordingSource(Source[LeRobotSource]):
 class RecordingPlayer(InputsPlayer):
     """Shows the stretches of one data set, frame by frame, and keeps what controls are made of.
 
-    settings: with every camera of the model mapped.
+    Args:
+        settings: With every camera of the model mapped.
     """
 
     def __init__(self, settings: LeRobotSource) -> None:
@@ -481,7 +487,10 @@ class RecordingPlayer(InputsPlayer):
 def mapped_cameras(typed: Pairs, model: Sequence[str], recorded: Sequence[str]) -> Pairs:
     """Camera of the model and feature of the data set, in the model's order.
 
-    typed: as the user mapped them; empty for equal names, or the only one of either. Raises RecordingError.
+    Raises RecordingError.
+
+    Args:
+        typed: As the user mapped them; empty for equal names, or the only one of either.
     """
     both = f"the model has {', '.join(model) or 'none'}; the data set has {', '.join(recorded) or 'none'}"
     how = (

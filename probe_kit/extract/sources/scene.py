@@ -35,7 +35,8 @@ def _size(value: Any) -> Any:
 class SceneOptions(Part):
     """The changes that a command or a study makes to a scene: a preset, and fields of `SceneSpec`.
 
-    scene: the preset; None for the protocol's or the model's own. None and False leave the preset's value.
+    Attributes:
+        scene: The preset; None for the protocol's or the model's own. None and False leave the preset's value.
     """
 
     scene: common.Scene = None
@@ -89,9 +90,12 @@ class SceneOptions(Part):
 class SceneSettings(SourceSettings):
     """Questions of a suite in the built-in scene.
 
-    suite: suite folder; None for the embedded suite. categories: slugs; None for all of the suite. items: items
-    per category; None for all. wordings: of `suite.items.WORDINGS`, each a condition of the run; None for the
-    items' own words alone. scene: by default the model's own, see `Family.home`.
+    Attributes:
+        suite: Suite folder; None for the embedded suite.
+        categories: Slugs; None for all of the suite.
+        items: Items per category; None for all.
+        wordings: Of `suite.items.WORDINGS`, each a condition of the run; None for the items' own words alone.
+        scene: By default the model's own, see `Family.home`.
     """
 
     kind: Literal["scene"] = "scene"

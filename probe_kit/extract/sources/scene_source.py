@@ -35,7 +35,8 @@ if TYPE_CHECKING:
 class ScenePlayer(Player):
     """Plays episodes of the scene.
 
-    played: with the script `expert`, `expert-mirrored` or `idle`, that plays every episode to its end at once.
+    Args:
+        played: With the script `expert`, `expert-mirrored` or `idle`, that plays every episode to its end at once.
     """
 
     def __init__(self, scene: SceneSpec, played: Played | None = None) -> None:
@@ -183,7 +184,10 @@ class SceneSource(Source[SceneSettings]):
         """Every episode in order, with its seeds, in each wording that its item has.
 
         Both layouts of an item start from the same scene, and all wordings of an episode from the same seeds.
-        Raises UsageError for a wording that no item has, SuiteError if an item's own words for one are none.
+
+        Raises:
+            UsageError: For a wording that no item has.
+            SuiteError: If an item's own words for one are none.
         """
         # Of the items themselves: an episode in another wording holds its item with that wording as instruction.
         content = {item.item_id: item.content_sha256 for item in self.suite.items}
@@ -303,7 +307,8 @@ class SceneSource(Source[SceneSettings]):
     def _first_states(self) -> Any:
         """(n, 8) states of the arm at the first inference of some rows; those that cannot be set up are left out.
 
-        Raises SceneError if none can be set up.
+        Raises:
+            SceneError: If none can be set up.
         """
         states, failed = [], None
         player = ScenePlayer(self.settings.scene)
@@ -322,8 +327,9 @@ class SceneSource(Source[SceneSettings]):
     def rehearse(self, rows: Iterable[Row]) -> None:
         """Set up the first row, or the next ones if its start cannot be reached.
 
-        Raises SceneError if none of the first rows can be set up, such as for an arm whose meshes are not
-        installed, and SuiteError if a picture of the first one is not what the suite says.
+        Raises:
+            SceneError: If none of the first rows can be set up, such as for an arm whose meshes are not installed.
+            SuiteError: If a picture of the first one is not what the suite says.
         """
         env, failed = Act2AnswerEnv(self.settings.scene), None
         try:

@@ -37,13 +37,18 @@ REFUSED_WITHOUT_ACTING = (
 class SourceSettings(Part):
     """Settings of a source, which open it.
 
-    kind: the name of the source in files. opens: MODULE:CLASS of the `Source`, which is imported when it is
-    opened. command: the option that a command names it with; empty for the scene. shows: the reason why options of
-    other sources do not apply. subject, loads: what its options are about, and what is loaded of it, in words.
-    decides: fields of other parts that are the source's own. refuses: fields of other parts that do not apply,
-    some with the only value that does not. moves: fields that a later command may give anew, with what it says of
-    them, because a file or module lies elsewhere. played: the word before the name in a run's label; empty for a
-    label without it.
+    Attributes:
+        kind: The name of the source in files.
+        command: The option that a command names it with; empty for the scene.
+        shows: The reason why options of other sources do not apply.
+        opens: MODULE:CLASS of the `Source`, which is imported when it is opened.
+        subject: What its options are about, and what is loaded of it, in words.
+        loads: As `subject`.
+        decides: Fields of other parts that are the source's own.
+        refuses: Fields of other parts that do not apply, some with the only value that does not.
+        moves: Fields that a later command may give anew, with what it says of them, because a file or module lies
+            elsewhere.
+        played: The word before the name in a run's label; empty for a label without it.
     """
 
     kind: str
@@ -132,10 +137,13 @@ class Played:
 class Source[Chosen: SourceSettings](ABC):
     """An opened source; `check` gives the same source as it is shown to a model.
 
-    own_units: whether actions are predictions in the checkpoint's own units; those of an arm otherwise.
-    executes: whether actions move anything. columns: names of numbers that become labels, such as facts.
-    suite: of questions with two pictures. chunk: actions that a policy predicts at a time; 0 where its card says
-    so. groups: what rows are grouped by, in words.
+    Attributes:
+        own_units: Whether actions are predictions in the checkpoint's own units; those of an arm otherwise.
+        executes: Whether actions move anything.
+        groups: What rows are grouped by, in words.
+        columns: Names of numbers that become labels, such as facts.
+        chunk: Actions that a policy predicts at a time; 0 where its card says so.
+        suite: Of questions with two pictures.
     """
 
     own_units: ClassVar[bool] = True
@@ -180,7 +188,8 @@ class Source[Chosen: SourceSettings](ABC):
     def identity(self, execute: int) -> dict[str, Any]:
         """The part of a run's identity that says where observations come from.
 
-        execute: actions per inference; 0 for a model that predicts none.
+        Args:
+            execute: Actions per inference; 0 for a model that predicts none.
         """
 
     @abstractmethod
@@ -221,8 +230,10 @@ class Source[Chosen: SourceSettings](ABC):
     def shown_cameras(self, declared: Sequence[str] | None = None) -> tuple[str, ...] | None:
         """Return the model's cameras that get a picture, the first one in front; None where only a model can say.
 
-        Of a source that was checked against a model they are those of the model. declared: the cameras of a
-        checkpoint that is not loaded yet, None where its files do not say.
+        Of a source that was checked against a model they are those of the model.
+
+        Args:
+            declared: The cameras of a checkpoint that is not loaded yet, None where its files do not say.
         """
         del declared
         return None
@@ -295,7 +306,10 @@ def check_units(
 ) -> None:
     """Raise UnitsError for states far outside the checkpoint's statistics, unless that is accepted.
 
-    shares: (D,) of `unusual_shares`. names: of the numbers of the state. where: the source.
+    Args:
+        shares: (D,) of `unusual_shares`.
+        names: Of the numbers of the state.
+        where: The source.
     """
     if accepted or not (shares > MOST_UNUSUAL).any():
         return

@@ -38,8 +38,10 @@ Read = tuple[int, int]
 class AttentionMass:
     """Shares of attention, by (block of the backbone whose keys are read, iteration).
 
-    by_head: (B, H, T) float32, a mean over acting positions; what is missing to 1 lies on the acting part's own
-    tokens. Not causal: a token can receive attention without being used. Serves an optional display only.
+    Attributes:
+        by_head: (B, H, T) float32, a mean over acting positions; what is missing to 1 lies on the acting part's
+            own tokens. Not causal: a token can receive attention without being used. Serves an optional display
+            only.
     """
 
     by_head: dict[Read, NDArray[np.float32]] = field(default_factory=dict)
@@ -52,7 +54,8 @@ class AttentionMass:
     def heads_on(self, tokens: NDArray[np.bool_]) -> dict[Read, NDArray[np.float64]]:
         """The share on some tokens by head, (B, H); tokens: (T,) or (B, T) bool, such as the patches of a tile.
 
-        Raises RolesMismatchError for another number of tokens.
+        Raises:
+            RolesMismatchError: For another number of tokens.
         """
         shares: dict[Read, NDArray[np.float64]] = {}
         for read, mass in self.by_head.items():
@@ -78,7 +81,9 @@ class AttentionMass:
 def capture_attention(policy: Policy) -> Iterator[AttentionMass]:
     """Record the attention of the acting stream while `policy` acts once; its actions stay bit-identical.
 
-    Raises UnsupportedInterventionError for a family without attention recording, CaptureError if none occurred.
+    Raises:
+        UnsupportedInterventionError: For a family without attention recording.
+        CaptureError: If none occurred.
     """
     policy.interventions.check("attention", policy.card.family)
     mass = AttentionMass()
@@ -111,10 +116,14 @@ def capture_patterns(
 ) -> Iterator[ActivationCache]:
     """Capture the attention patterns of blocks while the model runs once; its output stays bit-identical.
 
-    sites: of the quantity `heads`; the pattern of a site is (B, H, S, T) float32 on the host, and its rows sum
-    to 1, or to 0 where a position attends to nothing. Raises UnknownSiteError for another quantity, UsageError
-    beyond `most_bytes`, CaptureError for a pattern that does not give what the heads read, and what `capture`
-    raises.
+    Args:
+        sites: Of the quantity `heads`; the pattern of a site is (B, H, S, T) float32 on the host, and its rows sum
+            to 1, or to 0 where a position attends to nothing.
+
+    Raises:
+        UnknownSiteError: For another quantity.
+        UsageError: Beyond `most_bytes`.
+        CaptureError: For a pattern that does not give what the heads read, and what `capture` raises.
     """
     head_sites = tuple(dict.fromkeys(sites))
     if other := [site for site in head_sites if site.quantity != HEADS]:
@@ -142,9 +151,10 @@ def capture_patterns(
 def attended_roles(model: Model, roles: Mapping[str, Sequence[Roles]], site: Site, tokens: int) -> list[Roles]:
     """The roles of the T = `tokens` positions that a site attends to, per row.
 
-    roles: of every stream, as `Model.token_roles` or `AnswerModel.asked_roles` says them. A stream that acts reads
-    the backbone's positions, then its own; where a decoder puts out tokens, those that came before. Raises
-    RolesMismatchError for a number of tokens that fits neither.
+    Args:
+        roles: Of every stream, as `Model.token_roles` or `AnswerModel.asked_roles` says them. A stream that acts
+            reads the backbone's positions, then its own; where a decoder puts out tokens, those that came before.
+            Raises RolesMismatchError for a number of tokens that fits neither.
     """
     stream, backbone = model.stream_of(site), first_of("backbone", model.streams.values())
     acting = first_of("action", model.streams.values())

@@ -67,8 +67,9 @@ def without_fused_encoder() -> Iterator[None]:
 def reason_of_change(infer: Infer, plain: NDArray[np.float32], infer_captured: Infer) -> str:
     """Why an inference under capture differs from `plain`, and what to change, as sentences.
 
-    infer: the inference without hooks, whose output `plain` is, of any shape. infer_captured: the same with hooks.
-    Both are repeated at most once.
+    Args:
+        infer: The inference without hooks, whose output `plain` is, of any shape.
+        infer_captured: The same with hooks. Both are repeated at most once.
     """
     if not same_bits(infer(), plain):
         return (
@@ -138,9 +139,12 @@ class ActivationCache(Mapping[Site, Tensor]):
     def stack(self, stream: str, quantity: str = "residual") -> Tensor:
         """All of one stream and quantity as one tensor.
 
-        Returns (layers, B, T, D), or (layers, iterations, B, T, D) where sites have iterations; layers and
-        iterations ascend, as many as were captured. Raises UnknownSiteError if none was, if a layer lacks an
-        iteration that another has, or if shapes differ.
+        Returns:
+            (layers, B, T, D), or (layers, iterations, B, T, D) where sites have iterations; layers and iterations
+            ascend, as many as were captured.
+
+        Raises:
+            UnknownSiteError: If none was, if a layer lacks an iteration that another has, or if shapes differ.
         """
         sites = sorted(
             (site for site in self._kept if (site.stream, site.quantity) == (stream, quantity)),
@@ -210,11 +214,13 @@ _captured_now: WeakSet[Model] = WeakSet()
 def capture(model: Model, sites: Iterable[Site], reduce: Reduce | None = None) -> Iterator[ActivationCache]:
     """Capture `sites` while the model runs once.
 
-    reduce: what to keep of a site, called with (site, (B, T, D)) on the device at the moment it fires, such as a
-    pooled view; it must return a new tensor. None keeps a copy.
-    Raises SiteNeverFiredError or SiteFiredTooOftenError if a site fired another number of times than its
-    tap promises, NonFiniteActivationError if a copy holds NaN or infinity, CaptureError if this model
-    is being captured already or a tapped module is compiled.
+    Raises SiteNeverFiredError or SiteFiredTooOftenError if a site fired another number of times than its tap
+    promises, NonFiniteActivationError if a copy holds NaN or infinity, CaptureError if this model is being
+    captured already or a tapped module is compiled.
+
+    Args:
+        reduce: What to keep of a site, called with (site, (B, T, D)) on the device at the moment it fires, such as
+            a pooled view; it must return a new tensor. None keeps a copy.
     """
     if model in _captured_now:
         raise CaptureError("this model is being captured already; leave the first capture before the next")
@@ -239,9 +245,12 @@ def capture(model: Model, sites: Iterable[Site], reduce: Reduce | None = None) -
 def edit(model: Model, edits: Mapping[Site, EditFunction]) -> Iterator[None]:
     """Replace activations while the model runs once, at exactly the place where `capture` reads them.
 
-    edits: per site a function from the activation (B, T, D) to its replacement, of the same shape and dtype.
-    A capture entered inside this context reads the replacements.
-    Raises CaptureError if a replacement has another shape or dtype, and for fires as `capture` does.
+    Args:
+        edits: Per site a function from the activation (B, T, D) to its replacement, of the same shape and dtype. A
+            capture entered inside this context reads the replacements.
+
+    Raises:
+        CaptureError: If a replacement has another shape or dtype, and for fires as `capture` does.
     """
 
     def write(site: Site, tap: Tap, passing: Tensor) -> None:
@@ -360,8 +369,10 @@ def gradients_at(
 ) -> tuple[float, ActivationCache]:
     """The metric of one inference, and its gradient at every site: (B, T, D) float32, zero where nothing reads it.
 
-    Costs about three inferences, however many sites. Raises UnsupportedInterventionError, and what `capture`
-    raises.
+    Costs about three inferences, however many sites.
+
+    Raises:
+        UnsupportedInterventionError: And what `capture` raises.
     """
     policy.interventions.check("gradients", policy.card.family)
     with flowing_tensors(policy, sites) as flowing:

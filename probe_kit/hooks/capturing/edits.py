@@ -40,11 +40,12 @@ Vectors = Mapping[str, NDArray[np.float32]]
 class Edit:
     """One change of some sites, applied row by row.
 
-    kind: `zero` sets to zero; `add` adds `strength` times a direction; `remove` takes away `strength` times the
-    component along it; `replace` goes the share `strength` of the way to a source, token by token.
-    roles: of the tokens that change, such as `language` or `image`; None for all but padding.
-    vector: `vector_hash` of the direction (D,) or source (T, D); "" for `zero`.
-    Raises UsageError for a combination that means nothing.
+    Attributes:
+        kind: `zero` sets to zero; `add` adds `strength` times a direction; `remove` takes away `strength` times
+            the component along it; `replace` goes the share `strength` of the way to a source, token by token.
+        roles: Of the tokens that change, such as `language` or `image`; None for all but padding.
+        vector: `vector_hash` of the direction (D,) or source (T, D); "" for `zero`. Raises UsageError for a
+            combination that means nothing.
     """
 
     kind: Kind
@@ -137,7 +138,8 @@ class ReplaceWith:
 class ReplaceInSubspace:
     """Replace the component within a subspace by another inference's. basis: (K, D) orthonormal.
 
-    complement: the other way round: all but that component is replaced.
+    Attributes:
+        complement: The other way round: all but that component is replaced.
     """
 
     source: "ActivationCache"
@@ -294,8 +296,9 @@ def apply_patch(
 ) -> Iterator[EditLog]:
     """Change the tokens of some sites while the policy infers once, for one observation.
 
-    Raises CaptureError for another number of tokens, and what `hooks.edit` raises, such as for a site that fires
-    another number of times than its tap promises.
+    Raises:
+        CaptureError: For another number of tokens, and what `hooks.edit` raises, such as for a site that fires
+            another number of times than its tap promises.
     """
     with apply_patches(policy, {site: [(tokens, change)] for site in sites}) as log:
         yield log
@@ -320,8 +323,9 @@ def apply_edits(
 ) -> Iterator[EditLog]:
     """Apply `edits` while the model runs once on `observations`; several at one site act in their order.
 
-    Raises UsageError for a vector that is missing, has another hash or does not fit, UnknownSiteError for a site
-    without roles, and what `hooks.edit` raises.
+    Raises:
+        UsageError: For a vector that is missing, has another hash or does not fit.
+        UnknownSiteError: For a site without roles, and what `hooks.edit` raises.
     """
     roles, arrays = model.token_roles(observations), dict(vectors or {})
     changes: dict[Site, list[tuple[TokenSelection, TokenEdit]]] = defaultdict(list)

@@ -24,9 +24,10 @@ from probe_kit.hooks.contract.sites import HEADS, Site
 def project_heads(model: Model, cache: ActivationCache, site: Site | str) -> Tensor:
     """(H, B, T, D): what the output projection makes of every head alone, without its bias.
 
-    cache: holds `site`, of the quantity `heads`. The sum over heads, plus the bias, is the projection's output:
-    the site `attention`, where the family has no norm, scale or gate behind the projection. Raises
-    UnknownSiteError for another quantity, or a site that was not captured.
+    Args:
+        cache: Holds `site`, of the quantity `heads`. The sum over heads, plus the bias, is the projection's
+            output: the site `attention`, where the family has no norm, scale or gate behind the projection. Raises
+            UnknownSiteError for another quantity, or a site that was not captured.
     """
     heads_site = Site.parse(site) if isinstance(site, str) else site
     if heads_site.quantity != HEADS:
@@ -52,8 +53,10 @@ def project_heads(model: Model, cache: ActivationCache, site: Site | str) -> Ten
 class LogitLens:
     """The tokens that the layers of one stream would put out.
 
-    layers: (L,) of the residuals; the last one is the output of the model, if its last residual was captured.
-    ids, logits: (L, B, K) of tokens; the same tokens in every layer if they were given, else the likeliest first.
+    Attributes:
+        layers: (L,) of the residuals; the last one is the output of the model, if its last residual was captured.
+        ids: (L, B, K) of tokens; the same tokens in every layer if they were given, else the likeliest first.
+        logits: As `ids`.
     """
 
     layers: tuple[int, ...]
@@ -72,10 +75,16 @@ def logit_lens(
 ) -> LogitLens:
     """Final norm and head of the model, applied to every captured residual of one stream.
 
-    ids: tokens whose logits are wanted; without, the k likeliest of every layer. at: position in the stream.
-    stream: default the one whose last residual chooses tokens. iteration: of the stream; default the first.
-    Raises UnsupportedInterventionError for a model that puts out no tokens, UnknownSiteError if no residual of the
-    stream was captured, UsageError for ids that the model does not have.
+    Args:
+        ids: Tokens whose logits are wanted; without, the k likeliest of every layer.
+        at: Position in the stream.
+        stream: Default the one whose last residual chooses tokens.
+        iteration: Of the stream; default the first.
+
+    Raises:
+        UnsupportedInterventionError: For a model that puts out no tokens.
+        UnknownSiteError: If no residual of the stream was captured.
+        UsageError: For ids that the model does not have.
     """
     unembedding = model.unembedding
     if unembedding is None:

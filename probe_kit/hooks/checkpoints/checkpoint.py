@@ -267,10 +267,14 @@ def is_on_hub(checkpoint: str) -> bool:
 
 def plain_folder(checkpoint: str, patterns: Sequence[str] = PATTERNS) -> Path:
     """The local folder of a folder path or hub id such as `lerobot/pi0_base`, or `owner/repo/folder` for one model
+
     of a repository that holds several; `@revision` behind it names a branch, a tag or a commit.
 
-    patterns: which files of a hub repository, or of its folder, are needed; no others are downloaded.
-    Raises CheckpointError if the folder is not there or the hub cannot deliver it.
+    Args:
+        patterns: Which files of a hub repository, or of its folder, are needed; no others are downloaded.
+
+    Raises:
+        CheckpointError: If the folder is not there or the hub cannot deliver it.
     """
     try:
         folder = Path(checkpoint).expanduser()
@@ -336,8 +340,10 @@ def _not_here(checkpoint: str) -> str:
 def hub_files(checkpoint: str) -> list[str]:
     """Paths of the files of a hub id, sorted: as the hub lists them, or as the cache has them out of its reach.
 
-    Of `owner/repo/folder`, below that folder. Nothing is downloaded. Raises CheckpointError for what is no hub id,
-    and for a repository that neither has.
+    Of `owner/repo/folder`, below that folder. Nothing is downloaded.
+
+    Raises:
+        CheckpointError: For what is no hub id, and for a repository that neither has.
     """
     parts = hub_name(checkpoint)
     if parts is None:
@@ -364,8 +370,10 @@ def _possible(folder: Path) -> Path:
     """The folder, if its files can be read and no configuration asks for a network beyond all sizes.
 
     A configuration that is none is left to its loader, which names it.
-    Raises CheckpointError for those, and for a file beside the weights that is a pipe, a device or huge: libraries
-    read such files without a bound.
+
+    Raises:
+        CheckpointError: For those, and for a file beside the weights that is a pipe, a device or huge: libraries
+            read such files without a bound.
     """
     for file in sorted(path for pattern in ("*", "*/*") for path in folder.glob(pattern)):
         if file.suffix in _READ and not file.is_dir() and file.exists():
@@ -394,7 +402,9 @@ def _content(file: Path) -> Any:
 def chosen_dtype(requested: str | None, stored: object, offered: Collection[str]) -> str:
     """The dtype that was asked for, or else what a checkpoint's configuration says; float32 where neither does.
 
-    Raises UsageError for another one that was asked for, CheckpointError for one that is stored.
+    Raises:
+        UsageError: For another one that was asked for.
+        CheckpointError: For one that is stored.
     """
     if requested is not None:
         if requested not in offered:
@@ -411,7 +421,8 @@ def chosen_dtype(requested: str | None, stored: object, offered: Collection[str]
 def side_files(folder: Path, prefix: str = "") -> dict[str, Path]:
     """The files of `folder` besides weights and documents, by name: all that a loader may read there.
 
-    prefix: put before every name, to tell folders apart.
+    Args:
+        prefix: Put before every name, to tell folders apart.
     """
     return {
         f"{prefix}{path.name}": path

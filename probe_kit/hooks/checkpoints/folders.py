@@ -58,8 +58,11 @@ class AdapterFiles:
     def base_folder(self, patterns: Sequence[str] = PATTERNS) -> Path:
         """The folder of the base's checkpoint; a relative path may start at the adapter.
 
-        patterns: the files that are needed of a base on the hub. Raises CheckpointError if it is not there, or is
-        an adapter itself.
+        Args:
+            patterns: The files that are needed of a base on the hub.
+
+        Raises:
+            CheckpointError: If it is not there, or is an adapter itself.
         """
         return base_folder_of(self.folder, self.settings, patterns)
 
@@ -106,8 +109,9 @@ def adapter_settings(file: Path) -> dict[str, Any]:
 def adapter_in(folder: Path) -> AdapterFiles | None:
     """The LoRA adapter in a checkpoint's folder; None where there is none.
 
-    Raises CheckpointError for an adapter that cannot be merged exactly, for one of which a file is missing, and
-    for weights beside it of which no file says whether they are the base's or merged.
+    Raises:
+        CheckpointError: For an adapter that cannot be merged exactly, for one of which a file is missing, and for
+            weights beside it of which no file says whether they are the base's or merged.
     """
     folder = _JOINED.get(str(folder), folder)
     file = folder / ADAPTER_FILE
@@ -200,9 +204,12 @@ _DONE: dict[tuple[object, ...], Path] = {}
 def checkpoint_folder(checkpoint: str, patterns: Sequence[str] = PATTERNS) -> Path:
     """The folder of a checkpoint, by path or hub id; that of an adapter alone is joined with its base's files.
 
-    patterns: see `plain_folder`; also of a base on the hub. A file of the adapter replaces the base's, so its
-    statistics win. The joined folder holds links and is removed at the end of the process.
-    Raises CheckpointError as `plain_folder` does, and for a base that is not there or has no configuration either.
+    Args:
+        patterns: See `plain_folder`; also of a base on the hub. A file of the adapter replaces the base's, so its
+            statistics win. The joined folder holds links and is removed at the end of the process.
+
+    Raises:
+        CheckpointError: As `plain_folder` does, and for a base that is not there or has no configuration either.
     """
     folder = plain_folder(checkpoint, patterns)
     file = folder / ADAPTER_FILE
@@ -224,7 +231,8 @@ def checkpoint_folder(checkpoint: str, patterns: Sequence[str] = PATTERNS) -> Pa
 def inside_or_hub(folder: Path, name: str, patterns: Sequence[str] = SMALL_FILES) -> Path:
     """The folder that a checkpoint names: inside its own, anywhere, or on the hub. patterns: the files to fetch.
 
-    Raises CheckpointError for one that is not there.
+    Raises:
+        CheckpointError: For one that is not there.
     """
     inside = folder / name
     return inside if inside.is_dir() else checkpoint_folder(name, patterns)
@@ -284,10 +292,15 @@ def check_files(
 ) -> None:
     """Look at what can be wrong with a checkpoint before anything heavy is imported.
 
-    types: what `type` or `model_type` of its config may be. weights: whether its weights will be read. instead:
-    for other types that people may take for one of them, what to do.
-    Raises CheckpointError for a missing or unreadable config or one of another model, and for a LoRA adapter that
-    cannot be merged; WeightsError for missing weights, and for two sets of them.
+    Args:
+        types: What `type` or `model_type` of its config may be.
+        weights: Whether its weights will be read. instead: for other types that people may take for one of them,
+            what to do.
+
+    Raises:
+        CheckpointError: For a missing or unreadable config or one of another model, and for a LoRA adapter that
+            cannot be merged.
+        WeightsError: For missing weights, and for two sets of them.
     """
     file = folder / CONFIG_FILE
     adapter = adapter_in(folder) if weights else None

@@ -42,8 +42,9 @@ class Interruptions:
 def contained(limit: float | None = None) -> Iterator[Interruptions]:
     """Run a policy's code in the body; afterwards this process is as it was.
 
-    limit: seconds after which the process is ended by SIGALRM, which no code can hold up; None for no limit.
-    A process that the body forked ends here: it would play on beside its parent, into the same run.
+    Args:
+        limit: Seconds after which the process is ended by SIGALRM, which no code can hold up; None for no limit. A
+            process that the body forked ends here: it would play on beside its parent, into the same run.
     """
     process = os.getpid()
     try:
@@ -216,7 +217,9 @@ def with_origin(reason: str, model: str, location: str) -> str:
 def while_acting(model: str, location: str, limit: float | None = None) -> Iterator[None]:
     """Errors of a policy's code in the body. Raises PolicyFailedError naming the model, or an error of ours.
 
-    location: where its checkpoint lies, for what is found out about it this late. limit: as `contained` has it.
+    Args:
+        location: Where its checkpoint lies, for what is found out about it this late.
+        limit: As `contained` has it.
     """
     with contained(limit) as interruptions:
         try:

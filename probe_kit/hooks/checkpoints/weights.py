@@ -50,10 +50,15 @@ class Adapter:
     ) -> dict[str, Tensor]:
         """`tensors` with the adapter in them: W + s B A in float32, rounded once to the weight's own dtype.
 
-        module: the network that they belong to, on any device; it stays as it is. tensors: the base's, under the
-        module's names. name_in_module: the module's name of a tensor in a file.
-        Raises WeightsError unless every tensor of the adapter has its place in the network and every place its
-        factors, and MissingExtraError without peft.
+        Args:
+            module: The network that they belong to, on any device; it stays as it is.
+            tensors: The base's, under the module's names.
+            name_in_module: The module's name of a tensor in a file.
+
+        Raises:
+            WeightsError: Unless every tensor of the adapter has its place in the network and every place its
+                factors.
+            MissingExtraError: Without peft.
         """
         factors, copies = self._sorted()
         merged = dict(tensors)
@@ -170,7 +175,8 @@ _FEWEST = 2
 class Weights:
     """The tensors of a checkpoint as its files hold them; `random`: the weights are untrained.
 
-    adapter: what `load_weights` merges into them, if anything.
+    Attributes:
+        adapter: What `load_weights` merges into them, if anything.
     """
 
     tensors: Mapping[str, Tensor]
@@ -200,7 +206,8 @@ class Weights:
 class WeightsAudit:
     """The result of loading: `tensors` in the model equal the file, the `allowed_missing` ones do not.
 
-    adapter: what was merged into the file's tensors, in words; empty for nothing.
+    Attributes:
+        adapter: What was merged into the file's tensors, in words; empty for nothing.
     """
 
     sha256: str
@@ -219,10 +226,15 @@ def read_weights(folder: Path, unlisted: Iterable[str] = ()) -> Weights:
     """Read `model.safetensors`, every shard of `model.safetensors.index.json`, or the only `.pt` file.
 
     Of a LoRA adapter its tensors and those of its base, which `load_weights` merges. A `.pt` file is read with
-    `weights_only=True`: it cannot run code. unlisted: tensors that shards may hold although the index does not
-    name them.
-    Raises WeightsError if a file is missing or damaged, if the index and the shards disagree, or if there are two
-    sets of weights; CheckpointError for an adapter that cannot be merged exactly.
+    `weights_only=True`: it cannot run code.
+
+    Args:
+        unlisted: Tensors that shards may hold although the index does not name them.
+
+    Raises:
+        WeightsError: If a file is missing or damaged, if the index and the shards disagree, or if there are two
+            sets of weights.
+        CheckpointError: For an adapter that cannot be merged exactly.
     """
     files = adapter_in(folder)
     return _read_folder(folder, unlisted) if files is None else with_adapter(
@@ -351,11 +363,15 @@ def load_weights(
 ) -> WeightsAudit:
     """Copy `tensors` into `module` and prove that they arrived.
 
-    weights: the files, which give the audit its hash. tensors: the same content under the module's names.
-    allowed_missing: parameters that inference never reads and the file may lack.
-    assign: make `tensors` themselves the parameters instead of copying them; for a module on the meta device.
-    name_in_module: the module's name of a tensor in a file, for the adapter that is merged.
-    Raises WeightsError naming missing, extra, mis-shaped and non-finite tensors; the module is then not used.
+    Args:
+        weights: The files, which give the audit its hash.
+        tensors: The same content under the module's names.
+        allowed_missing: Parameters that inference never reads and the file may lack.
+        assign: Make `tensors` themselves the parameters instead of copying them; for a module on the meta device.
+        name_in_module: The module's name of a tensor in a file, for the adapter that is merged.
+
+    Raises:
+        WeightsError: Naming missing, extra, mis-shaped and non-finite tensors; the module is then not used.
     """
     if builds_sizes_only():
         return WeightsAudit("", True, 0, sum(weight.numel() for weight in module.parameters()), ())

@@ -33,7 +33,10 @@ __all__ = [
 class CheckFailedError(AssertionError):
     """An adapter does not do what a check expects.
 
-    actual, expected: in words. change: what to do; empty where the advice of the check itself fits.
+    Args:
+        actual: In words.
+        expected: As `actual`.
+        change: What to do; empty where the advice of the check itself fits.
     """
 
     def __init__(self, actual: str, expected: str, change: str = "") -> None:
@@ -45,8 +48,11 @@ class CheckFailedError(AssertionError):
 class Check:
     """A promise that every adapter keeps.
 
-    name: of the function. sentence: the promise. change: where to look in an adapter that does not keep it.
-    body: takes a `Subject`; raises CheckFailedError, or SkipTest where the promise is not about this adapter.
+    Attributes:
+        name: Of the function.
+        sentence: The promise.
+        change: Where to look in an adapter that does not keep it.
+        body: Takes a `Subject`; raises CheckFailedError, or SkipTest where the promise is not about this adapter.
     """
 
     name: str
@@ -129,7 +135,12 @@ _FROM_THE_ERROR = "no error"
 class Outcome:
     """The outcome of one check.
 
-    sentence: the promise that was checked. actual, expected, change: of a failure, in words. reason: of a skip.
+    Attributes:
+        sentence: The promise that was checked.
+        actual: Of a failure, in words.
+        expected: As `actual`.
+        change: As `actual`.
+        reason: Of a skip.
     """
 
     name: str
@@ -148,7 +159,8 @@ class Outcome:
 def tried(name: str, sentence: str, change: str, body: Callable[[], object], package: str) -> Outcome:
     """Run a check; whatever the adapter raises is a failure. Ctrl-C is raised.
 
-    package: of the adapter, to name the place of its error. What it changes in this process is put back.
+    Args:
+        package: Of the adapter, to name the place of its error. What it changes in this process is put back.
     """
     try:
         with contained() as interruptions:

@@ -61,7 +61,10 @@ EMBEDDED = "embedded"
 class SourceWeights:
     """The identity of the weights that a policy's network grew from; None for an unknown part.
 
-    checkpoint: their hub id. sha256: as `ModelCard.weights_sha256`. parameters: their count in memory.
+    Attributes:
+        checkpoint: Their hub id.
+        sha256: As `ModelCard.weights_sha256`.
+        parameters: Their count in memory.
     """
 
     checkpoint: str | None = None
@@ -73,19 +76,22 @@ class SourceWeights:
 class ModelCard:
     """The identity of a loaded model: weights, settings and shape.
 
-    settings: everything outside the weights that actions, answers or activations depend on, such as the prompt and
-    the contents of every file a loader reads; part of a run's identity.
-    weights_seed: of an untrained network; None for weights from a file.
-    batch: the largest number of observations per call, None for any; 1 where batching changes the numbers.
-    needs: what every observation must hold besides picture, state and instruction; see `Observation.lacks`.
-    chunk, execute: actions per inference and how many of them are executed; 0 for a model that does not act.
-    ensemble: exponent of the weights with which the plans of overlapping chunks for one step are averaged, the
-    newest with the largest weight; None executes the head of the newest chunk.
-    source: the family of the VLM whose network this policy grew from, if it is one of ours. source_weights: of
-    that family, the weights; None where they are unknown, as for a checkpoint that is not the family's own.
-    repositories: commits of further repositories of the hub that were read, by name: of the base of an adapter, a
-    vision-language model or a tokenizer.
-    exact: False if the weights that ran are only near those of the file, as after quantisation.
+    Attributes:
+        chunk: Actions per inference and how many of them are executed; 0 for a model that does not act.
+        execute: As `chunk`.
+        settings: Everything outside the weights that actions, answers or activations depend on, such as the prompt
+            and the contents of every file a loader reads; part of a run's identity.
+        exact: False if the weights that ran are only near those of the file, as after quantisation.
+        weights_seed: Of an untrained network; None for weights from a file.
+        batch: The largest number of observations per call, None for any; 1 where batching changes the numbers.
+        needs: What every observation must hold besides picture, state and instruction; see `Observation.lacks`.
+        ensemble: Exponent of the weights with which the plans of overlapping chunks for one step are averaged, the
+            newest with the largest weight; None executes the head of the newest chunk.
+        source: The family of the VLM whose network this policy grew from, if it is one of ours.
+        source_weights: Of that family, the weights; None where they are unknown, as for a checkpoint that is not
+            the family's own.
+        repositories: Commits of further repositories of the hub that were read, by name: of the base of an
+            adapter, a vision-language model or a tokenizer.
     """
 
     family: str

@@ -46,9 +46,12 @@ Kind = type[bool] | type[int] | type[float] | type[str]
 class Option:
     """One option of a family.
 
-    kind: bool, int, float or str. help: one line for `probe-kit models NAME`. default: as people read it.
-    choices: the admissible values; empty for any of the kind. is_path: whether it may name a file or folder, which
-    a run finds again wherever its command was typed.
+    Attributes:
+        kind: Bool, int, float or str.
+        help: One line for `probe-kit models NAME`.
+        default: As people read it.
+        choices: The admissible values; empty for any of the kind.
+        is_path: Whether it may name a file or folder, which a run finds again wherever its command was typed.
     """
 
     name: str
@@ -120,11 +123,15 @@ PLAIN: Rotation = "roll-pitch-yaw"
 class ProtocolRow:
     """The settings with which a protocol uses a family.
 
-    execute: actions executed per inference. options: of the family, whatever the checkpoint. of_checkpoint: the
-    ones that only the protocol's own checkpoint needs. rotation: `roll-pitch-yaw` passes the angles of an action
-    on; `axis-angle` passes axis times angle of the same turn on, which the controller then reads as angles.
-    unmatched: what of the protocol cannot be done here. variant: which of several checkpoints it is, as in labels.
-    alternatives: rows of the others; without a checkpoint, the row that holds them is used.
+    Attributes:
+        execute: Actions executed per inference.
+        options: Of the family, whatever the checkpoint.
+        of_checkpoint: The ones that only the protocol's own checkpoint needs.
+        rotation: `roll-pitch-yaw` passes the angles of an action on; `axis-angle` passes axis times angle of the
+            same turn on, which the controller then reads as angles.
+        unmatched: What of the protocol cannot be done here.
+        variant: Which of several checkpoints it is, as in labels.
+        alternatives: Rows of the others; without a checkpoint, the row that holds them is used.
     """
 
     checkpoint: str
@@ -191,8 +198,10 @@ TEXT = ("language", "special")
 class DeclaredStream:
     """A stream of a family at a released size.
 
-    tokens: at a picture of 640 × 480 and an instruction of ten words, about; sizes of runs are estimated by it.
-    roles: what its tokens can be.
+    Attributes:
+        tokens: At a picture of 640 × 480 and an instruction of ten words, about; sizes of runs are estimated by
+            it.
+        roles: What its tokens can be.
     """
 
     stream: Stream
@@ -265,22 +274,24 @@ _UNDECLARED = {
 class Interventions:
     """The interventions that a family supports, to test whether a stream is used.
 
-    Following, the comparison of actions on swapped images or words, every policy supports: it is two
-    inferences.
+    Following, the comparison of actions on swapped images or words, every policy supports: it is two inferences.
 
-    edits: per stored stream the quantities that can be rewritten; None for all that its streams have.
-    unread: streams whose end nothing that acts reads: an edit of the last residual or the final norm there leaves
-    the actions bit for bit, which makes it a control.
-    prompt_kv: whether it keeps keys and values of the prompt that the acting stream reads, see `Model.prompt_kv`.
-    first_affected_token: the first output that an edit of backbone or `kv` reaches through `kv`: 0, or 1 where the
-    prompt's own pass already chooses the first token.
-    attention: whether it records the acting stream's attention to every token of the prompt.
-    tiles: whether it says which of the picture's tokens come of which patches, see `Model.patch_order`.
-    gradients: whether `Policy.differentiable` gives its actions with a graph.
-    readout: `first-chunk` where the first chunk shows where the hand will go; `per-step` where an inference gives
-    one action in discrete bins. Conditions are then evaluated at every call of an unedited episode, not executed.
-    instead: for what is not supported, why and what to do.
-    Raises UsageError for advice on a kind of intervention that does not exist.
+    Attributes:
+        edits: Per stored stream the quantities that can be rewritten; None for all that its streams have.
+        unread: Streams whose end nothing that acts reads: an edit of the last residual or the final norm there
+            leaves the actions bit for bit, which makes it a control.
+        prompt_kv: Whether it keeps keys and values of the prompt that the acting stream reads, see
+            `Model.prompt_kv`.
+        first_affected_token: The first output that an edit of backbone or `kv` reaches through `kv`: 0, or 1 where
+            the prompt's own pass already chooses the first token.
+        attention: Whether it records the acting stream's attention to every token of the prompt.
+        tiles: Whether it says which of the picture's tokens come of which patches, see `Model.patch_order`.
+        gradients: Whether `Policy.differentiable` gives its actions with a graph.
+        readout: `first-chunk` where the first chunk shows where the hand will go; `per-step` where an inference
+            gives one action in discrete bins. Conditions are then evaluated at every call of an unedited episode,
+            not executed.
+        instead: For what is not supported, why and what to do. Raises UsageError for advice on a kind of
+            intervention that does not exist.
     """
 
     edits: Mapping[str, tuple[str, ...]] | None = None

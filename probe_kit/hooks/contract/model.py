@@ -24,8 +24,11 @@ from probe_kit.hooks.contract.sites import Site, Stream, first_of
 class Unembedding:
     """The modules that turn the last residual of a decoder into logits.
 
-    streams: whose last residual it reads; the positions that choose tokens come last. norm, head: modules, called
-    one after the other. softcap: the logits l become softcap · tanh(l / softcap), as in Gemma 2.
+    Attributes:
+        streams: Whose last residual it reads; the positions that choose tokens come last.
+        norm: Modules, called one after the other.
+        head: As `norm`.
+        softcap: The logits l become softcap · tanh(l / softcap), as in Gemma 2.
     """
 
     streams: tuple[str, ...]
@@ -54,7 +57,9 @@ class Unembedding:
 class Rows:
     """One of several equal blocks of a batch: under guidance a module runs 2B rows, and only half are the stream.
 
-    index: which block, counted from 0. blocks: how many.
+    Attributes:
+        index: Which block, counted from 0.
+        blocks: How many.
     """
 
     index: int = 0
@@ -80,18 +85,20 @@ EVERY = slice(None)
 class Tap:
     """An input or output of `module`, called `fires` times per inference, at which a site is read and written.
 
-    tokens: the positions of that (B, T, D) tensor which belong to the site, where one call serves two streams.
-    rows: the block of the batch which belongs to the site, where one call serves several.
-    first: calls of `module` in an inference that come before those of this stream and are passed over.
-    argument: name of the keyword that carries the tensor, where the module is not called with it in first place.
-    view: brings what passes to (B, T, D) where it has another form; it must share memory, so that an edit of the
-    result edits what passes.
-    more: whether an inference may call `module` further times, which belong to no site: where the model itself
-    decides how many tokens it puts out.
+    The residual stream is read at inputs, not outputs: some families drive their layers piecewise or add in place,
+    and then a layer's output is never seen or seen too late. The first submodule of a block is always called with
+    the residual stream itself, so writing into that tensor writes the stream.
 
-    The residual stream is read at inputs, not outputs: some families drive their layers piecewise or add in
-    place, and then a layer's output is never seen or seen too late. The first submodule of a block is always
-    called with the residual stream itself, so writing into that tensor writes the stream.
+    Attributes:
+        tokens: The positions of that (B, T, D) tensor which belong to the site, where one call serves two streams.
+        rows: The block of the batch which belongs to the site, where one call serves several.
+        first: Calls of `module` in an inference that come before those of this stream and are passed over.
+        argument: Name of the keyword that carries the tensor, where the module is not called with it in first
+            place.
+        view: Brings what passes to (B, T, D) where it has another form; it must share memory, so that an edit of
+            the result edits what passes.
+        more: Whether an inference may call `module` further times, which belong to no site: where the model itself
+            decides how many tokens it puts out.
     """
 
     module: nn.Module
@@ -137,12 +144,14 @@ class HeadsTap(Tap):
 class Model(ABC):
     """A network whose activations can be captured: what capture, edits, verification and the store need.
 
-    streams: stored by an extraction. further_streams: captured by naming their sites only, such as vision towers.
-    prompt_kv: the keys and values of the prompt that the acting part reads, block by block, as a stream of the
-    quantities `KV`; captured and edited by naming their sites, such as `kv.02.values`; None where a family
-    has none. Its tokens are the backbone's.
-    role_names: per stream, every role its tokens can play.
-    absent_inputs: inputs that it never reads by design: `instruction`, `state`, `picture` or `picture.CAMERA`.
+    Attributes:
+        streams: Stored by an extraction.
+        further_streams: Captured by naming their sites only, such as vision towers.
+        prompt_kv: The keys and values of the prompt that the acting part reads, block by block, as a stream of the
+            quantities `KV`; captured and edited by naming their sites, such as `kv.02.values`; None where a family
+            has none. Its tokens are the backbone's.
+        role_names: Per stream, every role its tokens can play.
+        absent_inputs: Inputs that it never reads by design: `instruction`, `state`, `picture` or `picture.CAMERA`.
     """
 
     card: ModelCard
@@ -179,7 +188,10 @@ class Model(ABC):
     def read_late_files(self) -> None:
         """Read what is otherwise read at the first inference, such as a tokenizer of another repository.
 
-        Its commit then stands in the card. Raises CheckpointError for what is not here.
+        Its commit then stands in the card.
+
+        Raises:
+            CheckpointError: For what is not here.
         """
         return
 
@@ -234,8 +246,9 @@ class Model(ABC):
     def check(self, observations: Sequence[Observation], seeds: Sequence[int] | None = None) -> None:
         """Refuse what the card rules out; adapters call it first.
 
-        Raises ObservationError for a batch over `card.batch`, an observation without what `card.needs` names, and
-        another number of seeds than of observations.
+        Raises:
+            ObservationError: For a batch over `card.batch`, an observation without what `card.needs` names, and
+                another number of seeds than of observations.
         """
         if seeds is not None and len(seeds) != len(observations):
             raise ObservationError(f"{len(observations)} observations but {len(seeds)} seeds; give each its own")
@@ -258,10 +271,11 @@ class Policy(Model):
 
     Deterministic for given seeds. Capturing changes no action, bit for bit.
 
-    interventions: what of the interventions it supports; a family says the same before it is loaded.
-    flagged: (B,) rows of the last `act` in which the network put out something that is no action; what the row
-    then does is the family's. None for a family that cannot tell.
-    draws_noise: whether noise of the seed enters every inference, as in a flow; None if undeclared.
+    Attributes:
+        interventions: What of the interventions it supports; a family says the same before it is loaded.
+        draws_noise: Whether noise of the seed enters every inference, as in a flow; None if undeclared.
+        flagged: (B,) rows of the last `act` in which the network put out something that is no action; what the row
+            then does is the family's. None for a family that cannot tell.
     """
 
     interventions: ClassVar[Interventions] = ALL_EDITS
@@ -292,8 +306,11 @@ class Policy(Model):
     def record_attention(self, note: Callable[[int, int, Tensor], None]) -> AbstractContextManager[None]:
         """A context in which `note` receives the attention of the acting stream; see `hooks.attention`.
 
-        note: called with a block of the backbone, an iteration, and weights (B, H, S, T): of S acting positions on
-        the backbone's T tokens. No number of the inference may change. Raises UnsupportedInterventionError.
+        Raises UnsupportedInterventionError.
+
+        Args:
+            note: Called with a block of the backbone, an iteration, and weights (B, H, S, T): of S acting
+                positions on the backbone's T tokens. No number of the inference may change.
         """
         del note
         self.interventions.check("attention", self.card.family)
@@ -306,7 +323,9 @@ class Policy(Model):
 
         For `hooks.gradients_at`. Weights need no gradient, no module is compiled, attention is eager, and numbers
         equal those of `act` to 1e-5 in float32. A number without a slope, such as a gripper that is open or
-        closed, has gradient zero. Raises UnsupportedInterventionError.
+        closed, has gradient zero.
+
+        Raises UnsupportedInterventionError.
         """
         del observations, seeds
         self.interventions.check("gradients", self.card.family)
@@ -322,7 +341,8 @@ class Policy(Model):
     def with_cameras(self, cameras: Sequence[str]) -> "Policy":
         """The same policy, given pictures of these cameras; all but the first from `Observation.cameras`.
 
-        Raises ObservationError for cameras that it cannot be given together.
+        Raises:
+            ObservationError: For cameras that it cannot be given together.
         """
         if tuple(cameras) != self.card.cameras[:1]:
             raise ObservationError(
@@ -342,7 +362,8 @@ class Policy(Model):
     def unusual_states(self, states: NDArray[np.float32]) -> NDArray[np.bool_]:
         """(n, D) which numbers of recorded states (n, D) lie far outside the checkpoint's own statistics.
 
-        Raises CheckpointError for a checkpoint without statistics.
+        Raises:
+            CheckpointError: For a checkpoint without statistics.
         """
         return np.zeros(states.shape, bool)
 
@@ -369,7 +390,8 @@ class Policy(Model):
     def predict(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
         """One chunk of actions per recorded observation, in the checkpoint's own units and width.
 
-        Returns (B, chunk, D) float32. It makes no claim that the actions fit an arm; states are taken as recorded.
+        Returns:
+            (B, chunk, D) float32. It makes no claim that the actions fit an arm; states are taken as recorded.
         """
         return self.act(observations, seeds)
 
@@ -377,9 +399,11 @@ class Policy(Model):
     def act(self, observations: Sequence[Observation], seeds: Sequence[int]) -> NDArray[np.float32]:
         """One chunk of actions per observation.
 
-        Returns (B, chunk, 7) float32: xyz delta in metres and roll-pitch-yaw delta in radians in the robot
-        base frame, gripper 1 = open and 0 = closed, at 5 Hz. All randomness of a row comes from its seed.
         Raises InstructionError or ObservationError for what the policy cannot take in whole.
+
+        Returns:
+            (B, chunk, 7) float32: xyz delta in metres and roll-pitch-yaw delta in radians in the robot base frame,
+            gripper 1 = open and 0 = closed, at 5 Hz. All randomness of a row comes from its seed.
         """
 
 
@@ -387,11 +411,12 @@ class Policy(Model):
 class Prompt:
     """A question about an observation.
 
-    text: the whole question as a person would ask it; the family puts its frame around it.
-    options: how the admissible answers begin, such as letters; the logits of their first tokens are compared. They
-    stand directly behind the frame, so an option in front begins with `AnswerModel.lead`.
-    begun: how the answer has begun already, put behind the frame; it begins with `AnswerModel.lead` too.
-    pictured: whether the picture is shown; False asks in words alone.
+    Attributes:
+        text: The whole question as a person would ask it; the family puts its frame around it.
+        options: How the admissible answers begin, such as letters; the logits of their first tokens are compared.
+            They stand directly behind the frame, so an option in front begins with `AnswerModel.lead`.
+        begun: How the answer has begun already, put behind the frame; it begins with `AnswerModel.lead` too.
+        pictured: Whether the picture is shown; False asks in words alone.
     """
 
     observation: Observation
@@ -405,10 +430,11 @@ class Prompt:
 class Reading:
     """The result of one prefill.
 
-    option_logits: (B, options) float32, one column per option of the questions, in their order.
-    option_mass: (B,) float32 share of the next token's probability that lies on the options together.
-    option_ids: (B, options) int64 tokens of the options; None if the model does not say them.
-    state: from which `AnswerModel.speak` continues; opaque to all other code.
+    Attributes:
+        option_logits: (B, options) float32, one column per option of the questions, in their order.
+        option_mass: (B,) float32 share of the next token's probability that lies on the options together.
+        state: From which `AnswerModel.speak` continues; opaque to all other code.
+        option_ids: (B, options) int64 tokens of the options; None if the model does not say them.
     """
 
     option_logits: NDArray[np.float32]
@@ -420,7 +446,8 @@ class Reading:
     def of(cls, logits: NDArray[np.float32], options: Sequence[Sequence[int]], state: Any = None) -> "Reading":
         """Return the reading of the logits (B, V) behind every prompt. options: per row, the ids of its options.
 
-        Raises UsageError for options of a question that have the same id, or another number than their neighbours.
+        Raises:
+            UsageError: For options of a question that have the same id, or another number than their neighbours.
         """
         if len({len(row) for row in options}) > 1:
             raise UsageError("the questions of one call have different numbers of options; ask them in several")
@@ -448,7 +475,8 @@ Measured on small models, batches against single rows: logits move by 1e-5 in fl
 class AnswerModel(Model):
     """A model that answers questions in text. Being asked is one inference, as `capture` counts it.
 
-    whole_prompt: whether the backbone's stream has the last position of the prompt, where the answer begins.
+    Attributes:
+        whole_prompt: Whether the backbone's stream has the last position of the prompt, where the answer begins.
     """
 
     whole_prompt: bool = False
@@ -469,6 +497,7 @@ class AnswerModel(Model):
         """One prefill of all questions, which must have equally many options: every tap fires as promised.
 
         Questions with and without a picture do not go together in one call.
+
         Raises InstructionError or ObservationError for what the model cannot take in whole, UsageError for an
         option that changes the prompt's own tokens, or begins like another one.
         """

@@ -14,11 +14,12 @@ from probe_kit.errors import ObservationError
 class Observation:
     """The inputs of a model at one moment.
 
-    image: (H, W, 3) uint8, the third-person camera.
-    state: (8,) float32: TCP x, y, z in metres in the robot base frame, roll, pitch, yaw in radians relative
-    to the gripper pointing down, 0, gripper openness in [0, 1].
-    intrinsics: (3, 3) float32 pinhole matrix in pixels of `image`, x to the right and y down; None if unknown.
-    cameras: further pictures (H, W, 3) uint8 by the name of their camera.
+    Attributes:
+        image: (H, W, 3) uint8, the third-person camera.
+        state: (8,) float32: TCP x, y, z in metres in the robot base frame, roll, pitch, yaw in radians relative to
+            the gripper pointing down, 0, gripper openness in [0, 1].
+        intrinsics: (3, 3) float32 pinhole matrix in pixels of `image`, x to the right and y down; None if unknown.
+        cameras: Further pictures (H, W, 3) uint8 by the name of their camera.
     """
 
     image: NDArray[np.uint8]
@@ -58,9 +59,10 @@ _EMPTY, _GRIPPER = 6, 7
 def laid_out(state: NDArray[np.float32], numbers: int, openness: str = "measured") -> NDArray[np.float32]:
     """(..., numbers) float32 of (..., 8): `Observation.state`, without its empty place where 7 numbers are read.
 
-    openness: `measured` is 0 closed to 1 open. `release` is what Act2Answer's evaluation calls so: 1 minus the
-    finger joint in metres, 0.985 closed and 0.963 open, so that both look alike.
-    For any other count, and for a state of another size, the numbers stay as they are; who reads them refuses.
+    Args:
+        openness: `measured` is 0 closed to 1 open. `release` is what Act2Answer's evaluation calls so: 1 minus the
+            finger joint in metres, 0.985 closed and 0.963 open, so that both look alike. For any other count, and
+            for a state of another size, the numbers stay as they are; who reads them refuses.
     """
     rows = np.array(state, np.float32)
     if rows.shape[-1] != ARM_NUMBERS:

@@ -77,10 +77,17 @@ class Roles:
 def pool(tokens: Tensor, roles: Roles, views: Sequence[str]) -> Tensor:
     """Pooled views of one sequence, reduced in float32 on the device of `tokens`.
 
-    tokens: (..., T, D), any float dtype. views: as in `view_names`.
-    Returns (..., V, D) float32. Padding enters no view.
-    Raises EmptyRoleError for a view without a token, RolesMismatchError for roles of another length,
-    UnknownSiteError for an unknown view.
+    Args:
+        tokens: (..., T, D), any float dtype.
+        views: As in `view_names`.
+
+    Returns:
+        (..., V, D) float32. Padding enters no view.
+
+    Raises:
+        EmptyRoleError: For a view without a token.
+        RolesMismatchError: For roles of another length.
+        UnknownSiteError: For an unknown view.
     """
     if tokens.shape[-2] != len(roles):
         raise RolesMismatchError(
@@ -93,7 +100,9 @@ def pool(tokens: Tensor, roles: Roles, views: Sequence[str]) -> Tensor:
 def prepare_pool(roles: Iterable[Roles], views: Sequence[str], device: torch.device | str) -> None:
     """Bring to `device` what `pool` needs for these roles, which otherwise happens while the model runs.
 
-    Raises EmptyRoleError and UnknownSiteError as `pool` does.
+    Raises:
+        EmptyRoleError: As `pool` does.
+        UnknownSiteError: As `pool` does.
     """
     indexed_device = torch.device(device)
     if indexed_device.type == "cuda" and indexed_device.index is None:

@@ -42,13 +42,15 @@ _LABELS = {"expert": "action expert", "action": "action tokens", "answer": "answ
 class Site:
     """One named tensor: `backbone.07.residual`, `expert.03.residual@4`.
 
-    stream: a stream of the model, such as `backbone` (VLM) or `expert` (action part); see `Stream.part`.
-    layer, quantity: `residual` is the stream *entering* block `layer`; 0 is the embeddings, the last one enters
-    the final norm. `attention` and `mlp` are what block `layer` adds to it, as it is added: behind a norm, gate or
-    scale, where the family has one. `final_norm` is its normed end. `heads` is what the block's attention heads
-    read, see `HEADS`. A family may declare further quantities.
-    iteration: flow-matching step, counted from 0 (pure noise); for action tokens, the token; the camera, for
-    `vision` with several of them; None where the stream runs once.
+    Attributes:
+        stream: A stream of the model, such as `backbone` (VLM) or `expert` (action part); see `Stream.part`.
+        layer: `residual` is the stream *entering* block `layer`; 0 is the embeddings, the last one enters the
+            final norm. `attention` and `mlp` are what block `layer` adds to it, as it is added: behind a norm,
+            gate or scale, where the family has one. `final_norm` is its normed end. `heads` is what the block's
+            attention heads read, see `HEADS`. A family may declare further quantities.
+        quantity: As `layer`.
+        iteration: Flow-matching step, counted from 0 (pure noise); for action tokens, the token; the camera, for
+            `vision` with several of them; None where the stream runs once.
     """
 
     stream: str
@@ -79,18 +81,19 @@ class Site:
 class Stream:
     """The shape and meaning of one residual stream.
 
-    layers: number of residual sites, one more than the number of blocks.
-    width: features per token.
-    iterations: flow-matching steps or action tokens per inference, or None where the stream runs once.
-    part: of the model it belongs to: `backbone` (VLM), `action` (where the action is made: an expert, or the
-    positions that choose action tokens), `vision`, or `bridge` between them.
-    label: what people read; default the name in plain words.
-    quantities: what can be captured of it; `residual` always.
-    probed: whether peaks, retention and default probes use it; False for the unconditional half of guidance.
-    sums: whether residual + attention + mlp make the next residual; False where something else enters between
-    blocks, such as DeepStack's pictures.
-    heads: attention heads of every block, where the family taps the quantity `heads`; 0 where it does not.
-    Raises UsageError for an unknown part, or none where the name does not tell it.
+    Attributes:
+        layers: Number of residual sites, one more than the number of blocks.
+        width: Features per token.
+        iterations: Flow-matching steps or action tokens per inference, or None where the stream runs once.
+        part: Of the model it belongs to: `backbone` (VLM), `action` (where the action is made: an expert, or the
+            positions that choose action tokens), `vision`, or `bridge` between them.
+        label: What people read; default the name in plain words.
+        quantities: What can be captured of it; `residual` always.
+        probed: Whether peaks, retention and default probes use it; False for the unconditional half of guidance.
+        sums: Whether residual + attention + mlp make the next residual; False where something else enters between
+            blocks, such as DeepStack's pictures.
+        heads: Attention heads of every block, where the family taps the quantity `heads`; 0 where it does not.
+            Raises UsageError for an unknown part, or none where the name does not tell it.
     """
 
     name: str
@@ -124,7 +127,9 @@ class Stream:
         """All sites of one quantity, ordered by iteration, then layer.
 
         `final_norm` exists once, behind the last block; `residual` per layer; every other quantity per block.
-        Raises UnknownSiteError for a quantity that this stream does not have.
+
+        Raises:
+            UnknownSiteError: For a quantity that this stream does not have.
         """
         if quantity not in self.captured:
             raise UnknownSiteError(

@@ -27,8 +27,9 @@ _PACKAGE = "package"
 def write_adapter(name: str, folder: Path | str | None = None) -> list[Path]:
     """Write the package of the family `name` into `folder`, by default one of its name; returns its files.
 
-    Raises UsageError for a name that no family can have or that one has, for that of an installed module, and for
-    a folder that holds anything.
+    Raises:
+        UsageError: For a name that no family can have or that one has, for that of an installed module, and for a
+            folder that holds anything.
     """
     if not _NAME.fullmatch(name) or keyword.iskeyword(name):
         raise UsageError(

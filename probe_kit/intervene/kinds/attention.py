@@ -50,9 +50,11 @@ ROLES = ("image", *TILES, "language", "state", "special")
 class AttentionReadout(Intervention):
     """Two inferences per episode, or with the readout `per-step` per call of it: clean, and recorded.
 
-    roles: of the backbone's tokens; empty for `ROLES`, as many of them as the family has. `all` is always
-    recorded: what is missing to 1 lies on the acting part's own tokens. Raises UsageError for a role that comes
-    twice."""
+    Attributes:
+        roles: Of the backbone's tokens; empty for `ROLES`, as many of them as the family has. `all` is always
+            recorded: what is missing to 1 lies on the acting part's own tokens. Raises UsageError for a role that
+            comes twice.
+    """
 
     kind: ClassVar[str] = ATTENTION
     summary: ClassVar[str] = "Shares of the acting stream's attention (descriptive)."
@@ -86,7 +88,8 @@ class AttentionReadout(Intervention):
     ) -> dict[str, bytes]:
         """The attention of every inference; the certificate gets the axes of the array.
 
-        Raises CaptureChangedActionError if recording changed an action.
+        Raises:
+            CaptureChangedActionError: If recording changed an action.
         """
         largest = float(outcomes.max_action_change.max(initial=0.0))
         if largest:
@@ -172,8 +175,9 @@ def attention_recorded(
 ) -> Condition:
     """Return the clean inference with attention weights recorded; nothing is changed.
 
-    stream: whose tokens are attended to. boxes: by camera (patches, 4) where its patches lie; empty where the
-    family does not say.
+    Args:
+        stream: Whose tokens are attended to.
+        boxes: By camera (patches, 4) where its patches lie; empty where the family does not say.
     """
 
     def play(context: ConditionContext) -> ConditionResult:
@@ -208,9 +212,12 @@ def _on_patches(mass: "AttentionMass", masks: Sequence[NDArray[np.bool_]]) -> ND
 class PatchAttention:
     """The attention of N inferences on the P patches of the cameras' pictures.
 
-    episodes, calls: (N,), as of `AttentionShares`. weights: (N, B, P) float16, shares of the acting stream's
-    attention, means over iterations and heads. cameras: (P,) names, those of a camera together. boxes: (P, 4), see
-    `token_boxes`.
+    Attributes:
+        episodes: (N,), as of `AttentionShares`.
+        calls: As `episodes`.
+        weights: (N, B, P) float16, shares of the acting stream's attention, means over iterations and heads.
+        cameras: (P,) names, those of a camera together.
+        boxes: (P, 4), see `token_boxes`.
     """
 
     episodes: NDArray[np.str_]
@@ -253,8 +260,13 @@ def stored_patch_attention(run: RunReader) -> dict[str, PatchAttention]:
 def shares_by_role(mass: "AttentionMass", masks: Sequence[NDArray[np.bool_] | None]) -> NDArray[np.float32]:
     """(B, I, H, R) shares by block, iteration, head and role.
 
-    NaN where a block is not read in an iteration, and of a role that no token has. Of one observation. masks: (T,)
-    each, None for no token. Raises CaptureError for blocks with different numbers of heads.
+    NaN where a block is not read in an iteration, and of a role that no token has. Of one observation.
+
+    Args:
+        masks: (T,) each, None for no token.
+
+    Raises:
+        CaptureError: For blocks with different numbers of heads.
     """
     shapes = {weights.shape[:2] for weights in mass.by_head.values()}
     if len(shapes) != 1 or next(iter(shapes))[0] != 1:
@@ -287,9 +299,14 @@ Shares = NDArray[np.float64]
 class AttentionShares:
     """Attention of N inferences. roles: names of R, the first one `all`.
 
-    episodes, groups, categories, sides: (N,), `sides` those of the correct picture. calls: (N,) inference of the
-    episode, counted from 0. mass: (N, B, I, H, R) float32 shares; NaN where a block is not read in an iteration
-    and of roles that no token of an inference plays, such as a tile behind the arm.
+    Attributes:
+        episodes: (N,), `sides` those of the correct picture.
+        groups: As `episodes`.
+        categories: As `episodes`.
+        sides: As `episodes`.
+        calls: (N,) inference of the episode, counted from 0.
+        mass: (N, B, I, H, R) float32 shares; NaN where a block is not read in an iteration and of roles that no
+            token of an inference plays, such as a tile behind the arm.
     """
 
     roles: tuple[str, ...]
@@ -332,7 +349,8 @@ class AttentionShares:
     def rows(self, by: Sequence[Axis] = ("block", "iteration", "head")) -> "list[AttentionRow]":
         """One per category, role and place along the axes `by`; means over the others, every episode alike.
 
-        Raises UsageError for an axis that does not exist.
+        Raises:
+            UsageError: For an axis that does not exist.
         """
         if unknown := set(by) - set(get_args(Axis)):
             raise UsageError(f"attention has no axis {min(unknown)!r}; it has {', '.join(get_args(Axis))}")
@@ -399,7 +417,11 @@ class AttentionShares:
 class AttentionRow(Effect):
     """The share of the attention on one role's tokens, in one category.
 
-    block, iteration, head, call: of which; None for the mean over all.
+    Attributes:
+        block: Of which; None for the mean over all.
+        iteration: As `block`.
+        head: As `block`.
+        call: As `block`.
     """
 
     role: str

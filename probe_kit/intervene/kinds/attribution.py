@@ -63,7 +63,8 @@ _LEGEND = (
 def _estimated(cell: Cell, by_row: Mapping[tuple[int, int], float]) -> Condition:
     """Return no inference: the clean action, and by how much an estimate says that patching a cell moves it.
 
-    by_row: displacement by row and step of the run.
+    Args:
+        by_row: Displacement by row and step of the run.
     """
 
     def play(context: ConditionContext) -> ConditionResult:
@@ -77,9 +78,13 @@ def _estimated(cell: Cell, by_row: Mapping[tuple[int, int], float]) -> Condition
 class AttributionPatching(Intervention):
     """An estimate for every cell, from one backward pass per episode, and exact patches of some of them.
 
-    sites, roles: of the cells. ends: where gradients are taken, see `Ends`. top: cells of each kind with the
-    largest estimates that are patched exactly; controls: so many more, drawn from the rest with `seed`. The
-    anchors are patched exactly too: all of `kv`, and all tokens of each layer of the backbone with a cell.
+    Attributes:
+        sites: Of the cells.
+        roles: As `sites`.
+        ends: Where gradients are taken, see `Ends`.
+        top: Cells of each kind with the largest estimates that are patched exactly.
+        controls: So many more, drawn from the rest with `seed`. The anchors are patched exactly too: all of `kv`,
+            and all tokens of each layer of the backbone with a cell.
     """
 
     kind: ClassVar[str] = NAME

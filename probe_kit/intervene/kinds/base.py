@@ -58,12 +58,18 @@ class Intervention(Choice, ABC):
     source has of its donor, empty for `usual_vary`. frames: of an episode, evenly spaced; None for 4. pairs: of
     the user's own, episode and frame of the clean inference and of its donor.
 
-    Of the class. kind: its name on the command line. summary: a line of help. position: in help. options: those of
-    `OPTIONS` that it takes, and their meaning; another one raises UsageError. needs:
-    the interventions that a family must support, besides those of the fields `sites` and `roles`. fits_always:
-    whether items are inferred beforehand. has_verdict: whether `classify_use` classifies its rows. is_descriptive:
-    whether it edits and tests nothing. asks_where: whether it edits places of the network, so that a line says
-    which layer matters. needs_sides: whether it applies to runs of the scene alone.
+    Of the class. kind: its name on the command line.
+
+    Attributes:
+        summary: A line of help.
+        position: In help.
+        options: Those of `OPTIONS` that it takes, and their meaning; another one raises UsageError. needs: the
+            interventions that a family must support, besides those of the fields `sites` and `roles`. fits_always:
+            whether items are inferred beforehand.
+        has_verdict: Whether `classify_use` classifies its rows. is_descriptive: whether it edits and tests
+            nothing.
+        asks_where: Whether it edits places of the network, so that a line says which layer matters.
+        needs_sides: Whether it applies to runs of the scene alone.
     """
 
     summary: ClassVar[str]
@@ -218,11 +224,13 @@ NONE = "none"
 class AlongDirection(Intervention):
     """An intervention along a direction, with matched random ones as controls.
 
-    direction: `mean-difference` or `probe`, one vector per place found in means over tokens without the episode it
-    is used on; `mean-difference:K`, K directions found in the tokens themselves, see `directions`; FILE#NAME, see
-    `direction_files`; some kinds take `none`. controls: so many random directions of the data's own covariance,
-    orthogonal to it. vector: of a file; then `direction` is its name. takes_none: of the class, whether tokens may
-    be edited along no direction.
+    Attributes:
+        takes_none: Of the class, whether tokens may be edited along no direction.
+        direction: `mean-difference` or `probe`, one vector per place found in means over tokens without the
+            episode it is used on; `mean-difference:K`, K directions found in the tokens themselves, see
+            `directions`; FILE#NAME, see `direction_files`; some kinds take `none`.
+        controls: So many random directions of the data's own covariance, orthogonal to it.
+        vector: Of a file; then `direction` is its name.
     """
 
     takes_none: ClassVar[bool] = True
@@ -311,11 +319,18 @@ class ConditionName:
 class EffectRow(Effect):
     """The effect of one edit in one category, with the columns that all kinds of edits have.
 
-    sites: that were edited. role: of the tokens. direction: empty if they were edited in full. net, net_ci: share
-    of episodes that do with the edit what the kind counts, such as a flip to the target side, minus the share that
-    do the reverse, with its 95 % interval by groups. max_action_change: largest difference in any
-    action of any episode; 0 is bit for bit. fires, no_op_fires: of edited sites in all episodes, and those that
-    changed nothing. relative_change: how far tokens were moved, in their own norms. key: of the intervention.
+    Attributes:
+        sites: That were edited.
+        role: Of the tokens.
+        direction: Empty if they were edited in full.
+        net: Share of episodes that do with the edit what the kind counts, such as a flip to the target side, minus
+            the share that do the reverse, with its 95 % interval by groups.
+        net_ci: As `net`.
+        max_action_change: Largest difference in any action of any episode; 0 is bit for bit.
+        fires: Of edited sites in all episodes, and those that changed nothing.
+        no_op_fires: As `fires`.
+        relative_change: How far tokens were moved, in their own norms.
+        key: Of the intervention.
     """
 
     sites: str
@@ -341,8 +356,11 @@ class EffectRow(Effect):
 def common_columns(outcomes: ConditionOutcomes, row: int, name: ConditionName, gains: Values) -> dict[str, Any]:
     """Return the columns of `EffectRow` of one condition.
 
-    outcomes: of one category. row: of the condition in them. gains: (E,) 1 where an episode does with the edit
-    what the kind counts and did not without it, −1 for the reverse.
+    Args:
+        outcomes: Of one category.
+        row: Of the condition in them.
+        gains: (E,) 1 where an episode does with the edit what the kind counts and did not without it, −1 for the
+            reverse.
     """
     logged = dict(zip(LOG_FIELDS, outcomes.edit_log[row].T, strict=True))
     norm = float((logged["norm"] * logged["fires"]).sum())
@@ -372,8 +390,11 @@ def net_interval(gains: Values, outcomes: ConditionOutcomes) -> tuple[float, flo
 class ControlTest(NamedTuple):
     """One condition against its controls. controls: their rows. beyond: (E,) its values less their mean.
 
-    t, p, p_fwe: one-sided, by sign flips of whole groups; p_fwe against the largest t of the category. All are
-    None for a condition that is not tested.
+    Attributes:
+        t: One-sided, by sign flips of whole groups; p_fwe against the largest t of the category. All are None for
+            a condition that is not tested.
+        p: As `t`.
+        p_fwe: As `t`.
     """
 
     controls: list[int]
@@ -393,9 +414,12 @@ def compare_with_controls(
 ) -> list[ControlTest]:
     """Compare every condition that is no control with its own controls, in the order of the conditions.
 
-    values: (K, E) tested to be above zero. names: of the K conditions. outcomes: of one category. skipped: rows
-    that are not tested though they are no controls, such as an identity patch. broken_controls: rows of controls
-    that nothing is compared with, such as those that disrupt the task.
+    Args:
+        values: (K, E) tested to be above zero.
+        names: Of the K conditions.
+        outcomes: Of one category.
+        skipped: Rows that are not tested though they are no controls, such as an identity patch.
+        broken_controls: Rows of controls that nothing is compared with, such as those that disrupt the task.
     """
     controls = [
         [at for at, other in enumerate(names) if other.is_control_of(name) and at not in broken_controls]
@@ -458,8 +482,10 @@ def effect_table[Row](
 ) -> "Table":
     """Return a table.
 
-    names: headings of the columns that name a line. lines: these names and the row of each. parts: by title, the
-    text of a row's cell by column.
+    Args:
+        names: Headings of the columns that name a line.
+        lines: These names and the row of each.
+        parts: By title, the text of a row's cell by column.
     """
     from probe_kit._tables.table import Cell, Heading, Table, grouped
 

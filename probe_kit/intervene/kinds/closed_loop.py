@@ -87,9 +87,11 @@ def identity_patch(sites: Sequence[Site]) -> Condition:
 class ClosedLoop(AlongDirection):
     """Interchange at a few targets in closed loop: identity patch, image swap, every target and its controls.
 
-    targets: `PLACE|ROLE`, such as `backbone.02|image`; see `best_patch_targets`. direction: as of `Interchange`;
-    a target is also patched within it, and within `controls` random ones of the data's own covariance, where a
-    place is one site and the role no tile; `none` for neither. Every target is also patched in full.
+    Attributes:
+        targets: `PLACE|ROLE`, such as `backbone.02|image`; see `best_patch_targets`.
+        direction: As of `Interchange`; a target is also patched within it, and within `controls` random ones of
+            the data's own covariance, where a place is one site and the role no tile; `none` for neither. Every
+            target is also patched in full.
     """
 
     kind: ClassVar[str] = "closed-loop"
@@ -119,7 +121,8 @@ class ClosedLoop(AlongDirection):
     def from_options(cls, run: Run, **options: Any) -> Self:
         """Return it at the named sites and roles, else at `best_patch_targets`.
 
-        Raises UsageError for roles without sites.
+        Raises:
+            UsageError: For roles without sites.
         """
         sites, roles = options.pop("sites", None), options.pop("roles", None)
         if roles and not sites:
@@ -239,14 +242,23 @@ KIND = ClosedLoop
 class ClosedLoopEffect(EffectRow):
     """The effect of one edit on whole episodes, in one category; see `EffectRow`.
 
-    correct, wrong, in_zone: shares of episodes. wrong_in_zone: share of wrong ones among those in a zone; None if
-    there is none. net: share of episodes that end wrong minus that without the edit; net_left, net_right: by the
-    side of the wrong picture. control_net: mean of its controls that do not disrupt the task. gained, lost:
-    episodes that end wrong only with the edit, and only without; p_mcnemar: exact and two-sided, episodes of an
-    item taken as independent, so that it is no verdict. t, p, p_fwe: of net beyond the controls', one-sided, by
-    sign flips of whole groups; p_fwe against the largest t of the category; None for what enters no verdict.
-    disrupted: whether the cube is in a zone less than half as often. max_action_change: of any number of any
-    trajectory.
+    Attributes:
+        correct: Shares of episodes.
+        wrong: As `correct`.
+        in_zone: As `correct`.
+        wrong_in_zone: Share of wrong ones among those in a zone; None if there is none. net: share of episodes
+            that end wrong minus that without the edit.
+        net_left: By the side of the wrong picture.
+        net_right: As `net_left`.
+        control_net: Mean of its controls that do not disrupt the task. gained, lost: episodes that end wrong only
+            with the edit, and only without.
+        p_mcnemar: Exact and two-sided, episodes of an item taken as independent, so that it is no verdict.
+        t: Of net beyond the controls', one-sided, by sign flips of whole groups; p_fwe against the largest t of
+            the category; None for what enters no verdict.
+        p: As `t`.
+        p_fwe: As `t`.
+        disrupted: Whether the cube is in a zone less than half as often. max_action_change: of any number of any
+            trajectory.
     """
 
     correct: float

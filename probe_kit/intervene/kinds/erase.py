@@ -81,9 +81,12 @@ _LEGEND = (
 class ConceptErasure(Intervention):
     """Every place and role: written back as it was, erased, and with matched random subspaces taken away instead.
 
-    sites: patterns of places of one site each. roles: whose tokens. method: see `erasers.Method`. controls:
-    so many of the same rank. What erases an episode was fitted on the tokens of the other folds' episodes, of the
-    items that are played. Raises UsageError for a method that does not exist.
+    Attributes:
+        sites: Patterns of places of one site each.
+        roles: Whose tokens.
+        method: See `erasers.Method`. controls: so many of the same rank. What erases an episode was fitted on the
+            tokens of the other folds' episodes, of the items that are played. Raises UsageError for a method that
+            does not exist.
     """
 
     kind: ClassVar[str] = "erase"
@@ -220,7 +223,8 @@ def _name_of(cell: Cell, name: str) -> str:
 def erased(cell: Cell, name: str, erasers: Mapping[str, Eraser]) -> Condition:
     """Return the clean inference with the tokens of one cell without what an eraser takes away.
 
-    erasers: by episode, fitted without it; empty to write back what is there.
+    Args:
+        erasers: By episode, fitted without it; empty to write back what is there.
     """
 
     def play(context: ConditionContext) -> ConditionResult:
@@ -275,14 +279,20 @@ def _probe_accuracy(features: "TokenFeatures", fits: Sequence[tuple[Fold, Eraser
 class ErasureEffect(EffectRow):
     """The effect on the action of erasing an answer at one place, in one category; see `EffectRow`.
 
-    right_before, right: share of episodes whose action goes to the correct picture's side, without and with the
-    edit. share_left: of how far actions go to the correct side; None if they do not go there, because a share of
-    noise is noise. net: share of episodes that no longer go there minus those that do now. mean_displacement:
-    metres away from the correct side. control_share_left, control_net, control_displacement: means of the
-    controls. p: exact and one-sided, that an item's action moves away from the correct picture farther than
-    under the controls, by items and by groups, the larger one. p_fwe: of the same, by sign flips of whole groups
-    against the largest t of the category. probe_accuracy_before, probe_accuracy: held-out accuracy of a fresh
-    probe on the mean over tokens.
+    Attributes:
+        right_before: Share of episodes whose action goes to the correct picture's side, without and with the edit.
+        right: As `right_before`.
+        share_left: Of how far actions go to the correct side; None if they do not go there, because a share of
+            noise is noise. net: share of episodes that no longer go there minus those that do now.
+            mean_displacement: metres away from the correct side.
+        control_share_left: Means of the controls.
+        control_net: As `control_share_left`.
+        control_displacement: As `control_share_left`.
+        p: Exact and one-sided, that an item's action moves away from the correct picture farther than under the
+            controls, by items and by groups, the larger one.
+        p_fwe: Of the same, by sign flips of whole groups against the largest t of the category.
+        probe_accuracy_before: Held-out accuracy of a fresh probe on the mean over tokens.
+        probe_accuracy: As `probe_accuracy_before`.
     """
 
     right_before: float

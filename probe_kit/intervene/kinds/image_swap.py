@@ -82,12 +82,18 @@ DECIDES = 0.5
 class InputEffect(Effect):
     """The effect of one input, in one category, without sides; sizes are in spreads of clean actions.
 
-    vary: the input that was exchanged for a donor's. changed: share of pairs in which any number of the action
-    changed; 0 means that the input does not arrive. size, control_size, full_size: mean size of the change by the
-    donor's input, by its control and by all of the donor's inputs. share, share_ci: displacement toward the
-    donor's action by this input, as a share of the exchange of all inputs, with its 95 % interval by groups; None
-    where that changes nothing. p: exact and one-sided, that the change is larger than the control's, by items and
-    by groups, the larger one. finding: `decides`, `moves`, `no effect` within the bound, or `open`.
+    Attributes:
+        vary: The input that was exchanged for a donor's.
+        changed: Share of pairs in which any number of the action changed; 0 means that the input does not arrive.
+        size: Mean size of the change by the donor's input, by its control and by all of the donor's inputs.
+        control_size: As `size`.
+        full_size: As `size`.
+        share: Displacement toward the donor's action by this input, as a share of the exchange of all inputs, with
+            its 95 % interval by groups; None where that changes nothing.
+        share_ci: As `share`.
+        p: Exact and one-sided, that the change is larger than the control's, by items and by groups, the larger
+            one.
+        finding: `decides`, `moves`, `no effect` within the bound, or `open`.
     """
 
     vary: str
@@ -192,8 +198,10 @@ def _describe_input(row: InputEffect) -> str:
 class Reach(NamedTuple):
     """The lateral distance between a policy's own two choices.
 
-    metres: more than zero. source: `actions`, the clean inferences of all categories, or `tiles`, the distance
-    between the tiles, where too few inferences go to one of the sides.
+    Attributes:
+        metres: More than zero.
+        source: `actions`, the clean inferences of all categories, or `tiles`, the distance between the tiles,
+            where too few inferences go to one of the sides.
     """
 
     metres: float
@@ -217,16 +225,25 @@ class Reach(NamedTuple):
 class ImageSwapEffect(Effect):
     """The effect of a swap on the actions, in one category.
 
-    follow_rate: share of episodes in which the action goes to the correct picture, and to the other side once the
-    two are swapped; reversal_rate: in which it does the reverse. net_follow_rate: their
-    difference, with its 95 % interval by groups. follow_p, reversal_p: exact, one-sided: an item's action moves
-    toward (away from) the correct picture more often than by chance; the larger of by items and by groups.
-    median_displacement: metres between the two actions. reach, reach_source: see `Reach`. reach_share: mean
-    displacement toward the correct picture in units of the reach, 1 for a whole change of sides, with Student's
-    95 % interval by groups. moved_share: the same whichever way the action moves. left_reached, right_reached: of
-    the episodes with the correct picture on that side, the share that reaches it (beyond a quarter of the reach
-    from the middle), minus that share with swapped images. readout: `first-chunk` or `per-step`, of all
-    displacements. key: of the stored intervention.
+    Attributes:
+        follow_rate: Share of episodes in which the action goes to the correct picture, and to the other side once
+            the two are swapped.
+        reversal_rate: In which it does the reverse.
+        net_follow_rate: Their difference, with its 95 % interval by groups.
+        follow_p: Exact, one-sided: an item's action moves toward (away from) the correct picture more often than
+            by chance; the larger of by items and by groups.
+        reversal_p: As `follow_p`.
+        median_displacement: Metres between the two actions.
+        reach: See `Reach`.
+        reach_source: As `reach`.
+        reach_share: Mean displacement toward the correct picture in units of the reach, 1 for a whole change of
+            sides, with Student's 95 % interval by groups.
+        moved_share: The same whichever way the action moves.
+        left_reached: Of the episodes with the correct picture on that side, the share that reaches it (beyond a
+            quarter of the reach from the middle), minus that share with swapped images.
+        right_reached: As `left_reached`.
+        readout: `first-chunk` or `per-step`, of all displacements.
+        key: Of the stored intervention.
     """
 
     n_episodes: int
@@ -313,8 +330,12 @@ def swap_responses_by_episode(run: RunReader) -> dict[str, int]:
 def stored_image_swaps(run: RunReader, readout: str | None = None) -> dict[str, ImageSwapEffect]:
     """Return by category the effects of the image swaps that are stored for the episodes the run has now.
 
-    readout: of those alone; None for any. Of several the preferred one, see `outcomes`; empty if there is none.
-    Raises RunDamagedError if any stored intervention was changed.
+    Args:
+        readout: Of those alone; None for any. Of several the preferred one, see `outcomes`; empty if there is
+            none.
+
+    Raises:
+        RunDamagedError: If any stored intervention was changed.
     """
     preferred = preferred_by_category(run, NAME, readout)
     stored = {result.stored.key: result.stored for result in preferred.values()}

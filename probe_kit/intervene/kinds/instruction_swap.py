@@ -52,9 +52,13 @@ _LEGEND = (
 class InputSensitivity:
     """The changes of the first inferences of one category; one input is swapped, the others stay.
 
-    instruction, images, noise: median lateral metres between where the two actions would bring the hand.
-    instruction_changed, images_changed: share of episodes in which any number of the action changed at all; 0
-    means that the policy ignores that input.
+    Attributes:
+        instruction: Median lateral metres between where the two actions would bring the hand.
+        images: As `instruction`.
+        noise: As `instruction`.
+        instruction_changed: Share of episodes in which any number of the action changed at all; 0 means that the
+            policy ignores that input.
+        images_changed: As `instruction_changed`.
     """
 
     instruction: float

@@ -68,12 +68,18 @@ class PatchEffect(EffectRow):
     """The effect of an edit at one place, in one category; see `EffectRow`.
 
     net: share of episodes whose action flips to the target side, minus those that flip away from it; net_left,
-    net_right: the same by target side. coefficient: of steering, else empty. effect: share of what the whole image
-    swap does to where the action goes, toward the target side, with its 95 % interval by groups; None if that does
-    nothing, so that a share would be a ratio of noise. mean_displacement, control_displacement: metres toward the
-    target side, of the edit and of its matched controls. t, p, p_fwe: of the displacement beyond the controls',
-    one-sided, by sign flips of whole groups, of an interchange in the direction of the swap itself; p_fwe against
-    the largest t of all edits of the category.
+
+    Attributes:
+        coefficient: Of steering, else empty.
+        effect: Share of what the whole image swap does to where the action goes, toward the target side, with its
+            95 % interval by groups; None if that does nothing, so that a share would be a ratio of noise.
+        net_right: The same by target side.
+        mean_displacement: Metres toward the target side, of the edit and of its matched controls.
+        control_displacement: As `mean_displacement`.
+        t: Of the displacement beyond the controls', one-sided, by sign flips of whole groups, of an interchange in
+            the direction of the swap itself; p_fwe against the largest t of all edits of the category.
+        p: As `t`.
+        p_fwe: As `t`.
     """
 
     coefficient: str
@@ -188,7 +194,9 @@ USUAL, WRONG = "mean-difference", "wrong"
 def stored_site_effects(run: RunReader) -> dict[str, list[PatchEffect]]:
     """Return the maps by category: the effects of tokens patched in full, a row for every place and role.
 
-    The backbone first and `kv` last, shallow before deep. Raises RunDamagedError.
+    The backbone first and `kv` last, shallow before deep.
+
+    Raises RunDamagedError.
     """
     return _by_category(_maps(run))
 
@@ -254,7 +262,8 @@ def localised_by_category(maps: Mapping[str, Sequence[PatchEffect]]) -> dict[str
 def carrying_directions(along: Mapping[str, Sequence[PatchEffect]]) -> dict[str, tuple[str, ...]]:
     """Return by category the directions that carry half of the effect, beyond random ones.
 
-    along: as `stored_subspace_effects` gives it. A direction is spelt `mean-difference at backbone.02 image`.
+    Args:
+        along: As `stored_subspace_effects` gives it. A direction is spelt `mean-difference at backbone.02 image`.
     """
     return {
         category: tuple(
@@ -347,7 +356,10 @@ def best_patch_targets(run: RunReader, categories: Sequence[str]) -> tuple[str, 
 
     The last one is behind everything else through which the answer passes; where none of the backbone was located,
     the last of the acting stream or of `kv`. Of its roles the one with the largest effect, and all tokens only
-    where no single role carries half of it. Raises UsageError if none was located.
+    where no single role carries half of it.
+
+    Raises:
+        UsageError: If none was located.
     """
     stored = stored_site_effects(run)
     best = [best_cell(stored.get(category, [])) for category in categories]
@@ -475,9 +487,11 @@ class PatchKind(AlongDirection):
 class Interchange(PatchKind):
     """Every place is tried at every role, alone.
 
-    sites: patterns, see `resolve_sites`. roles: of the tokens that are patched; a stream is tried at those
-    that it has. direction: patches tokens within it alone; `none` in full. controls: so many times as many random
-    directions, per place and role; see `AlongDirection`.
+    Attributes:
+        sites: Patterns, see `resolve_sites`.
+        roles: Of the tokens that are patched; a stream is tried at those that it has. direction: patches tokens
+            within it alone; `none` in full. controls: so many times as many random directions, per place and role;
+            see `AlongDirection`.
     """
 
     kind: ClassVar[str] = "interchange"

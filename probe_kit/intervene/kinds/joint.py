@@ -60,8 +60,12 @@ _PARTS = {EVERY: "all cells of", MINIMAL: "smallest set:", SECOND: "without it:"
 class SearchedSets(NamedTuple):
     """The result of the search in one category; the sets may be empty.
 
-    choosing: the groups that were searched. cells: the smallest set; second: of the other cells, the smallest set
-    that carries the effect as well. effect: of `cells`, in these groups. tried: how many sets.
+    Attributes:
+        choosing: The groups that were searched.
+        cells: The smallest set.
+        second: Of the other cells, the smallest set that carries the effect as well.
+        effect: Of `cells`, in these groups.
+        tried: How many sets.
     """
 
     choosing: tuple[str, ...]
@@ -80,9 +84,13 @@ class SearchedSets(NamedTuple):
 class JointPlaces(Intervention):
     """Every cell alone, all cells but it, all of them, and the smallest set that carries the effect.
 
-    A cell is the tokens of a role at a place. sites: patterns of places that are read in parallel, the blocks of
-    `kv`, one layer, or the heads of one block; of several layers the first decides. roles: of the cells' tokens.
-    The smallest set is searched in one half of each category's groups, drawn with `seed`, and scored in the other.
+    A cell is the tokens of a role at a place.
+
+    Attributes:
+        sites: Patterns of places that are read in parallel, the blocks of `kv`, one layer, or the heads of one
+            block; of several layers the first decides.
+        roles: Of the cells' tokens. The smallest set is searched in one half of each category's groups, drawn with
+            `seed`, and scored in the other.
     """
 
     kind: ClassVar[str] = NAME
@@ -234,12 +242,15 @@ _COLUMNS: Mapping[str, Any] = {
 class JointEffect(Effect):
     """The effect of one set of cells in one category.
 
-    cells: its cells, joined by `+`; of all cells their places and roles, `kv` if nothing of it is missing. part:
-    `cell`, `every-cell`, `minimal` or `second`. alone: share of the swap with only these cells patched; needed:
-    what all cells lose without them, of the swap; both with 95 % intervals by groups, None where the swap itself
-    is not significant. p, p_fwe: that the set alone moves the action toward the target side. Of cells by sign
-    flips of whole groups, p_fwe against all cells; of the smallest sets exact. The smallest sets are scored on the
-    groups in which they were not searched.
+    Attributes:
+        cells: Its cells, joined by `+`; of all cells their places and roles, `kv` if nothing of it is missing.
+            part: `cell`, `every-cell`, `minimal` or `second`.
+        alone: Share of the swap with only these cells patched; needed: what all cells lose without them, of the
+            swap; both with 95 % intervals by groups, None where the swap itself is not significant.
+        p: That the set alone moves the action toward the target side. Of cells by sign flips of whole groups,
+            p_fwe against all cells; of the smallest sets exact. The smallest sets are scored on the groups in
+            which they were not searched.
+        p_fwe: As `p`.
     """
 
     part: str
@@ -299,8 +310,10 @@ def is_read_jointly(rows: Sequence[JointEffect]) -> bool:
 class JointReading:
     """The cells at which it is read, or passes in the backbone, and how. cells: none where that remains open.
 
-    is_jointly: of a smallest set, whose cells are one text joined by `+`. is_past: it reaches the action past all
-    cells. alone: the shares that single cells carry, by cell.
+    Attributes:
+        alone: The shares that single cells carry, by cell.
+        is_jointly: Of a smallest set, whose cells are one text joined by `+`.
+        is_past: It reaches the action past all cells.
     """
 
     verb: str

@@ -53,12 +53,15 @@ def steered(cell: Cell, name: str, coefficient: float, target_side: TargetSide, 
 class Steering(PatchKind):
     """Every place and coefficient, toward one side, and the same for the controls; 0 is always played as well.
 
-    sites: patterns of places. role: whose tokens are moved. direction: `mean-difference` or `probe`, one vector
-    found in the mean of these tokens and added to each; or `mean-difference:K`, at each position the difference of
-    the class means there, within the K directions that positions share.
-    coefficients: in half class-mean differences along the direction. target_side: `wrong` and `correct` are those
-    of the clean images. controls: so many orthogonal directions. Raises UsageError for a coefficient or side that
-    does not exist.
+    Attributes:
+        sites: Patterns of places.
+        role: Whose tokens are moved.
+        direction: `mean-difference` or `probe`, one vector found in the mean of these tokens and added to each; or
+            `mean-difference:K`, at each position the difference of the class means there, within the K directions
+            that positions share.
+        coefficients: In half class-mean differences along the direction.
+        target_side: `wrong` and `correct` are those of the clean images.
+        controls: So many orthogonal directions. Raises UsageError for a coefficient or side that does not exist.
     """
 
     kind: ClassVar[str] = "steer"
@@ -118,7 +121,9 @@ class Steering(PatchKind):
 
         The swap is the unit of the effect: a steering is a share of what it does.
 
-        Raises UnknownSiteError, and NoDirectionError for a named place without a direction.
+        Raises:
+            UnknownSiteError: For a named place without a direction.
+            NoDirectionError: For a named place without a direction.
         """
         cells = [Cell(site_group, self.role) for site_group in resolve_all(self.sites, session.policy).values()]
         conditions = [CLEAN_RUN, SOURCE_RUN]

@@ -51,12 +51,17 @@ FIRST = 3
 class AttributionEffect(Effect):
     """One cell in one category.
 
-    sites, role: of its tokens. is_anchor: a complete cut, patched exactly to test the screen. is_drawn: patched
-    exactly although its estimate was not among the largest. estimate, exact: shares of the image swap with 95 %
-    intervals by groups, None where the swap itself is not significant or no exact patch was made. p_fwe: of the
-    exact patch, one-sided, max-T over those of the category. rank: by estimate among the cells of its kind, 1 for
-    the largest; None in a void screen. finding: of the category's screen: `anchored`, `void`, or `n/a` where no
-    anchor carries the effect.
+    Attributes:
+        sites: Of its tokens.
+        role: As `sites`.
+        is_anchor: A complete cut, patched exactly to test the screen.
+        is_drawn: Patched exactly although its estimate was not among the largest.
+        estimate: Shares of the image swap with 95 % intervals by groups, None where the swap itself is not
+            significant or no exact patch was made.
+        exact: As `estimate`.
+        p_fwe: Of the exact patch, one-sided, max-T over those of the category.
+        rank: By estimate among the cells of its kind, 1 for the largest; None in a void screen.
+        finding: Of the category's screen: `anchored`, `void`, or `n/a` where no anchor carries the effect.
     """
 
     sites: str
@@ -100,8 +105,9 @@ def estimate_patches(
 
     Σ (source − clean) · ∂ slope / ∂ activation, over the tokens and features of the cell.
 
-    act: how an inference is made; by default `infer`. Two inferences, and one with a backward pass; two of these
-    for both ends.
+    Args:
+        act: How an inference is made; by default `infer`. Two inferences, and one with a backward pass; two of
+            these for both ends.
     """
     from probe_kit.hooks import capture, gradients_at
 
@@ -131,7 +137,9 @@ def sum_over_cells(
 ) -> NDArray[np.float64]:
     """Return (C,) Σ (source − clean) · slope over the tokens and features of every cell, in one inference.
 
-    slopes: the gradients at the same sites, of which the mean is taken. masks: (T,) the tokens of every cell.
+    Args:
+        slopes: The gradients at the same sites, of which the mean is taken.
+        masks: (T,) the tokens of every cell.
     """
     products = {
         site: (source[site].float() - clean[site].float())[0]
@@ -213,8 +221,10 @@ def screen_rows(
 ) -> list[AttributionEffect]:
     """Return the effects of cells of one category, in the order of `order_cells`.
 
-    estimates, exact: by cell, (E,) how far its patch moves the output by gradients, and moved it. anchors, drawn:
-    cells that are a complete cut, and that were chosen at random.
+    Args:
+        estimates: By cell, (E,) how far its patch moves the output by gradients, and moved it. anchors, drawn:
+            cells that are a complete cut, and that were chosen at random.
+        exact: As `estimates`.
     """
     _, _, p_fwe = exchange.test(np.array(list(exact.values())))
     p_of = dict(zip(exact, map(float, p_fwe), strict=True))
@@ -285,8 +295,10 @@ def _compared(anchor: AttributionEffect) -> str:
 class Screen:
     """Estimates by gradients of each cell, and whether they can be believed.
 
-    rows: the anchors, then the cells of each kind by rank; in a void screen in the order in which they were given.
-    cells: by name.
+    Attributes:
+        rows: The anchors, then the cells of each kind by rank; in a void screen in the order in which they were
+            given.
+        cells: By name.
     """
 
     rows: tuple[AttributionEffect, ...]
@@ -328,8 +340,10 @@ class Screen:
     def choose(self, top: int = 20, drawn: int = 20, seed: int = 0) -> tuple[tuple[Cell, ...], tuple[Cell, ...]]:
         """Return cells for exact patches: of each kind the `top` largest estimates, and `drawn` of all others.
 
-        The largest exact effect of the drawn ones bounds what the screen missed. Raises UsageError for a screen
-        that is not anchored: it has no order.
+        The largest exact effect of the drawn ones bounds what the screen missed.
+
+        Raises:
+            UsageError: For a screen that is not anchored: it has no order.
         """
         if self.finding != "anchored":
             raise UsageError(f"{self}; patch cells exactly with sweep_cells, or sets with find_minimal_cells")
@@ -351,9 +365,13 @@ def attribute_cells(model: "Policy", pairs: Sequence[Pair], cells: Sequence[Cell
     Anchors are patched exactly: all of `kv`, and all tokens of each layer of the backbone with a cell. If one that
     carries the effect is missed by more than a factor of 3, the screen is void.
 
-    metric: of actions (chunk, D), with a graph, such as `session.lateral_motion`. Cost per pair: two inferences,
-    one with a backward pass, and one per anchor. Raises UnsupportedInterventionError, before any inference, for a
-    family without gradients; UsageError without pairs or cells, and for pairs of questions.
+    Args:
+        metric: Of actions (chunk, D), with a graph, such as `session.lateral_motion`. Cost per pair: two
+            inferences, one with a backward pass, and one per anchor.
+
+    Raises:
+        UnsupportedInterventionError: Before any inference, for a family without gradients.
+        UsageError: Without pairs or cells, and for pairs of questions.
     """
     import torch
 

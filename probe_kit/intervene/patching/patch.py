@@ -80,8 +80,12 @@ def run_with_cache(
 ) -> "tuple[Output, ActivationCache]":
     """The output of one inference, and the activations (1, T, D) of it.
 
-    places: patterns such as `backbone.*`, `kv.*`, `expert.03@0-4` or `backbone.*.heads`; None for the residual
-    streams that an extraction stores. Raises UnknownSiteError, and what `capture` raises.
+    Args:
+        places: Patterns such as `backbone.*`, `kv.*`, `expert.03@0-4` or `backbone.*.heads`; None for the residual
+            streams that an extraction stores.
+
+    Raises:
+        UnknownSiteError: And what `capture` raises.
     """
     from probe_kit.hooks import capture
 
@@ -93,9 +97,12 @@ def run_with_cache(
 def run_with_hooks(model: "Model", model_input: Given, hooks: Mapping[str, HookFunction], seed: int = 0) -> Output:
     """The output of one inference in which functions change activations.
 
-    hooks: by pattern of places a function of (activation, `HookPoint`), called at each of their sites; the
-    activation may be changed in place, but must be returned. Raises UsageError for a site that two patterns name,
-    and what `edit` raises.
+    Args:
+        hooks: By pattern of places a function of (activation, `HookPoint`), called at each of their sites; the
+            activation may be changed in place, but must be returned.
+
+    Raises:
+        UsageError: For a site that two patterns name, and what `edit` raises.
     """
     from probe_kit.hooks import edit
 
@@ -146,7 +153,11 @@ def find_cells(model: "Model", *patterns: str) -> tuple[Cell, ...]:
 
     PLACES as for `--sites`: `backbone.*`, `kv.02`, `expert.03@0-4`, `backbone.*.heads.*`. ROLES, separated by
     commas: `all`, roles of the stream's tokens such as `image`, or positions such as `7` or `7-11`; without, all
-    tokens. Raises UnknownSiteError for a place that is not there, UsageError for a role that no token can have.
+    tokens.
+
+    Raises:
+        UnknownSiteError: For a place that is not there.
+        UsageError: For a role that no token can have.
     """
     cells = []
     for pattern in patterns:
@@ -178,9 +189,14 @@ def patch_cells(
 ) -> Output:
     """Return the output of the clean inference with the cells' activations from the source.
 
-    along: patch only the component within the span of its rows (K, D), at every cell. complement: patch all but
-    that component. Two inferences. Raises EmptyRoleError for a role that no token has now, UsageError for a basis
-    that is not orthonormal, CaptureError for a source with another number of tokens.
+    Args:
+        along: Patch only the component within the span of its rows (K, D), at every cell.
+        complement: Patch all but that component. Two inferences.
+
+    Raises:
+        EmptyRoleError: For a role that no token has now.
+        UsageError: For a basis that is not orthonormal.
+        CaptureError: For a source with another number of tokens.
     """
     together = as_tuple(cells)
     _, source = run_with_cache(model, pair.source, pair.seed, [cell.site_group.name for cell in together])
@@ -198,8 +214,10 @@ def patched(
 ) -> Iterator[EditLog]:
     """Patch cells while the model of `tokens` infers once; every patch of the package is made here.
 
-    source: activations of the pair's source, at the sites of the cells. along, complement: see `patch_cells`.
-    Gives the log of the edits.
+    Args:
+        source: Activations of the pair's source, at the sites of the cells.
+        along: See `patch_cells`. Gives the log of the edits.
+        complement: As `along`.
     """
     changes: dict[Site, list[tuple[TokenSelection, TokenEdit]]] = {}
     for cell in cells:
@@ -241,8 +259,11 @@ def _change(source: "ActivationCache", tokens: int, along: Basis | None, complem
 class AttentionPattern:
     """The attention of the heads of a block, in one inference.
 
-    weights: (H, S, T) float32, rows sum to 1. queries: roles of the S tokens that attend; keys: of the T attended
-    ones. Both are None for a stream whose tokens have no roles, such as a vision tower.
+    Attributes:
+        weights: (H, S, T) float32, rows sum to 1.
+        queries: Roles of the S tokens that attend.
+        keys: Of the T attended ones. Both are None for a stream whose tokens have no roles, such as a vision
+            tower.
     """
 
     weights: NDArray[np.float32]
@@ -252,7 +273,8 @@ class AttentionPattern:
     def mean_share(self, role: str, asking: str = "") -> NDArray[np.float64]:
         """(H,) the share on tokens of `role`, a mean over tokens of the role `asking`, or over all real tokens.
 
-        Raises EmptyRoleError if no token attends, or the stream has no roles.
+        Raises:
+            EmptyRoleError: If no token attends, or the stream has no roles.
         """
         if self.queries is None or self.keys is None:
             raise EmptyRoleError("the tokens of this stream have no roles; use weights (H, S, T)")
@@ -268,8 +290,9 @@ def attention_patterns(
 ) -> dict[Site, AttentionPattern]:
     """The model's own attention patterns in one inference, by site.
 
-    places: patterns of heads, such as `backbone.*.heads` or `expert.02.heads@9`. Raises what `capture_patterns`
-    raises.
+    Args:
+        places: Patterns of heads, such as `backbone.*.heads` or `expert.02.heads@9`. Raises what
+            `capture_patterns` raises.
     """
     from probe_kit.hooks import attended_roles, capture_patterns
 

@@ -42,8 +42,14 @@ SEED_TEXT = "patching"
 class Sweep:
     """The effects of K sets of cells in E pairs.
 
-    cells: the sets. groups, items: (E,) of the pairs. toward: (E,) ±1, see `Pair`. clean, source: (E,) the metric
-    of both inferences; patched: (K, E) of those with a set of cells patched.
+    Attributes:
+        cells: The sets.
+        groups: (E,) of the pairs.
+        items: As `groups`.
+        toward: (E,) ±1, see `Pair`.
+        clean: (E,) the metric of both inferences.
+        source: As `clean`.
+        patched: (K, E) of those with a set of cells patched.
     """
 
     cells: tuple[tuple[Cell, ...], ...]
@@ -109,7 +115,8 @@ class Sweep:
     def heatmap(self, column: str = "share") -> "Figure":
         """Cells by layer and role, coloured by a column of the table.
 
-        Raises UsageError for sets of several cells, or without any number in the column.
+        Raises:
+            UsageError: For sets of several cells, or without any number in the column.
         """
         from matplotlib.figure import Figure
 
@@ -147,8 +154,14 @@ def sweep_cells(
 ) -> Sweep:
     """Patch every cell, or every set of cells, of `cells` in every pair; one inference each, and two per pair.
 
-    metric: of an output and what was given, such as `session.lateral_displacement`; of the same inference as the
-    patch. along, complement: see `patch_cells`. Raises UsageError without pairs, and what `patch_cells` raises.
+    Args:
+        metric: Of an output and what was given, such as `session.lateral_displacement`; of the same inference as
+            the patch.
+        along: See `patch_cells`.
+        complement: As `along`.
+
+    Raises:
+        UsageError: Without pairs, and what `patch_cells` raises.
     """
     sets = tuple(as_tuple(together) for together in cells)
     if not pairs or not sets:
@@ -190,8 +203,10 @@ def find_minimal_set[C](
 
     Return a set of which no cell can be left out, its effect, and how many sets were tried.
 
-    effects: the effect of each of some sets. At most n (n + 1) / 2 sets of up to `MOST_SINGLY` cells are tried.
-    Adding cells one by one would stop at once where a majority decides: no first cell has an effect.
+    Args:
+        effects: The effect of each of some sets. At most n (n + 1) / 2 sets of up to `MOST_SINGLY` cells are
+            tried. Adding cells one by one would stop at once where a majority decides: no first cell has an
+            effect.
     """
     have = tuple(cells)
     (full,) = effects([have])
@@ -227,9 +242,12 @@ def choosing_half(groups: Sequence[str], seed: int) -> tuple[str, ...]:
 class MinimalCells:
     """The smallest set of cells that keeps an effect, and what it does in pairs in which it was not searched.
 
-    cells: of them none can be left out. chosen_effect: their share in the pairs of the search, of `tried` sets.
-    share: in the other half of the groups, with its interval; None where the source is not significant there.
-    p: that the set moves the metric toward the source there. choosing: groups of the search.
+    Attributes:
+        cells: Of them none can be left out.
+        chosen_effect: Their share in the pairs of the search, of `tried` sets.
+        share: In the other half of the groups, with its interval; None where the source is not significant there.
+        p: That the set moves the metric toward the source there.
+        choosing: Groups of the search.
     """
 
     cells: tuple[Cell, ...]
@@ -248,7 +266,10 @@ def compare_alone_and_without(
     Columns: cells; alone with alone_low, alone_high: share of the source's effect; needed with needed_low,
     needed_high: (all cells) − (all but it), as a share; p_fwe of the cell alone; finding as of `--kind joint`,
     "n/a" where the source is not significant. The cells must be parallel: blocks of `kv`, roles or heads of one
-    layer. Raises UsageError for fewer than two cells.
+    layer.
+
+    Raises:
+        UsageError: For fewer than two cells.
     """
     import pandas as pd
 
@@ -284,7 +305,10 @@ def find_minimal_cells(
     """The smallest set of cells that keeps the share `keep` of what all of them carry.
 
     It is searched in one half of the groups, drawn with `seed`, and scored in the other; see `find_minimal_set`.
-    The cells must be parallel. Raises UsageError for fewer than two cells, or fewer than two groups.
+    The cells must be parallel.
+
+    Raises:
+        UsageError: For fewer than two cells, or fewer than two groups.
     """
     distinct = _several(cells)
     groups, _ = groups_and_items(pairs)

@@ -71,7 +71,9 @@ def write_checkpoint(
 ) -> None:
     """Write config, dimensions, tokenizer, statistics and weights in lerobot's layout.
 
-    note: what the weights are; it goes into the metadata of the file. dtype: the weights are stored in.
+    Args:
+        note: What the weights are; it goes into the metadata of the file.
+        dtype: The weights are stored in.
     """
     folder.mkdir(parents=True, exist_ok=True)
     policy.config.save_pretrained(folder)
@@ -151,7 +153,8 @@ def new_vlm_tiny(seed: int) -> Any:
 def write_vlm_tiny(folder: Path, network: Any, note: str) -> None:
     """Write config, tokenizer, picture settings and weights in transformers' layout.
 
-    note: what the weights are; it goes into the metadata of the file.
+    Args:
+        note: What the weights are; it goes into the metadata of the file.
     """
     folder.mkdir(parents=True, exist_ok=True)
     network.config.save_pretrained(folder)

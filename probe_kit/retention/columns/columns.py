@@ -40,12 +40,19 @@ Sort = Callable[[RetentionRow], Any]
 class Column:
     """One column of a table.
 
-    key: the field that it shows, as `part.field`. heading: with its unit, the same in all formats. help: its entry
-    in the glossary. text: what a row shows; "–" or nothing where it has no value. sort: what the report sorts by,
-    the field itself by default. difference: what a difference between runs shows. heat: whether the report and
-    LaTeX colour it by `sort`, from 0 to 1. averaged: whether a category mean averages the field. also_averaged:
-    further fields of the same column that are averaged. strong: which rows are bold. note: shown in the report on
-    pointing at the cell. answers: heading and help where the rows are of models that were asked, if these differ.
+    Attributes:
+        key: The field that it shows, as `part.field`.
+        heading: With its unit, the same in all formats.
+        help: Its entry in the glossary.
+        text: What a row shows; "–" or nothing where it has no value.
+        sort: What the report sorts by, the field itself by default.
+        difference: What a difference between runs shows.
+        heat: Whether the report and LaTeX colour it by `sort`, from 0 to 1.
+        averaged: Whether a category mean averages the field. also_averaged: further fields of the same column that
+            are averaged.
+        strong: Which rows are bold.
+        note: Shown in the report on pointing at the cell.
+        answers: Heading and help where the rows are of models that were asked, if these differ.
     """
 
     key: str
@@ -82,7 +89,9 @@ class Column:
 class ColumnGroup:
     """Columns that answer one question.
 
-    section: by which `--details` shows them. detail: shown only where there is room, in Markdown and the report.
+    Attributes:
+        detail: Shown only where there is room, in Markdown and the report.
+        section: By which `--details` shows them.
     """
 
     title: str

@@ -45,7 +45,8 @@ _CONTROLS = {RANDOM_FEATURES: "random features", UNTRAINED: "an untrained networ
 def finding(row: RetentionRow, vlm: RetentionRow | None = None) -> str:
     """Return what is found in a category: a verdict, a colon, and where on the way to the action it is lost.
 
-    vlm: the row of a VLM that answered the same questions.
+    Args:
+        vlm: The row of a VLM that answered the same questions.
     """
     if not row.is_side:
         return label_finding(row)
@@ -339,7 +340,8 @@ def _retention(row: RetentionRow) -> str:
 class RunSummary:
     """A row and a sentence per category of a run. vlm: the model that was asked the same questions, or empty.
 
-    mean: over the categories; None of labels, whose metrics differ.
+    Attributes:
+        mean: Over the categories; None of labels, whose metrics differ.
     """
 
     run: str

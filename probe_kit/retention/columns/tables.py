@@ -54,8 +54,11 @@ def retention_tables(
 ) -> dict[str, Table]:
     """Return by title the answers of VLM runs, success rates of policy runs, retention and controls.
 
-    A table without rows is left out, and a column in which no row has anything to show. unpaired: why runs have no
-    differences; notes of the last table of behaviour. sections: groups of columns that are shown, all by default.
+    A table without rows is left out, and a column in which no row has anything to show.
+
+    Args:
+        unpaired: Why runs have no differences; notes of the last table of behaviour.
+        sections: Groups of columns that are shown, all by default.
     """
     once, probed = once_per_category(rows), [row for row in rows if row.view is not None]
     is_controlled = any(row.controls.baselines or row.controls.untrained for row in probed)

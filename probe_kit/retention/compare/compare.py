@@ -53,8 +53,11 @@ EpisodeKey = tuple[str, str, str]
 class CommonItems:
     """The episodes of one category that several runs have in common.
 
-    episodes: (item, layout) of them. n_items: items of them. of_items: items of any of the runs.
-    is_complete: whether every run has these episodes and no others.
+    Attributes:
+        episodes: (item, layout) of them.
+        n_items: Items of them.
+        of_items: Items of any of the runs.
+        is_complete: Whether every run has these episodes and no others.
     """
 
     episodes: frozenset[tuple[str, str]]
@@ -132,8 +135,12 @@ _FINEST = 1000
 def gains(first: "Sequence[pd.DataFrame]", second: "Sequence[pd.DataFrame]") -> dict[str, Any]:
     """Return an exact, two-sided test of both sides being right equally often, as fields of `Difference`.
 
-    Whole groups of items are turned together. first, second: tables of episodes, each of one run and category;
-    runs of a side count by their mean. Empty unless every run of both sides has the same episodes.
+    Whole groups of items are turned together.
+
+    Args:
+        first: Tables of episodes, each of one run and category; runs of a side count by their mean. Empty unless
+            every run of both sides has the same episodes.
+        second: As `first`.
     """
     sides = [_of_side(tables) for tables in (first, second)]
     if None in sides:
@@ -176,20 +183,33 @@ def _of_side(tables: "Sequence[pd.DataFrame]") -> tuple[dict[str, Fraction], dic
 class Difference:
     """`group` minus `minus` in one category and view, each the mean of its runs; 95 % intervals.
 
-    group, minus: names of groups, or of single runs, whose locations are then `run` and `minus_run`. paired:
-    whether both ran the same items, which then count as pairs. view: None where the two have no probed view in
-    common. sr, backbone, action: success rate and cross-fitted accuracies. retention: None unless defined on
-    both sides. p: of `sr`, exact, signs of whole groups of items flipped, in the row `mean` of all items at
-    once; None unless paired. p_holm: over the categories of all pairs of the table, or over the pairs in rows
-    `mean`. Intervals and p are of these models on other items. sr_models, retention_models: of other models,
-    where a side is a group of several. call: the captured inference that both were probed at, None without
-    probes or where they differ. mode: what the models of both did. n_items: items that all runs of both sides have
-    and that the numbers are of; of_items: items that any of them has. None where that is not known. n_groups:
-    independent groups of items whose signs `p` flips, None without a p. sr_group, sr_minus: the two rates. only,
-    only_minus: episodes in which one side alone is right, or more often than the other; None unless paired.
-    same_frames, source: of a VLM minus a policy, whether all began with the same frames, and whether the policy's
-    network grew from the weights that were asked; None of others, and where unknown. In a row of category `mean`,
-    numbers are averages over the `categories` that both groups have.
+    Attributes:
+        group: Names of groups, or of single runs, whose locations are then `run` and `minus_run`. paired: whether
+            both ran the same items, which then count as pairs.
+        minus: As `group`.
+        view: None where the two have no probed view in common.
+        sr: Success rate and cross-fitted accuracies.
+        backbone: As `sr`.
+        action: As `sr`.
+        retention: None unless defined on both sides.
+        sr_models: Of other models, where a side is a group of several.
+        retention_models: As `sr_models`.
+        call: The captured inference that both were probed at, None without probes or where they differ.
+        p: Of `sr`, exact, signs of whole groups of items flipped, in the row `mean` of all items at once; None
+            unless paired.
+        p_holm: Over the categories of all pairs of the table, or over the pairs in rows `mean`. Intervals and p
+            are of these models on other items.
+        mode: What the models of both did.
+        n_items: Items that all runs of both sides have and that the numbers are of.
+        of_items: Items that any of them has. None where that is not known. n_groups: independent groups of items
+            whose signs `p` flips, None without a p.
+        sr_group: The two rates. only,
+        sr_minus: As `sr_group`.
+        only_minus: Episodes in which one side alone is right, or more often than the other; None unless paired.
+        same_frames: Of a VLM minus a policy, whether all began with the same frames, and whether the policy's
+            network grew from the weights that were asked; None of others, and where unknown. In a row of category
+            `mean`, numbers are averages over the `categories` that both groups have.
+        source: As `same_frames`.
     """
 
     group: str
@@ -229,7 +249,8 @@ class Difference:
 class Side:
     """One side of a comparison: what it is called, its runs and their rows, and where it lies if it is one run.
 
-    origins: see `compare_models`.
+    Attributes:
+        origins: See `compare_models`.
     """
 
     name: str
@@ -255,9 +276,11 @@ def compare(
 ) -> list[Difference]:
     """Return the first side minus the second, per view and category, and over all categories.
 
-    of: success rates, backbone, action and retention; or success rates (answers of a VLM) alone. items: by
-    category, what all runs have in common, see `common_items`. others_too: compare categories without such items,
-    each side on its own. Holm's p is that of `with_holm`, over all rows that are shown together.
+    Args:
+        of: Success rates, backbone, action and retention; or success rates (answers of a VLM) alone.
+        items: By category, what all runs have in common, see `common_items`.
+        others_too: Compare categories without such items, each side on its own. Holm's p is that of `with_holm`,
+            over all rows that are shown together.
     """
     runs = [*first.runs, *second.runs]
     shared = common_items(runs) if items is None else items
@@ -363,8 +386,10 @@ def _by_view(rows: Sequence[RowWithEstimates]) -> dict[str | None, RowsOfRuns]:
 class _Gap:
     """One category of two sides.
 
-    rates: success of either side, None where a run has none. sr: their difference. accuracies: by stream. pooled:
-    scores of either side, None without probes.
+    Attributes:
+        rates: Success of either side, None where a run has none.
+        sr: Their difference.
+        accuracies: By stream. pooled: scores of either side, None without probes.
     """
 
     paired: bool
@@ -495,11 +520,17 @@ def compare_runs(
 ) -> PairedRuns:
     """Return every other run minus the run `against`, by default the first; VLM runs and policy runs apart.
 
-    runs: in the order in which they were named. rows: theirs. against: a run's name in tables, its folder's name
-    or its location. vlm_vla: whether VLM runs are compared with policy runs elsewhere. pairs: by location, those
-    that are compared instead, each the first minus the second. Runs of one seed and wording are compared, on the
-    items that both have: success rates on these alone, probes where no run has other items.
-    Raises UsageError for a name that is none of the runs, or several.
+    Args:
+        runs: In the order in which they were named.
+        rows: theirs.
+        against: A run's name in tables, its folder's name or its location.
+        vlm_vla: Whether VLM runs are compared with policy runs elsewhere.
+        pairs: By location, those that are compared instead, each the first minus the second. Runs of one seed and
+            wording are compared, on the items that both have: success rates on these alone, probes where no run
+            has other items.
+
+    Raises:
+        UsageError: For a name that is none of the runs, or several.
     """
     if against is not None and len(runs) < 2:
         raise UsageError(f"--compare {against} needs a second run to compare with it")
@@ -528,8 +559,13 @@ def compare_groups(
     """Return every group of runs minus every earlier one, or minus the group `against`; see `compare_runs`.
 
     Two groups count as pairs in categories in which all of their runs have at least 80 % of the items in common,
-    and then on these items alone. In other categories each group has its own items. origins: see `origins_of`.
-    Raises UsageError for a group that is none of them, and a declared origin of no run.
+    and then on these items alone. In other categories each group has its own items.
+
+    Args:
+        origins: See `origins_of`.
+
+    Raises:
+        UsageError: For a group that is none of them, and a declared origin of no run.
     """
     differences: list[Difference] = []
     notes: list[str] = []
@@ -550,7 +586,8 @@ def compare_groups(
 def group_pairs(groups: Sequence[str], against: str | None = None) -> list[tuple[str, str]]:
     """Return every group with every earlier one, or every other group with `against`: minuend, subtrahend.
 
-    Raises UsageError for a group that is none of them.
+    Raises:
+        UsageError: For a group that is none of them.
     """
     if against is None:
         return [(later, earlier) for earlier, later in combinations(groups, 2)]
@@ -626,7 +663,10 @@ def compare_wordings(runs: Sequence[RunReader]) -> list[Difference]:
     """Return every two wordings of each run against each other, the earlier one minus the later.
 
     It separates not knowing from not being able: who places the cube by "the left picture" and not by what the
-    picture shows can act and does not know. runs: those that acted, judged by the rule of the table.
+    picture shows can act and does not know.
+
+    Args:
+        runs: Those that acted, judged by the rule of the table.
     """
     settings = RowSettings(None, "all", ())
     differences: list[Difference] = []

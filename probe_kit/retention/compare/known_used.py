@@ -46,9 +46,13 @@ _MOST_NAMED = 3
 class Comparison:
     """A test whether two of the three are right of equally many items.
 
-    only_first, only_second: items on which they differ. p_mcnemar: exact over items; p_groups: the same, whole
-    groups of items turned together; p: the larger of the two. p_holm: over all categories and pairs, of all joins
-    that are shown together.
+    Attributes:
+        only_first: Items on which they differ.
+        only_second: As `only_first`.
+        p_mcnemar: Exact over items.
+        p_groups: The same, whole groups of items turned together.
+        p: The larger of the two.
+        p_holm: Over all categories and pairs, of all joins that are shown together.
     """
 
     first: str
@@ -65,14 +69,19 @@ class Comparison:
 class CategoryCounts:
     """One category, or all of them (`all`).
 
-    answered_correctly, encoded, acted_correctly: items right in both layouts. counts: items by these three, such
-    as `101` for answered, not encoded, acted on; without probes `1-1`. guessed: as many as coins would give.
-    episodes: the same counts of single episodes; nothing is tested there. signal: whether the probes beat chance
-    and every control that was run, without which encoded means nothing; None without probes, or over categories
-    that differ in it. not_acted_on: of the items answered right and encoded those the action does not follow,
-    with the exact 95 % interval of their share; None without signal, and over all categories only of those with
-    signal. p_linked: whether answered and acted on go together among
-    encoded items: Fisher's exact test, over categories a permutation within them.
+    Attributes:
+        answered_correctly: Items right in both layouts.
+        encoded: As `answered_correctly`.
+        acted_correctly: As `answered_correctly`.
+        counts: Items by these three, such as `101` for answered, not encoded, acted on; without probes `1-1`.
+        guessed: As many as coins would give.
+        episodes: The same counts of single episodes; nothing is tested there. signal: whether the probes beat
+            chance and every control that was run, without which encoded means nothing; None without probes, or
+            over categories that differ in it.
+        not_acted_on: Of the items answered right and encoded those the action does not follow, with the exact 95 %
+            interval of their share; None without signal, and over all categories only of those with signal.
+        p_linked: Whether answered and acted on go together among encoded items: Fisher's exact test, over
+            categories a permutation within them.
     """
 
     category: str
@@ -97,8 +106,11 @@ class CategoryCounts:
 class KnownUsedTable:
     """A VLM run and a policy run joined, item by item.
 
-    vlm, policy: labels of the runs. view: of the probes; None without any.
-    notes: remarks on the join, a sentence each.
+    Attributes:
+        vlm: Labels of the runs.
+        policy: As `vlm`.
+        view: Of the probes; None without any.
+        notes: Remarks on the join, a sentence each.
     """
 
     vlm: str
@@ -141,10 +153,14 @@ def match_runs(
 ) -> KnownUsedTable:
     """Join a VLM run (as `scored` reads it) with a policy run and its probes.
 
-    results: probes of the policy run; None joins known and used only. view: one that was probed, by default the
-    first. seed: of permutations.
-    Raises UsageError for runs of the wrong kinds or without a question in common, OtherFramesError if their first
-    frames differ or carry no hash.
+    Args:
+        results: Probes of the policy run; None joins known and used only.
+        view: One that was probed, by default the first.
+        seed: Of permutations.
+
+    Raises:
+        UsageError: For runs of the wrong kinds or without a question in common.
+        OtherFramesError: If their first frames differ or carry no hash.
     """
     check_sides(policy, "a comparison with answers")
     if vlm.ask is None or policy.ask is not None:
@@ -184,7 +200,8 @@ class Joins:
 def join_runs(runs: Sequence[TableRun], results: Mapping[tuple[str, str], ProbeResults]) -> Joins:
     """Return answer, probe and success of every pair of a VLM run and a policy run.
 
-    results: of the runs of the table, by location and target. Tests are corrected over all pairs.
+    Args:
+        results: Of the runs of the table, by location and target. Tests are corrected over all pairs.
     """
     probes_of = {location: probes for (location, _), probes in results.items()}
     policies = [run for run in runs if not run.answers and run.is_judged]

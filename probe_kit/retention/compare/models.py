@@ -70,9 +70,10 @@ def split_checkpoint(checkpoint: str) -> tuple[str, int] | None:
 def origins_of(runs: Sequence[RunReader], declared: Mapping[str, str] | None = None) -> dict[str, str]:
     """Return what the model of every run grew from, by location; runs of equal origin are of one model.
 
-    declared: origins by location, such as `finetuned_from` of a study. Other runs have the folder of their
-    training where their checkpoint is one of several steps, else their weights, else their own location. Raises
-    UsageError for a declared location that is none of the runs.
+    Args:
+        declared: Origins by location, such as `finetuned_from` of a study. Other runs have the folder of their
+            training where their checkpoint is one of several steps, else their weights, else their own location.
+            Raises UsageError for a declared location that is none of the runs.
     """
     places = {str(run.location): run for run in runs}
     if strange := [location for location in declared or {} if location not in places]:
@@ -97,10 +98,14 @@ Sides = tuple[Sequence[Sequence[RowWithEstimates]], Sequence[Sequence[RowWithEst
 class ModelTest:
     """Two groups of models compared with the model as the unit.
 
-    n, n_minus: models of either group; runs of one origin are of one. difference: of the groups' means, with
-    Welch's 95 % interval. p: exact and two-sided, of exchanging the models' labels, which tests equal
-    distributions and not only equal means; smallest_p: the least that so few models allow. Both are None where the
-    smaller group has the larger spread, see `is_exchangeable`.
+    Attributes:
+        n: Models of either group; runs of one origin are of one.
+        n_minus: As `n`.
+        difference: Of the groups' means, with Welch's 95 % interval.
+        p: Exact and two-sided, of exchanging the models' labels, which tests equal distributions and not only
+            equal means.
+        smallest_p: The least that so few models allow. Both are None where the smaller group has the larger
+            spread, see `is_exchangeable`.
     """
 
     n: int
@@ -114,7 +119,8 @@ class ModelTest:
     def of(cls, first: Sequence[float], second: Sequence[float], largest: float = inf) -> "ModelTest | None":
         """Return the test of one value per model; None for two single models, or where one has no value.
 
-        largest: the difference that no two groups can exceed, see `welch_interval`.
+        Args:
+            largest: The difference that no two groups can exceed, see `welch_interval`.
         """
         if len(first) + len(second) < 3 or not (first and second and all(map(isfinite, (*first, *second)))):
             return None
@@ -133,8 +139,10 @@ def compare_models(
 ) -> ModelTest | None:
     """Return the test of two sides with a value per origin of models.
 
-    origins: what the model of each run grew from, by location; by default its weights. largest: see `ModelTest`.
-    None where a model has no value, or is on both sides: its labels cannot be exchanged.
+    Args:
+        origins: What the model of each run grew from, by location; by default its weights.
+        largest: See `ModelTest`. None where a model has no value, or is on both sides: its labels cannot be
+            exchanged.
     """
     first, second = (_by_model(side, value) for side in rows)
     if first is None or second is None or first.keys() & second.keys():

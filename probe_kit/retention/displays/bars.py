@@ -271,7 +271,8 @@ _LOOKS: Mapping[str, tuple[str, str]] = {
 class KnownUsedDisplay(BarDisplay):
     """A bar per category: shares of its items by what is known, encoded and used, in both layouts each.
 
-    joined: what `probe_kit.retention.compare.known_used.match_runs` returns.
+    Attributes:
+        joined: What `probe_kit.retention.compare.known_used.match_runs` returns.
     """
 
     joined: KnownUsedTable

@@ -55,10 +55,14 @@ EventCalls = Mapping[str, Mapping[str, int]]
 class CallLine:
     """Held-out accuracy of a stream's best site by captured inference; arrays (C,), accuracies as shares.
 
-    accuracy: of the sites that the inner folds choose, on the outer folds; low, high: its 95 % interval, NaN with
-    too few groups. significant: above chance against all sites of the
-    stream, and above the controls that were run. null: what the best site of permuted labels stays below in 95 %,
-    NaN with few label permutations. episodes: how many got that far. part: of the model, see `Stream.part`.
+    Attributes:
+        part: Of the model, see `Stream.part`.
+        accuracy: Of the sites that the inner folds choose, on the outer folds.
+        low: Its 95 % interval, NaN with too few groups.
+        high: As `low`.
+        significant: Above chance against all sites of the stream, and above the controls that were run.
+        null: What the best site of permuted labels stays below in 95 %, NaN with few label permutations.
+        episodes: How many got that far.
     """
 
     stream: str
@@ -105,7 +109,9 @@ FEWEST = 10
 class CallCurves:
     """One category in one view over the captured inferences of a run.
 
-    results: the probes by call. events: when they fell due, as `event_calls` says; empty without trajectories.
+    Attributes:
+        results: The probes by call.
+        events: When they fell due, as `event_calls` says; empty without trajectories.
     """
 
     results: Mapping[int, ProbeResults]
@@ -119,7 +125,8 @@ class CallCurves:
     ) -> Self:
         """Read probes by call, as `load_results_by_call` gives them. events: as `event_calls` gives them.
 
-        Raises UsageError for probes of a single call, or without that category and view.
+        Raises:
+            UsageError: For probes of a single call, or without that category and view.
         """
         if len(results) < 2:
             raise UsageError(
@@ -228,8 +235,10 @@ class CallCurveDisplay(Display):
 
     Filled markers are above chance against all sites of their stream, and above the controls that were run; the
     dotted line is what the best site of permuted labels stays below in 95 %. Upright lines: when the events of the
-    trajectories fell due, in the median, with quartiles. A site is chosen anew at each call. event: from which
-    accuracies are counted instead, see `plot_aligned`.
+    trajectories fell due, in the median, with quartiles. A site is chosen anew at each call.
+
+    Attributes:
+        event: From which accuracies are counted instead, see `plot_aligned`.
     """
 
     category: str
@@ -249,7 +258,9 @@ class CallCurveDisplay(Display):
     ) -> Self:
         """Read probes by call (`load_results_by_call`). events: from `event_calls` of a run with trajectories.
 
-        Raises UnknownSiteError for a view that was not probed, UsageError for fewer than two calls.
+        Raises:
+            UnknownSiteError: For a view that was not probed.
+            UsageError: For fewer than two calls.
         """
         first = next(iter(results.values()))
         curves = CallCurves.of(results, category, known_view(first, view), events)

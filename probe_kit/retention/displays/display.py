@@ -44,9 +44,13 @@ SHOWN = 12
 class ProvenanceLine:
     """The origin of the numbers of a figure.
 
-    weights: sha256 of the weights that acted, None for a scripted policy. suite: `name@version#hash`.
-    n: number of episodes, in words. settings: sha256 of the run's settings. probes: key of the probe results.
-    call: captured inference that was probed, None without probes.
+    Attributes:
+        weights: sha256 of the weights that acted, None for a scripted policy.
+        suite: `name@version#hash`.
+        n: Number of episodes, in words.
+        settings: sha256 of the run's settings.
+        probes: Key of the probe results.
+        call: Captured inference that was probed, None without probes.
     """
 
     model: str
@@ -197,7 +201,9 @@ def panels(
 ) -> "tuple[Figure, list[Axes]]":
     """A figure of `count` panels of `width` × `height` inches, at most three or `columns` in a row.
 
-    share: whether panels share both axes. in_pyplot: whether pyplot knows the figure, so that notebooks show it.
+    Args:
+        share: Whether panels share both axes.
+        in_pyplot: Whether pyplot knows the figure, so that notebooks show it.
     """
     from matplotlib import pyplot as plt
 
@@ -276,7 +282,10 @@ def footer(figure: "Figure", text: str) -> None:
 def legend_above(figure: "Figure", handles: "Sequence[Artist]", title: str = "") -> None:
     """A legend along the upper side, in as many columns as the figure has room for; many rows make it higher.
 
-    matplotlib fills a legend column by column, and leaves their number to its caller. title: lines above it.
+    matplotlib fills a legend column by column, and leaves their number to its caller.
+
+    Args:
+        title: Lines above it.
     """
     lengths = [len(str(handle.get_label())) + _MARK for handle in handles]
     room = _LETTERS_PER_INCH * figure.get_figwidth()
@@ -325,10 +334,17 @@ OPEN = "open: not shown"
 class Display(ABC):
     """One panel of numbers: on axes of its own, or beside others in one figure.
 
-    A display that has been plotted shows its figure. title: above the panel. measure: name of the upright axis.
-    certificates: where its numbers come from. figure_size: inches of a panel by itself; panel_size: of
-    one of several. is_level: whether panels side by side have one range of the upright axis. is_framed: whether
-    all spines are drawn. ax_: what `plot` drew on.
+    A display that has been plotted shows its figure.
+
+    Attributes:
+        title: Above the panel.
+        measure: Name of the upright axis.
+        certificates: Where its numbers come from.
+        figure_size: Inches of a panel by itself.
+        is_level: Whether panels side by side have one range of the upright axis.
+        ax_: What `plot` drew on.
+        panel_size: Of one of several.
+        is_framed: Whether all spines are drawn.
     """
 
     title: str = ""
@@ -398,8 +414,11 @@ def in_panels(
 ) -> "Figure":
     """Return displays of one kind in one figure, under one legend.
 
-    displays: one or more; None leaves a place empty. size: of a panel in inches, by default that of its kind.
-    columns, in_pyplot: as in `panels`.
+    Args:
+        displays: One or more; None leaves a place empty.
+        size: Of a panel in inches, by default that of its kind.
+        columns: As in `panels`.
+        in_pyplot: As `columns`.
     """
     present = [display for display in displays if display is not None]
     first = present[0]
@@ -481,7 +500,8 @@ def best_of(iterations: Iterations) -> Iterations:
 def best_row(curve: ProbeCurve, stream: str) -> int:
     """Return the position of the site of a stream that has the largest score above its own chance.
 
-    Raises UnknownSiteError without any.
+    Raises:
+        UnknownSiteError: Without any.
     """
     rows = curve.stream(stream)
     if not rows.size:

@@ -40,8 +40,11 @@ _MANY = 300  # points, above which a vector figure holds them as a picture
 class FinalPositionsDisplay(Display):
     """Final places of the cube in metres: x away from the robot, y to its left.
 
-    xy: (E, 2), NaN where the simulator broke. outcome: (E,) `correct`, `wrong` or `oob`. scene: tile places and
-    sizes, zone radius and the start of the cube, as stored with the run. rule: by which outcomes are.
+    Attributes:
+        xy: (E, 2), NaN where the simulator broke.
+        outcome: (E,) `correct`, `wrong` or `oob`.
+        scene: Tile places and sizes, zone radius and the start of the cube, as stored with the run.
+        rule: By which outcomes are.
     """
 
     category: str | None
@@ -58,8 +61,11 @@ class FinalPositionsDisplay(Display):
     def from_run(cls, run: RunReader, category: str | None = None, scene: Mapping[str, Any] | None = None) -> Self:
         """Read the episodes of a run, all of them or those of one category.
 
-        scene: `SceneSpec.to_json()`; that of the run by default. Raises UsageError if the run has no scene or no
-        positions, or no such category.
+        Args:
+            scene: `SceneSpec.to_json()`; that of the run by default.
+
+        Raises:
+            UsageError: If the run has no scene or no positions, or no such category.
         """
         episodes: pd.DataFrame = run.episodes
         if category is not None:

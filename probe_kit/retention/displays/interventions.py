@@ -62,9 +62,12 @@ class Points:
 class SiteEffectDisplay(Display):
     """Curves by backbone layer: held-out accuracy of probes, and the episodes that turn when tokens are exchanged.
 
-    readable: accuracy in percent. passes: by role, share of episodes in percent whose action turns to the side of
-    the swapped images, minus those that turn from it. read: the same for the keys and values that the acting
-    part reads of each block; None where it was not tested. Filled: significant, family-wise.
+    Attributes:
+        readable: Accuracy in percent.
+        passes: By role, share of episodes in percent whose action turns to the side of the swapped images, minus
+            those that turn from it.
+        read: The same for the keys and values that the acting part reads of each block; None where it was not
+            tested. Filled: significant, family-wise.
     """
 
     measure: str = "% of episodes"
@@ -129,7 +132,9 @@ class SiteEffectDisplay(Display):
 def shown_passing(run: RunReader) -> dict[str, list[PatchEffect]]:
     """Return by category what a figure by layers shows: the backbone at every role, `kv` as a whole.
 
-    Categories of which nothing of the two is stored are not there. Raises RunDamagedError.
+    Categories of which nothing of the two is stored are not there.
+
+    Raises RunDamagedError.
     """
     by_category = {
         category: [
@@ -189,9 +194,13 @@ _LABELS = {CORRECT: "correct picture's tile", OTHER: "other picture's tile", ACT
 class AttentionDisplay(Display):
     """A curve by block of the backbone: the share of attention in percent that lies on one role's tokens.
 
-    blocks: (B,) those that are read. roles: names of R; of tiles by where the answer lies. mean: (R, B) over
-    iterations, heads and inferences. iterations: (R, B, I) over heads and inferences. heads: (R, B, H) over
-    iterations and inferences. Descriptive: attended tokens need not be used, and no verdict reads this.
+    Attributes:
+        blocks: (B,) those that are read.
+        roles: Names of R; of tiles by where the answer lies.
+        mean: (R, B) over iterations, heads and inferences.
+        iterations: (R, B, I) over heads and inferences.
+        heads: (R, B, H) over iterations and inferences. Descriptive: attended tokens need not be used, and no
+            verdict reads this.
     """
 
     measure: str = "% of attention (describes, no cause)"
@@ -207,7 +216,8 @@ class AttentionDisplay(Display):
     def from_run(cls, run: RunReader, category: str, stored: Mapping[str, AttentionShares] | None = None) -> Self:
         """Read the newest attention that is stored of a category. stored: what `stored_attention` returns.
 
-        Raises NoInterventionsError if there is none.
+        Raises:
+            NoInterventionsError: If there is none.
         """
         recorded = (stored_attention(run) if stored is None else stored).get(category)
         if recorded is None:
@@ -271,9 +281,11 @@ _HEAVIEST = 0.8
 def attention_on_picture(run: RunReader, category: str | None = None) -> "Figure":
     """An episode's first inference: the attention on each patch over the picture, of all blocks and of each.
 
-    Means over heads and iterations; the strongest patch of a panel has the full colour. category: by default the
-    first one with stored patches, of whose episodes the first one with a picture is drawn. Raises
-    NoInterventionsError where patches or pictures are not stored.
+    Means over heads and iterations; the strongest patch of a panel has the full colour.
+
+    Args:
+        category: By default the first one with stored patches, of whose episodes the first one with a picture is
+            drawn. Raises NoInterventionsError where patches or pictures are not stored.
     """
     pictured = _first_pictured(run, category)
     if pictured is None:
@@ -358,11 +370,17 @@ def attention_figures(source: FigureSource) -> Iterator[ReportFigure]:
 class DoseResponseDisplay(Display):
     """A curve by coefficient: the share of episodes that turn to the target side, minus those that turn from it.
 
-    coefficients: (K,) in half class-mean differences, ascending, 0 among them. net, net_left, net_right: (K,)
-    percent, of all episodes and of those that are pushed to either side, one of which may be saturated.
-    controls: (C, K) percent of random directions of the same norm, NaN at a coefficient at which none was played.
-    relative_change: (K,) how far tokens were moved, in their own norms; beyond two, an effect is little evidence.
-    significant: (K,) beyond the controls, family-wise.
+    Attributes:
+        coefficients: (K,) in half class-mean differences, ascending, 0 among them.
+        net: (K,) percent, of all episodes and of those that are pushed to either side, one of which may be
+            saturated.
+        net_left: As `net`.
+        net_right: As `net`.
+        controls: (C, K) percent of random directions of the same norm, NaN at a coefficient at which none was
+            played.
+        relative_change: (K,) how far tokens were moved, in their own norms; beyond two, an effect is little
+            evidence.
+        significant: (K,) beyond the controls, family-wise.
     """
 
     measure: str = "% of episodes that turn"
@@ -387,7 +405,11 @@ class DoseResponseDisplay(Display):
     ) -> Self:
         """Read the steering that is stored of a category. position: one of several, as `backbone.02 image`.
 
-        stored: what `stored_steering` returns. Raises NoInterventionsError if there is none.
+        Args:
+            stored: What `stored_steering` returns.
+
+        Raises:
+            NoInterventionsError: If there is none.
         """
         by_position = (stored_steering(run) if stored is None else stored).get(category, {})
         if not by_position or (position is not None and position not in by_position):

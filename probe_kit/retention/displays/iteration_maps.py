@@ -41,9 +41,13 @@ if TYPE_CHECKING:
 class IterationMapDisplay(Display):
     """Held-out accuracy at every layer and iteration of one stream, for one category in one view.
 
-    accuracy: (I, L) shares. significant: (I, L), above chance against the best site of the stream, and
-    above the controls that were run. layers, iterations: the numbers along both sides, (L,) and (I,). Colours run
-    from chance to 100 % in every map of every run.
+    Attributes:
+        layers: The numbers along both sides, (L,) and (I,). Colours run from chance to 100 % in every map of every
+            run.
+        iterations: As `layers`.
+        accuracy: (I, L) shares.
+        significant: (I, L), above chance against the best site of the stream, and above the controls that were
+            run.
     """
 
     category: str
@@ -64,8 +68,10 @@ class IterationMapDisplay(Display):
     ) -> Self:
         """Read stored probes; view: the first probed one by default; stream: where the action is made.
 
-        Raises UnknownSiteError for a view that was not probed or a stream without iterations,
-        UnknownCategoryError for a category that was not probed, UsageError for a target that is no side.
+        Raises:
+            UnknownSiteError: For a view that was not probed or a stream without iterations.
+            UnknownCategoryError: For a category that was not probed.
+            UsageError: For a target that is no side.
         """
         view = known_view(results, view)
         curve = curve_of(results, category, view)
@@ -142,7 +148,8 @@ class IterationMapDisplay(Display):
 def iteration_maps(results: ProbeResults, view: str | None = None, stream: str | None = None) -> "Figure":
     """A layer × iteration map of every category on one scale of colours.
 
-    Raises UnknownSiteError for a view that was not probed or a stream without iterations.
+    Raises:
+        UnknownSiteError: For a view that was not probed or a stream without iterations.
     """
     categories = results.settings.categories
     return in_panels([IterationMapDisplay.from_results(results, name, view, stream) for name in categories])

@@ -40,8 +40,10 @@ if TYPE_CHECKING:
 class BestSiteDisplay(Display):
     """A panel of a label's probes at the best site of a stream: that of the largest score above its own chance.
 
-    curve: of this site alone. signal: whether it exceeds chance, family-wise, and every control that was run.
-    scores_of_controls: those that it is compared with, the best first.
+    Attributes:
+        curve: Of this site alone.
+        signal: Whether it exceeds chance, family-wise, and every control that was run.
+        scores_of_controls: Those that it is compared with, the best first.
     """
 
     target: str
@@ -61,7 +63,9 @@ class BestSiteDisplay(Display):
     ) -> Self:
         """Read stored probes; view, category: the first probed one by default.
 
-        Raises UnknownSiteError for a view or stream that was not probed, UsageError for labels of another kind.
+        Raises:
+            UnknownSiteError: For a view or stream that was not probed.
+            UsageError: For labels of another kind.
         """
         category, view, curve = probed_curve(results, view, category)
         if why_not := cls.why_not(curve):

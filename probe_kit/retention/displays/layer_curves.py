@@ -56,7 +56,8 @@ Shares = NDArray[np.float64]
 def of_iterations(scores: "pd.DataFrame", iterations: Iterations) -> "pd.DataFrame":
     """The rows of one stream that take part; all of a stream that runs once.
 
-    Raises UsageError if the stream has no such iteration.
+    Raises:
+        UsageError: If the stream has no such iteration.
     """
     steps = scores["iteration"].dropna()
     if iterations in ("all", "best") or steps.empty:
@@ -72,8 +73,9 @@ def of_iterations(scores: "pd.DataFrame", iterations: Iterations) -> "pd.DataFra
 class LayerLine:
     """Held-out score by layer; arrays (L,), accuracies as shares or R², with their 95 % interval over groups.
 
-    iteration: of all values, None where the stream runs once or where every layer has its best one.
-    significant: above chance, family-wise, and above the controls that were run.
+    Attributes:
+        iteration: Of all values, None where the stream runs once or where every layer has its best one.
+        significant: Above chance, family-wise, and above the controls that were run.
     """
 
     iteration: int | None
@@ -96,12 +98,14 @@ class LayerLine:
 class StreamCurve(LayerLine):
     """One stream's held-out score by layer; arrays (L,), accuracies as shares or R².
 
-    part: of the model, see `Stream.part`. depth: the layer as a fraction.
-
-    sites: L best ones of the iterations that are shown, of a label by the score above their own chance. score: of
-    these. iterations: how many are shown.
-    lines: what is drawn: one per iteration, or the best. peaks: (layer, iteration) of the best sites, all of them
-    where several tie.
+    Attributes:
+        part: Of the model, see `Stream.part`.
+        sites: L best ones of the iterations that are shown, of a label by the score above their own chance. score:
+            of these.
+        depth: The layer as a fraction.
+        iterations: How many are shown.
+        lines: What is drawn: one per iteration, or the best.
+        peaks: (layer, iteration) of the best sites, all of them where several tie.
     """
 
     stream: str
@@ -116,7 +120,8 @@ class StreamCurve(LayerLine):
     def of_stream(cls, scores: "pd.DataFrame", iterations: Iterations = "best") -> Self:
         """Read the rows of one category, view and stream of `ProbeResults.scores`.
 
-        Raises UsageError if the stream has no such iteration.
+        Raises:
+            UsageError: If the stream has no such iteration.
         """
         scores = of_iterations(scores, iterations)
         excess = scores["score"] - (0.0 if scores["target"].iloc[0] in SIDES else scores["chance"].fillna(0.0))
@@ -164,9 +169,12 @@ PERCENT = 100.0
 class Ground:
     """The chance, band and control that the scores of one stream are compared with; arrays (L,) by layer.
 
-    chance: one half for a side, else the mean score of the label permutations at the layer's best site; NaN
-    without any. null_band: ends of the range that holds 95 % of the scores under label permutation, of a side
-    those of all sites; None below 20 permutations. control: name and score of the best control of a label.
+    Attributes:
+        chance: One half for a side, else the mean score of the label permutations at the layer's best site; NaN
+            without any.
+        null_band: Ends of the range that holds 95 % of the scores under label permutation, of a side those of all
+            sites; None below 20 permutations.
+        control: Name and score of the best control of a label.
     """
 
     chance: NDArray[np.float64]
@@ -219,7 +227,10 @@ class LayerCurveDisplay(Display):
     """Held-out score by layer, for one category in one view: accuracy of a side, metric of a label.
 
     Filled markers are above chance against the best site of their stream (family-wise p < 0.05), and above every
-    control that was run. grounds: what the scores are compared with, one per stream.
+    control that was run.
+
+    Attributes:
+        grounds: What the scores are compared with, one per stream.
     """
 
     target: str
@@ -240,9 +251,14 @@ class LayerCurveDisplay(Display):
     ) -> Self:
         """Read stored probes; category, view: the first probed one by default.
 
-        iterations: a line for each of `all`, for the `best` of every layer, for the `last` one or one by number.
-        Raises UnknownSiteError for a view, and UnknownCategoryError for a category, that was not probed, and
-        UsageError for an iteration that no stream has.
+        Args:
+            iterations: A line for each of `all`, for the `best` of every layer, for the `last` one or one by
+                number.
+
+        Raises:
+            UnknownSiteError: For a view.
+            UnknownCategoryError: For a category, that was not probed.
+            UsageError: For an iteration that no stream has.
         """
         category, view, _ = probed_curve(results, view, category)
         scores, settings = scores_of(results, category, view), results.settings
@@ -319,13 +335,20 @@ def layer_curve(
 ) -> "Figure":
     """Return a figure of held-out score by layer for every category (`figure.savefig(…)`).
 
-    Backbone beside action, which has a line per iteration on one scale of colours; iterations: `all`, or `best`
-    for the best of every layer, `last`, or one by number. Bars: each layer's 95 % interval, where the stream runs
-    once. Filled markers are above chance against the best site of their stream (family-wise p < 0.05), and above
-    every control that was run. Grey: chance, and the band that holds 95 % of the scores under label permutation;
-    of a label at the best site of each layer, with the best control. view: the first probed one by default.
-    categories: all by default. Raises UnknownSiteError for a view that was not probed, UsageError for an
-    iteration.
+    Backbone beside action, which has a line per iteration on one scale of colours;
+
+    Args:
+        view: The first probed one by default.
+        iterations: `all`, or `best` for the best of every layer, `last`, or one by number. Bars: each layer's 95 %
+            interval, where the stream runs once. Filled markers are above chance against the best site of their
+            stream (family-wise p < 0.05), and above every control that was run. Grey: chance, and the band that
+            holds 95 % of the scores under label permutation; of a label at the best site of each layer, with the
+            best control.
+        categories: All by default.
+
+    Raises:
+        UnknownSiteError: For a view that was not probed.
+        UsageError: For an iteration.
     """
     view, names = known_view(results, view), categories or results.settings.categories
     displays = [LayerCurveDisplay.from_results(results, name, view, iterations) for name in names]
@@ -392,8 +415,10 @@ def draw_line(
 ) -> None:
     """Draw one line; filled markers where it is significant. bars: each layer's own 95 % interval.
 
-    A layer that was chosen, such as the best iteration's, has no interval of its own. scale: 100 for percent, on
-    whose fixed axis scores that lie below are marked at the edge.
+    A layer that was chosen, such as the best iteration's, has no interval of its own.
+
+    Args:
+        scale: 100 for percent, on whose fixed axis scores that lie below are marked at the edge.
     """
     layers, scores = line.layers + sidestep, scale * line.score
     if bars:

@@ -32,7 +32,9 @@ DOTS = f"Dots mark evidence: {SIGNAL}"
 class DrawnRun:
     """A run of a table, of labels each with one. stem: beginning of its files' names.
 
-    position: among the runs. results: its probes, None without any.
+    Attributes:
+        position: Among the runs.
+        results: Its probes, None without any.
     """
 
     of_table: TableRun
@@ -101,9 +103,13 @@ class FigureSource:
 class ReportFigure:
     """A figure that can be drawn.
 
-    name: file stem. subject: which numbers it shows, such as `behaviour` or `probes`. run: its position among the
-    runs, None if it shows all of them. reading: how to read it, in plain language. is_table: its numbers are a
-    table that is printed as such elsewhere. is_detail: the main figures can be read without it.
+    Attributes:
+        name: File stem.
+        subject: Which numbers it shows, such as `behaviour` or `probes`.
+        reading: How to read it, in plain language.
+        run: Its position among the runs, None if it shows all of them.
+        is_table: Its numbers are a table that is printed as such elsewhere.
+        is_detail: The main figures can be read without it.
     """
 
     name: str
@@ -133,7 +139,8 @@ Maker = Callable[[FigureSource], Iterator[ReportFigure]]
 def in_report(rank: int, *targets: Literal["sides", "labels"]) -> Callable[[Maker], Maker]:
     """Mark a function that yields figures of reports and `--figures`. rank: in their order.
 
-    targets: the tables that it draws, those of sides by default.
+    Args:
+        *targets: The tables that it draws, those of sides by default.
     """
 
     def mark(make: Maker) -> Maker:
@@ -190,8 +197,11 @@ class ProbedView:
     ) -> ReportFigure:
         """Return a figure of it for a report; those of other views than the first are details.
 
-        name: of the figure in file names. title: without the view. reading: how to read it, in plain language.
-        draw: makes it of results, view and `more`.
+        Args:
+            name: Of the figure in file names.
+            title: Without the view.
+            reading: How to read it, in plain language.
+            draw: Makes it of results, view and `more`.
         """
         settings = self.results.settings
         views = settings.views

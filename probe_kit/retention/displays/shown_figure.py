@@ -24,7 +24,8 @@ def picture_of(figure: Figure) -> Picture:
 class ShownFigure(Figure):
     """A matplotlib figure like any other, that also shows itself and saves fit for print.
 
-    caption: what it is about, in full: model, weights, suite, sizes, probes, settings.
+    Attributes:
+        caption: What it is about, in full: model, weights, suite, sizes, probes, settings.
     """
 
     caption: str = ""

@@ -53,9 +53,11 @@ if TYPE_CHECKING:
 class CurvesDisplay(Display):
     """Held-out accuracy by layer, one line per name, for one category; of each layer the best iteration.
 
-    curves: by name, such as a view or a run. looks: what is drawn alike in all panels, in order. Along the lower
-    side are layers, or depth as a fraction where curves differ in their number. has_bars: whether layers have
-    their 95 % intervals.
+    Attributes:
+        curves: By name, such as a view or a run.
+        looks: What is drawn alike in all panels, in order. Along the lower side are layers, or depth as a fraction
+            where curves differ in their number.
+        has_bars: Whether layers have their 95 % intervals.
     """
 
     measure: str = "held-out accuracy (%)"
@@ -113,7 +115,9 @@ class RoleCurvesDisplay(CurvesDisplay):
     ) -> Self:
         """Read stored probes; views: all probed ones of the stream by default. iterations: which take part.
 
-        Raises UnknownSiteError if none of them was probed there, UnknownCategoryError for a category.
+        Raises:
+            UnknownSiteError: If none of them was probed there.
+            UnknownCategoryError: For a category.
         """
         candidates = tuple(views or results.settings.views)
         curve_of(results, category, results.settings.views[0])
@@ -193,10 +197,13 @@ class ModelDepthDisplay(Display):
     ) -> Self:
         """Read the stored probes of several runs; view: the first probed one of each by default.
 
-        names: what runs are called, in order; by default as when they were probed.
+        Args:
+            names: What runs are called, in order; by default as when they were probed.
 
-        Raises UnknownSiteError for a view that was not probed, UsageError if no run has that stream, or for probes
-        of a target that is no side: other metrics have no common scale.
+        Raises:
+            UnknownSiteError: For a view that was not probed.
+            UsageError: If no run has that stream, or for probes of a target that is no side: other metrics have no
+                common scale.
         """
         if labels := [probes.settings.target for probes in results if not probes.settings.is_side]:
             raise UsageError(
@@ -319,9 +326,15 @@ def curves_side_by_side(
     """Layer curves of several runs: a panel per category and part of the model, a line per run.
 
     Of iterative streams the best of the iterations at each layer counts. Lines have no intervals: the table says
-    whether two runs differ. Along the lower side layers, or depth as a fraction where runs differ in their
-    number. names: of the runs, in order. view: one that some of them were probed in. categories: that are shown,
-    all by default. Raises UsageError if none was.
+    whether two runs differ. Along the lower side layers, or depth as a fraction where runs differ in their number.
+
+    Args:
+        names: Of the runs, in order.
+        view: One that some of them were probed in.
+        categories: That are shown, all by default.
+
+    Raises:
+        UsageError: If none was.
     """
     probed = {name: probes for name, probes in zip(names, results, strict=True) if view in probes.settings.views}
     lines = tuple(ProvenanceLine.of_results(probes, view) for probes in probed.values())
@@ -353,7 +366,11 @@ def _of_part(results: ProbeResults, category: str, view: str, part: str) -> "pd.
 def maps_side_by_side(results: Sequence[ProbeResults], names: Sequence[str], view: str) -> "Figure":
     """Layer × iteration maps of where the action is made: a row per category, a column per run, one scale.
 
-    names: of the runs, in order. Raises UsageError if fewer than two runs have iterations in that view.
+    Args:
+        names: Of the runs, in order.
+
+    Raises:
+        UsageError: If fewer than two runs have iterations in that view.
     """
     with_maps = [(name, probes) for name, probes in zip(names, results, strict=True) if has_maps(probes, view)]
     if len(with_maps) < 2:

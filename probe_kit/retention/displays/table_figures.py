@@ -48,7 +48,10 @@ class Cell:
 class HeatTableDisplay(Display):
     """A table drawn as a figure; the numbers are `cells[row][column].values`.
 
-    rows, columns: their names. parts: names of the values side by side in a cell. certificates: one per row.
+    Attributes:
+        rows: Their names.
+        columns: As `rows`.
+        parts: Names of the values side by side in a cell. certificates: one per row.
     """
 
     rows: tuple[str, ...]
@@ -244,7 +247,8 @@ def place_labels(
 ) -> None:
     """Write each name near its point (data coordinates) in its ink, with a thin line where it had to move away.
 
-    lines: level or upright ones by their ends, such as error bars, which names avoid where they can.
+    Args:
+        lines: Level or upright ones by their ends, such as error bars, which names avoid where they can.
     """
     unit = axes.figure.dpi / 72  # pixels per point of type
     anchors = [axes.transData.transform(point) / unit for point in points]
@@ -317,8 +321,11 @@ class GapPoint:
 class KnowledgeActionDisplay(Display):
     """Success rate against the best probe of a stream, a point per category and model.
 
-    On the diagonal success equals what can be read; below it, more is decodable. Both axes run from 0 to
-    100 %, whatever is shown. modes: whether the shares are of policies, of answers or of both.
+    On the diagonal success equals what can be read; below it, more is decodable. Both axes run from 0 to 100 %,
+    whatever is shown.
+
+    Attributes:
+        modes: Whether the shares are of policies, of answers or of both.
     """
 
     stream: str
@@ -331,7 +338,8 @@ class KnowledgeActionDisplay(Display):
     ) -> Self:
         """Read a retention table; view: the first one of each run by default.
 
-        Raises UsageError if no run was probed in that stream and view.
+        Raises:
+            UsageError: If no run was probed in that stream and view.
         """
         view_of: dict[tuple[str | None, str], str | None] = {}
         points, drawn = [], []

@@ -22,7 +22,10 @@ class EpisodeGrid:
     """cards: one per episode, with how many `frames` it shows and the place of its `picture`, None without one.
 
     Where only the first frame is shown, it may be the left `half` of that picture.
-    pictures: base64 of the WebPs, each once, in blocks of `BLOCK`. note: what was left out and why, or empty.
+
+    Attributes:
+        pictures: base64 of the WebPs, each once, in blocks of `BLOCK`.
+        note: What was left out and why, or empty.
     """
 
     cards: tuple[dict[str, Any], ...]

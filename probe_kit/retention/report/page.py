@@ -102,9 +102,12 @@ def write_report(
 ) -> Path:
     """Write the report of `runs` as one HTML file, whole or not at all, and return its path.
 
-    table: their retention table, of sides with its defaults if it is not given. pictures: at most so many episodes
-    show their frames; a page of labels shows none. Raises UsageError without runs, and for a run that the table
-    was not made of.
+    Args:
+        table: Their retention table, of sides with its defaults if it is not given.
+        pictures: At most so many episodes show their frames; a page of labels shows none.
+
+    Raises:
+        UsageError: Without runs, and for a run that the table was not made of.
     """
     path = Path(path)
     write_whole(path, report_html(runs, table, pictures=pictures))
@@ -271,7 +274,11 @@ def _labels(
     """Return a section per label of the table.
 
     Its rows of the table and what they say, its figures, its best sites beside their controls, a table per run,
-    and what the probes say. names: of the runs. of_run: name of the run where sections are of one.
+    and what the probes say.
+
+    Args:
+        names: Of the runs.
+        of_run: Name of the run where sections are of one.
     """
     sections: list[dict[str, Any]] = []
     for target in table.targets:
@@ -542,8 +549,10 @@ def _of_target(probes: ProbeResults) -> str:
 class Words:
     """The glossary of a page: words of its tables, each with an anchor such as `word-7` that cells link to.
 
-    entries: name, meaning and anchor of each word, by the title of the table. headings: the anchor of a column's
-    word and meaning; two tables may give a word two meanings. values: the anchor of a cell's text that is a word.
+    Attributes:
+        entries: Name, meaning and anchor of each word, by the title of the table.
+        headings: The anchor of a column's word and meaning; two tables may give a word two meanings.
+        values: The anchor of a cell's text that is a word.
     """
 
     entries: Mapping[str, tuple[tuple[str, str, str], ...]]

@@ -69,8 +69,10 @@ if TYPE_CHECKING:
 class RowWithEstimates:
     """A row and the estimates behind its numbers.
 
-    rates: shares of episodes by name, such as `sr`. streams: scores, None without probes. outcomes: the episodes
-    of its success rate, if it has one.
+    Attributes:
+        rates: Shares of episodes by name, such as `sr`.
+        streams: Scores, None without probes.
+        outcomes: The episodes of its success rate, if it has one.
     """
 
     row: RetentionRow
@@ -83,8 +85,9 @@ class RowWithEstimates:
 class RowSettings:
     """The settings of a table.
 
-    epsilons: zone radii in metres for `sr_by_epsilon`, which belong to the rule `disc`. absent_below: accuracy
-    below which a stream's best site counts as absent.
+    Attributes:
+        epsilons: Zone radii in metres for `sr_by_epsilon`, which belong to the rule `disc`.
+        absent_below: Accuracy below which a stream's best site counts as absent.
     """
 
     views: Sequence[str] | None
@@ -97,8 +100,10 @@ class RowSettings:
 def run_rows(table_run: TableRun, results: ProbeResults | None, settings: RowSettings) -> list[RowWithEstimates]:
     """One row per category and view of a run, in the order of its episodes; without `results`, success rates only.
 
-    Probes of a target that is no side have rows without success. Raises UnknownSiteError for a view that was not
-    probed.
+    Probes of a target that is no side have rows without success.
+
+    Raises:
+        UnknownSiteError: For a view that was not probed.
     """
     if results is not None and not results.settings.is_side:
         return [
@@ -160,7 +165,8 @@ def _row(
 def add_image_swap(row: RetentionRow, evidence: StoredEvidence, tie: str = "") -> RetentionRow:
     """The row with the effect of the image swap on its category, judged by its own probes.
 
-    tie: of the row's category and view, see `evidence.stored_ties`.
+    Args:
+        tie: Of the row's category and view, see `evidence.stored_ties`.
     """
     of_category = evidence.swaps.get(row.category)
     if of_category is None:
@@ -220,9 +226,10 @@ _PARTS = ("success", "rules", "answers", "backbone", "action", "controls", "imag
 def mean_row(estimated: Sequence[RowWithEstimates], averaged: Sequence[str]) -> RetentionRow:
     """The category average of rows of one run and view; retention is the ratio of the mean scores.
 
-    averaged: fields that are averaged over the categories that have them, as `part.field`; the columns declare
-    them, see `probe_kit.retention.columns.columns`. Intervals: of independent categories, see
-    `mean_interval` and `Scores.mean`.
+    Args:
+        averaged: Fields that are averaged over the categories that have them, as `part.field`; the columns declare
+            them, see `probe_kit.retention.columns.columns`. Intervals: of independent categories, see
+            `mean_interval` and `Scores.mean`.
     """
     rows = [part.row for part in estimated]
     of_streams = [part.streams for part in estimated if part.streams is not None]
@@ -361,7 +368,9 @@ def with_probes(
 ) -> tuple[RetentionRow, StreamScores | None]:
     """Return the row with the parts of its category's probes, and their scores; None where there are none.
 
-    seed_text: of the run; scores on equal groups of one are paired. absent_below: see `verdict`.
+    Args:
+        absent_below: See `verdict`.
+        seed_text: Of the run; scores on equal groups of one are paired.
     """
     curve = None if row.view is None else results.curves.get((row.category, row.view))
     if row.view is None or curve is None:
@@ -489,7 +498,8 @@ def number_or_none(value: float) -> float | None:
 def with_reason(row: RetentionRow, results: ProbeResults, tests: int = 1) -> RetentionRow:
     """Return a row of a label that says whether there is something to retain, and else what is missing.
 
-    tests: the number that p is corrected for.
+    Args:
+        tests: The number that p is corrected for.
     """
     note, reason = _missing(row, results, tests)
     return replace(row, retention=replace(row.retention, defined=not note, note=note, reason=reason))
@@ -564,7 +574,8 @@ def target_row(
 ) -> RetentionRow:
     """Return the row of a target, also of a side, in one category and view, without success.
 
-    Raises UnknownSiteError if it was not probed.
+    Raises:
+        UnknownSiteError: If it was not probed.
     """
     settings = results.settings
     if (category, view) not in results.curves:

@@ -22,10 +22,14 @@ Mode = Literal["answers", "acts"]
 class RunInfo:
     """The run that the numbers of a row are of.
 
-    location: folder or URL. label: what the run is called in tables and legends. settings: sha256 of the run's
-    settings; probes: key of its probe results. action_stream: `expert`, or `action` in a policy without one, whose
-    iterations are action tokens. call: the captured inference that was probed, from 0. capture_only: activations
-    were captured and the model did not act.
+    Attributes:
+        location: Folder or URL.
+        settings: sha256 of the run's settings.
+        probes: Key of its probe results.
+        label: What the run is called in tables and legends.
+        action_stream: `expert`, or `action` in a policy without one, whose iterations are action tokens.
+        call: The captured inference that was probed, from 0.
+        capture_only: Activations were captured and the model did not act.
     """
 
     location: str
@@ -75,12 +79,17 @@ class RunInfo:
 class AnswerStats:
     """The way in which the model of a VLM run was asked, and what else its answers say; all None for a policy run.
 
-    asked_for: `target`, `distractor` or `absent`. score: by which of its scores `success.sr` is. accuracy_text,
-    accuracy_logits, accuracy_order_balanced: shares that are right by each score. share_unparsable: answers in
-    text that could not be parsed. share_by_clause: those that were found among other words; accuracy_strict:
-    accuracy_text with these as unparsable, where they are many; both None for runs that do not store it.
-    option_mass: mean probability of the admissible answers together. letter_bias: mean logit by which the option
-    named first is preferred. share_near_tie: choices that rounding may have made.
+    Attributes:
+        asked_for: `target`, `distractor` or `absent`.
+        score: By which of its scores `success.sr` is. accuracy_text,
+        accuracy_logits: Shares that are right by each score.
+        accuracy_order_balanced: As `accuracy_logits`.
+        share_unparsable: Answers in text that could not be parsed.
+        share_by_clause: Those that were found among other words; accuracy_strict: accuracy_text with these as
+            unparsable, where they are many; both None for runs that do not store it.
+        option_mass: Mean probability of the admissible answers together.
+        letter_bias: Mean logit by which the option named first is preferred.
+        share_near_tie: Choices that rounding may have made.
     """
 
     prompt: str | None = None
@@ -103,9 +112,13 @@ class AnswerStats:
 class SwapEffect:
     """Effect of exchanging the two pictures, if `probe-kit intervene` was run.
 
-    follow_rate, reversal_rate: shares of episodes; net_follow_rate: their difference; reach_share: displacement
-    toward the correct picture in units of the policy's reach; follow_p: exact, one-sided;
-    see `intervene.ImageSwapEffect`. use: the verdict of that, the row's own probes and stored interchanges.
+    Attributes:
+        follow_rate: Shares of episodes.
+        reversal_rate: As `follow_rate`.
+        net_follow_rate: Their difference.
+        reach_share: Displacement toward the correct picture in units of the policy's reach.
+        follow_p: Exact, one-sided; see `intervene.ImageSwapEffect`.
+        use: The verdict of that, the row's own probes and stored interchanges.
     """
 
     follow_rate: float | None = None
@@ -132,21 +145,29 @@ class SwapEffect:
 class StreamPart:
     """The scores of probes of one stream.
 
-    score: accuracy of the sites that the inner folds choose, on the outer folds; balanced between the sides,
-    so that chance is one half. ci: its 95 % interval. peak: accuracy of the site that is best on all of them,
-    which is too high by the luck of being chosen. at_most: an upper 95 % limit of the best site's accuracy.
-    verdict: `shown` (family-wise above chance, and above every control that was run), `absent` (not shown,
-    `at_most` below a bound, and the bound findable by so many items), or `not shown`. site, layer, depth: the
-    first of the best sites, a place without an interval of its own; ties: how many others are as accurate.
-    p_fwe: of that site, family-wise. exceeds: whether it is better than `chance` and each control; None for one
-    that was not run. selectivity: its accuracy above that of the same probe on random labels of items.
-    minus_untrained: how much more accurate it is than the untrained network's best. remedy: what to do where no p
-    can be below 0.05; empty where one can.
-
     Of a target that is no side, peak is the metric of the site with the largest score above its own chance, and
-    chance the mean score of the label permutations there. above: score above chance of the sites that the inner
-    folds choose, on the outer folds; above_ci: its 95 % interval, Student's. Score, verdict, at_most, selectivity
-    and minus_untrained are of sides alone.
+    chance the mean score of the label permutations there.
+
+    Attributes:
+        score: Accuracy of the sites that the inner folds choose, on the outer folds; balanced between the sides,
+            so that chance is one half.
+        ci: Its 95 % interval.
+        peak: Accuracy of the site that is best on all of them, which is too high by the luck of being chosen.
+        above: Score above chance of the sites that the inner folds choose, on the outer folds.
+        above_ci: Its 95 % interval, Student's. Score, verdict, at_most, selectivity and minus_untrained are of
+            sides alone.
+        at_most: An upper 95 % limit of the best site's accuracy.
+        verdict: `shown` (family-wise above chance, and above every control that was run), `absent` (not shown,
+            `at_most` below a bound, and the bound findable by so many items), or `not shown`.
+        site: The first of the best sites, a place without an interval of its own.
+        layer: As `site`.
+        depth: As `site`.
+        ties: How many others are as accurate.
+        p_fwe: Of that site, family-wise.
+        exceeds: Whether it is better than `chance` and each control; None for one that was not run.
+        selectivity: Its accuracy above that of the same probe on random labels of items.
+        minus_untrained: How much more accurate it is than the untrained network's best.
+        remedy: What to do where no p can be below 0.05; empty where one can.
     """
 
     stream: str | None = None
@@ -196,8 +217,11 @@ class BackbonePart(StreamPart):
 class ActionPart(StreamPart):
     """The scores of probes where the action is made; see `StreamPart`.
 
-    iteration: the flow-matching step or action token of the site. first_peak, first_layer: of the best layer at
-    the first iteration, which has seen no action. All three are None where the stream runs once.
+    Attributes:
+        iteration: The flow-matching step or action token of the site.
+        first_peak: Of the best layer at the first iteration, which has seen no action. All three are None where
+            the stream runs once.
+        first_layer: As `first_peak`.
     """
 
     iteration: int | None = None
@@ -209,12 +233,15 @@ class ActionPart(StreamPart):
 class RetentionPart:
     """Share of the backbone's signal that can be read where the action is made.
 
-    value: score of the action above one half over that of the backbone; in a mean the ratio of the mean scores of
-    all probed categories. ci: its 95 % interval, (None, None) where the backbone is not known well enough to
-    divide by. published: the ratio of the peaks; in a mean the mean of these ratios over the categories whose
-    backbone signal is shown; of sides alone. defined: whether the backbone's signal is shown, in a mean in any
-    category; note: why not, in few words. reason: of a target that is no side the same with what was found, what
-    was expected and what to do.
+    Attributes:
+        value: Score of the action above one half over that of the backbone; in a mean the ratio of the mean scores
+            of all probed categories.
+        ci: Its 95 % interval, (None, None) where the backbone is not known well enough to divide by.
+        published: The ratio of the peaks; in a mean the mean of these ratios over the categories whose backbone
+            signal is shown; of sides alone.
+        defined: Whether the backbone's signal is shown, in a mean in any category.
+        note: Why not, in few words.
+        reason: Of a target that is no side the same with what was found, what was expected and what to do.
     """
 
     value: float | None = None
@@ -229,10 +256,14 @@ class RetentionPart:
 class ControlScores:
     """The scores that those of probes are compared with.
 
-    n_groups: independent groups of items. n_samples: episodes, or inferences of them, that were probed. missing:
-    by side, the share of items without their episode of that side. probe_minus_sr: backbone score − success rate.
-    baselines: accuracy of each control that never sees the model; leaks: those above chance. untrained: name of
-    the untrained network's run.
+    Attributes:
+        n_groups: Independent groups of items.
+        n_samples: Episodes, or inferences of them, that were probed. missing: by side, the share of items without
+            their episode of that side.
+        probe_minus_sr: Backbone score − success rate.
+        baselines: Accuracy of each control that never sees the model.
+        leaks: Those above chance.
+        untrained: Name of the untrained network's run.
     """
 
     n_groups: int | None = None
@@ -252,9 +283,11 @@ MEAN = "mean"
 class RetentionRow:
     """One row of the retention table: its parts. A part with nothing to say holds defaults.
 
-    view: how tokens became one vector, None without probes. target: what the probes decode; task:
-    its kind. group: of several groups of runs, this run's. In a row
-    of category `mean`, numbers are averages over `categories` and retention leaves out `left_out`.
+    Attributes:
+        view: How tokens became one vector, None without probes.
+        target: What the probes decode; task: its kind.
+        group: Of several groups of runs, this run's. In a row of category `mean`, numbers are averages over
+            `categories` and retention leaves out `left_out`.
     """
 
     category: str

@@ -57,8 +57,10 @@ Top = tuple[NDArray[np.float64], NDArray[np.float64], Any]
 def read_tile(path: Path, yaw: int = RELEASE_YAW) -> Tile:
     """The tile in a binary glTF. yaw: degrees by which the scene turns it about z, of `YAWS`.
 
-    Raises SuiteError if it cannot be read, if nothing faces up, and if what does has no picture, more than one, or
-    one that is tinted, repeated or askew. Raises MissingExtraError without trimesh.
+    Raises:
+        SuiteError: If it cannot be read, if nothing faces up, and if what does has no picture, more than one, or
+            one that is tinted, repeated or askew.
+        MissingExtraError: Without trimesh.
     """
     trimesh = require("trimesh", "act2answer")
     if not path.is_file():
@@ -190,8 +192,9 @@ class Pair:
 def read_pairs(root: Path) -> list[Pair]:
     """Every question in the order of its index.
 
-    Raises SuiteError for an answer that is no side (the release takes it for left), for one tile on both sides (it
-    has one body per name), and for indices that are not 0, 1, 2 … (it asks for them one by one).
+    Raises:
+        SuiteError: For an answer that is no side (the release takes it for left), for one tile on both sides (it
+            has one body per name), and for indices that are not 0, 1, 2 … (it asks for them one by one).
     """
     path = root / PAIRS
     records = read_annotations(path, SOURCE, REMEDY, list)
@@ -259,8 +262,13 @@ def convert_set(
 ) -> Suite:
     """The first `n` questions of the set in `root` as a suite in `out`; sides, words and pictures stay.
 
-    categories: the one that its questions are counted under; None for the one that the folder's name tells.
-    Raises UsageError, SuiteError naming file and record, MissingExtraError without trimesh.
+    Args:
+        categories: The one that its questions are counted under; None for the one that the folder's name tells.
+
+    Raises:
+        UsageError: Naming file and record.
+        SuiteError: Naming file and record.
+        MissingExtraError: Without trimesh.
     """
     options = options_from(Act2AnswerOptions, dict(values))
     if options.tile_yaw not in YAWS:

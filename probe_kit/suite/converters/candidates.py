@@ -21,8 +21,10 @@ from probe_kit.suite.pictures import WHITE, decode_picture
 class SourcePicture:
     """A picture of the source. `load` gives it upright and RGB; two equal ids are one picture.
 
-    least_side: what the shorter side must have in pixels, None for the usual limit.
-    operation: what `load` did to it. original: path or key it is read from.
+    Attributes:
+        original: Path or key it is read from.
+        operation: What `load` did to it.
+        least_side: What the shorter side must have in pixels, None for the usual limit.
     """
 
     image_id: str
@@ -48,10 +50,13 @@ class Wording:
 class Candidate:
     """One question of the source with the picture that answers it, and with the one that does not if it has one.
 
-    answer: short answer in words, where the pictures are the answer to a question in words.
-    wording: given where the source says what the picture shows; else the rewriting rules have to find one.
-    family: pictures are paired inside one family first. forbids: names that must not be in the other picture;
-    shows: names it is known to show. needs_person: only a person can accept it.
+    Attributes:
+        answer: Short answer in words, where the pictures are the answer to a question in words.
+        wording: Given where the source says what the picture shows; else the rewriting rules have to find one.
+        family: Pictures are paired inside one family first.
+        shows: Names it is known to show.
+        forbids: Names that must not be in the other picture.
+        needs_person: Only a person can accept it.
     """
 
     source_id: str
@@ -79,7 +84,8 @@ class Candidate:
 class Reading:
     """The content of a source: candidates, the number of records per category, and why others were left out.
 
-    files: annotation files read. license, attribution, url and revision are those of the source.
+    Attributes:
+        files: Annotation files read. license, attribution, url and revision are those of the source.
     """
 
     license: str
@@ -102,12 +108,18 @@ class Reading:
 class ConvertOptions:
     """Settings every source shares.
 
-    min_side: pixels of the shorter side. max_aspect: longer over shorter side. min_spread: standard deviation of
-    the grey levels. legible_at: tile side in pixels at which edges must survive, None for no such check.
-    paper_polarity: keep every comparison as the source asks it, which lets pictures alone give the answer.
-    image_root: where pictures lie if not below the root.
-    llm_base, llm_model, llm_cache: an OpenAI-compatible service that proposes wordings no rule finds; its key is
-    read from the environment variable PROBE_KIT_LLM_KEY. trust_llm: emit them without a person.
+    Attributes:
+        min_side: Pixels of the shorter side.
+        max_aspect: Longer over shorter side.
+        min_spread: Standard deviation of the grey levels.
+        legible_at: Tile side in pixels at which edges must survive, None for no such check.
+        paper_polarity: Keep every comparison as the source asks it, which lets pictures alone give the answer.
+        image_root: Where pictures lie if not below the root.
+        llm_base: An OpenAI-compatible service that proposes wordings no rule finds; its key is read from the
+            environment variable PROBE_KIT_LLM_KEY.
+        llm_model: As `llm_base`.
+        llm_cache: As `llm_base`.
+        trust_llm: Emit them without a person.
     """
 
     min_side: int = 100
@@ -159,7 +171,9 @@ class MmbenchOptions(ConvertOptions):
 class OkVqaOptions(ConvertOptions):
     """instances: folder with COCO's `instances_<split>.json`, which can show that an animal is absent.
 
-    min_agreement: share of the ten answers that must agree. min_object_share: of the picture's area.
+    Attributes:
+        min_agreement: Share of the ten answers that must agree.
+        min_object_share: Of the picture's area.
     """
 
     instances: str | None = None
@@ -179,8 +193,10 @@ class VlThinkOptions(ConvertOptions):
 class Act2AnswerOptions:
     """The options of a set in Act2Answer's own format, for what the format does not say.
 
-    tile_yaw: degrees by which its scene turns the tiles; 90 as released, 0 as VL-Think does.
-    contains_real_face: whether its pictures show real people. license: an SPDX name, if you know it.
+    Attributes:
+        tile_yaw: Degrees by which its scene turns the tiles; 90 as released, 0 as VL-Think does.
+        contains_real_face: Whether its pictures show real people.
+        license: An SPDX name, if you know it.
     """
 
     tile_yaw: int = 90
@@ -240,7 +256,8 @@ def field_of(record: Any, name: str, kind: type, source: str, where: str) -> Any
 def by_key[Key, Value](entries: Iterable[tuple[Key, Value, str]], source: str, key: str) -> dict[Key, Value]:
     """The values of (key, value, where) by their key. key: its name, for messages.
 
-    Raises SuiteError naming both records of a key that occurs twice.
+    Raises:
+        SuiteError: Naming both records of a key that occurs twice.
     """
     values: dict[Key, Value] = {}
     places: dict[Key, str] = {}

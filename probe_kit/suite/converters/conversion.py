@@ -92,12 +92,18 @@ def convert(
 ) -> Suite:
     """A suite made from the benchmark in `root`, written to `out` and loaded.
 
-    n: most items per category. curation: a reviewed file; only what it accepts is emitted. emit_curation: where to
-    write a file to review. options: fields of the source's options, such as `min_side` (see `SOURCES`).
-    The same arguments give the same bytes. `stats.json` counts every stage beside the paper.
-    Sets in Act2Answer's own format (`act2answer`) are converted question by question, whatever `seed` is.
-    Raises UsageError for arguments, and SuiteError naming file, record and remedy for a tree that is not what it
-    should be; `out` is then left as it was.
+    Args:
+        n: Most items per category.
+        curation: A reviewed file; only what it accepts is emitted.
+        emit_curation: Where to write a file to review.
+        **options: Fields of the source's options, such as `min_side` (see `SOURCES`). The same arguments give the
+            same bytes. `stats.json` counts every stage beside the paper. Sets in Act2Answer's own format
+            (`act2answer`) are converted question by question, whatever `seed` is.
+
+    Raises:
+        UsageError: For arguments.
+        SuiteError: Naming file, record and remedy for a tree that is not what it should be; `out` is then left as
+            it was.
     """
     if source not in EVERY_SOURCE:
         raise UsageError(f"unknown source {source!r}; available: {', '.join(EVERY_SOURCE)}.")

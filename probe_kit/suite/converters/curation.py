@@ -112,7 +112,8 @@ def _decided(row: dict[str, Any], where: str) -> dict[str, Any]:
 def apply_curation(proposals: Sequence[Proposal], rows: Sequence[Row], path: Path) -> dict[str, Proposal]:
     """The accepted proposals by candidate id, reworded where a person did so.
 
-    Raises SuiteError for ids this conversion does not have, and for rows whose question has changed since.
+    Raises:
+        SuiteError: For ids this conversion does not have, and for rows whose question has changed since.
     """
     by_id = {proposal.candidate_id: proposal for proposal in proposals}
     unknown = [row["candidate_id"] for row in rows if row["candidate_id"] not in by_id]

@@ -55,7 +55,10 @@ def pair_candidates(
 
     Questions that bring both pictures keep them, and half of those with an opposite ask for it, so that the
     pictures alone do not give the answer. Others are paired two by two and asked both ways.
-    reuse: every two of those, instead of every picture once. alike: whether two pictures are too much the same.
+
+    Args:
+        reuse: Every two of those, instead of every picture once.
+        alike: Whether two pictures are too much the same.
     """
     native = [candidate for candidate in candidates if candidate.distractor is not None]
     single = [candidate for candidate in candidates if candidate.distractor is None]

@@ -73,7 +73,8 @@ class _Rule:
 def rewrite(question: str, answer: str = "", options_are_names: bool = False) -> Wording | None:
     """The wording of the first rule that matches, None (rule R0) if a person has to write it.
 
-    answer: the right option's text, for questions whose options are words.
+    Args:
+        answer: The right option's text, for questions whose options are words.
     """
     text = clean(question)
     if options_are_names and _IDENTITY.match(text):
@@ -264,8 +265,11 @@ a leading article), polarity (pos, neg or none), keep (false if choosing one of 
 def propose_wording(candidate: Candidate, options: ConvertOptions) -> Wording | None:
     """Return the wording that the service proposes, None if it proposes nothing usable.
 
-    Replies are kept in `llm_cache`, so that the same conversion needs no network again. Raises UsageError for
-    incomplete options, and SuiteError if the service does not answer.
+    Replies are kept in `llm_cache`, so that the same conversion needs no network again.
+
+    Raises:
+        UsageError: For incomplete options.
+        SuiteError: If the service does not answer.
     """
     if options.llm_base is None:
         return None

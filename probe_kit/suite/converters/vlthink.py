@@ -134,7 +134,8 @@ def _repaint(board: Path, color: str) -> Image.Image:
 def upright_board(path: Path) -> Image.Image:
     """The art of one board. Textures are stored with rows and columns exchanged: as such, STOP reads backwards.
 
-    Raises SuiteError if the file is not a binary glTF with one embedded picture.
+    Raises:
+        SuiteError: If the file is not a binary glTF with one embedded picture.
     """
     art = trimmed(_texture(path).transpose(Image.Transpose.TRANSPOSE))
     art.thumbnail((_MOST_PIXELS, _MOST_PIXELS), Image.Resampling.LANCZOS)

@@ -37,9 +37,11 @@ Draw = Callable[[Pen, float, RGB], None]
 @dataclass(frozen=True)
 class Gradable:
     """A thing asked for by more or by less of one property. Its colour is free, unless `shaded`: then its shade
+
     is the level.
 
-    upright: whether it must not be turned, because a turn would change the property.
+    Attributes:
+        upright: Whether it must not be turned, because a turn would change the property.
     """
 
     more: str

@@ -152,8 +152,9 @@ def random_placement(
 ) -> Placement:
     """A placement for a drawing that has the tile to itself: up to 5 % off centre, up to `turn` degrees turned.
 
-    scales: the range of its radius; a drawing that fills the unit disk leaves the tile above FULL_DISK.
-    mirrored: whether it may also be mirrored; not where that would change what is shown, as with lettering.
+    Args:
+        scales: The range of its radius; a drawing that fills the unit disk leaves the tile above FULL_DISK.
+        mirrored: Whether it may also be mirrored; not where that would change what is shown, as with lettering.
     """
     return Placement(
         scale=round(rng.uniform(*scales), 4),
@@ -220,7 +221,8 @@ class Canvas:
 class Tile:
     """Everything one picture is drawn from: plain values, and so a record of it.
 
-    ink: a colour from which the background stands apart.
+    Attributes:
+        ink: A colour from which the background stands apart.
     """
 
     ink: RGB

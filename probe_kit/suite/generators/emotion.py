@@ -40,9 +40,13 @@ _MOUTH_Y = 0.5
 class Expression:
     """The settings of a face; each of them is 0 at rest.
 
-    smile: corners of the mouth up (1) or down (-1). gape: mouth open, 0 to 1. wave: a trembling mouth, 0 to 1.
-    frown: inner ends of the brows down (1) or up (-1). lift: brows up, 0 to 1.
-    eyes: wide open (1), at rest (0), shut (-1).
+    Attributes:
+        smile: Corners of the mouth up (1) or down (-1).
+        gape: Mouth open, 0 to 1.
+        wave: A trembling mouth, 0 to 1.
+        frown: Inner ends of the brows down (1) or up (-1).
+        lift: Brows up, 0 to 1.
+        eyes: Wide open (1), at rest (0), shut (-1).
     """
 
     smile: float = 0

@@ -25,7 +25,8 @@ from probe_kit.suite.generators.generator import Concept, Generator, none_alike,
 class Pictogram:
     """A public sign; a forbidden one is drawn under a red ring and bar.
 
-    shows: what is drawn, where the name says what it stands for instead.
+    Attributes:
+        shows: What is drawn, where the name says what it stands for instead.
     """
 
     name: str

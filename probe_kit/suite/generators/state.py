@@ -39,7 +39,8 @@ _VIVID = ("red", "green", "blue", "orange", "purple")
 class TwoStates:
     """A thing asked for in the one state or in the other; `draw` takes whether it is in the first.
 
-    colors: the basic colours it comes in.
+    Attributes:
+        colors: The basic colours it comes in.
     """
 
     first: str

@@ -37,7 +37,10 @@ LEAST_SCALE = 0.1
 class Block:
     """Consecutive rows of a site, all of episodes that the same outer fold tests.
 
-    rows: of the site. episode: (B,) episode of every row. outer: number of the outer fold that tests them.
+    Attributes:
+        rows: Of the site.
+        episode: (B,) episode of every row.
+        outer: Number of the outer fold that tests them.
     """
 
     rows: slice
@@ -49,9 +52,12 @@ class Block:
 class TrainingSets:
     """The F sets of episodes on which probes are trained: of every inner fold, then of every outer one.
 
-    member: (F, E) float32, 1 where an episode belongs to a set. outer: (F,) the outer fold each belongs to, of
-    whose test episodes it has none. counts: (F,) samples. mean, scale: (F, D) float64, what standardises a set,
-    measured from the site's mean in units of its scale.
+    Attributes:
+        member: (F, E) float32, 1 where an episode belongs to a set.
+        outer: (F,) the outer fold each belongs to, of whose test episodes it has none.
+        counts: (F,) samples.
+        mean: (F, D) float64, what standardises a set, measured from the site's mean in units of its scale.
+        scale: As `mean`.
     """
 
     member: NDArray[np.float32]
@@ -65,11 +71,16 @@ class TrainingSets:
 class JointSite:
     """M samples of E episodes, standardised by the site's own mean and scale and sorted by outer fold.
 
-    features: (M, D) raw rows in this order. blocks: they cover all rows.
-    mean, scale: (D,) float64; infinite scale for a feature that never varies. unclear: whether any feature is so
-    near to never varying that training sets may disagree on it.
-    axes: (D, D) float32, principal axes of the standardised samples; variances: (D,) squared lengths along them.
-    turned: (M, D) float32, standardised samples along the axes: they shape steps, never a gradient that counts.
+    Attributes:
+        features: (M, D) raw rows in this order.
+        blocks: They cover all rows.
+        mean: (D,) float64; infinite scale for a feature that never varies.
+        scale: As `mean`.
+        unclear: Whether any feature is so near to never varying that training sets may disagree on it.
+        axes: (D, D) float32, principal axes of the standardised samples.
+        variances: (D,) squared lengths along them.
+        turned: (M, D) float32, standardised samples along the axes: they shape steps, never a gradient that
+            counts.
     """
 
     features: RowSubset
@@ -175,9 +186,12 @@ TINY = float(np.finfo(np.float32).tiny)
 class NewtonState:
     """The objective of k problems at some weights.
 
-    value: (k,) C · Σ loss + penalty. gradient: (k, R) by weights along axes, float64. size, length: (k,) norms
-    of gradient and weights as scikit-learn's objective has them. curvature: (k, …) what products with the Hessian
-    need.
+    Attributes:
+        value: (k,) C · Σ loss + penalty.
+        gradient: (k, R) by weights along axes, float64.
+        size: (k,) norms of gradient and weights as scikit-learn's objective has them.
+        length: As `size`.
+        curvature: (k, …) what products with the Hessian need.
     """
 
     value: Array
@@ -412,7 +426,8 @@ def _losses(margins: Array) -> tuple[Array, Array, Array]:
 def solve(problems: JointProblems, start: Array) -> Array:
     """Optimal weights (K, R) of all problems, found from `start` (K, R).
 
-    Raises ProbeNotConvergedError rather than return one that is not at its optimum.
+    Raises:
+        ProbeNotConvergedError: Rather than return one that is not at its optimum.
     """
     search = _NewtonSolver(problems)
     return search.refined(problems.turned_back(search.rough(problems.turned(start))))

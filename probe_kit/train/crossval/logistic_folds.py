@@ -30,7 +30,10 @@ def cross_validate(samples: Samples, labels: NDArray[np.bool_], folds: list[Nest
 
     Wide tokens with few columns are solved for all training sets together, where these have the same features, and
     so are small problems.
-    Raises ProbeNotConvergedError, and TooFewGroupsError for a training set with a single class.
+
+    Raises:
+        ProbeNotConvergedError: For a training set with a single class.
+        TooFewGroupsError: For a training set with a single class.
     """
     if can_be_joint(samples, labels.shape[1]) and (site := JointSite.of(samples, folds)).alike:
         return cross_validate_jointly(site, samples, labels, folds)
@@ -109,7 +112,9 @@ def cross_validate_together(
 ) -> list[FittedFold]:
     """The probes of every outer fold, each column of (E, K) labels on its own.
 
-    Raises ProbeNotConvergedError, and TooFewGroupsError for a training set with a single class.
+    Raises:
+        ProbeNotConvergedError: For a training set with a single class.
+        TooFewGroupsError: For a training set with a single class.
     """
     inner = _at_once([fold for nested in folds for fold in nested.inner], labels)
     parts = [_Together.of(samples, labels, some).losses() for some in inner]
@@ -138,7 +143,9 @@ def _at_once[T](folds: Iterable[T], labels: NDArray[np.bool_]) -> Iterator[tuple
 class _Together:
     """The training sets of F folds, and K label columns for each: column f · K + k of the solver is of fold f.
 
-    labels: (E, K). signs: (N, F · K), 0 where a fold has fewer than N samples.
+    Attributes:
+        labels: (E, K).
+        signs: (N, F · K), 0 where a fold has fewer than N samples.
     """
 
     folds: Sequence[Fold]
@@ -231,7 +238,10 @@ def cross_validate_jointly(
 
     Every C starts from nothing: with the one before as a start, problems took nearly as many products, which were
     a seventh as wide and so half as fast.
-    Raises ProbeNotConvergedError, and TooFewGroupsError for a training set with a single class.
+
+    Raises:
+        ProbeNotConvergedError: For a training set with a single class.
+        TooFewGroupsError: For a training set with a single class.
     """
     share = site.sets.member @ labels / site.sets.member.sum(axis=1)[:, None]
     if ((share == 0) | (share == 1)).any():
@@ -289,7 +299,10 @@ class _SharedColumns:
     def _select_strengths(self) -> tuple[NDArray[np.intp], Array, list[InnerQuality]]:
         """(F, L) position of the chosen C by outer fold and column; (C, F, L, D + 1) weights to start from.
 
-        The weights are the mean of the inner folds'. Returns also the inner quality of every outer fold.
+        The weights are the mean of the inner folds'.
+
+        Returns:
+            Also the inner quality of every outer fold.
         """
         sets = [(number, inner) for number, nested in enumerate(self.folds) for inner in nested.inner]
         of_fold = np.array([number for number, _ in sets])

@@ -37,8 +37,11 @@ def nested_folds(
 ) -> list[NestedFold]:
     """Outer folds for scoring, each with inner folds for choosing C; all positions refer to the E episodes.
 
-    labels, groups: (E,). split: makes the folds of labels, groups, their number and a seed. Raises what it raises,
-    by default TooFewGroupsError.
+    Args:
+        labels: (E,).
+        groups: As `labels`.
+        split: Makes the folds of labels, groups, their number and a seed. Raises what it raises, by default
+            TooFewGroupsError.
     """
     group_of = np.asarray(groups)
     return [
@@ -57,9 +60,11 @@ def nested_folds(
 class InnerQuality:
     """Quality of an outer fold's inner predictions, each label column at the penalty that is best by it.
 
-    The larger the better: minus log-losses, minus squared errors, or shares of right classes. total: (K,) summed
-    over the training episodes. first: (E,) the first column's by episode, 0 for the episodes that the outer fold
-    tests.
+    The larger the better: minus log-losses, minus squared errors, or shares of right classes.
+
+    Attributes:
+        total: (K,) summed over the training episodes.
+        first: (E,) the first column's by episode, 0 for the episodes that the outer fold tests.
     """
 
     total: Matrix
@@ -75,10 +80,11 @@ class InnerQuality:
 class FittedFold:
     """The probes of one outer fold.
 
-    decisions: (n, K) of its test episodes. strengths: (K,) the C chosen for each label column. inner: the
-    quality of the inner folds' predictions at these C.
-    weights (D,), intercept: the first column's probe on raw features, and the deviation (`spread`) of its
-    training samples along them.
+    Attributes:
+        decisions: (n, K) of its test episodes.
+        strengths: (K,) the C chosen for each label column.
+        inner: The quality of the inner folds' predictions at these C. weights (D,), intercept: the first column's
+            probe on raw features, and the deviation (`spread`) of its training samples along them.
     """
 
     decisions: Matrix

@@ -35,8 +35,10 @@ PENALTIES: Matrix = np.array([*10.0 ** np.arange(-2, 6), np.inf])
 class RidgeFold:
     """Training and test samples of one fold, factorised.
 
-    spectrum: (R,) eigenvalues. to_coordinates: (R, n) turns centred training targets into coordinates.
-    to_predictions: (m, R) turns shrunken coordinates into predictions of the test samples.
+    Attributes:
+        spectrum: (R,) eigenvalues.
+        to_coordinates: (R, n) turns centred training targets into coordinates.
+        to_predictions: (m, R) turns shrunken coordinates into predictions of the test samples.
     """
 
     spectrum: Matrix
@@ -73,8 +75,11 @@ class RidgeFold:
 class Predictions:
     """Held-out predictions of E samples for K columns of labels.
 
-    values: (E, K) decision values of a side, else class numbers or quantities. strengths: (F,) C or λ of the first
-    column. inner: every fold's inner quality. folds: the logistic probes of the folds; empty of ridge.
+    Attributes:
+        values: (E, K) decision values of a side, else class numbers or quantities.
+        strengths: (F,) C or λ of the first column.
+        inner: Every fold's inner quality.
+        folds: The logistic probes of the folds; empty of ridge.
     """
 
     values: Matrix
@@ -145,15 +150,20 @@ def _along_penalties(samples: Samples, labels: Matrix, classes: int, fold: Fold)
 class SiteProbe:
     """The results of a site's probe on E samples, with F outer folds and P label permutations.
 
-    decisions: (E,) out-of-fold decision values of a side (positive: left), else predicted class numbers or
-    quantities. scores: (E,) their mean is the metric; of a side whether the decision is right. strengths: (F,)
-    chosen in each outer fold: C of logistic probes, λ of ridge, of which the larger penalises more. weights,
-    intercepts: (F, D) float32 and (F,) of each outer fold's probe of a side, on raw features; D is 0 for other
-    targets. spreads: (F,) deviation of the fold's training samples along its weights, in units of the features.
-    null: (P,) metric under the label permutations. inner: (F, E) quality of each sample's prediction in the inner
-    folds of each outer fold, by which penalties are chosen, the larger the better; 0 for the samples that the
-    outer fold tests. Of a side the log-likelihood of its label. Of others the gain of `_predict_by_ridge` or the
-    log-likelihood, minus the mean over the label permutations.
+    Attributes:
+        decisions: (E,) out-of-fold decision values of a side (positive: left), else predicted class numbers or
+            quantities.
+        scores: (E,) their mean is the metric; of a side whether the decision is right.
+        strengths: (F,) chosen in each outer fold: C of logistic probes, λ of ridge, of which the larger penalises
+            more. weights,
+        intercepts: (F, D) float32 and (F,) of each outer fold's probe of a side, on raw features; D is 0 for other
+            targets.
+        spreads: (F,) deviation of the fold's training samples along its weights, in units of the features.
+        null: (P,) metric under the label permutations.
+        inner: (F, E) quality of each sample's prediction in the inner folds of each outer fold, by which penalties
+            are chosen, the larger the better; 0 for the samples that the outer fold tests. Of a side the
+            log-likelihood of its label. Of others the gain of `_predict_by_ridge` or the log-likelihood, minus the
+            mean over the label permutations.
     """
 
     decisions: Matrix
@@ -175,8 +185,13 @@ def probe_site(
 ) -> SiteProbe:
     """Probe the samples of E episodes for (E,) labels, and again for every column of (E, P) label permutations.
 
-    labels: bool of a side, else coded. task: None for a side, whose score is not balanced: its layouts are.
-    Raises ProbeNotConvergedError where the probe is logistic, and NonFiniteActivationError for NaN or infinity.
+    Args:
+        labels: Bool of a side, else coded.
+        task: None for a side, whose score is not balanced: its layouts are.
+
+    Raises:
+        ProbeNotConvergedError: Where the probe is logistic.
+        NonFiniteActivationError: For NaN or infinity.
     """
     check_non_finite(samples)
     columns = np.column_stack([labels, permuted_labels])
@@ -210,7 +225,10 @@ def probe_site(
 def predict_once(samples: Samples, labels: Matrix, task: Task, fold: NestedFold) -> tuple[Matrix, float]:
     """Return predictions (m,) for the test samples of one outer fold, and its C or λ.
 
-    labels: (E,); those of test samples have no effect. Raises ProbeNotConvergedError.
+    Raises ProbeNotConvergedError.
+
+    Args:
+        labels: (E,); those of test samples have no effect.
     """
     predictions = _predict(samples, labels[:, None], task, [fold])
     return predictions.values[fold.outer.test, 0], float(predictions.strengths[0])

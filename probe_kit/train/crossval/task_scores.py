@@ -73,9 +73,11 @@ def score_interval(
 ) -> tuple[float, float]:
     """Return the 95 % interval of the mean of (n,) scores, groups as the unit.
 
-    labels: (n,) coded. deviations: (n,) of a quantity from the mean of its fold's training labels, squared; None
-    for a probe that was fitted elsewhere, whose R² compares with the mean of these labels. Balanced accuracy has
-    Wilson's interval (`Accuracy`), R² that of `explained_interval`, which is approximate.
+    Args:
+        labels: (n,) coded.
+        deviations: (n,) of a quantity from the mean of its fold's training labels, squared; None for a probe that
+            was fitted elsewhere, whose R² compares with the mean of these labels. Balanced accuracy has Wilson's
+            interval (`Accuracy`), R² that of `explained_interval`, which is approximate.
     """
     if task == "continuous":
         if deviations is None:

@@ -17,10 +17,14 @@ RANDOM_FEATURES, UNTRAINED = "random-features", "untrained"
 class ControlScore:
     """Held-out score of the same nested probe on features that never saw the model, or of an untrained network.
 
-    ci: 95 % interval over groups. chance, p: by the label permutations of the category's probes; chance is 1/2
-    for a side, None without permutations, and p is None without any. stream: whose width `random-features` have,
-    or whose best site that of `untrained` is; empty for others. view: of `untrained`. by_step: metric at each of
-    `ProbeCurve.steps`, in order.
+    Attributes:
+        ci: 95 % interval over groups.
+        p: As `chance`.
+        chance: By the label permutations of the category's probes; chance is 1/2 for a side, None without
+            permutations, and p is None without any.
+        stream: Whose width `random-features` have, or whose best site that of `untrained` is; empty for others.
+        view: Of `untrained`.
+        by_step: Metric at each of `ProbeCurve.steps`, in order.
     """
 
     name: str
@@ -44,9 +48,9 @@ class ControlScore:
 class UntrainedScore:
     """The gain of a probe of a side over the untrained network's, on the same episodes.
 
-    ci: 95 % interval over groups.
-
-    peak: the best site of the stream here against the best site there; otherwise the same site in both.
+    Attributes:
+        peak: The best site of the stream here against the best site there; otherwise the same site in both.
+        ci: 95 % interval over groups.
     """
 
     category: str
@@ -65,8 +69,10 @@ class UntrainedScore:
 class ControlComparison:
     """A test of a site's probe against a control: paired by group, family-wise over its stream.
 
-    control: of a side `random-features`, or `untrained` for the best site of that stream in the untrained network;
-    of other targets every control that was run. reference: the control's score.
+    Attributes:
+        control: Of a side `random-features`, or `untrained` for the best site of that stream in the untrained
+            network; of other targets every control that was run.
+        reference: The control's score.
     """
 
     control: str
@@ -90,7 +96,9 @@ def has_signal(exceeds: Exceeds) -> bool:
 class Controls:
     """Scores of the controls so far.
 
-    comparisons: every site compared with controls. left_out: why a default control was not run, by name.
+    Attributes:
+        comparisons: Every site compared with controls.
+        left_out: Why a default control was not run, by name.
     """
 
     scores: tuple[ControlScore, ...] = ()

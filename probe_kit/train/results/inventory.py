@@ -25,10 +25,12 @@ from probe_kit.train.results.store import (
 class StoredProbes:
     """One set of probe results.
 
-    created: when they were fitted. controls: baselines and, last, `untrained: NAME`. state: `used` if `retention`
-    reads them by default, `other` if it does so for their key, `label` if they are of a label of one's own,
-    `other episodes` if the run has others by now. wording: which one of the run's they are of, empty where the run
-    is in its items' own words.
+    Attributes:
+        state: `used` if `retention` reads them by default, `other` if it does so for their key, `label` if they
+            are of a label of one's own, `other episodes` if the run has others by now.
+        created: When they were fitted.
+        controls: Baselines and, last, `untrained: NAME`.
+        wording: Which one of the run's they are of, empty where the run is in its items' own words.
     """
 
     key: str
@@ -49,9 +51,14 @@ class StoredProbes:
 class Inventory:
     """A run and what is stored with it.
 
-    episodes, planned: how many are there, and of how many. failed: episodes that were given up. streams: by name,
-    in words. wordings: episodes by the wording they were asked in, empty for the items' own words alone.
-    probes: oldest first. unfinished: finished sites of interrupted sweeps, by key.
+    Attributes:
+        episodes: How many are there, and of how many.
+        planned: As `episodes`.
+        failed: Episodes that were given up.
+        streams: By name, in words.
+        probes: Oldest first.
+        unfinished: Finished sites of interrupted sweeps, by key.
+        wordings: Episodes by the wording they were asked in, empty for the items' own words alone.
     """
 
     run: str

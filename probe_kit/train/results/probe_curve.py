@@ -25,16 +25,24 @@ class ProbeCurve:
 
     A sample is an episode, or one captured inference of it.
 
-    sites: S of them. labels: (E,) bool of a side (true: left), else coded: class numbers or quantities. episodes,
-    items, groups: (E,) identities. fold_of: (E,) outer fold. decisions: (S, E) out-of-fold decision values of a
-    side, else predicted class numbers or quantities. strengths: (S, F) chosen C of a logistic probe, λ of ridge.
-    null: (S, P) metric under label permutation. inner: (S, F, G) quality of every group in the inner folds of each
-    outer fold, the groups in the order of their names, 0 for the groups that the outer fold tests: of a side its
-    log-likelihood, else what the penalty is chosen by, above its mean over the permutations. parts: S times what
-    the site's stream is part of, see `Stream.part`; default by the stream's name. sample_scores: (S, E) held out,
-    None for a side, see `scores`. classes: their names, empty for a quantity. inferences: (E,) captured inference.
-    aligned: (E,) place behind the event where windows begin, None where they begin at the first inference.
-    smallest_p: no p can be lower.
+    Attributes:
+        sites: S of them.
+        labels: (E,) bool of a side (true: left), else coded: class numbers or quantities. episodes,
+        items: (E,) identities.
+        groups: As `items`.
+        fold_of: (E,) outer fold.
+        decisions: (S, E) out-of-fold decision values of a side, else predicted class numbers or quantities.
+        strengths: (S, F) chosen C of a logistic probe, λ of ridge.
+        null: (S, P) metric under label permutation.
+        inner: (S, F, G) quality of every group in the inner folds of each outer fold, the groups in the order of
+            their names, 0 for the groups that the outer fold tests: of a side its log-likelihood, else what the
+            penalty is chosen by, above its mean over the permutations.
+        parts: S times what the site's stream is part of, see `Stream.part`; default by the stream's name.
+        classes: Their names, empty for a quantity.
+        sample_scores: (S, E) held out, None for a side, see `scores`.
+        inferences: (E,) captured inference.
+        aligned: (E,) place behind the event where windows begin, None where they begin at the first inference.
+        smallest_p: No p can be lower.
     """
 
     sites: tuple[Site, ...]
@@ -97,7 +105,8 @@ class ProbeCurve:
     def sums(self) -> GroupSums:
         """Correct decisions per site and group of items, balanced between the sides: chance is one half.
 
-        Raises UnbalancedEpisodesError where a fold was trained on one side only.
+        Raises:
+            UnbalancedEpisodesError: Where a fold was trained on one side only.
         """
         return balanced_sums(self.decisions, self.labels, self.fold_of, self.groups)
 
@@ -167,8 +176,9 @@ class ProbeCurve:
     def step_scores(self, scores: Matrix) -> Matrix:
         """Return (E,) scores whose mean over the samples of a step is the metric at that step.
 
-        scores: (E,) of one site. Classes are balanced within each step, over those that occur there. Weights of
-        the whole window would lift a step of rare classes above 1. Scores of a quantity stay.
+        Args:
+            scores: (E,) of one site. Classes are balanced within each step, over those that occur there. Weights
+                of the whole window would lift a step of rare classes above 1. Scores of a quantity stay.
         """
         if not self.classes:
             return scores

@@ -39,12 +39,17 @@ FORMAT = 8  # raise when settings have other fields or would give other numbers
 class ProbeSettings:
     """Everything that decides the numbers; its hash is the results' key.
 
-    seed_text: of the run, see `RunReader`; scores on equal groups of one are paired. episodes: sha256 of the ids
-    of the run's episodes, so that a run that grew is probed again. label: sha256 of the labels of the target.
-    token_permutations: 0 where no token view is probed. call: captured inference that a label of a whole episode
-    is decoded from. window: inferences per episode. group_by: column of the groups. exchange_within: column of the
-    strata, empty for exchanges everywhere. grouping: sha256 of groups and strata, empty for a side. align_to:
-    column of the event where windows begin, `#` and a part of its hash; empty for the first inference.
+    Attributes:
+        seed_text: Of the run, see `RunReader`; scores on equal groups of one are paired.
+        episodes: sha256 of the ids of the run's episodes, so that a run that grew is probed again.
+        token_permutations: 0 where no token view is probed.
+        call: Captured inference that a label of a whole episode is decoded from.
+        label: sha256 of the labels of the target.
+        group_by: Column of the groups.
+        exchange_within: Column of the strata, empty for exchanges everywhere.
+        grouping: sha256 of groups and strata, empty for a side. align_to: column of the event where windows begin,
+            `#` and a part of its hash; empty for the first inference.
+        window: Inferences per episode.
     """
 
     model: str
@@ -93,9 +98,11 @@ Place = tuple[str, str, Site]
 class Direction:
     """The probes of one place in raw features: w · x + b > 0 reads `left`, one probe per outer fold (F).
 
-    weights: (F, D) float32. intercepts: (F,). Each fold's probe never saw the episodes that fold tests
-    (`Curve.fold_of`): to steer an episode without having trained on it, take its fold's row.
-    spreads: (F,) deviation of the training samples along weights / ‖weights‖, the σ of a steering strength.
+    Attributes:
+        weights: (F, D) float32.
+        intercepts: (F,). Each fold's probe never saw the episodes that fold tests (`Curve.fold_of`): to steer an
+            episode without having trained on it, take its fold's row.
+        spreads: (F,) deviation of the training samples along weights / ‖weights‖, the σ of a steering strength.
     """
 
     weights: NDArray[np.float32]
@@ -179,7 +186,10 @@ def write_direction_file(directions: Mapping[Place, Direction], file: Path, weig
     """Write the probes' directions for `intervene --direction FILE#NAME`, and return how many.
 
     A vector is the mean of the folds' unit weights, times the deviation of the samples along it: a coefficient
-    counts deviations, toward `left`. weights: hash of the network's. Probes without any weight are left out.
+    counts deviations, toward `left`.
+
+    Args:
+        weights: Hash of the network's. Probes without any weight are left out.
     """
     vectors, about = {}, {}
     for (category, view, site), direction in read_directions(directions, directions).items():
@@ -319,11 +329,14 @@ def score_text(value: float | None, is_side: bool) -> str:
 class ProbeResults:
     """Probes of one target in one run under one set of settings.
 
-    curves: one per (category, view). directions: the probes' weights per (category, view, site), of a side.
-    controls: what the probes are compared with, as far as requested.
-    created: when they were fitted (UTC, ISO 8601); not part of the key. stamp: hash of the commits they were
-    fitted to, empty for arrays in memory. label: what tables call the run, by default its model; not part of the
-    key either. left_out: how many episodes and inferences have no part in any category, by reason.
+    Attributes:
+        curves: One per (category, view).
+        directions: The probes' weights per (category, view, site), of a side.
+        controls: What the probes are compared with, as far as requested.
+        created: When they were fitted (UTC, ISO 8601); not part of the key.
+        stamp: Hash of the commits they were fitted to, empty for arrays in memory.
+        label: What tables call the run, by default its model; not part of the key either.
+        left_out: How many episodes and inferences have no part in any category, by reason.
     """
 
     settings: ProbeSettings
@@ -341,7 +354,8 @@ class ProbeResults:
     def remedy(self, category: str, view: str, tests: int = 1) -> str:
         """Return what to do where no p of a view can be below the level; empty where one can.
 
-        tests: the number that p is corrected for.
+        Args:
+            tests: The number that p is corrected for.
         """
         settings, is_token = self.settings, is_token_view(view)
         permutations = settings.token_permutations if is_token else settings.permutations
@@ -430,7 +444,9 @@ _OF_LABEL = ". Chance: mean score of this site with exchanged labels"
 def best_sites_table(fitted: Sequence[ProbeResults], splits: bool = True) -> Table:
     """Return a row per category, stream, view and captured inference, and per control of a target that is no side.
 
-    fitted: probes of one target in a run, one per inference. Controls of a side are in the table with `splits`.
+    Args:
+        fitted: Probes of one target in a run, one per inference. Controls of a side are in the table with
+            `splits`.
     """
     first, several_calls = fitted[0].settings, len(fitted) > 1
     several_views, metric = len(first.views) > 1, "accuracy %" if first.is_side else METRICS[first.task]

@@ -67,7 +67,8 @@ class SweepCheckpoint:
     def read(self, view: str, site: Site) -> dict[str, SiteProbe] | None:
         """The probes of a site by category, or None if the sweep did not get that far.
 
-        Raises RunDamagedError if they were changed, or are of another site or of other commits.
+        Raises:
+            RunDamagedError: If they were changed, or are of another site or of other commits.
         """
         arrays = self.pieces.read(f"{view}+{site}", SiteProbe)
         if arrays is None:
@@ -102,8 +103,9 @@ _TEXTS, _FACTS = ("parts", "classes"), ("task", "is_side", "smallest_p")
 def save_results(results: ProbeResults, run: Path | Location, *, requested: bool = True) -> None:
     """Write to `probes/<key>/` of the run that lies there, all or nothing; probes that are there are kept.
 
-    requested: whether a user wants these probes, which `load_results` then prefers to all older ones, rather
-    than needing them in passing, as the untrained control of another run.
+    Args:
+        requested: Whether a user wants these probes, which `load_results` then prefers to all older ones, rather
+            than needing them in passing, as the untrained control of another run.
     """
     location, scores = locate(run), {SCORES: csv_of_frame(results.scores).encode()}
     controls: dict[str, bytes] = {}
@@ -145,13 +147,17 @@ def is_stored(run: Location, key: str) -> bool:
 def load_results(run: RunReader, key: str | None = None, target: str | None = None) -> ProbeResults:
     """Return the stored results called `key`, or else the newest for `target` on the episodes the run has now.
 
-    target: a side, a built-in column, or one of a table; by default the correct side. The newest of a side are of
-    the first captured inference; those of later ones are read by their key.
+    Args:
+        key: As `probe-kit run show` lists it; its beginning will do, and no other results are read. Newest: those
+            that were asked for last, whether they were fitted then or loaded.
+        target: A side, a built-in column, or one of a table; by default the correct side. The newest of a side are
+            of the first captured inference; those of later ones are read by their key.
 
-    key: as `probe-kit run show` lists it; its beginning will do, and no other results are read. Newest: those
-    that were asked for last, whether they were fitted then or loaded. Raises NoProbesError if there are none,
-    UsageError for a key that is not there or of another target, and RunDamagedError if results that are read were
-    changed, lost their settings, have another format, or are of other activations.
+    Raises:
+        NoProbesError: If there are none.
+        UsageError: For a key that is not there or of another target.
+        RunDamagedError: If results that are read were changed, lost their settings, have another format, or are of
+            other activations.
     """
     location = run.location
     if key is not None:

@@ -160,7 +160,10 @@ class Moments(NamedTuple):
 class Standardiser:
     """Mean and scale of every feature that varies, learned on training samples only.
 
-    varies: (D,) bool, features with non-zero variance. mean, scale: (V,) float64 of these V features.
+    Attributes:
+        varies: (D,) bool, features with non-zero variance.
+        mean: (V,) float64 of these V features.
+        scale: As `mean`.
     """
 
     varies: Array

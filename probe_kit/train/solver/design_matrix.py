@@ -171,7 +171,8 @@ class DenseDesign(_OfAllColumns):
 class StackedDesign:
     """Samples of several folds in memory, (F, N, R) float64, filled up with zeros before the last column.
 
-    fold_of: (K,) the fold that each label column belongs to.
+    Attributes:
+        fold_of: (K,) the fold that each label column belongs to.
     """
 
     samples: Array
@@ -231,8 +232,10 @@ class StackedDesign:
 class StreamedDesign(_OfAllColumns):
     """Samples made from raw features block by block in every product: standardised, then turned to `axes`.
 
-    axes: (V, R − 1) of the V features that vary. variances: (R − 1,) squared lengths of the columns without the
-    intercept's. Memory is one block in float64, and (N, K) for K problems.
+    Attributes:
+        axes: (V, R − 1) of the V features that vary.
+        variances: (R − 1,) squared lengths of the columns without the intercept's. Memory is one block in float64,
+            and (N, K) for K problems.
     """
 
     features: RowSubset
@@ -298,7 +301,8 @@ IN_MEMORY = 2**29
 class Projection:
     """A training fold's samples in standardised principal coordinates, and the way to get others there.
 
-    train: N samples in R + 1 (nearly) orthogonal columns, the last one all ones for the intercept.
+    Attributes:
+        train: N samples in R + 1 (nearly) orthogonal columns, the last one all ones for the intercept.
     """
 
     standardise: Standardiser

@@ -33,9 +33,14 @@ def newton_steps(
 ) -> tuple[Array, Array, Array]:
     """Solve (penalty + ZᵀSZ) step = −gradient per column, to relative `precision` (K,), in the design's precision.
 
-    penalty: (R, 1). gradient: (R, K). curvature: (N, K), the diagonals S. Returns the steps (R, K), what they
-    change in the decisions, Z · step (N, K), which costs no product more, and the numbers of the columns that were
-    not solved in time, whose steps are 0.
+    Args:
+        penalty: (R, 1).
+        gradient: (R, K).
+        curvature: (N, K), the diagonals S.
+
+    Returns:
+        The steps (R, K), what they change in the decisions, Z · step (N, K), which costs no product more, and the
+        numbers of the columns that were not solved in time, whose steps are 0.
     """
     xp = array_namespace(gradient)
     # Scaled to length 1: `precision` is relative, and no square underflows in float32.
@@ -110,8 +115,12 @@ SAFETY = 0.3
 class _Point:
     """The weights at which problems, one column each, are, and the objective there.
 
-    weights: (R, K). decisions: (N, K) Z · weights. loss: (K,) of all samples. misfit: (N, K) 1 − P(label).
-    pulled: (R, K) Zᵀ · (signs ∘ misfit).
+    Attributes:
+        weights: (R, K).
+        decisions: (N, K) Z · weights.
+        loss: (K,) of all samples.
+        misfit: (N, K) 1 − P(label).
+        pulled: (R, K) Zᵀ · (signs ∘ misfit).
     """
 
     weights: Array
@@ -158,9 +167,10 @@ class _Problems:
 class LogisticSolver:
     """Solves every column of a label matrix for one C after another, each warm-started by the one before.
 
-    samples: N samples in R orthogonal columns, the last one all ones for the intercept.
-    tolerance: a solution is accepted when ‖gradient‖ ≤ tolerance · ‖w‖. The objective is 1-strongly convex in w,
-    so this bounds ‖w − w*‖ / ‖w‖ as well, up to a factor for the intercept (the samples' mean norm).
+    Args:
+        samples: N samples in R orthogonal columns, the last one all ones for the intercept.
+        tolerance: A solution is accepted when ‖gradient‖ ≤ tolerance · ‖w‖. The objective is 1-strongly convex in
+            w, so this bounds ‖w − w*‖ / ‖w‖ as well, up to a factor for the intercept (the samples' mean norm).
     """
 
     def __init__(self, samples: Design, tolerance: float = 1e-9) -> None:
@@ -176,8 +186,9 @@ class LogisticSolver:
     def path(self, labels: NDArray[np.bool_], strengths: NDArray[np.float64]) -> Iterator[Array]:
         """Optimal weights (R, K) of every label column of (N, K), for each C of ascending `strengths`.
 
-        Raises ProbeNotConvergedError rather than return a column that is not at its optimum, and
-        TooFewGroupsError for a column with a single class, which has no optimum.
+        Raises:
+            ProbeNotConvergedError: Rather than return a column that is not at its optimum.
+            TooFewGroupsError: For a column with a single class, which has no optimum.
         """
         check_single_class(labels)
         signs = 2.0 * self.xp.asarray(labels, dtype=self.xp.float64, device=self.penalty.device) - 1.0
@@ -299,7 +310,8 @@ class LogisticSolver:
     def _moved(self, todo: _Problems, gradient: Array, step: Array, change: Array, *, is_exact: bool) -> _Point:
         """The points along `step`, which is halved per column until the objective falls enough.
 
-        is_exact: whether what is known of them is float64; else float32 adds to what is.
+        Args:
+            is_exact: Whether what is known of them is float64; else float32 adds to what is.
         """
         start = todo.at
         value, slope = self._objective(todo.strength, start), (gradient * step).sum(axis=0)

@@ -74,7 +74,8 @@ def full_size_eo1() -> EO1Policy:
 def chat_step(folder: Path, fields: Mapping[str, Any]) -> EO1QwenProcessorStep:
     """lerobot's step that reads a chat. folder: of the processor's files.
 
-    Raises CheckpointError for files without a chat template.
+    Raises:
+        CheckpointError: For files without a chat template.
     """
     logging.getLogger("transformers.processing_utils").addFilter(_is_news)
     safely = SimpleNamespace(from_pretrained=partial(load_pretrained, Qwen2_5_VLProcessor))

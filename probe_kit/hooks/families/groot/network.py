@@ -43,8 +43,11 @@ VLM = GROOT_N1_7_BACKBONE_MODEL
 def network_config(values: Mapping[str, Any], config: GrootConfig, vlm: str) -> GR00TN17Config:
     """The network's configuration: the content of its `config.json`, and what lerobot's `config` sets over it.
 
-    vlm: `VLM`, or the folder of the vision-language model's configuration. Raises CheckpointError for another kind
-    of backbone.
+    Args:
+        vlm: `VLM`, or the folder of the vision-language model's configuration.
+
+    Raises:
+        CheckpointError: For another kind of backbone.
     """
     network = GR00TN17Config.from_dict(dict(values))
     if network.backbone_model_type != "qwen":
@@ -90,7 +93,8 @@ def full_size_groot() -> GrootPolicy:
 def flow_actions(policy: Any, inputs: Mapping[str, Tensor], noise: Tensor) -> Tensor:
     """(B, H, D) normalised actions from noise of that shape: lerobot's flow, one inference.
 
-    inputs: what lerobot's processors pack. H, D: the network's own horizon and widest action.
+    Args:
+        inputs: What lerobot's processors pack. H, D: the network's own horizon and widest action.
     """
     model, head = policy._groot_model, policy._groot_model.action_head
     placed = {name: _placed(tensor, model) for name, tensor in inputs.items()}
@@ -144,7 +148,8 @@ class GrootChoice(Evaluation):
 class Places:
     """The folders of a checkpoint's parts. network: content of the network's `config.json`. base, vlm: folders.
 
-    model_name: the vision-language model as the network's configuration is to name it.
+    Attributes:
+        model_name: The vision-language model as the network's configuration is to name it.
     """
 
     network: Mapping[str, Any]
@@ -156,7 +161,8 @@ class Places:
     def of(cls, folder: Path, base: str, vlm: str | None) -> "Places":
         """base: as the policy's configuration names it, a folder in the checkpoint or a hub id. vlm: another one.
 
-        Raises CheckpointError for what is not there.
+        Raises:
+            CheckpointError: For what is not there.
         """
         base_folder = inside_or_hub(folder, base)
         content = read_json_object(base_folder / CONFIG_FILE, CheckpointError, _AGAIN)
@@ -173,8 +179,12 @@ def is_nvidias(folder: Path) -> bool:
 def nvidias_config(folder: Path, embodiment: str | None) -> GrootConfig:
     """lerobot's configuration for a checkpoint in NVIDIA's layout.
 
-    embodiment: its tag; None where the files have one only. Raises CheckpointError for missing files, UsageError
-    for a tag that they do not have.
+    Args:
+        embodiment: Its tag; None where the files have one only.
+
+    Raises:
+        CheckpointError: For missing files.
+        UsageError: For a tag that they do not have.
     """
     settings = processor_settings(folder)
     statistics, numbers = (

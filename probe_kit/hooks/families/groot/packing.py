@@ -86,7 +86,9 @@ _ACTION = dict.fromkeys(("rep", "type", "format", "state_key"), _ANY)
 class StateFields:
     """The state of one embodiment. excluded: the network reads zeros. angles: groups read as sine and cosine.
 
-    deviations, action_deviations: groups of the state and of the action that are mapped by mean and deviation.
+    Attributes:
+        deviations: Groups of the state and of the action that are mapped by mean and deviation.
+        action_deviations: As `deviations`.
     """
 
     excluded: bool
@@ -114,7 +116,8 @@ def processor_settings(folder: Path) -> dict[str, Any]:
 def read_state_fields(folder: Path, settings: Mapping[str, Any], tag: str) -> StateFields:
     """The settings of the processor file for the state of embodiment `tag`.
 
-    Raises CheckpointError for several frames of the state, and for a field that may change numbers unseen.
+    Raises:
+        CheckpointError: For several frames of the state, and for a field that may change numbers unseen.
     """
     path = folder / PROCESSOR_FILE
     modalities = settings.get("modality_configs", {}).get(tag, {})
@@ -258,7 +261,8 @@ class NvidiasPictures(GrootN17VLMEncodeStep):  # type: ignore[misc]
 def nvidias_pictures(step: GrootN17VLMEncodeStep, settings: Mapping[str, Any] | None) -> NvidiasPictures:
     """The step with NVIDIA's resizing.
 
-    settings: of its processor file, whose missing fields have NVIDIA's values; None in lerobot's layout.
+    Args:
+        settings: Of its processor file, whose missing fields have NVIDIA's values; None in lerobot's layout.
     """
     values = {field.name: getattr(step, field.name) for field in fields(GrootN17VLMEncodeStep) if field.init}
     if settings is not None:
@@ -301,7 +305,8 @@ _HARMLESS = ("rename_observations_processor", "to_batch_processor", "device_proc
 class Steps:
     """lerobot's steps of one checkpoint: packing, pictures and words, actions. source: where they come from.
 
-    fields: what NVIDIA's processor file says of the state; None in lerobot's layout.
+    Attributes:
+        fields: What NVIDIA's processor file says of the state; None in lerobot's layout.
     """
 
     pack: GrootN17PackInputsStep
@@ -321,9 +326,12 @@ def read_steps(
 ) -> Steps:
     """The steps that lerobot makes of NVIDIA's files, or of the pipelines that it saved.
 
-    resize: `nvidia` or `lerobot`, whose code brings pictures to their size; None for the layout's own. letterbox:
-    whether pictures are made square with bars first; None for what the files say.
-    Raises CheckpointError for files that are missing, and for a step or field that is not known here.
+    Args:
+        resize: `nvidia` or `lerobot`, whose code brings pictures to their size; None for the layout's own.
+            letterbox: whether pictures are made square with bars first; None for what the files say.
+
+    Raises:
+        CheckpointError: For files that are missing, and for a step or field that is not known here.
     """
     settings = processor_settings(folder) if is_raw_groot_n1_7_checkpoint(folder) else None
     steps = _lerobots_steps(folder, config) if settings is None else _nvidias_steps(folder, config, settings)

@@ -24,8 +24,10 @@ _TURN = 2 * np.pi
 class StateUnits(Normaliser):
     """The state as NVIDIA's processor gives it to the network.
 
-    angles: (begin, end) of the groups in which the sines of all numbers, then their cosines stand for the numbers.
-    excluded: whether the network reads zeros in their place.
+    Attributes:
+        angles: (begin, end) of the groups in which the sines of all numbers, then their cosines stand for the
+            numbers.
+        excluded: Whether the network reads zeros in their place.
     """
 
     angles: tuple[tuple[int, int], ...] = ()
@@ -64,7 +66,8 @@ def state_units(
 ) -> Normaliser:
     """The units of lerobot's packing step, or of NVIDIA's processor where its `fields` are there.
 
-    Raises CheckpointError where it would let the state pass unchanged.
+    Raises:
+        CheckpointError: Where it would let the state pass unchanged.
     """
     if fields is not None:
         return _nvidias_state(step, numbers, source, fields)
@@ -82,8 +85,9 @@ def action_units(
 ) -> Normaliser:
     """The units of lerobot's step that decodes actions. fields: of NVIDIA's processor file, if it is there.
 
-    Raises CheckpointError for statistics that are missing, and for actions relative to the state: they have no
-    unit of their own.
+    Raises:
+        CheckpointError: For statistics that are missing, and for actions relative to the state: they have no unit
+            of their own.
     """
     if isinstance(step, GrootN17ActionDecodeStep):
         return _grouped(step, numbers, source, () if fields is None else fields.action_deviations)
@@ -129,7 +133,11 @@ def _side_by_side(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], dict[str, tuple[int, int]]]:
     """Two statistics of groups as vectors, which numbers are means and deviations, and where each group stands.
 
-    names: the statistics of groups that are not in `scored`. Raises CheckpointError for one that is missing.
+    Args:
+        names: The statistics of groups that are not in `scored`.
+
+    Raises:
+        CheckpointError: For one that is missing.
     """
     parts: tuple[list[NDArray[np.float32]], ...] = ([], [])
     flags: list[bool] = []
@@ -158,7 +166,8 @@ def _grouped(
 ) -> Normaliser:
     """The groups of NVIDIA's statistics side by side, in the order of the configuration.
 
-    scored: groups that are mapped by mean and deviation.
+    Args:
+        scored: Groups that are mapped by mean and deviation.
     """
     action = (step.modality_config or {}).get("action", {})
     keys, kinds = action.get("modality_keys", []), action.get("action_configs", [])

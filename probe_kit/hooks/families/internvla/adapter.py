@@ -256,7 +256,12 @@ def load_internvla(
 ) -> InternVLA:
     """Load InternVLA-M1 from a run's folder, one of its weight files, a converted folder, or a hub id.
 
-    Options: see the family. Raises CheckpointError, WeightsError, and UsageError for options that cannot be.
+    Options: see the family.
+
+    Raises:
+        CheckpointError: For options that cannot be.
+        WeightsError: For options that cannot be.
+        UsageError: For options that cannot be.
     """
     name = checkpoint or DEFAULT_CHECKPOINT
     parts = find_parts(name, vlm, weights, unread=random_weights)

@@ -42,8 +42,10 @@ _DEVELOPMENT = "qwen2_5_vl_config"
 class Parts:
     """The files and folders of a checkpoint.
 
-    run: the folder of config.yaml and the statistics. weights: a .pt file, or a folder of safetensors. vlm: the
-    folder of the vision-language model's configuration, tokenizer and processor.
+    Attributes:
+        run: The folder of config.yaml and the statistics.
+        weights: A .pt file, or a folder of safetensors.
+        vlm: The folder of the vision-language model's configuration, tokenizer and processor.
     """
 
     config: InternVLAConfig
@@ -76,10 +78,14 @@ def _read(path: Path) -> Weights:
 def find_parts(checkpoint: str, vlm: str | None, weights: str | None = None, unread: bool = False) -> Parts:
     """The parts of a run's folder, its `checkpoints/`, one `.pt` file of it, a converted folder, or a hub id.
 
-    vlm: folder or hub id of the vision-language model's files; default what the run's configuration names.
-    weights: name of a step's file; default the only one, or `RELEASED_STEP` among several. No other is downloaded.
-    unread: nothing is looked for, since no weights will be read.
-    Raises CheckpointError naming what is missing or ambiguous.
+    Args:
+        vlm: Folder or hub id of the vision-language model's files; default what the run's configuration names.
+        weights: Name of a step's file; default the only one, or `RELEASED_STEP` among several. No other is
+            downloaded.
+        unread: Nothing is looked for, since no weights will be read.
+
+    Raises:
+        CheckpointError: Naming what is missing or ambiguous.
     """
     path = Path(checkpoint).expanduser()
     if path.is_file():
@@ -170,9 +176,17 @@ _RUN_FILES = (RUN_FILE, DIMS_FILE, STATISTICS_FILE)
 def convert(checkpoint: str, out: Path, vlm: str | None = None) -> str:
     """Write `out` with the same tensors as safetensors, the run's files, and those of the vision-language model.
 
-    checkpoint, vlm: as `load_internvla` takes them. Nothing of the pickle is executed.
-    Returns the sha256 over (name, dtype, shape, bytes) of all tensors, the same before and after.
-    Raises UsageError if `out` exists, CheckpointError and WeightsError for what cannot be read.
+    Args:
+        checkpoint: As `load_internvla` takes them. Nothing of the pickle is executed.
+        vlm: As `checkpoint`.
+
+    Returns:
+        The sha256 over (name, dtype, shape, bytes) of all tensors, the same before and after.
+
+    Raises:
+        UsageError: If `out` exists.
+        CheckpointError: For what cannot be read.
+        WeightsError: For what cannot be read.
     """
     if out.exists():
         raise UsageError(f"{out} exists; name a folder that does not, so that nothing is overwritten")

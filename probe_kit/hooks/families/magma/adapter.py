@@ -364,8 +364,13 @@ def load_magma(
 ) -> Magma:
     """Load Magma or one of its fine-tunes, from a folder or hub id.
 
-    Options: see the family. steps: tokens per inference, for comparisons with other than seven; only seven are
-    an action. Raises UsageError, and what `load_checkpoint` raises.
+    Options: see the family.
+
+    Args:
+        steps: Tokens per inference, for comparisons with other than seven; only seven are an action.
+
+    Raises:
+        UsageError: And what `load_checkpoint` raises.
     """
     for name, value, choices in (
         ("prompt", prompt, PROMPTS),

@@ -42,7 +42,8 @@ from probe_kit.models.magma import (
 class ChatText(TokenizerFile):
     """Magma's chat template: header tokens, image placeholder, question.
 
-    user_first: the user's turn stands before the system's, as Act2Answer's release has it.
+    Attributes:
+        user_first: The user's turn stands before the system's, as Act2Answer's release has it.
     """
 
     config: MagmaConfig
@@ -97,8 +98,11 @@ class ChatText(TokenizerFile):
     def prompt(self, question: str, begun: str = "", pictured: bool = True) -> TokenPrompt:
         """The whole prompt of a question about one picture, or in words alone.
 
-        begun: how the answer has begun already.
-        Raises InstructionError for a question that holds a token of the frames.
+        Args:
+            begun: How the answer has begun already.
+
+        Raises:
+            InstructionError: For a question that holds a token of the frames.
         """
         self.check_marks(question + begun)
         before = picture_question("", self.config.image_start_end) if pictured else ""
@@ -146,9 +150,11 @@ def load_checkpoint(
 ) -> tuple[Loaded[MagmaNetwork], str]:
     """Load a folder or hub id; also return the name the file has for layer scales, `gamma` or `weight`.
 
-    dtype: float32 or bfloat16; default what the checkpoint says. layer_scale: `gamma` refuses a file that names
-    them otherwise; None and `weight` accept both names.
     Raises CheckpointError, WeightsError, UsageError for another dtype, MissingExtraError.
+
+    Args:
+        dtype: float32 or bfloat16; default what the checkpoint says.
+        layer_scale: `gamma` refuses a file that names them otherwise; None and `weight` accept both names.
     """
     folder = checkpoint_folder(checkpoint)
     config = MagmaConfig.from_folder(folder)
@@ -231,7 +237,10 @@ PACKAGED = "the package (its magma_statistics.json says whence)"
 def magma_statistics(folder: Path, file: str | None) -> tuple[Mapping[str, Any], str]:
     """The statistics of `file`, of the checkpoint, or of the package, and the name of their source.
 
-    The released checkpoint has none: the evaluation client holds them. Raises CheckpointError for a bad file.
+    The released checkpoint has none: the evaluation client holds them.
+
+    Raises:
+        CheckpointError: For a bad file.
     """
     if file is not None:
         return read_statistics(Path(file).expanduser()), file

@@ -107,7 +107,8 @@ def lerobots_policy(
 ) -> MolmoAct2Policy:
     """A `MolmoAct2Policy` in eval mode with uninitialised weights and CUDA graphs off.
 
-    network: the configuration in the VLM's own folder `folder`.
+    Args:
+        network: The configuration in the VLM's own folder `folder`.
     """
     device = building_device(device)
     config.device, config.checkpoint_path = device, str(folder)
@@ -176,7 +177,9 @@ def _gated_forward(
 def flow_actions(policy: Any, inputs: Mapping[str, Tensor], noise: Tensor, padded: Tensor) -> Tensor:
     """(B, H, 32) from noise of that shape: lerobot's flow, one inference.
 
-    inputs: what lerobot's processor packs. padded: (B, 32) True for numbers that no action has.
+    Args:
+        inputs: What lerobot's processor packs.
+        padded: (B, 32) True for numbers that no action has.
     """
     backbone, model_inputs = policy._backbone(), policy._model_inputs(inputs)
     steps = int(policy.config.num_inference_steps or backbone.config.flow_matching_num_steps)

@@ -24,7 +24,9 @@ from probe_kit.hooks.families.shared.lerobot.pipelines import MASKED, check_same
 class JointFrame:
     """The first joints in the data set's convention: sign times joint, plus offset.
 
-    signs: 1 or -1 per joint. offsets: in the data set's units.
+    Attributes:
+        signs: 1 or -1 per joint.
+        offsets: In the data set's units.
     """
 
     signs: NDArray[np.float32]
@@ -56,7 +58,8 @@ class FramedUnits(Normaliser):
     def normalise(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """Physical units to the numbers the network reads; (..., D).
 
-        Raises ObservationError for a number that stays as it is and lies outside -1 to 1, as lerobot does.
+        Raises:
+            ObservationError: For a number that stays as it is and lies outside -1 to 1, as lerobot does.
         """
         entered = self.frame.entered(values)
         outside = (np.abs(entered) > 1) & self.plain
@@ -110,7 +113,9 @@ def read_steps(config: Any, folder: Path) -> None:
 
     state_frame, action_frame: of the joints. clamps_state, clamps_action: whether numbers are moved to -1 to 1.
     unclamped: (D,) True for numbers of the state that the clamp leaves out; None for those without statistics.
-    Raises CheckpointError for frames that are none, and for a packing step of another configuration.
+
+    Raises:
+        CheckpointError: For frames that are none, and for a packing step of another configuration.
     """
     saved = step_fields(folder)
     if (packing := saved.get(_PACK)) is None:

@@ -41,7 +41,8 @@ from probe_kit.models.prismatic import CROP_AREA, PrismaticConfig, PrismaticNetw
 class ActionTokens:
     """The last `bins` text ids, from the highest down, name bins of [-1, 1].
 
-    vocabulary: number of text ids, without the padding of the embedding.
+    Attributes:
+        vocabulary: Number of text ids, without the padding of the embedding.
     """
 
     vocabulary: int
@@ -213,7 +214,10 @@ def load_openvla(
 ) -> OpenVLA:
     """Load OpenVLA, one of its fine-tunes, or a LoRA adapter that names its base, from a folder or hub id.
 
-    Options: see the family. Raises UsageError, and what `load_checkpoint` raises.
+    Options: see the family.
+
+    Raises:
+        UsageError: And what `load_checkpoint` raises.
     """
     chooser(temperature, ())
     loaded = load_checkpoint(checkpoint or DEFAULT_CHECKPOINT, device, dtype, random_weights, bits, weights_seed)

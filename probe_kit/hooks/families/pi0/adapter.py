@@ -59,7 +59,8 @@ def is_old_layout(config: Mapping[str, Any]) -> bool:
 def current_config(config: Mapping[str, Any], source: str) -> dict[str, Any]:
     """The same settings under today's names. source: where the config lies, for messages.
 
-    Raises CheckpointError for a setting that is no longer supported.
+    Raises:
+        CheckpointError: For a setting that is no longer supported.
     """
     wrong = {name: config[name] for name, value in _FIXED.items() if config.get(name, value) != value}
     if wrong:
@@ -236,7 +237,8 @@ def load_pi0_tiny(
 ) -> Pi0:
     """The embedded default: pi0 at 0.84 million parameters, trained to act on Color and Shape.
 
-    name: of the embedded checkpoint.
+    Args:
+        name: Of the embedded checkpoint.
     """
     location = checkpoint or str(embedded_checkpoint(name))
     policy = Pi0.load(location, device, dtype, random_weights, weights_seed)

@@ -134,8 +134,12 @@ class FastTokenizer:
 class ActionText:
     """The place of FAST's tokens in the network's output: behind `begin`, before `end`.
 
-    fast: the tokenizer. last: the id of its token 0; the others lie below. begin: ids of "Action: ". end: the id
-    that ends a chunk. checked: whether a row must begin with `begin`.
+    Attributes:
+        fast: The tokenizer.
+        last: The id of its token 0; the others lie below.
+        begin: Ids of "Action: ".
+        end: The id that ends a chunk.
+        checked: Whether a row must begin with `begin`.
     """
 
     fast: FastTokenizer
@@ -217,10 +221,12 @@ def decode_tokens(
 ) -> Tensor:
     """(B, n) ids of `least` to `most` tokens: until every row has put out the end.
 
-    model: lerobot's `PI0FastPytorch`. pictures: (B, 3, H, W) in [-1, 1], and (B,) masks, of every camera. text:
-    tokens and mask (B, T). bounds: ids that begin and end the actions. choose: (B,) ids of logits (B, V). A row
-    that has ended is decoded with the others, so that no row depends on another one; what it puts out behind its
-    end means nothing.
+    Args:
+        model: Lerobot's `PI0FastPytorch`.
+        pictures: (B, 3, H, W) in [-1, 1], and (B,) masks, of every camera. text: tokens and mask (B, T).
+        bounds: Ids that begin and end the actions.
+        choose: (B,) ids of logits (B, V). A row that has ended is decoded with the others, so that no row depends
+            on another one; what it puts out behind its end means nothing.
     """
     joint = model.paligemma_with_expert
     rows, device = len(text[0]), text[0].device
@@ -300,7 +306,8 @@ class Pi0Fast(StatePrompt, PaliGemmaPolicy):
     def build(cls, config: Any, folder: Path) -> Any:
         """lerobot's policy at the size `dims.json` gives, or at the released size.
 
-        Raises UsageError for a number of captured tokens that an inference cannot put out, and for a temperature.
+        Raises:
+            UsageError: For a number of captured tokens that an inference cannot put out, and for a temperature.
         """
         captured, most = config.evaluation.captured_tokens, int(config.max_decoding_steps)
         if not 1 <= captured <= most:

@@ -129,7 +129,8 @@ class FileTokenizer(TokenizerFile):
 def find_tokenizer(folders: Sequence[Path], tokenizer: str | None, beginning: int | None) -> FileTokenizer:
     """The checkpoint's tokenizer, or the one in the folder `tokenizer`.
 
-    Raises CheckpointError naming the missing files.
+    Raises:
+        CheckpointError: Naming the missing files.
     """
     places = list(folders) if tokenizer is None else [Path(tokenizer).expanduser()]
     for folder in places:

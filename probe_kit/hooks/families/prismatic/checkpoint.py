@@ -80,9 +80,13 @@ _FEATURIZERS = ("featurizer", "fused_featurizer")
 def read_release(file: Path, config: PrismaticConfig) -> Weights:
     """The tensors of a model of the release under the network's names.
 
-    file: `latest-checkpoint.pt`, read with `weights_only=True`. Towers that it does not hold are read from timm's
-    files on the hub, and their positions resampled to the model's picture as timm does it.
-    Raises WeightsError for a file of another layout, CheckpointError for a tower that cannot be fetched.
+    Args:
+        file: `latest-checkpoint.pt`, read with `weights_only=True`. Towers that it does not hold are read from
+            timm's files on the hub, and their positions resampled to the model's picture as timm does it.
+
+    Raises:
+        WeightsError: For a file of another layout.
+        CheckpointError: For a tower that cannot be fetched.
     """
     content = unpickled(file)
     parts = content.get("model") if isinstance(content, dict) else None
@@ -188,8 +192,11 @@ def load_checkpoint(
 ) -> Loaded[PrismaticNetwork]:
     """Load a folder or hub id, which may hold a LoRA adapter that names its base, or a training run's files.
 
-    dtype: float32 or bfloat16; default what the checkpoint says. bits: quantise the language model after the
-    audit. Raises CheckpointError, WeightsError, UsageError for another dtype, MissingExtraError.
+    Raises CheckpointError, WeightsError, UsageError for another dtype, MissingExtraError.
+
+    Args:
+        dtype: float32 or bfloat16; default what the checkpoint says.
+        bits: Quantise the language model after the audit.
     """
     if bits is not None:
         check_quantisation(bits, device)

@@ -22,7 +22,9 @@ GRIPPER_OPEN = 0.5
 class ActionStatistics:
     """Per dimension the 1 % and 99 % quantiles of a data set.
 
-    mask: False for dimensions that stay as the model puts them out, such as a gripper that is 0 or 1 in the data.
+    Attributes:
+        mask: False for dimensions that stay as the model puts them out, such as a gripper that is 0 or 1 in the
+            data.
     """
 
     lacking: ClassVar[str] = (
@@ -40,7 +42,9 @@ class ActionStatistics:
     def choose(cls, statistics: Mapping[str, Any], key: str | None, source: str = "the checkpoint") -> Self:
         """The statistics of data set `key`; without one, of the only data set. source: the file that holds them.
 
-        Raises UsageError for a key that is not there or has to be chosen, CheckpointError for bad statistics.
+        Raises:
+            UsageError: For a key that is not there or has to be chosen.
+            CheckpointError: For bad statistics.
         """
         if not statistics:
             raise CheckpointError(cls.lacking)

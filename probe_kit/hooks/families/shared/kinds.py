@@ -46,7 +46,8 @@ TOKENIZER_FOLDER = Option("tokenizer", str, "Folder of another tokenizer.json.",
 def lerobot_family(name: str, description: str, checkpoint: str | None, adapter: str, **fields: Any) -> Family:
     """A policy of lerobot's. adapter: `folder.adapter:Class`; the folder is named as lerobot names the policy.
 
-    fields: others of `Family`.
+    Args:
+        **fields: Others of `Family`.
     """
     kind, path = adapter.partition(".")[0], f"{_FAMILIES}.{adapter}"
     shared = {
@@ -109,10 +110,13 @@ EVALUATION_OPTIONS = (
 class Evaluation:
     """The treatment of observations and actions around the network; its fields are the options of loaders.
 
-    statistics: a file, the name of a shipped one, `none` for numbers that are units already, or None for what the
-    checkpoint says. picture: how a picture comes to the network's resolution; None for what the layout of the
-    checkpoint implies. openness: the state's last number, see `state_layout`. unread: settings of an old
-    config.json that are left out, comma-separated.
+    Attributes:
+        statistics: A file, the name of a shipped one, `none` for numbers that are units already, or None for what
+            the checkpoint says.
+        picture: How a picture comes to the network's resolution; None for what the layout of the checkpoint
+            implies.
+        openness: The state's last number, see `state_layout`.
+        unread: Settings of an old config.json that are left out, comma-separated.
     """
 
     statistics: str | None = None

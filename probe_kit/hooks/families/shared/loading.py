@@ -26,9 +26,13 @@ DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 class Loaded[Network: nn.Module]:
     """A network with its weights, what loading proved, and where it is from.
 
-    dtype: of the weights, as the card has it. checkpoint: as requested. folder: of its other files. weights_seed:
-    of random weights, else None. notes, exact: of the card. adapter: the folder of a LoRA adapter, whose files
-    count before those of `folder`.
+    Attributes:
+        dtype: Of the weights, as the card has it.
+        checkpoint: As requested.
+        folder: Of its other files. weights_seed: of random weights, else None.
+        notes: Of the card.
+        exact: As `notes`.
+        adapter: The folder of a LoRA adapter, whose files count before those of `folder`.
     """
 
     network: Network
@@ -59,8 +63,10 @@ class Loaded[Network: nn.Module]:
     ) -> ModelCard:
         """The card of the model; its settings begin with the content of every file that is read.
 
-        files: besides the weights, by name; default those of the folder. tokenizer: of another folder, or a name.
-        fields: further ones of `ModelCard`.
+        Args:
+            files: Besides the weights, by name; default those of the folder.
+            tokenizer: Of another folder, or a name.
+            **fields: Further ones of `ModelCard`.
         """
         read = side_files(self.folder) if files is None else dict(files)
         if tokenizer is not None and (other := Path(tokenizer).expanduser()) != self.folder and other.is_dir():
@@ -105,10 +111,16 @@ def load_network[Network: nn.Module](
 
     A file may leave out parameters that are another one's double, such as tied output weights.
 
-    dtype: float32 or bfloat16; default that of the tensors in the file, float32 for random weights.
-    name_in_module: the network's name of a tensor in the file. tensors_of: the tensors under the network's names,
-    where that is not all. draw: random weights of a seed. finish: called with the whole network, before it goes to
-    the device. Raises UsageError for another dtype, WeightsError for weights that are not exactly the network's.
+    Args:
+        dtype: float32 or bfloat16; default that of the tensors in the file, float32 for random weights.
+        name_in_module: The network's name of a tensor in the file.
+        tensors_of: The tensors under the network's names, where that is not all.
+        draw: Random weights of a seed.
+        finish: Called with the whole network, before it goes to the device.
+
+    Raises:
+        UsageError: For another dtype.
+        WeightsError: For weights that are not exactly the network's.
     """
     if random_weights:
         name = chosen_dtype(dtype, None, DTYPES)
@@ -147,8 +159,9 @@ def assign_weights(
 ) -> WeightsAudit:
     """Make `tensors` the parameters of a network on the meta device, and tie doubles again.
 
-    Raises WeightsError for a double with other numbers and for tensors without memory, and what `load_weights`
-    raises.
+    Raises:
+        WeightsError: For a double with other numbers and for tensors without memory, and what `load_weights`
+            raises.
     """
     tied = doubles(network)
     audit = load_weights(network, weights, tensors, tied, assign=True, name_in_module=name_in_module)
@@ -201,8 +214,10 @@ _OF_VALUES = (ValueError, TypeError, LookupError, AttributeError, ArithmeticErro
 class Recipe:
     """The way from the files of a checkpoint to a family's network.
 
-    config: of the values of config.json. build: an empty network of a configuration, dtype and device.
-    names: from tensors in files to those of the network.
+    Attributes:
+        config: Of the values of config.json.
+        build: An empty network of a configuration, dtype and device.
+        names: From tensors in files to those of the network.
     """
 
     config: Callable[[Mapping[str, Any]], Any]
@@ -220,8 +235,10 @@ def load_vlm(
 ) -> Loaded[Any]:
     """The network of a checkpoint with exactly the weights of its files, or its random twin.
 
-    Raises UsageError without a checkpoint, CheckpointError for a configuration that describes no such network, and
-    WeightsError for weights that are not exactly the network's.
+    Raises:
+        UsageError: Without a checkpoint.
+        CheckpointError: For a configuration that describes no such network.
+        WeightsError: For weights that are not exactly the network's.
     """
     if checkpoint is None:
         raise UsageError("name a folder or hub id as --checkpoint")

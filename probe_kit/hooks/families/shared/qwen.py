@@ -195,7 +195,8 @@ class QwenVLA(QwenVision, Policy):
     def rows(self, observations: Sequence[Observation]) -> list[list[int]]:
         """Per observation the ids the backbone gets, the picture's as often as its size demands.
 
-        Raises InstructionError for a prompt that is too long.
+        Raises:
+            InstructionError: For a prompt that is too long.
         """
         limit = int(self.vlm.config.text_config.max_position_embeddings)
         rows = []

@@ -35,10 +35,14 @@ def decoder_tap(
 ) -> Tap:
     """Return the tap of a site: the first norm of the block it enters, the last norm, or a part of a block.
 
-    norm: behind the last block; `end`: at which of its ends the last residual passes. entry: path of the block's
-    first submodule, empty for the block itself. added: by quantity, the path of the submodule whose output a block
-    adds, where it is neither `mlp` nor the output projection; of `heads`, whose input they are. fires, fields: of
-    `Tap`.
+    Args:
+        norm: Behind the last block.
+        fires: Of `Tap`.
+        entry: Path of the block's first submodule, empty for the block itself.
+        added: By quantity, the path of the submodule whose output a block adds, where it is neither `mlp` nor the
+            output projection; of `heads`, whose input they are.
+        end: At which of its ends the last residual passes.
+        **fields: As `fires`.
     """
     if site.quantity == "final_norm":
         return Tap(norm, fires, "output", **fields)
@@ -66,8 +70,12 @@ def output_projection(attention: Any) -> Any:
 class Stack:
     """One transformer stack inside a policy.
 
-    entry, added, end: as `decoder_tap` has them. tap_fields: further ones of every tap, such as the positions that
-    belong to the stream. stream_fields: of the `Stream`; heads are counted where they are not among them.
+    Attributes:
+        entry: As `decoder_tap` has them.
+        added: As `entry`.
+        end: As `entry`.
+        tap_fields: Further ones of every tap, such as the positions that belong to the stream.
+        stream_fields: Of the `Stream`; heads are counted where they are not among them.
     """
 
     layers: Sequence[nn.Module]
@@ -101,8 +109,10 @@ TOWER: Mapping[str, Any] = MappingProxyType({"part": "vision", "quantities": ("r
 def token_stack(layers: Any, norm: Any, width: int, iterations: int | None, **tap_fields: Any) -> Stack:
     """Return a decoder that runs over the prompt and then over what it puts out, in one of these two roles.
 
-    iterations: the captured passes, or None for the prompt; calls behind them belong to no site. tap_fields: the
-    `tokens` of its passes that belong to the stream, and `first`, the passes before those of the stream.
+    Args:
+        iterations: The captured passes, or None for the prompt; calls behind them belong to no site.
+        **tap_fields: The `tokens` of its passes that belong to the stream, and `first`, the passes before those of
+            the stream.
     """
     return Stack(layers, norm, width, iterations, tap_fields={"more": True, **tap_fields})
 
@@ -201,8 +211,10 @@ def returned(_: Any, __: tuple[Any, ...], ___: dict[str, Any], output: Any) -> T
 def recomputed(attention: Any, inputs: tuple[Any, ...], keywords: dict[str, Any], _: Any) -> Tensor:
     """(B, H, 1, K) of the last position, of Llama's kind of attention, whose fast kernels return no weights.
 
-    Computed once more from the module's inputs and the keys it left. Raises UnsupportedInterventionError for an
-    attention of another kind.
+    Computed once more from the module's inputs and the keys it left.
+
+    Raises:
+        UnsupportedInterventionError: For an attention of another kind.
     """
     # With a norm of queries, as in Qwen3, or a soft cap, as in Gemma 2, these lines would give other weights.
     other_steps = [name for name in _OTHER_STEPS if getattr(attention, name, None) is not None]
@@ -225,7 +237,9 @@ def recomputed(attention: Any, inputs: tuple[Any, ...], keywords: dict[str, Any]
 def shares(queries: Tensor, keys: Tensor, scale: float, keywords: dict[str, Any]) -> Tensor:
     """(B, H, S, K) float32 softmax of queries (B, H, S, E) on keys (B, G, K, E), H a multiple of G.
 
-    keywords: may hold `attention_mask` (B, 1, S or more, K or more): True where a key is seen, or what is added.
+    Args:
+        keywords: May hold `attention_mask` (B, 1, S or more, K or more): True where a key is seen, or what is
+            added.
     """
     keys = keys.repeat_interleave(queries.shape[1] // keys.shape[1], dim=1)
     logits = queries.float() @ keys.float().transpose(2, 3) * scale

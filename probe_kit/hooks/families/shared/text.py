@@ -71,7 +71,8 @@ class TokenizerFile:
     def encoding(self, text: str, special: bool = False) -> Any:
         """The library's encoding. special: with the tokens that the file puts around a text.
 
-        Raises InstructionError for a word that the tokenizer does not know.
+        Raises:
+            InstructionError: For a word that the tokenizer does not know.
         """
         encoding = self.tokenizer.encode(text, add_special_tokens=special)
         unknown = getattr(self.tokenizer.model, "unk_token", None)
@@ -108,7 +109,8 @@ def positions_of(encoding: Any, start: int, stop: int) -> tuple[bool, ...]:
 def first_behind(before: Sequence[int], extended: Sequence[int], option: str) -> int:
     """The first id of an option. before, extended: the ids of a prompt without it and with it behind.
 
-    Raises UsageError for an option that changes the prompt's own ids: its logit would be that of another prompt.
+    Raises:
+        UsageError: For an option that changes the prompt's own ids: its logit would be that of another prompt.
     """
     count = len(before)
     if len(extended) == count or extended[:count] != before:
@@ -142,8 +144,11 @@ def values_of(file: Path) -> dict[str, Any]:
 class Frame:
     """The fixed strings around a question.
 
-    before: in front of the picture's positions. behind: between them and the question. bare: in front of a
-    question that comes without a picture. end: behind the question; the answer begins there.
+    Attributes:
+        before: In front of the picture's positions.
+        behind: Between them and the question.
+        bare: In front of a question that comes without a picture.
+        end: Behind the question; the answer begins there.
     """
 
     before: str
@@ -159,9 +164,12 @@ class Frame:
 class TokenPrompt:
     """A whole prompt.
 
-    text: behind the picture's positions. ids: of everything. question: which of the ids are the question.
-    picture: first position of the picture and the one behind its last; equal where there is none, or where one
-    placeholder stands for it.
+    Attributes:
+        text: Behind the picture's positions.
+        ids: Of everything.
+        question: Which of the ids are the question.
+        picture: First position of the picture and the one behind its last; equal where there is none, or where one
+            placeholder stands for it.
     """
 
     text: str
@@ -182,8 +190,12 @@ class FramedText(TokenizerFile):
     def of(cls, folder: Path, frame: Frame, config: Any, generation: Path) -> "FramedText":
         """Read the files in `folder`.
 
-        config: of the language model. generation: folder that may hold generation_config.json.
-        Raises CheckpointError for missing files and for a tokenizer of another model.
+        Args:
+            config: Of the language model.
+            generation: Folder that may hold generation_config.json.
+
+        Raises:
+            CheckpointError: For missing files and for a tokenizer of another model.
         """
         TokenizerFile(folder).check_present()
         text = cls(folder, frame, int(config.vocab_size), _ends(generation, config))
@@ -210,9 +222,13 @@ class FramedText(TokenizerFile):
     ) -> TokenPrompt:
         """The prompt of a question.
 
-        begun: how the answer has begun already. picture: ids at the positions of a picture, None without one;
-        `marks` of them at either end are no picture but say where it begins and ends.
-        Raises InstructionError for text that holds a token of the frames or one the tokenizer does not know.
+        Args:
+            begun: How the answer has begun already.
+            picture: Ids at the positions of a picture, None without one; `marks` of them at either end are no
+                picture but say where it begins and ends.
+
+        Raises:
+            InstructionError: For text that holds a token of the frames or one the tokenizer does not know.
         """
         self.check_marks(question + begun)
         lead = self.frame.bare if picture is None else self.frame.behind

@@ -33,9 +33,13 @@ _NEUTRAL = {
 def chooser(temperature: float, seeds: Sequence[int], top: int | None = TOP, among: range | None = None) -> Choose:
     """Greedy for temperature 0; else draws, each row by its own seed.
 
-    top: draw from so many of the likeliest only, and from those as likely as the last of them, as `generate` does;
-    None from all. among: draw from these ids only; None from all.
-    Raises UsageError for a negative or non-finite temperature.
+    Args:
+        top: Draw from so many of the likeliest only, and from those as likely as the last of them, as `generate`
+            does; None from all.
+        among: Draw from these ids only; None from all.
+
+    Raises:
+        UsageError: For a negative or non-finite temperature.
     """
     if not 0 <= temperature < float("inf"):
         raise UsageError(f"temperature is {temperature}; expected 0 for the likeliest token, or a positive number")
@@ -73,9 +77,14 @@ def _draw(logits: Tensor, temperature: float, top: int | None, generator: torch.
 def top_of(top_k: str, folders: Sequence[Path]) -> int | None:
     """The number of likeliest ids to draw from; None for all.
 
-    top_k: a number, `all`, or `checkpoint`: what its generation_config.json says, else `TOP`, as `generate` of
-    transformers 4 does it. folders: where that file may lie, the first one before the others.
-    Raises UsageError for another word, CheckpointError for a file that shapes the draw by other settings too.
+    Args:
+        top_k: A number, `all`, or `checkpoint`: what its generation_config.json says, else `TOP`, as `generate` of
+            transformers 4 does it.
+        folders: Where that file may lie, the first one before the others.
+
+    Raises:
+        UsageError: For another word.
+        CheckpointError: For a file that shapes the draw by other settings too.
     """
     if top_k == ALL:
         return None

@@ -38,8 +38,12 @@ from probe_kit.models.decoding import Decoded, LeftPacked, positions
 class Prefill:
     """The result of one pass over prompts.
 
-    network: called like transformers' own classes. mask: (B, T). last: (…, B, 1), positions of the last tokens.
-    logits: (B, V), choosing the first tokens of the answers. cache: keys and values of all prompts.
+    Attributes:
+        network: Called like transformers' own classes.
+        mask: (B, T).
+        last: (…, B, 1), positions of the last tokens.
+        logits: (B, V), choosing the first tokens of the answers.
+        cache: Keys and values of all prompts.
     """
 
     network: Any
@@ -154,7 +158,9 @@ Pictures = list[NDArray[np.uint8]]
 class VisionLanguageModel(SpeakingModel):
     """A loaded vision-language model. Subclasses say how it is spoken to and how a picture becomes positions.
 
-    recipe: how its network is made of files. stream_tolerance: of activations in golden references, absolute.
+    Attributes:
+        recipe: How its network is made of files.
+        stream_tolerance: Of activations in golden references, absolute.
     """
 
     family: ClassVar[str]
@@ -197,7 +203,9 @@ class VisionLanguageModel(SpeakingModel):
     ) -> Self:
         """Load a model of any size from a folder or hub id; see `load_vlm`.
 
-        tokenizer: folder of another one. settings: further options of the family, for its constructor.
+        Args:
+            tokenizer: Folder of another one.
+            **settings: Further options of the family, for its constructor.
         """
         loaded = load_vlm(cls.recipe, checkpoint, device, dtype, random_weights, weights_seed)
         return cls(loaded, tokenizer, **settings)
@@ -352,7 +360,9 @@ class VisionLanguageModel(SpeakingModel):
     def further_outputs(self, first: Prompt, produced: Mapping[str, Produce]) -> dict[str, Produce]:
         """Quantities of a golden reference that only this family has, or has in another form.
 
-        first: the first question. produced: how the quantities of every family are made.
+        Args:
+            first: The first question.
+            produced: How the quantities of every family are made.
         """
         del first, produced
         return {}

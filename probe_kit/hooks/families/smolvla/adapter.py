@@ -38,10 +38,13 @@ from probe_kit.models.pi0 import STATISTICS
 def build_smolvla(config: SmolVLAConfig, folder: Path, device: str = "cpu") -> SmolVLAPolicy:
     """A `SmolVLAPolicy` in eval mode, float32, with uninitialised weights.
 
-    folder: the checkpoint; `vlm_model_name` may be a path relative to it, or a hub id. Only the VLM's
-    configuration and tokenizer are read: its weights are part of the policy's own file.
-    device: `meta` serves to look at names and shapes.
-    Raises CheckpointError if the VLM's configuration cannot be found.
+    Args:
+        folder: The checkpoint; `vlm_model_name` may be a path relative to it, or a hub id. Only the VLM's
+            configuration and tokenizer are read: its weights are part of the policy's own file.
+        device: `meta` serves to look at names and shapes.
+
+    Raises:
+        CheckpointError: If the VLM's configuration cannot be found.
     """
     device = building_device(device)
     config.device = device

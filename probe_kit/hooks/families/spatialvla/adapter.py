@@ -83,8 +83,13 @@ def load_checkpoint(
 ) -> LoadedSpatialVLA:
     """Load a folder or hub id.
 
-    dtype: float32 or bfloat16; default what the checkpoint says. Raises CheckpointError, WeightsError, UsageError
-    for another dtype.
+    Args:
+        dtype: float32 or bfloat16; default what the checkpoint says.
+
+    Raises:
+        CheckpointError: For another dtype.
+        WeightsError: For another dtype.
+        UsageError: For another dtype.
     """
     folder = checkpoint_folder(checkpoint)
     config = SpatialVLAConfig.from_folder(folder)
@@ -124,8 +129,10 @@ _END = "\n"
 class Speech:
     """The way from an instruction to ids.
 
-    template: with a place for the instruction. lowercase: as in training; the released evaluation does not.
-    tokenizer_choice: None for the checkpoint's, or a folder.
+    Attributes:
+        template: With a place for the instruction.
+        lowercase: As in training; the released evaluation does not.
+        tokenizer_choice: None for the checkpoint's, or a folder.
     """
 
     config: SpatialVLAConfig
@@ -157,8 +164,9 @@ class Speech:
     def prompt(self, instruction: str) -> list[int]:
         """Ids of the whole prompt: the picture's places, beginning of sequence, text, new line.
 
-        Raises InstructionError for text that the tokenizer reads as a picture or an action, or that takes the new
-        line into itself: the model chooses its action there.
+        Raises:
+            InstructionError: For text that the tokenizer reads as a picture or an action, or that takes the new
+                line into itself: the model chooses its action there.
         """
         text = self.template.replace(SLOT, instruction.lower() if self.lowercase else instruction)
         ids = self.tokenizer.encode(text + _END)
@@ -337,7 +345,8 @@ class SpatialVLA(TokenDecoder, Policy):
     ) -> Decoded:
         """`steps` greedy tokens behind every prompt; one inference, as `capture` counts it.
 
-        fed: (B, steps - 1) ids that are fed back instead of those chosen.
+        Args:
+            fed: (B, steps - 1) ids that are fed back instead of those chosen.
         """
         packed, device = self.pack(rows), self.loaded.device
         slots = [self.bins.slots[step % STEP_TOKENS] for step in range(self.steps)] if self.constrained else None
@@ -415,7 +424,10 @@ def load_spatialvla(
 ) -> SpatialVLA:
     """Load SpatialVLA or one of its fine-tunes from a folder or hub id.
 
-    Options: see the family. Raises UsageError, and what `load_checkpoint` raises.
+    Options: see the family.
+
+    Raises:
+        UsageError: And what `load_checkpoint` raises.
     """
     if iterations not in ("step", "chunk"):
         raise UsageError(f"iterations is {iterations!r}; expected step or chunk")
@@ -443,7 +455,9 @@ def spatialvla_units(checkpoint: str, *, unnorm_key: str | None = None, **_: Any
 def choose_statistics(loaded: LoadedSpatialVLA, key: str | None) -> ActionStatistics:
     """The statistics of data set `key`; without one, of the only data set there is.
 
-    Raises UsageError for a key that is not there or has to be chosen, CheckpointError for bad statistics.
+    Raises:
+        UsageError: For a key that is not there or has to be chosen.
+        CheckpointError: For bad statistics.
     """
     by_data_set, source = _statistics(loaded.folder, loaded.processor)
     statistics = ActionStatistics.choose(by_data_set, key, source)

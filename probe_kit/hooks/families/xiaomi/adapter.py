@@ -131,7 +131,8 @@ class Xiaomi(QwenVLA):
     def robot(self) -> Robot:
         """The robot as whose scene pictures are shown; the default one where no statistics name a robot.
 
-        Raises UsageError for one that Act2Answer's arm cannot stand in for.
+        Raises:
+            UsageError: For one that Act2Answer's arm cannot stand in for.
         """
         units = self.units_or_reason()
         return robot_of(DEFAULT_ROBOT if isinstance(units, str) else units.robot)
@@ -254,7 +255,12 @@ def load_xiaomi(
 ) -> Xiaomi:
     """Load Xiaomi-Robotics-R0 from a folder or hub id.
 
-    Options: see the family. Raises CheckpointError, WeightsError, and UsageError for options that cannot be.
+    Options: see the family.
+
+    Raises:
+        CheckpointError: For options that cannot be.
+        WeightsError: For options that cannot be.
+        UsageError: For options that cannot be.
     """
     if steps < 1:
         raise UsageError(f"{steps} Euler steps make no action; expected 1 or more")

@@ -110,7 +110,9 @@ def current_xvla_keys(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 def denoised_actions(policy: Any, inputs: Mapping[str, Tensor], noise: Tensor) -> Tensor:
     """(B, chunk, D) actions from noise (B, chunk, widest action): lerobot's denoising, one inference.
 
-    inputs: in lerobot's keys. The network predicts actions, not a velocity: every step mixes them with the noise.
+    Args:
+        inputs: In lerobot's keys. The network predicts actions, not a velocity: every step mixes them with the
+            noise.
     """
     model, steps = policy.model, max(1, int(policy.config.num_denoising_steps))
     model_inputs = policy._build_model_inputs(dict(inputs))
@@ -139,10 +141,13 @@ STEPS = ("xvla_image_to_float", _MEAN, _DOMAIN)
 def read_steps(config: Any, folder: Path, domain: int | None) -> None:
     """Put what the processor files say into lerobot's configuration; `domain` counts over theirs.
 
-    domain: the robot's number. imagenet: whether pictures are normalised with ImageNet's mean and deviation.
-    tokenizer_name: also the folder in the checkpoint.
-    Raises CheckpointError. lerobot takes robot 0 where nothing names one: here it is an error, and so is a step
-    that changes numbers in another way.
+    Args:
+        domain: The robot's number. imagenet: whether pictures are normalised with ImageNet's mean and deviation.
+            tokenizer_name: also the folder in the checkpoint.
+
+    Raises:
+        CheckpointError: . lerobot takes robot 0 where nothing names one: here it is an error, and so is a step
+            that changes numbers in another way.
     """
     check_pipelines(folder)
     check_steps(folder, POSTPROCESSOR, (*NORMALISERS, *STEPS))

@@ -40,7 +40,8 @@ class DenoisingPolicy(LerobotPolicy):
     def denoise(self, batch: Mapping[str, Tensor], noise: Tensor) -> Tensor:
         """(B, chunk, D) normalised actions for a batch in lerobot's keys, with a graph where gradients are on.
 
-        noise: (B, *noise_shape) float32.
+        Args:
+            noise: (B, *noise_shape) float32.
         """
 
     @property
@@ -188,8 +189,11 @@ def chat_labels(
 ) -> list[str]:
     """The role of every position of a chat: `language` between two marks, else `special`.
 
-    pictures: the roles of the pictures, each a run of patches, in their order. picture, state: the ids of a patch
-    and of the state. words: the ids of the marks; the first counts where it stands last.
+    Args:
+        pictures: The roles of the pictures, each a run of patches, in their order.
+        picture: The ids of a patch and of the state.
+        words: The ids of the marks; the first counts where it stands last.
+        state: As `picture`.
     """
     begin = len(ids) - ids[::-1].index(words[0])
     end, roles, role = ids.index(words[1], begin), iter(pictures), ""
@@ -219,7 +223,11 @@ class PackedPolicy(DenoisingPolicy):
     ) -> tuple[dict[str, Tensor], list[Tokens]]:
         """The observations as the network reads them, and of each its prompt without the actions.
 
-        state: (B, numbers) as the network reads them. Raises InstructionError for a text that it cannot take in.
+        Args:
+            state: (B, numbers) as the network reads them.
+
+        Raises:
+            InstructionError: For a text that it cannot take in.
         """
         rows: list[PackedRow] = [
             self.packing.row(self.pictures_of(observation), observation.instruction, numbers)
@@ -290,7 +298,8 @@ def _check_small_weights(folder: Path) -> None:
 def sizes_file(folder: Path) -> Path | None:
     """The `dims.json` of a small checkpoint; None for one of the released size.
 
-    Raises CheckpointError for a small one that lost it.
+    Raises:
+        CheckpointError: For a small one that lost it.
     """
     sizes = [parent / "dims.json" for parent in (folder, folder.parent) if (parent / "dims.json").is_file()]
     if not sizes:

@@ -47,13 +47,17 @@ Mask = NDArray[np.bool_] | bool
 class Normaliser:
     """A map per dimension between physical units and the numbers of a network, in lerobot's conventions.
 
-    mode: MEAN_STD, MIN_MAX, QUANTILES, QUANTILE10, IDENTITY, or several in words. low, high: (D,) float32, what
-    stands for -1 and 1; mean and deviation of numbers that are `scored`. eps: in place of a range or beside a
-    deviation. source: the file they come from.
-    scored: (D,) which numbers are mapped by mean and deviation; None for what `mode` says. plain: those that stay
-    as they are. clamped: those of the network that are moved to -1 to 1. sign: the action that becomes −1 or 1,
-    as LIBERO's gripper; None where there is none.
-    Raises CheckpointError for statistics that are not finite, or whose scale is not positive.
+    Attributes:
+        mode: MEAN_STD, MIN_MAX, QUANTILES, QUANTILE10, IDENTITY, or several in words.
+        low: (D,) float32, what stands for -1 and 1; mean and deviation of numbers that are `scored`.
+        high: As `low`.
+        eps: In place of a range or beside a deviation.
+        source: The file they come from.
+        scored: (D,) which numbers are mapped by mean and deviation; None for what `mode` says.
+        plain: Those that stay as they are.
+        clamped: Those of the network that are moved to -1 to 1.
+        sign: The action that becomes −1 or 1, as LIBERO's gripper; None where there is none. Raises
+            CheckpointError for statistics that are not finite, or whose scale is not positive.
     """
 
     mode: str
@@ -140,9 +144,13 @@ class Normaliser:
 def read_normaliser(folder: Path, pipeline: str, feature: str, kind: str) -> Normaliser:
     """The map of one feature from `<pipeline>.json` and the safetensors file it names.
 
-    pipeline: `policy_preprocessor` or `policy_postprocessor`. feature: `observation.state` or `action`.
-    kind: the feature's type in lerobot's norm_map, `STATE` or `ACTION`.
-    Raises CheckpointError if statistics are missing: lerobot would let the values pass unchanged.
+    Args:
+        pipeline: `policy_preprocessor` or `policy_postprocessor`.
+        feature: `observation.state` or `action`.
+        kind: The feature's type in lerobot's norm_map, `STATE` or `ACTION`.
+
+    Raises:
+        CheckpointError: If statistics are missing: lerobot would let the values pass unchanged.
     """
     path = folder / f"{pipeline}.json"
     if not path.is_file():
@@ -180,7 +188,8 @@ def _statistics(
 def read_buffers(folder: Path) -> dict[str, NDArray[np.float32]]:
     """The statistics that lerobot kept among the weights until 2025, by their names there; mostly none.
 
-    Raises CheckpointError if a weights file cannot be read.
+    Raises:
+        CheckpointError: If a weights file cannot be read.
     """
     buffers: dict[str, NDArray[np.float32]] = {}
     for path in sorted(folder.glob("model*.safetensors")):
@@ -198,8 +207,12 @@ def from_buffers(
 ) -> Normaliser | None:
     """The map of one feature from old buffers; None where the configuration normalises nothing.
 
-    modes: `normalization_mapping` of the configuration. source: whose weights they are, for messages.
-    Raises CheckpointError if a buffer is missing, or was never filled.
+    Args:
+        modes: `normalization_mapping` of the configuration.
+        source: Whose weights they are, for messages.
+
+    Raises:
+        CheckpointError: If a buffer is missing, or was never filled.
     """
     stored_mode = modes.get(kind, "IDENTITY")
     mode = str(getattr(stored_mode, "value", stored_mode))

@@ -27,9 +27,14 @@ def known_values(
 ) -> dict[str, Any]:
     """`values` without the fields that do nothing here.
 
-    read_fields: fields that the installed lerobot reads. inert: of a newer one. unread: those that the caller says
-    change nothing. waived: whether users can say so, with -M unread.
-    Raises CheckpointError naming every other field that lerobot does not know, and its value.
+    Args:
+        read_fields: Fields that the installed lerobot reads.
+        inert: Of a newer one.
+        unread: Those that the caller says change nothing.
+        waived: Whether users can say so, with -M unread.
+
+    Raises:
+        CheckpointError: Naming every other field that lerobot does not know, and its value.
     """
     extra = {name: value for name, value in values.items() if name not in read_fields and name not in unread}
     changing = {
@@ -185,7 +190,8 @@ def check_pipelines(folder: Path) -> None:
 def check_steps(folder: Path, pipeline: str, family_steps: Collection[str]) -> None:
     """Raise CheckpointError for a step or a field whose effect is unknown here, and for normalised pictures.
 
-    family_steps: names of steps besides the harmless ones.
+    Args:
+        family_steps: Names of steps besides the harmless ones.
     """
     steps = saved_steps(folder, pipeline)
     names = [step.name for step in steps]
@@ -211,7 +217,9 @@ def check_steps(folder: Path, pipeline: str, family_steps: Collection[str]) -> N
 def check_values(values: Mapping[str, Any], honoured: Mapping[str, tuple[Any, ...] | None], subject: str) -> None:
     """Raise CheckpointError for a field whose effect is unknown here, and for a value that is not honoured.
 
-    honoured: fields with the values that are honoured; None for any. subject: the file and the part of it.
+    Args:
+        honoured: Fields with the values that are honoured; None for any.
+        subject: The file and the part of it.
     """
     for name, value in values.items():
         if name not in honoured:

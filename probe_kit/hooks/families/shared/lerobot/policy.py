@@ -116,8 +116,9 @@ class LerobotPolicy(Policy):
     def with_cameras(self, cameras: Sequence[str]) -> Self:
         """The same policy, given pictures of several cameras; all but the first from `Observation.cameras`.
 
-        Raises ObservationError unless they are the first ones of the configuration, in its order: lerobot moves
-        present cameras to the front.
+        Raises:
+            ObservationError: Unless they are the first ones of the configuration, in its order: lerobot moves
+                present cameras to the front.
         """
         if tuple(cameras) != self.cameras[: len(cameras)] or not cameras:
             raise ObservationError(
@@ -205,10 +206,14 @@ class LerobotPolicy(Policy):
     ) -> Self:
         """Load a lerobot checkpoint from a folder or hub id.
 
-        dtype: float32 or bfloat16; default what the checkpoint's config says.
-        random_weights: same architecture, tokenizer and statistics, but random weights of `weights_seed`.
-        options: what its files do not say, the fields of `choice`.
-        Raises CheckpointError for missing files, WeightsError for weights that are not exactly the model's.
+        Args:
+            dtype: float32 or bfloat16; default what the checkpoint's config says.
+            random_weights: Same architecture, tokenizer and statistics, but random weights of `weights_seed`.
+            **options: What its files do not say, the fields of `choice`.
+
+        Raises:
+            CheckpointError: For missing files.
+            WeightsError: For weights that are not exactly the model's.
         """
         folder, evaluation = checkpoint_folder(checkpoint), cls.choice(**options)
         config = cls._read_config(folder, evaluation)
@@ -272,8 +277,11 @@ class LerobotPolicy(Policy):
     def parse_config(cls, folder: Path, evaluation: Any) -> Any:
         """lerobot's configuration object of the folder's `config.json`, also of one that a newer lerobot wrote.
 
-        evaluation: of `choice`. Raises CheckpointError for a policy of another kind, and for a field that may
-        change inference.
+        Args:
+            evaluation: Of `choice`.
+
+        Raises:
+            CheckpointError: For a policy of another kind, and for a field that may change inference.
         """
         path = folder / CONFIG_FILE
         values = cls.current_values(read_json_object(path, CheckpointError, "Take the original file"), path)
@@ -456,7 +464,8 @@ class LerobotPolicy(Policy):
     ) -> dict[str, Tensor]:
         """The observations in lerobot's keys; the environment's picture goes to the first camera.
 
-        state: (B, numbers) as the network reads them; None for that of the observations.
+        Args:
+            state: (B, numbers) as the network reads them; None for that of the observations.
         """
         device = self.config.device
         numbers = self.state(observations) if state is None else state
@@ -500,7 +509,8 @@ class LerobotPolicy(Policy):
     ) -> tuple[Tensor, Tensor]:
         """(B, tokenizer_max_length) ids and mask; never truncates and never drops a word.
 
-        state: (B, numbers) as the network reads them, for prompts that hold it; None for zeros.
+        Args:
+            state: (B, numbers) as the network reads them, for prompts that hold it; None for zeros.
         """
         if state is None:
             state = np.zeros((len(instructions), self.state_numbers), np.float32)

@@ -20,9 +20,11 @@ from probe_kit.hooks.families.shared.lerobot.pipelines import CROP, PREPROCESSOR
 class PictureWindow:
     """Crop, then resize (bilinear, antialiased) as lerobot's `ImageCropResizeProcessorStep` does.
 
-    crop: top, left, height, width in pixels of the camera, or None. size: (height, width) after, or None.
-    camera: (height, width) of the pictures that `crop` was chosen on; others are brought to it first, with their
-    proportions kept by padding, as pi0 brings pictures to its own resolution. None for any.
+    Attributes:
+        crop: Top, left, height, width in pixels of the camera, or None.
+        size: (height, width) after, or None.
+        camera: (height, width) of the pictures that `crop` was chosen on; others are brought to it first, with
+            their proportions kept by padding, as pi0 brings pictures to its own resolution. None for any.
     """
 
     crop: tuple[int, int, int, int] | None = None
@@ -49,9 +51,11 @@ class PictureWindow:
 def read_window(folder: Path, camera: str, size: tuple[int, int] | None = None) -> PictureWindow:
     """The window of one camera (`observation.images.<name>`); the whole picture if the checkpoint names none.
 
-    size: (height, width) of that camera, as the checkpoint's configuration declares it.
+    Args:
+        size: (height, width) of that camera, as the checkpoint's configuration declares it.
 
-    Raises CheckpointError if the step holds something else than lerobot writes.
+    Raises:
+        CheckpointError: If the step holds something else than lerobot writes.
     """
     fields = step_fields(folder).get(CROP)
     if fields is None:
