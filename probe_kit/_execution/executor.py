@@ -9,10 +9,11 @@ from typing import Any, Protocol, Self
 from probe_kit.errors import ProbeKitError, UsageError, WorkerDiedError
 
 Work = Callable[[Any, Callable[[], Any], Callable[[Any], None]], None]
-"""The work of a worker, a function of a module: (setup, take, report).
+"""The work of a worker: a function of a module with the arguments (setup, take, report).
 
-setup: as the executor was given it. take: waits for the next task; None if a worker that still works on a task
-should finish it first. report: sends an event. The function never returns; it ends with its process.
+It gets `setup` as the executor was given it. `take` waits for the next task; it returns None if a worker that
+still works on a task should finish it first. `report` sends an event. The function never returns; it ends with its
+process.
 """
 
 
@@ -50,7 +51,7 @@ class Lost:
 
 
 def serve(connection: Connection) -> None:
-    """Do the work that the first message names; an error of ours is sent as a message."""
+    """Do the work that the first message names; a ProbeKitError is sent as a message."""
     work, setup = connection.recv()
 
     def take() -> Any:
@@ -66,9 +67,9 @@ def serve(connection: Connection) -> None:
 # -- the executor ---------------------------------------------------------------------------------------------
 
 MOST_STILLBORN = 3
-"""So many workers in a row that die before their first task are no accident of one of them."""
+"""Workers that die in a row before their first task, at which the executor gives up: so many are no accident."""
 _NAMED_TASKS = 3
-"""Of the tasks of a lost worker, the warning names so many."""
+"""The number of a lost worker's tasks that the warning names."""
 
 
 class WorkerLostWarning(UserWarning):
@@ -91,10 +92,10 @@ class Pool(Protocol):
         """End an idle worker."""
 
     def send(self, slot: int, message: object) -> None:
-        """Send a task."""
+        """Send a task to a worker."""
 
     def receive(self) -> Iterator[tuple[int, Any]]:
-        """Wait for messages of workers."""
+        """Wait for messages of workers, and yield each with the number of its worker."""
 
 
 @dataclass(frozen=True)
@@ -110,6 +111,13 @@ class TaskQueue[T]:
 
     A task that failed, or was in the hands of a worker that died, is suspect: it is tried again when all others
     are handed out, by a worker that holds nothing else, so that it can take no other task down with it.
+
+    Attributes:
+        tasks: Keys and tasks in order, of which one is read ahead.
+        noun: A word for one task, in the singular, as messages name it.
+        tries: The number of failures after which a task is given up.
+        fits: Whether a worker, by number, can do a task; all tasks are then read at once. None: every worker can
+            do each.
 
     Args:
         tasks: By key, read one ahead.
@@ -143,7 +151,7 @@ class TaskQueue[T]:
             self._read = not self._fresh
 
     def take(self, slot: int) -> T | None:
-        """Return the next task for a worker; None if it should finish what it holds, or wait."""
+        """Return the next task for a worker; None if it should finish the tasks it has, or wait."""
         tasks = self._held[slot]
         if any(key in self._failures for key in tasks):  # it holds a suspect, which takes no other task down
             return None
@@ -156,7 +164,7 @@ class TaskQueue[T]:
         return None
 
     def holds(self, slot: int) -> dict[Hashable, T]:
-        """Return the tasks in the hands of a worker."""
+        """Return the tasks in the hands of a worker, by key."""
         return dict(self._held[slot])
 
     def end(self, slot: int, key: Hashable) -> None:
@@ -169,13 +177,15 @@ class TaskQueue[T]:
             self._held[slot][key] = task
 
     def advanced(self, key: Hashable) -> None:
-        """Note that a task moves on: its failures so far count no longer."""
+        """Note that a task advances: its failures so far no longer count."""
         self._failures.pop(key, None)
 
     def retry(self, slot: int, key: Hashable, counts: bool = True) -> bool:
-        """Take a task that failed back from a worker. Returns whether it is tried again.
+        """Take a task that failed back from a worker, and return whether it is tried again.
 
         Args:
+            slot: The number of the worker.
+            key: The key of the task.
             counts: False for a failure that is no sign against the task.
         """
         task = self._held[slot].pop(key)
@@ -187,11 +197,15 @@ class TaskQueue[T]:
 
 
 def work_off[T](pool: Pool, queue: TaskQueue[T]) -> Iterator[tuple[int, Any]]:
-    """Let the workers of a pool do all tasks of a queue; yields number of worker and event, as they come.
+    """Let the workers of a pool do all tasks of a queue; yield a worker's number with each event, as they come.
 
     The caller ends every task in the queue, and retries what fails. A worker that dies is replaced, with a
     warning; a task that is lost once too often is the event `GivenUp`. A worker without further tasks is stopped.
-    Raises the ProbeKitError that a worker sends, and WorkerDiedError if workers die before their first task.
+
+    Raises:
+        ProbeKitError: That which a worker sends.
+        WorkerDiedError: If `MOST_STILLBORN` workers in a row die before their first task.
+        UsageError: If no worker can take a task that is left.
     """
     if queue.finished:
         return

@@ -24,7 +24,10 @@ GRACE_S = 10.0
 
 
 class Child:
-    """A child running `service`, a function `module:name` that takes the child's end of the connection."""
+    """A child running `service`, a function `module:name` that takes the child's end of the connection.
+
+    Its variables are those of this process; `environment` adds to them or replaces them.
+    """
 
     def __init__(self, service: str, environment: Mapping[str, str] | None = None) -> None:
         ours, theirs = socket.socketpair()
@@ -40,11 +43,11 @@ class Child:
 
     @property
     def pid(self) -> int:
-        """The process id."""
+        """The process id of the child."""
         return self._process.pid
 
     def close(self) -> int:
-        """Hang up and wait for the end; a child that does not end is killed. Returns its exit code."""
+        """Hang up, wait for the end of the child, which is killed if it does not end, and return its exit code."""
         self.connection.close()
         try:
             return self._process.wait(GRACE_S)
@@ -68,11 +71,22 @@ def main() -> None:
 
 VISIBLE_GPUS = "CUDA_VISIBLE_DEVICES"
 LONGEST_WAIT_S = 1.0
-"""A signal that arrives just before the system call does not end it: an endless wait would miss Ctrl-C."""
+"""The longest wait for a message.
+
+A signal that arrives just before the system call does not end it: an endless wait would miss Ctrl-C.
+"""
 
 
 class ProcessPool:
     """Workers in processes, numbered from 0. A context manager.
+
+    Attributes:
+        work: The work of every worker.
+        setup: The first argument of `work`, which is sent to every process.
+        size: The number of processes.
+        environment: By number, variables of the process beyond those of this one. None: no others.
+        exits: By exit code, the predicate of a sentence that says why a process ended. None: the sentence names
+            the code.
 
     Args:
         environment: By number, variables of the process beyond those of this one.
@@ -118,7 +132,7 @@ class ProcessPool:
         self._children[slot] = Child("probe_kit._execution.executor:serve", environment)
 
     def pid(self, slot: int) -> int:
-        """The process id."""
+        """The process id of a worker."""
         return self._children[slot].pid
 
     def send(self, slot: int, message: object) -> None:
@@ -127,7 +141,7 @@ class ProcessPool:
             self._children[slot].connection.send(message)
 
     def receive(self) -> Iterator[tuple[int, Any]]:
-        """Wait until a worker sends something; number and message of all that did, `Lost` of one that died."""
+        """Wait until workers send something; yield number and message of each, and `Lost` for one that died."""
         connections = [child.connection for child in self._children.values()]
         while not (ready := wait(connections, LONGEST_WAIT_S)):
             pass
@@ -143,7 +157,7 @@ class ProcessPool:
 
 
 def share_of_machine(slot: int, size: int, device: str) -> dict[str, str]:
-    """Variables of process number `slot` of `size`: a share of the cores, and one GPU where there are GPUs.
+    """The variables of process number `slot` of `size`: a share of the cores, and one GPU if `device` is a GPU.
 
     It is a share of what this process itself has: a worker of a pool that opens a pool divides its own share.
     """

@@ -16,11 +16,11 @@ from probe_kit.errors import UsageError
 AUTO = "auto"
 """The cluster this process belongs to, or else a new one on this machine."""
 KNOCK_TIMEOUT_S = 10.0
-"""Time in which the head of a cluster has to take a connection."""
+"""The time in which the head of a cluster has to accept a connection."""
 PATIENCE_S = 300.0
 """Time without any worker before a warning."""
 _THREADS = 3
-"""Of an actor: one works, one takes tasks, one gives reports away."""
+"""The threads of an actor: one works, one takes tasks, one delivers reports."""
 
 
 class ClusterFullWarning(UserWarning):
@@ -48,7 +48,7 @@ class RayWorker:
         self._tasks.put(task)
 
     def collect(self) -> tuple[str, list[Any]]:
-        """Wait for reports. Returns the name of the node, as `ray list nodes` has it, and the reports."""
+        """Wait for reports; return the name of the node, as `ray list nodes` has it, and the reports."""
         reports = [self._reports.get()]
         while not self._reports.empty():
             reports.append(self._reports.get())
@@ -59,6 +59,12 @@ class RayPool:
     """Workers as actors on the nodes of a cluster, numbered from 0. A context manager.
 
     Each holds a core and its GPUs, so that nodes share them. One without room begins later and delays no other.
+
+    Attributes:
+        work: The work of every worker.
+        setup: The first argument of `work`; the cluster stores it once.
+        address: The cluster's address; `AUTO` stands for the one this process belongs to, or a new one here.
+        gpus: The GPUs of every worker, from the resources of the cluster (`CPU`, `GPU`).
 
     Args:
         gpus: By the resources of the cluster (`CPU`, `GPU`), the GPUs of every worker.
@@ -116,7 +122,7 @@ class RayPool:
         self._actors[slot].give.remote(message)
 
     def receive(self) -> Iterator[tuple[int, Any]]:
-        """Wait until a worker reports; number and message of all that it sent, `Lost` of one that died."""
+        """Wait until a worker reports; yield number and message of all that it sent, `Lost` of one that died."""
         call = self._next_answer()
         slot = self._collecting.pop(call)
         try:
@@ -129,7 +135,7 @@ class RayPool:
             yield slot, report
 
     def _next_answer(self) -> Any:
-        """Return the next finished call. Warns once in a while that there is no worker to wait for."""
+        """Return the next finished call; warn at intervals of `PATIENCE_S` as long as no worker has begun."""
         while True:
             ready, _ = self._ray.wait(list(self._collecting), num_returns=1, timeout=PATIENCE_S)
             if ready:

@@ -40,7 +40,7 @@ def check_regular(path: Path, most: int = MOST_BYTES) -> None:
 
 
 def open_regular(path: Path, most: int = MOST_BYTES) -> BufferedReader:
-    """Open a regular file of at most `most` bytes. Raises OSError, with `strerror` in words, for another one."""
+    """Open a regular file of at most `most` bytes; for any other one raise OSError with `strerror` in words."""
     check_regular(path, most)
     # The file may have been exchanged since: opening a pipe would wait for its writer.
     handle = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -84,9 +84,9 @@ def _too_large(path: Path, size: int, most: int) -> OSError:
 # -- YAML -----------------------------------------------------------------------------------------------------
 
 MOST_NODES = 1_000_000
-"""Values of a YAML file, where an alias counts as all that it stands for."""
+"""The most values of a YAML file, where an alias counts as all that it stands for."""
 _MOST_YAML_BYTES = 16 << 20
-"""For which yaml takes 3.5 minutes; for `MOST_BYTES` json takes 3 seconds."""
+"""The largest YAML file, for which yaml takes 3.5 minutes; for `MOST_BYTES` json takes 3 seconds."""
 
 
 def load_yaml(file: Path) -> Any:
@@ -124,13 +124,13 @@ def _nodes(value: Any, counted: dict[int, int]) -> int:
 # -- JSON -----------------------------------------------------------------------------------------------------
 
 MOST_VALUES = 1 << 25
-"""Values of one text; in Python each takes 8 to 80 bytes, however short it is written."""
+"""The most values of one text; in Python each takes 8 to 80 bytes, however short it is written."""
 _HALF = re.compile(r"\\u[dD][89a-fA-F]")
 """An escape of half a surrogate pair, whose other half may be missing."""
 
 
 def parse_json(content: bytes | str, **options: Any) -> Any:
-    """The value. options: hooks of `json.loads`.
+    """Return the value of a JSON text; `options` are hooks of `json.loads`.
 
     Raises:
         ValueError: For text that is not UTF-8 or JSON, nests too deeply, has half characters, repeats a key, or
@@ -202,9 +202,17 @@ _JSON_KINDS: dict[type, str] = {dict: "an object", list: "a list"}
 def read_json(
     file: Path, raises: type[ProbeKitError], advice: str, most: int = MOST_BYTES, kind: type = object
 ) -> Any:
-    """The value in a file. most: bytes. kind: `dict` or `list`, if it must be one.
+    """Return the value in a JSON file.
 
-    Raises `raises` with `advice` if the file is missing, too large, unreadable, no JSON, or of another kind.
+    Args:
+        file: The file, which errors name.
+        raises: The class of the error if the file is missing, too large, unreadable, no JSON, or of another kind.
+        advice: The end of every message: a sentence without a period that says what to do.
+        most: The largest size in bytes.
+        kind: `dict` or `list` if the value must be one; `object` accepts every value.
+
+    Raises:
+        ProbeKitError: Of class `raises`, for any file that cannot be used.
     """
     try:
         value = load_json(file, most)
@@ -220,7 +228,7 @@ def read_json(
 
 
 def read_json_object(file: Path, raises: type[ProbeKitError], advice: str) -> dict[str, Any]:
-    """The object in a file; raises as `read_json` does."""
+    """Return the object in a JSON file; errors are those of `read_json`."""
     value: dict[str, Any] = read_json(file, raises, advice, kind=dict)
     return value
 
@@ -228,17 +236,17 @@ def read_json_object(file: Path, raises: type[ProbeKitError], advice: str) -> di
 # -- arrays ---------------------------------------------------------------------------------------------------
 
 MOST_ARRAY_BYTES = 4 << 30
-"""Of all arrays of a file, unpacked."""
+"""The most bytes of all arrays of a file, unpacked."""
 UNREADABLE = (OSError, ValueError, EOFError, KeyError, AttributeError, RuntimeError, BadZipFile, zlib.error)
-"""What `open_arrays`, and reading of an array, raise for a file that is none, damaged or asks for a password."""
+"""The errors of `open_arrays`, and of reading an array, if a file is none, damaged or asks for a password."""
 
 
 def open_arrays(source: Path | BinaryIO | bytes) -> "NpzFile":
-    """Open an `.npz` file; a context manager that holds arrays by name. Nothing is unpickled.
+    """Open an `.npz` file; the result is a context manager that holds arrays by name. Nothing is unpickled.
 
     Raises:
-        ValueError: For a file whose arrays have more than `MOST_ARRAY_BYTES` once they are unpacked, and one of
-            `UNREADABLE` for one that is no such file.
+        ValueError: For a file whose arrays have more than `MOST_ARRAY_BYTES` once they are unpacked.
+        Exception: One of `UNREADABLE` for a file that is no such file.
     """
     import numpy as np
 
@@ -258,7 +266,7 @@ def open_arrays(source: Path | BinaryIO | bytes) -> "NpzFile":
 
 
 def _check_header(packed: ZipFile, entry: ZipInfo) -> None:
-    """Raise ValueError for an array whose header claims other bytes than are there: numpy makes room for all."""
+    """Raise ValueError for an array whose header claims other bytes than it has: numpy allocates room for all."""
     from numpy.lib import format as npy
 
     with packed.open(entry) as file:

@@ -23,7 +23,7 @@ def complaints_of(error: ValidationError) -> Iterator[Complaint]:
 
 
 def in_words(error: ValidationError, most: int | None = 1) -> str:
-    """Return the first complaints in a line, each with its path. most: how many; None for all."""
+    """Return the first `most` complaints in a line, each with its path; None for all."""
     sentences = [f"{'.'.join(map(str, path))} {text}".strip() for path, text in complaints_of(error)]
     return "; ".join(sentences[:most])
 
@@ -55,6 +55,6 @@ def shortened(text: str) -> str:
 
 
 def joined(texts: Sequence[str]) -> str:
-    """Return what the choices of a union say of one value as one complaint."""
+    """Return as one complaint what the choices of a union say about one value."""
     first, *alternatives = texts
     return " or ".join([first, *(text.partition("expected ")[2] or text for text in alternatives)])

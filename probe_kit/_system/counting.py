@@ -6,8 +6,7 @@ from collections.abc import Collection, Sequence
 def counted(number: int, noun: str) -> str:
     """Return a number with its noun, in the plural unless it is one: `1 table`, `2 tables`, `3,440 categories`.
 
-    Args:
-        noun: In the singular, with words in front where it has any, such as `independent group`.
+    The noun is in the singular. It may have words in front, such as `independent group`.
     """
     if number == 1:
         return f"1 {noun}"

@@ -16,10 +16,10 @@ _SUFFIX = ".tmp"
 
 @contextmanager
 def draft_of(path: Path) -> Iterator[Path]:
-    """Yield a path for the file or folder `path`, which the body renames when it is whole; gone afterwards.
+    """Yield a path for a draft of the file or folder `path`; the body renames it when it is whole.
 
-    A draft lies in a hidden folder beside `path`, `.<name>.<letters>.tmp`, which is locked as long as its process
-    lives. Those that killed processes left for the same `path` are removed first.
+    After the body the draft is gone. It lies in a hidden folder beside `path`, `.<name>.<letters>.tmp`, which is
+    locked as long as its process lives. Drafts that killed processes left for the same `path` are removed first.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     _remove_abandoned(path)
@@ -28,14 +28,14 @@ def draft_of(path: Path) -> Iterator[Path]:
 
 
 def write_whole(path: Path, text: str) -> None:
-    """Write a text in UTF-8, over whatever is there: readers find the former text or all of this one."""
+    """Write a text in UTF-8 in place of what is there: readers find the former text or all of this one."""
     with draft_of(path) as draft:
         draft.write_text(text, encoding="utf-8", newline="\n")
         draft.replace(path)
 
 
 def move_draft(draft: Path, path: Path) -> None:
-    """Give a whole draft its name. Raises UsageError where something lies there meanwhile."""
+    """Give a whole draft its name, or raise UsageError if something else lies there by now."""
     if path.is_dir() and not any(path.iterdir()):
         path.rmdir()  # nothing is lost, and a file takes its place as well
     if path.exists():

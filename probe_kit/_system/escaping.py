@@ -16,7 +16,7 @@ UNSAFE = re.compile(f"[\x00-\x08\x0b-\x1f\x7f-\x9f{_BIDI}\u2028\u2029\ufeff\ud80
 
 
 def terminal_safe(text: str) -> str:
-    """`text` without anything that a terminal obeys; what was there shows as a sign of its own, such as ␛."""
+    """Return `text` without anything that a terminal obeys; such characters become visible signs, such as ␛."""
     return UNSAFE.sub(_sign, text)
 
 
@@ -36,7 +36,7 @@ _BARE = re.compile(
 
 
 def without_places(text: str, places: tuple[str, ...] = ()) -> str:
-    """`text` with the last part alone of every absolute path, and of `places`, which may hold spaces."""
+    """Return `text` with only the last part of every absolute path, and of `places`, which may hold spaces."""
     for path in sorted(filter(None, places), key=len, reverse=True):
         text = text.replace(path, _last(path))
     text = _QUOTED.sub(lambda match: f"{match[1]}{_last(match[2])}{match[1]}", text)
@@ -48,24 +48,25 @@ def _last(path: str) -> str:
 
 
 _FORMULA = re.compile(r"'*(?:[\t\r\n]|\s*[=+\-@＝＋－＠])")
-"""How a cell begins that spreadsheets compute or cut, or one that `escaped` made."""
+"""The beginning of a cell that spreadsheets compute or cut, or of one that `escaped` made."""
 
 
 def escaped(cell: Any) -> Any:
-    """A text that a spreadsheet would compute with a `'` in front, which marks it as text; all else as it is.
+    """Return a text that a spreadsheet would compute with a `'` in front, which marks it as text.
 
-    Numbers stay numbers: only `str` is looked at. `unescaped` gives every text back.
+    Every other cell is returned as it is. Numbers stay numbers: only `str` is looked at. `unescaped` restores
+    every text.
     """
     return f"'{cell}" if isinstance(cell, str) and _FORMULA.match(cell) else cell
 
 
 def unescaped(cell: str) -> str:
-    """The text that `escaped` was given."""
+    """Return the text that `escaped` was given."""
     return cell[1:] if cell.startswith("'") and _FORMULA.match(cell) else cell
 
 
 def csv_of_frame(frame: "pd.DataFrame") -> str:
-    """A frame as comma-separated values with a header, without its index; texts are `escaped`."""
+    """Return a frame as comma-separated values with a header, without its index; texts are `escaped`."""
     import pandas as pd
 
     safe = frame.rename(columns=escaped)
@@ -79,7 +80,7 @@ def csv_of_frame(frame: "pd.DataFrame") -> str:
 
 
 def csv_of_rows(columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> str:
-    """Rows as comma-separated values with a header; texts are `escaped`."""
+    """Return rows as comma-separated values with a header; texts are `escaped`."""
     lines = _Lines()
     table = csv.DictWriter(lines, columns, lineterminator=_Lines.END)
     table.writerow({name: escaped(name) for name in columns})
@@ -88,7 +89,10 @@ def csv_of_rows(columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> st
 
 
 class _Lines(io.StringIO):
-    """Ends lines in a newline whose writer ends them in `END`: only what ends its lines is quoted by Python's."""
+    """A text that ends lines in a newline, whose writer ends them in `END`.
+
+    Python's writer quotes a sign of line ends only where it ends its own lines.
+    """
 
     END = "\r\n"
 

@@ -14,13 +14,14 @@ from probe_kit.errors import MissingExtraError
 
 
 def lazy_names(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """The module-level `__getattr__` and `__dir__` (PEP 562) of `package`.
+    """Return the module-level `__getattr__` and `__dir__` (PEP 562) of `package`.
 
     `dir`, `help` and the completion of names find `homes` among the names of the package; `dir` imports nothing.
 
     Args:
-        homes: Name → module inside the package, `module:other_name` where it is called otherwise there, or
-            `module:` where the name is the module's own; a module of another package begins with `probe_kit.`.
+        package: The full name of the package, as `__name__` has it.
+        homes: By name its module inside the package, `module:other_name` where it has another name there, or
+            `module:` where the name is the module's own. A module of another package begins with `probe_kit.`.
     """
 
     def load(name: str) -> Any:
@@ -40,7 +41,7 @@ def lazy_names(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], 
 
 
 def entry_points(group: str) -> tuple[metadata.EntryPoint, ...]:
-    """Return the entry points of a group, read again where a folder of the import path has changed."""
+    """Return the entry points of a group, which are read again if a folder of the import path has changed."""
     return tuple(_read(tuple((folder, _modified(folder)) for folder in sys.path)).select(group=group))
 
 
@@ -61,7 +62,7 @@ def _modified(folder: str) -> int:
 
 
 def require(module: str, extra: str) -> Any:
-    """The module, or MissingExtraError naming the extra of probe-kit that brings it."""
+    """Return an optional module, or raise MissingExtraError naming the extra of probe-kit that installs it."""
     try:
         return import_module(module)
     except ImportError as error:
@@ -76,13 +77,14 @@ _ROOT = Path(__file__).parents[2]
 
 
 def install_command(extra: str = "", rebuild: str = "") -> str:
-    """Shell command that installs probe_kit again, with an extra or with one package built anew.
+    """The shell command that installs probe_kit again, with an extra or with one package built anew.
 
     In a checkout's own environment it is `./with-uv`, which brings uv. Elsewhere it is the pip of the running
     Python, or `uv pip` where that Python has none.
 
     Args:
-        rebuild: A package that needs numpy while it is compiled.
+        extra: The extra of probe-kit; empty for none.
+        rebuild: A package that needs numpy while it is compiled; empty for none.
     """
     if _is_of_checkout():
         options = [f"--extra {extra}"] * bool(extra) + [f"--reinstall-package {rebuild}"] * bool(rebuild)
@@ -95,12 +97,12 @@ def install_command(extra: str = "", rebuild: str = "") -> str:
 
 
 def install_folder_command(folder: Path) -> str:
-    """Shell command that installs the package in `folder`, which stays editable, for the Python that runs."""
+    """The shell command that installs the package in `folder` for the running Python; it stays editable."""
     return f"{_installer()} -e {shlex.quote(str(folder))}"
 
 
 def install_here_command() -> str:
-    """The same for the folder in which the shell is, in an activated environment.
+    """The shell command that installs, editable, the package in the shell's folder, in an activated environment.
 
     It holds on any machine, unless uv is the one that `with-uv` fetched into its folder.
     """

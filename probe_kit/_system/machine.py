@@ -11,20 +11,20 @@ from probe_kit._system.counting import counted
 from probe_kit.errors import UsageError
 
 CORES = "PROBE_KIT_CORES"
-"""The variable by which a pool gives its workers their share of the cores."""
+"""The environment variable by which a pool gives its workers their share of the cores."""
 _DEVICE = re.compile(r"(?P<kind>[a-z]+)(:(?P<index>\d+))?")
 _KINDS = ("cpu", "cuda", "hpu", "mps", "mtia", "xpu")
-"""Of torch's kinds of devices, those that compute."""
+"""The kinds of devices of torch that compute."""
 _GPU_NODES = ("nvidia[0-9]*", "nvidiactl", "nvhost-*", "nvgpu*", "nvmap", "dxg", "kfd")
 """Device files of Linux without any of which neither CUDA nor ROCm has a GPU."""
 _NVIDIA = Path("/proc/driver/nvidia/gpus")
 
 
 def check_device_name(device: str, present: bool = True) -> None:
-    """Raise UsageError for what is no device, or is one that this machine surely lacks; says what it has.
+    """Raise UsageError for a text that is no device, or names one that this machine surely lacks.
 
-    Args:
-        present: False accepts a device of another machine.
+    The message names the devices that the machine has. With `present=False` a device of another machine is
+    accepted.
     """
     match = _DEVICE.fullmatch(device)
     if match is None or match["kind"] not in _KINDS:
@@ -41,12 +41,12 @@ def check_device_name(device: str, present: bool = True) -> None:
 
 
 def what_is_here() -> str:
-    """One sentence on the devices that torch finds or, before torch is there, that the system shows."""
+    """A sentence on the devices that torch finds or, before torch is imported, that the system shows."""
     return f"This machine has {', '.join(_devices())}"
 
 
 def cores_here() -> int:
-    """Count the cores that this process may use: those of the system, or its share if it is a worker of a pool."""
+    """Count the cores this process may use: those of the system, or its share if it is a worker of a pool."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     share = os.environ.get(CORES, "")
     return min(cores, int(share)) if share.isdecimal() and int(share) else cores
@@ -81,7 +81,7 @@ def _surely_without_gpu() -> bool:
 
 @contextmanager
 def same_scheduling() -> Iterator[None]:
-    """Put the scheduling policy of this thread back at the end.
+    """Restore the scheduling policy of this thread at the end of the body.
 
     For root, the video encoder SVT-AV1 makes the thread that opens it a real-time one of the highest priority. All
     other processes of the machine would then wait for this one, and for those that it starts. Does nothing on

@@ -9,21 +9,21 @@ from probe_kit._system.bounded_files import open_regular
 from probe_kit._system.imports import require
 
 MOST_BYTES = 1 << 30
-"""Of the cells of one reading, in memory."""
+"""The most bytes of the cells of one reading, in memory."""
 MOST_VALUES = 1 << 25
-"""Numbers and texts of one reading; in Python each takes some 50 bytes."""
+"""The most numbers and texts of one reading; in Python each takes some 50 bytes."""
 MOST_FILE_BYTES = 1 << 40
-"""Of a file, whose footer says before any cell is read how large its columns are."""
+"""The most bytes of a file, whose footer says before any cell is read how large its columns are."""
 _ROWS = 4096
-"""Of a batch, or fewer, so that a column of texts takes at most `_BATCH_BYTES` in it."""
+"""The rows of a batch, or fewer, so that a column of texts takes at most `_BATCH_BYTES` in it."""
 _BATCH_BYTES = 64 << 20
 _WIDTHS = {"BOOLEAN": 1, "INT32": 4, "INT64": 8, "FLOAT": 4, "DOUBLE": 8, "INT96": 12}
-"""Bytes of a value in memory, by Parquet's type, of those that have one width."""
+"""The bytes of a value in memory, by Parquet's type, of those that have one width."""
 _TEXT = "BYTE_ARRAY"
 
 
 class TooLargeError(OSError):
-    """Cells of a Parquet file that would take more memory than is given to them."""
+    """Cells of a Parquet file that would take more memory than the limit."""
 
 
 @contextmanager
@@ -32,7 +32,14 @@ def open_parquet(source: Path | BinaryIO, extra: str) -> Iterator[Any]:
 
     Texts stay in their dictionaries: a column of one long text in every row is small until it is written out.
 
-    Raises OSError for what is no regular file, pyarrow's ArrowException for another format, MissingExtraError.
+    Args:
+        source: The file, or its content as a binary file that can seek.
+        extra: The extra of probe-kit that installs pyarrow, for the message if pyarrow is missing.
+
+    Raises:
+        OSError: For what is no regular file.
+        ArrowException: Pyarrow's error for a file of another format.
+        MissingExtraError: Without pyarrow.
     """
     parquet = require("pyarrow.parquet", extra)
     if isinstance(source, Path):
@@ -48,7 +55,7 @@ def open_parquet(source: Path | BinaryIO, extra: str) -> Iterator[Any]:
 
 
 def read_parquet(parquet: Any, columns: Sequence[str] | None = None, groups: Sequence[int] | None = None) -> Any:
-    """Return some columns and row groups of a file of `open_parquet` as a `pyarrow.Table`; None for all.
+    """Return columns and row groups of a file of `open_parquet` as a `pyarrow.Table`; None stands for all.
 
     Raises:
         TooLargeError: Before more than `MOST_BYTES` or `MOST_VALUES` are in memory.
@@ -74,7 +81,7 @@ def read_parquet(parquet: Any, columns: Sequence[str] | None = None, groups: Seq
 
 
 def _check_sizes(metadata: Any, columns: Sequence[str] | None, groups: Sequence[int]) -> int:
-    """The rows of a batch. Raises TooLargeError by what the footer says of the uncompressed cells."""
+    """Return the rows of a batch, or raise TooLargeError by what the footer says about the uncompressed cells."""
     size, values, longest = 0, 0, 1
     for number in groups:
         group = metadata.row_group(number)

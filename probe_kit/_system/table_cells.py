@@ -24,20 +24,20 @@ FAILED = frozenset(
 TRUE = frozenset({"yes", "y", "true", "t", "1", "1.0"})
 FALSE = frozenset({"no", "n", "false", "f", "0", "0.0"})
 MOST_DIGITS = 400
-"""Of an integer that are read: with so many it is refused, and Python converts no more than 4,300."""
+"""The digits of an integer that are read: with so many it is refused; Python converts no more than 4,300."""
 
 _INTEGER = re.compile(r"[+-]?[0-9]+")
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 _INFINITE = re.compile(r"[+-]?inf(inity)?", re.IGNORECASE)
 _MINUS = re.compile(r"^[‐‑−–—－](?=\s*[0-9.,])")
 _MARK = re.compile(r"^'(?=[+-]?[.,]?[0-9])")
-"""By which spreadsheets keep a number as text."""
+"""The mark by which spreadsheets keep a number as text."""
 _EDGES = "\u200b\u2060\ufeff"
 """Signs of no width, which Python does not count as white space."""
 
 
 def plain_cell(text: str) -> str:
-    """The cell without white space around it, and with a space for every line break in it."""
+    """Return the cell without white space around it, and with a space for every line break in it."""
     parts = (part.strip().strip(_EDGES).strip() for part in text.splitlines())
     return " ".join(filter(None, parts))
 
@@ -48,7 +48,7 @@ def is_missing(cell: str) -> bool:
 
 
 def problem_of(cell: str) -> str | None:
-    """Return what is wrong with a cell that is neither a value nor missing for certain; None for others."""
+    """Return what is wrong with a cell that is neither a value nor missing for certain; None for any other."""
     word = cell.lower()
     if word in DOUBTFUL:
         return f"{cell!r} may mean a missing value or a class. Leave the cell empty, or write a word for the class"
@@ -58,18 +58,18 @@ def problem_of(cell: str) -> str | None:
 
 
 def truth_of(cell: Any) -> bool | None:
-    """Return True for yes, y, true, t and 1, false for no, n, false, f and 0, in any case; None for others."""
+    """Return True for yes, y, true, t and 1, False for no, n, false, f and 0, in any case; None for others."""
     word = str(cell).strip().lower()
     return True if word in TRUE else False if word in FALSE else None
 
 
 def with_minus(cell: str) -> str:
-    """The cell with a plain minus where a typographic one stands before digits, and without a mark of texts."""
+    """Return the cell with a plain minus for a typographic one before digits, and without a mark of texts."""
     return _MINUS.sub("-", _MARK.sub("", cell))
 
 
 def number_of(cell: str) -> int | float | None:
-    """The number that a cell spells with digits, a decimal point and an exponent; None for others."""
+    """Return the number that a cell spells with digits, a decimal point and an exponent; None for any other."""
     text = with_minus(cell)
     if _INTEGER.fullmatch(text):
         return int(text[:MOST_DIGITS])
@@ -79,7 +79,7 @@ def number_of(cell: str) -> int | float | None:
 
 
 def name_of(cell: str) -> str:
-    """The cell as a name: composed characters (NFC), and one space for every run of white space."""
+    """Return the cell as a name: composed characters (NFC), and one space for every run of white space."""
     return " ".join(normalize("NFC", cell).split())
 
 
@@ -90,7 +90,8 @@ def check_spellings(cells: Sequence[Any], where: Callable[[int], str], error: Ca
 
     Args:
         cells: Texts as they were written, and values of other types, which have one spelling.
-        where: The place of a row, for the message.
+        where: The place of a row by its index, for the message.
+        error: The class of the error, or a function that makes one of a message.
     """
     spelled: dict[str, tuple[str, int]] = {}
     for row, cell in enumerate(cells):
@@ -106,7 +107,7 @@ def check_spellings(cells: Sequence[Any], where: Callable[[int], str], error: Ca
 
 
 def _spelling(cell: str) -> tuple[str, str]:
-    """The part that two spellings of one name share, and the spelling: of a number its zeros in front."""
+    """Return the part that two spellings of one name share, and the spelling: of a number its zeros in front."""
     number = number_of(cell)
     if number is None:
         return "".join(sign for sign in cell.casefold() if category(sign) != "Cf"), cell
@@ -117,7 +118,7 @@ def _spelling(cell: str) -> tuple[str, str]:
 
 
 def group_names(cells: Sequence[Any], where: Callable[[int], str], error: Callable[[str], Exception]) -> list[str]:
-    """Cells as names of groups: `7` and `7.0` are one group, texts are compared as `name_of` has them.
+    """Return cells as names of groups: `7` and `7.0` are one group; texts are compared as `name_of` returns them.
 
     Raises `error` for two spellings of one name, and for a cell that may mean a missing value.
     """
@@ -144,7 +145,7 @@ Where = Callable[[int], str]
 _BOOLEANS = {"true": True, "t": True, "false": False, "f": False}
 _ANSWERS = {"yes": "yes", "y": "yes", "true": "yes", "t": "yes", "no": "no", "n": "no", "false": "no", "f": "no"}
 _FOREIGN = {"ja", "j", "nein", "oui", "non", "si", "sí", "1", "0"}
-"""What may mean yes or no beside one of them, and is not read as either."""
+"""Words that may mean yes or no beside one of them, and are not read as either."""
 _COMMA = re.compile(r"[+-]?([0-9]+,[0-9]+|,[0-9]+)([eE][+-]?[0-9]+)?")
 """A number with a decimal comma."""
 _THOUSAND = re.compile(r"[+-]?[1-9][0-9]{0,2}[,.][0-9]{3}")
@@ -172,18 +173,20 @@ _NUMBER_AND_WORD = re.compile(r"[+-]?\d+\s*([^\W\d_].*)")
 def values_of(
     cells: Sequence[Cell], where: Where, semicolons: bool = False, as_names: bool = False, otherwise: str = ""
 ) -> list[Cell]:
-    """The values of a column whose texts spell numbers, true and false, classes, or nothing.
+    """Return the values of a column whose texts spell numbers, true and false, classes, or nothing.
+
+    Numbers may have a decimal comma or a percent sign if the whole column has it. A column with yes or no has the
+    classes `yes` and `no`.
 
     Args:
-        cells: Texts as `cell_of` gives them, or typed values of a data frame.
-        where: The place of a row, for messages.
+        cells: Texts as `cell_of` returns them, or typed values of a data frame.
+        where: The place of a row by its index, for messages.
         semicolons: Whether they separate the cells: where a comma is the decimal sign, `1.000` may be a thousand.
         as_names: Whether texts such as `10 cm` are names of classes.
-        otherwise: How the caller says so, for a message. Numbers may have a decimal comma or a percent sign where
-            the whole column has it. A column with yes or no has the classes `yes` and `no`.
+        otherwise: How the caller declares texts `as_names`, at the end of a message.
 
     Raises:
-        UsageError: For a text that looks like a quantity and is not a plain number (unless they are `as_names`),
+        UsageError: For a text that looks like a quantity and is not a plain number (unless texts are `as_names`),
             for a cell that may mean a missing value, and for two spellings of one class.
     """
     texts: list[Cell] = [name_of(cell) if isinstance(cell, str) else cell for cell in cells]
@@ -201,7 +204,7 @@ def values_of(
 
 
 def _answers(cells: Sequence[Cell], where: Where) -> list[Cell] | None:
-    """Truth values, or the texts `yes` and `no`; None for a column of anything else."""
+    """Return truth values, or the texts `yes` and `no`; None for a column of anything else."""
     words = {cell.lower() for cell in cells if isinstance(cell, str)}
     words |= {str(cell).lower() for cell in cells if isinstance(cell, bool)}
     has_numbers = any(isinstance(cell, int | float) and not isinstance(cell, bool) for cell in cells)
@@ -226,7 +229,7 @@ def _word[Value: (bool, str)](cell: Cell, words: dict[str, Value]) -> Value | No
 
 
 def _numbers(cells: Sequence[Cell], where: Where, semicolons: bool, as_names: bool) -> list[Cell]:
-    """The cells with numbers in place of the texts that spell them."""
+    """Return the cells with numbers in place of the texts that spell them."""
     texts = {row: with_minus(cell) for row, cell in enumerate(cells) if isinstance(cell, str)}
     numbers = [number_or_cell(cell) for cell in cells]
     if as_names:
@@ -262,7 +265,7 @@ def _numbers(cells: Sequence[Cell], where: Where, semicolons: bool, as_names: bo
 
 
 def number_or_cell(cell: Cell) -> Cell:
-    """Return the number that a text spells; any other cell as it is."""
+    """Return the number that a text spells, and any other cell as it is."""
     number = number_of(cell) if isinstance(cell, str) else None
     return cell if number is None else number
 

@@ -15,11 +15,11 @@ from probe_kit.errors import ProbeKitError, UsageError
 
 SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs"}
 MOST_CHARACTERS = 131_072
-"""Of a cell; a picture in a cell needs more."""
+"""The most characters of a cell; a picture in a cell needs more."""
 MOST_BYTES = 1 << 30
-"""Of a file, whose rows are read one by one."""
+"""The most bytes of a file, whose rows are read one by one."""
 _ANY_LENGTH = (1 << 31) - 1
-"""Of a cell of a heading that is tried: with a wrong separator the whole line is one."""
+"""The length of a cell of a heading while separators are tried: with a wrong one the whole line is one cell."""
 _DECLARED = re.compile(r'"?sep=(.)"?', re.IGNORECASE)
 _BYTE_ORDER = (
     (b"\xff\xfe\0\0", "UTF-32"),
@@ -33,7 +33,7 @@ _NO_TEXT = (
     (b"PAR1", "a Parquet file without the ending .parquet"),
     (b"\x1f\x8b", "compressed (gzip)"),
 )
-"""Beginnings of files that are taken for tables of text."""
+"""The beginnings of files that people give as tables of text and that are none."""
 _REMEDY = "Give a CSV file in UTF-8, as spreadsheets save it under the name CSV UTF-8"
 _QUOTE = 'Put a text with the separator between "quotes"'
 
@@ -47,10 +47,11 @@ class TextTable:
     """A file whose heading was read.
 
     Attributes:
-        names: The headings.
-        line: Of the heading.
-        encoding: Of Python.
-        error: Raised for rows that cannot be used.
+        names: The headings; empty for a column without one.
+        line: The line of the heading, counted from 1.
+        encoding: Python's name of the encoding.
+        error: The class of the error for rows that cannot be used.
+        most_characters: The most characters of a cell.
     """
 
     path: Path
@@ -62,15 +63,17 @@ class TextTable:
     most_characters: int
 
     def where(self, line: int, column: str | None = None) -> str:
-        """The place of a cell, as errors name it."""
+        """Return the place of a cell, as errors name it."""
         return f"{self.path}, line {line}" + ("" if column is None else f", column {column!r}")
 
     def rows(self, columns: Sequence[str] | None = None) -> Iterator[tuple[int, dict[str, str | None]]]:
-        """Line and cells by heading of every row, None for a missing cell; rows without any text are left out.
+        """Yield the line and the cells by heading of every row, None for a missing cell.
 
-        Args:
-            columns: Those to read; by default all with a heading. Raises `error` for a column that occurs twice,
-                for a row with more or fewer cells than the heading, and by default for a cell without a heading.
+        Rows without any text are left out. `columns` are those to read, by default all with a heading.
+
+        Raises:
+            ProbeKitError: Of the table's class `error`, for a column that occurs twice, for a row with more or
+                fewer cells than the heading, and by default for a cell without a heading.
         """
         read = [name for name in self.names if name] if columns is None else columns
         unnamed = [at for at, name in enumerate(self.names) if not name] if columns is None else []
@@ -98,7 +101,7 @@ class TextTable:
 
 
 def cell_of(text: str) -> str | None:
-    """A field as the text of its cell; None where it means "no value"."""
+    """Return a field as the text of its cell; None where it means "no value"."""
     cell = plain_cell(unescaped(text))
     return None if is_missing(cell) else cell
 
@@ -111,10 +114,17 @@ def open_table(
 ) -> TextTable:
     """Read the heading of a CSV or TSV file in UTF-8 or UTF-16.
 
+    The separator is a comma, a semicolon or a tab, or the one that a first line `sep=;` declares.
+
     Args:
-        keys: Headings of such a table; they decide where a heading has more than one separator. The separator is a
-            comma, a semicolon or a tab, or what a first line `sep=;` declares. Raises `error` for a file that
-            cannot be read, is in another encoding, or has a heading that several separators explain.
+        path: The file.
+        keys: Headings of such a table; they decide where a heading has more than one separator.
+        error: The class of all errors, also of those for rows that are read later.
+        most_characters: The most characters of a cell.
+
+    Raises:
+        ProbeKitError: Of class `error`, for a file that cannot be read, is in another encoding, or has a heading
+            that several separators explain.
     """
     encoding = _encoding(path, error)
     with _opened(path, encoding, error) as file:
@@ -139,7 +149,7 @@ def open_table(
 def _separator(
     headings: dict[str, tuple[int, tuple[str, ...]]], keys: Collection[str], path: Path, error: type[ProbeKitError]
 ) -> str:
-    """The only separator of a heading, or of several the one that gives the most keys."""
+    """Return the only separator of a heading, or of several the one that gives the most keys."""
     several = [separator for separator, (_, names) in headings.items() if len(names) > 1]
     if len(several) < 2:
         return (several or list(headings))[0]
@@ -155,7 +165,7 @@ def _separator(
 
 
 def _encoding(path: Path, error: type[ProbeKitError]) -> str:
-    """UTF-8, or UTF-16 where a byte order mark says so. Raises `error` for a file without end, or too large."""
+    """Return UTF-8, or UTF-16 if a byte order mark says so; raise `error` for a file without end, or too large."""
     try:
         with open_regular(path, MOST_BYTES) as file:
             start = file.read(4)
@@ -184,7 +194,7 @@ def _opened(path: Path, encoding: str, error: type[ProbeKitError]) -> Iterator[T
 
 
 def _undecodable(path: Path, encoding: str, problem: UnicodeError) -> str:
-    """The line and the byte that are not of the file's encoding."""
+    """Return the line and the byte that are not in the file's encoding, as words."""
     if encoding == "utf-16":
         return str(problem)
     with path.open("rb") as file:
@@ -200,7 +210,7 @@ def _undecodable(path: Path, encoding: str, problem: UnicodeError) -> str:
 def _records(
     file: TextIO, separator: str, path: Path, error: type[ProbeKitError], most_characters: int
 ) -> Iterator[tuple[int, list[str]]]:
-    """Line number and fields of every record that is not empty."""
+    """Yield line number and fields of every record that is not empty."""
     reader = csv.reader(file, delimiter=separator, strict=True)
     before = 0
     while True:
@@ -218,7 +228,7 @@ def _records(
 
 @contextmanager
 def _cells_of(most_characters: int) -> Iterator[None]:
-    """The csv module has one limit for all readers of a process."""
+    """Set the limit of a cell for the body; the csv module has one limit for all readers of a process."""
     limit = csv.field_size_limit(most_characters)
     try:
         yield

@@ -11,7 +11,7 @@ from typing import Any, Literal, Self
 from probe_kit._tables.numbers import NONE
 
 Number = Mapping[str, Any]
-"""A number behind a table with what it is of, or the numbers of a row."""
+"""A number behind a table with what it describes, or the numbers of a row."""
 _LIMITS = re.compile(r"(?<!^) ?(\[[^\]]*\])")
 """An interval behind its value."""
 _UNITS = re.compile(r"(,? (%|cm|points))?( \[[^\]]*\])?$")
@@ -22,13 +22,14 @@ _NUMBER = re.compile(r"[-+−±]?\d|< \d|n/a|–|$")
 
 @dataclass(frozen=True)
 class Cell:
-    """Text, and how formats that can show it do.
+    """A text, and how formats that can show it do.
 
     Attributes:
-        sort: By which a page sorts, the text by default.
-        heat: A share that colours the ground.
-        strong: bold. alarm: red.
-        note: Shown on a page by pointing at the cell.
+        sort: The key by which a page sorts, the text by default.
+        heat: A share that colors the ground.
+        strong: Whether the text is bold.
+        alarm: Whether the text is red.
+        note: A text that a page shows if the pointer is on the cell.
     """
 
     text: str
@@ -52,9 +53,11 @@ class Cell:
 
 @dataclass(frozen=True)
 class Heading:
-    """The text over a column. help: its entry in a glossary. group: a name over adjoining columns.
+    """The text over a column.
 
     Attributes:
+        help: Its entry in a glossary; empty for none.
+        group: A name over adjoining columns; empty for none.
         is_detail: Whether the column needs room, and is left out of terminals and LaTeX.
     """
 
@@ -66,11 +69,11 @@ class Heading:
 
 @dataclass(frozen=True)
 class Row:
-    """The cells of a line.
+    """The cells of a line. Pages keep means and differences below the others when they sort.
 
     Attributes:
-        is_mean: It averages others.
-        is_difference: It compares them. Pages keep both below the others when they sort.
+        is_mean: Whether the row averages others.
+        is_difference: Whether the row compares others.
     """
 
     cells: tuple[Cell, ...]
@@ -83,12 +86,12 @@ class Content:
     """The part of a table that a renderer reads: its text, and the numbers behind it.
 
     Attributes:
-        names: How many of the first columns name the rows.
-        notes: Sentences below it, which need no capital letter and no stop.
+        names: The number of first columns that name the rows.
+        notes: Sentences below the table, which need no capital letter and no period.
         numbers: An object per row or per number, shares in [0, 1], None where unknown.
         is_partial: Whether runs are missing that could be played; a note names them.
-        overflow: Of a terminal, what is done with columns that do not fit: `split` into further tables, `leave
-            out` by name, first `fold` intervals below their values, or `wrap` text, for columns of words.
+        overflow: What a terminal does with columns that do not fit: `split` into further tables, `leave out` by
+            name, first `fold` intervals below their values, or `wrap` text, for columns of words.
     """
 
     title: str
@@ -111,7 +114,16 @@ class Content:
         notes: Sequence[str] = (),
         **more: Any,
     ) -> Self:
-        """Return a table of text. mean: what a row that averages others is called. more: further fields."""
+        """Return a table of text.
+
+        Args:
+            title: The title, without a period.
+            headings: A heading per column; a text is a heading with nothing else.
+            rows: The cells by row; a text is a cell with nothing else.
+            mean: The name of the rows that average others; None if no row does.
+            notes: Sentences below the table; empty ones are left out.
+            **more: Further fields of the table.
+        """
         names = int(more.get("names", 1))
         cells = [tuple(cell if isinstance(cell, Cell) else Cell(cell) for cell in row) for row in rows]
         lines = [Row(row, mean is not None and mean in [cell.text for cell in row[:names]]) for row in cells]
@@ -154,7 +166,7 @@ class Content:
 
     @property
     def are_numeric(self) -> tuple[bool, ...]:
-        """Return by column whether it holds numbers, which stand to the right."""
+        """Return by column whether it holds numbers, which are aligned to the right."""
         return tuple(
             at >= self.names and any(texts) and all(map(_NUMBER.match, texts))
             for at, texts in enumerate(self._by_column)
@@ -177,7 +189,7 @@ class Content:
         )
 
     def filled(self, *empty: str) -> Self:
-        """Return the table without columns in which no row has anything to show; or only these texts."""
+        """Return the table without columns in which every row has a dash, nothing, or one of the texts `empty`."""
         return self.only(
             [
                 at
@@ -230,18 +242,19 @@ HEAT = (
     (0.8, "pkheat4", "9FBAD0"),
     (float("inf"), "pkheat5", "6FA3DA"),
 )
-"""Upper bound of retention, colour name, RGB: from lost (pale yellow) to kept (blue).
+"""The upper bound of retention, color name and RGB, from lost (pale yellow) to kept (blue).
 
-Lightness alone orders them, so that they differ in grey and for every kind of colour vision."""
+Lightness alone orders them, so that they differ in gray and for every kind of color vision.
+"""
 
 
 def heat_colour(value: float) -> str:
-    """The colour `#RRGGBB` of a share or ratio, from lost (pale yellow) to kept (blue)."""
+    """Return the color `#RRGGBB` of a share or ratio, from lost (pale yellow) to kept (blue)."""
     return f"#{next(rgb for bound, _, rgb in HEAT if value < bound)}"
 
 
 def heat_key() -> list[tuple[str, str]]:
-    """Colour and the shares it stands for, in words, from low to high."""
+    """Return each color with the shares it stands for, in words, from low to high."""
     bounds = [0.0, *(bound for bound, _, _ in HEAT[:-1])]
     words = [f"{100 * bound:.0f} to {100 * (bound + 0.2):.0f} %" for bound in bounds]
     words[0], words[-1] = "below 20 %", "80 % and more"

@@ -13,7 +13,7 @@ from probe_kit.errors import UsageError
 Kind = Literal["text", "boolean", "integer", "number"]
 
 EXACT = 2**53
-"""Integers beyond it have no exact float64."""
+"""The largest integer up to which every integer has an exact float64."""
 _ARTICLE = {"text": "text", "boolean": "true or false", "integer": "a number", "number": "a number"}
 
 
@@ -22,13 +22,13 @@ class LabelTable:
     """Some columns of a table of labels, as cells of Python types.
 
     Attributes:
-        source: The file, or `DataFrame`.
+        source: The path of the file, or `DataFrame`.
         unit: `line` of a file, or `row` where there are no lines.
-        names: All columns of the table.
-        columns: Cells of those that were asked for: texts of a CSV file, texts and typed values of a data frame,
-            None where missing.
-        lines: Number of every row in its file.
-        semicolons: Whether they separate the cells.
+        names: The headings of all columns of the table.
+        columns: The cells by column of those that were asked for: texts of a CSV file, texts and typed values of a
+            data frame, None where missing.
+        lines: The number of every row in its file.
+        semicolons: Whether semicolons separate the cells.
     """
 
     source: str
@@ -42,7 +42,7 @@ class LabelTable:
     def of_lines(
         cls, file: TextTable, lines: Iterable[tuple[int, Mapping[str, str | None]]], columns: Sequence[str]
     ) -> Self:
-        """Return some columns of a file. lines: number and cells of each, as `TextTable.rows` yields them."""
+        """Return some columns of a file, from number and cells of each line as `TextTable.rows` yields them."""
         table = cls(str(file.path), "line", file.names, {name: [] for name in columns}, [], file.separator == ";")
         for number, cells in lines:
             table.lines.append(number)
@@ -51,17 +51,17 @@ class LabelTable:
         return table
 
     def where(self, row: int, column: str | None = None) -> str:
-        """The place of a cell, as errors name it."""
+        """Return the place of a cell, as errors name it."""
         line = f"{self.source}, {self.unit} {self.lines[row]}"
         return line if column is None else f"{line}, column {terminal_safe(column)!r}"
 
     def at(self, rows: Sequence[int]) -> "LabelTable":
-        """The table of some rows."""
+        """Return the table of some rows, by their indices."""
         columns = {name: [cells[row] for row in rows] for name, cells in self.columns.items()}
         return replace(self, columns=columns, lines=[self.lines[row] for row in rows])
 
     def values(self, column: str, as_names: bool = False, otherwise: str = "") -> list[Cell]:
-        """The cells of one column as `values_of` reads them, of one kind. Raises UsageError."""
+        """Return the cells of one column as `values_of` reads them, of one kind. Raises UsageError for others."""
         cells = self.columns[column]
         for row, cell in enumerate(cells):
             if isinstance(cell, str):
@@ -70,7 +70,7 @@ class LabelTable:
         return self._of_one_kind(column, values)
 
     def typed(self, column: str) -> list[Cell]:
-        """The cells of one column as they are, of one kind. Raises UsageError for others."""
+        """Return the cells of one column as they are, of one kind. Raises UsageError for others."""
         return self._of_one_kind(column, self.columns[column])
 
     def _of_one_kind(self, column: str, cells: list[Cell]) -> list[Cell]:
@@ -104,7 +104,7 @@ class LabelTable:
             )
 
     def texts(self, column: str) -> list[str]:
-        """The cells of one column as they are written, none of them missing. Raises UsageError."""
+        """Return the cells of one column as they are written. Raises UsageError if one is missing."""
         cells = self.columns[column]
         for row, cell in enumerate(cells):
             if cell is None:
@@ -113,12 +113,12 @@ class LabelTable:
         return [str(cell) for cell in cells]
 
     def group_names(self, column: str) -> list[str]:
-        """The cells of one column as names of groups, none of them missing. Raises UsageError."""
+        """Return the cells of one column as names of groups. Raises UsageError if one is missing."""
         self.texts(column)
         return group_names(self.columns[column], lambda row: self.where(row, column), UsageError)
 
     def numbers(self, column: str) -> list[Cell]:
-        """The cells of one column, with numbers in place of the texts that spell them."""
+        """Return the cells of one column, with numbers in place of the texts that spell them."""
         return [number_or_cell(cell) for cell in self.columns[column]]
 
     def _kind(self, row: int, column: str, cell: Cell) -> Kind:

@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from math import isfinite
 
 NONE = "–"
-"""In place of a number."""
+"""The sign in place of a missing number."""
 Limits = tuple[float | None, float | None]
 """A 95 % interval; (None, None) where the data set no limits."""
 Write = Callable[[float | None], str]
@@ -21,12 +21,12 @@ def whole_percent(value: float | None) -> str:
 
 
 def number(value: float | None, digits: int = 2) -> str:
-    """Return a number with two decimals by default, and zero without a sign; a dash for None and NaN."""
+    """Return a number, by default with two decimals, and zero without a sign; a dash for None and NaN."""
     return NONE if value is None or value != value else f"{value:z.{digits}f}"
 
 
 def signed(value: float | None, digits: int = 2) -> str:
-    """Return the same with its sign."""
+    """Return a number with its sign, by default with two decimals; a dash for None and NaN."""
     return NONE if value is None or value != value else f"{value:+z.{digits}f}"
 
 

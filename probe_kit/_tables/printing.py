@@ -16,7 +16,7 @@ Format = Annotated[
 
 
 def print_table(table: Any, style: str, notes: Sequence[str] = ()) -> None:
-    """Print a table, or what has its methods, on stdout in a format of `STYLES`. notes: for people, on stderr."""
+    """Print a table, or an object with its methods, on stdout in a format of `STYLES`; `notes` go to stderr."""
     if style == "table":
         out.print(table)
     elif style == "json":

@@ -13,15 +13,15 @@ if TYPE_CHECKING:
     from rich.text import Text
 
 GAP = 2
-"""Blanks between columns."""
+"""The blanks between columns."""
 LEAST_TEXT = 12
-"""Columns of a console that a text is broken into at least."""
+"""The least columns of a console that a text is broken into."""
 _INDENT = "  "
-"""Of a row's name below that of its section."""
+"""The indent of a row's name below that of its section."""
 
 
 def lines(table: Content, width: int) -> "Iterator[RenderableType]":
-    """Yield what a console of so many columns shows: the title, one table or several, and the notes."""
+    """Yield what a console of `width` columns shows: the title, one table or several, and the notes."""
     from rich.text import Text
 
     left_out: list[str] = []
@@ -53,7 +53,7 @@ def _can_wrap(table: Content, width: int) -> bool:
 
 
 def _wrapped(table: Content) -> "RichTable":
-    """Return one table whose texts are broken where they do not fit, but neither names nor numbers."""
+    """Return one table whose texts are broken where they do not fit; names and numbers are not."""
     from rich.text import Text
 
     wrapped = _without_columns()
@@ -101,7 +101,7 @@ def _sections(table: Content) -> list[str]:
 
 
 def _names(table: Content) -> list[str]:
-    """Return what stands before every row: its names, and below a section those behind the first."""
+    """Return the text before every row: its names, or below a section those after the first."""
     names = []
     for row, section in zip(table.rows, _sections(table), strict=True):
         texts = [cell.text for cell in row.cells[: table.names]]
@@ -165,7 +165,7 @@ def _pieces(head: Sequence[int], needed: Sequence[int], room: int) -> Iterator[l
 
 
 def _table(table: Content, columns: Sequence[int]) -> "Iterator[RenderableType]":
-    """Yield one table. A row that has nothing to say in these columns is left out."""
+    """Yield one table. A row whose cells in these columns are all empty is left out."""
     from rich.text import Text
 
     rows = [

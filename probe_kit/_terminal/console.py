@@ -36,17 +36,17 @@ for _stream in ("stdout", "stderr"):
         setattr(sys, _stream, Path(os.devnull).open("w", encoding="utf-8"))  # noqa: SIM115 - open until the end
 _NOT_ASCII = re.compile(r"[^\x00-\x7f]")
 PAGE = 120
-"""Columns of a table that goes to a file or a pipe, where no terminal says how many there are."""
+"""The columns of a table that is written to a file or a pipe, where no terminal says how many there are."""
 
 
 class SafeConsole(Console):
-    """A console on which text is text: no markup is read, and no escape sequence but its own gets out."""
+    """A console on which text is text: it reads no markup, and writes no escape sequence but its own."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(markup=False, emoji=False, highlight=False, **options)
 
     def on_broken_pipe(self) -> None:
-        """A reader such as `head` has enough: let typer end the command quietly."""
+        """Raise BrokenPipeError, with which typer ends the command quietly: a reader such as `head` has enough."""
         raise BrokenPipeError(EPIPE, "the reader has gone")
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
@@ -56,7 +56,7 @@ class SafeConsole(Console):
 
 
 def marked(template: str, *values: object) -> Text:
-    """A template of ours with rich's markup and a `{}` for each value; what stands in a value is text only."""
+    """Fill a template of rich's markup, which has a `{}` for each value; a value is shown as text only."""
     text = Text.from_markup(template, emoji=False)
     parts = text.split("{}", allow_blank=True, include_separator=True)
     filled = iter(values)
@@ -78,13 +78,13 @@ def _fill(part: Text, value: str) -> None:
 
 
 out = SafeConsole(width=None if sys.stdout.isatty() or "COLUMNS" in os.environ else PAGE)
-"""Results: what a script would read."""
+"""The console of results: what a script would read."""
 err = SafeConsole(stderr=True)
-"""Progress, plans and notes."""
+"""The console of progress, plans and notes."""
 
 
 def split(text: str | None) -> tuple[str, ...] | None:
-    """The parts of a comma-separated option, each once; None stays None."""
+    """Return the parts of a comma-separated option, each once; None stays None."""
     return None if text is None else tuple(dict.fromkeys(filter(None, map(str.strip, text.split(",")))))
 
 
@@ -101,7 +101,8 @@ def print_json(value: Any) -> None:
 def print_json_text(text: str) -> None:
     """Print JSON on stdout.
 
-    What a terminal would obey, or stdout's encoding lacks, is written as JSON's own escapes, so nothing is lost.
+    Characters that a terminal would obey, or that stdout's encoding lacks, are written as JSON's own escapes, so
+    nothing is lost.
     """
     safe = UNSAFE.sub(_escaped, text)
     try:
@@ -112,7 +113,7 @@ def print_json_text(text: str) -> None:
 
 
 def _escaped(match: re.Match[str]) -> str:
-    """A sign as JSON writes it in ASCII: one escape, or the two of a surrogate pair."""
+    """Return a sign as JSON writes it in ASCII: one escape, or the two of a surrogate pair."""
     return json.dumps(match[0])[1:-1] if ord(match[0]) != 0x7F else "\\u007f"
 
 
@@ -127,12 +128,12 @@ def say(renderable: RenderableType) -> None:
 
 
 def say_note(text: str) -> None:
-    """Print on stderr what a reader of a result has to know."""
+    """Print on stderr a note that a reader of a result has to know."""
     say(marked("[yellow]note:[/] {}", text))
 
 
 def complain(kind: str, message: str, notes: Iterable[str] = ()) -> None:
-    """Print an error on stderr: what it is called, what it says, and what belongs to it."""
+    """Print an error on stderr: its name, its message, and the notes that belong to it."""
     say(marked("[bold red]{}[/]: {}", kind, message))
     for note in notes:
         say(f"  {note}")
@@ -140,7 +141,7 @@ def complain(kind: str, message: str, notes: Iterable[str] = ()) -> None:
 
 @contextmanager
 def progress() -> Iterator[Progress]:
-    """Progress on stderr: bars in a terminal; elsewhere what `counter` gives says a line now and then."""
+    """Yield the progress on stderr: bars in a terminal; elsewhere `counter` prints a line now and then."""
     columns = (
         TextColumn("{task.description}", markup=False),
         BarColumn(),
@@ -153,7 +154,7 @@ def progress() -> Iterator[Progress]:
 
 
 def counter(bar: Progress, description: str) -> Callable[..., None]:
-    """A callback (done, total, …) that moves one bar of `bar`, or says lines where there is no terminal."""
+    """Return a callback (done, total, …) that moves one bar of `bar`, or prints lines if there is no terminal."""
     if not err.is_terminal:
         return Heartbeat(description, say)
     task = bar.add_task(description, total=None)
@@ -167,19 +168,20 @@ def counter(bar: Progress, description: str) -> Callable[..., None]:
 # -- lines in place of bars -----------------------------------------------------------------------------------
 
 FIRST = 10.0
-"""Seconds until the first line."""
+"""The seconds until the first line."""
 EVERY = 60.0
-"""Seconds between two lines."""
+"""The seconds between two lines."""
 
 
 class Heartbeat:
     """A progress callback (finished, total, …): a line after `FIRST` seconds, every `EVERY`, and at the end.
 
+    The rate counts what was done since the first call: before it a model was loaded, or earlier work was read.
+
     Args:
-        what: What is counted.
-        say: Takes each line.
-        clock: Seconds, of any origin. The rate is that of what was done since the first call: before it a model
-            was loaded, or a run that is continued was made.
+        what: The things that are counted, at the beginning of a line.
+        say: A function that takes each line.
+        clock: A function that returns seconds since any origin.
     """
 
     def __init__(
@@ -194,7 +196,7 @@ class Heartbeat:
         self._ended: tuple[int, int] | None = None
 
     def __call__(self, finished: int, total: int, *_: object) -> None:
-        """`finished` of `total` are finished; whatever else a caller tells is not used."""
+        """Note that `finished` of `total` are done, and write a line if one is due; other arguments are unused."""
         now = self._clock()
         if self._first is None:
             self._first = finished, now
@@ -211,7 +213,7 @@ class Heartbeat:
 
 
 def spoken(seconds: float) -> str:
-    """A duration in its two largest units: `3 h 12 min`, `4 min 05 s`, `12 s`."""
+    """Return a duration in its two largest units: `3 h 12 min`, `4 min 05 s`, `12 s`."""
     minutes, seconds_left = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     if hours:
@@ -220,7 +222,7 @@ def spoken(seconds: float) -> str:
 
 
 def _per_time(rate: float) -> str:
-    """`rate` (per second) in the unit in which it is at least one, as far as an hour goes."""
+    """Return a rate per second in the unit in which it is at least one: per second, per minute or per hour."""
     for seconds, unit in ((1, "s"), (60, "min")):
         if rate * seconds >= 1:
             return f"{rate * seconds:.1f} per {unit}"

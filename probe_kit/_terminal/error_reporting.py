@@ -18,13 +18,13 @@ _UNUSABLE = {
     errno.EACCES, errno.EBUSY, errno.EEXIST, errno.EINVAL, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG,
     errno.ENODEV, errno.ENOENT, errno.ENOTDIR, errno.ENOTEMPTY, errno.ENXIO, errno.EPERM, errno.ETXTBSY,
 }  # fmt: skip
-"""What the system says of a path that cannot be what it was given for."""
+"""The errors of the system for a path that cannot be used as what it was given for."""
 _LONGEST = 300
-"""Characters of an unforeseen error's message that are shown; all of it is in the file."""
+"""The characters of an unforeseen error's message that are shown; the file has the whole message."""
 
 
 def report_error(error: BaseException) -> int:
-    """Print on stderr why a command ended; returns its exit code.
+    """Print on stderr why a command ended, and return its exit code.
 
     1: the result is not as requested, or an internal error occurred, whose traceback is in the file that is named.
     2: an argument or a path that was given cannot be used. 3: refused, or the disk is full or read-only.
@@ -65,7 +65,7 @@ def _path(name: str | bytes | int) -> str:
 
 
 def report_unexpected(error: BaseException) -> int:
-    """Report an internal error in one line, with the file of its traceback; returns the exit code."""
+    """Report an internal error in one line, with the file of its traceback, and return the exit code."""
     first = (str(error).strip().splitlines() or ["no message"])[0][:_LONGEST]
     hint = "Use fewer --batch, --workers or --items. " if isinstance(error, MemoryError) else ""
     complain(

@@ -25,8 +25,9 @@ from probe_kit.errors import UsageError
 class Part(BaseModel):
     """A frozen group of settings. Values without a name are those of the first fields.
 
-    Raises UsageError naming the field, the value and what is expected in its place, TypeError for more values than
-    fields.
+    Raises:
+        UsageError: For a value that does not fit; it names the field, the value and what is expected in its place.
+        TypeError: For more values than fields.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -41,19 +42,25 @@ class Part(BaseModel):
             raise UsageError(_unknown(type(self).__name__, error) or in_words(error)) from None
 
     def changed(self, **values: Any) -> Self:
-        """The group with other values, which are checked."""
+        """Return the group with other values, which are checked."""
         return type(self)(**(dict(self) | values))
 
 
 def _unknown(subject: str, error: ValidationError) -> str:
-    """A sentence on a field that a model lacks, if that is the first mistake. subject: the model's name."""
+    """Return a sentence on a field that the model `subject` lacks; empty if that is not the first mistake."""
     path, text = next(complaints_of(error))
     return f"{subject} has no setting {'.'.join(map(str, path))}; leave it out" if text == UNKNOWN else ""
 
 
 @dataclass(frozen=True)
 class FieldOption:
-    """A field that a command offers as an option. parameter: its name in Python, from the option's long form."""
+    """A field that a command offers as an option.
+
+    Attributes:
+        field: The name of the field in its model.
+        parameter: The option's name in Python, from its long form.
+        flag: The long form, such as `--captured-calls`.
+    """
 
     field: str
     parameter: str
@@ -71,7 +78,7 @@ class FieldOption:
 
 
 def options_of(model: type[BaseModel]) -> Iterator[FieldOption]:
-    """The options among the fields of a model, in their order."""
+    """Yield the options among the fields of a model, in their order."""
     for name, info in model.model_fields.items():
         for option in (entry for entry in info.metadata if isinstance(entry, OptionInfo)):
             texts = (option.default, *(option.param_decls or ()))
@@ -87,6 +94,10 @@ def command_with(
 
     The command gets the values that were typed by the name of their parameter, as its first argument. A parameter
     that two models share is one option; one that the command has itself, or does not offer, is not added.
+
+    Args:
+        *models: The models; required fields of the first one are required options.
+        offers: Whether the command offers a parameter, by its name; by default all.
     """
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
@@ -120,7 +131,7 @@ def command_with(
 
 
 def _required(models: Iterable[type[BaseModel]]) -> set[str]:
-    """The parameters that every command line has: those of required fields, but for fields that choose a model."""
+    """Return the parameters that every command line has: those of required fields of the first model."""
     first = next(iter(models), None)
     return (
         set() if first is None else {option.parameter for option in options_of(first) if option.info.is_required()}
@@ -152,7 +163,7 @@ def _panel(parameter: inspect.Parameter) -> str | None:
 
 
 def _bare(annotation: Any) -> Any:
-    """A type without the metadata of its parts, such as `int | None` of a bounded number that may be missing."""
+    """Return a type without the metadata of its parts, such as `int | None` of an optional bounded number."""
     if get_origin(annotation) is Annotated:
         return _bare(get_args(annotation)[0])
     if get_origin(annotation) in (Union, UnionType):
@@ -161,14 +172,14 @@ def _bare(annotation: Any) -> Any:
 
 
 def plain(value: Mapping[str, Any]) -> dict[str, Any]:
-    """The entries that are neither None nor False: those that were chosen."""
+    """Return the entries that are neither None nor False: those that were chosen."""
     return {name: entry for name, entry in value.items() if entry is not None and entry is not False}
 
 
 # -- help in panels -------------------------------------------------------------------------------------------
 
 MOST_OPTIONS = 12
-"""A command with more options than this prints its further panels with `--help-all` only."""
+"""The most options with which a command prints all of them; beyond, `--help-all` prints the further panels."""
 HELP_ALL = "--help-all"
 _MAIN_ONLY = "probe_kit.main_options_only"
 
@@ -184,7 +195,7 @@ class PanelledHelp(typer.core.TyperCommand):
         return super().parse_args(ctx, args)
 
     def get_params(self, ctx: Any) -> list[Any]:
-        """All options, or the most used ones while `--help` prints them."""
+        """Return all options, or the most used ones while `--help` prints them."""
         parameters = super().get_params(ctx)
         return (
             [parameter for parameter in parameters if not _panel_of(parameter)]

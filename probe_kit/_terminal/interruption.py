@@ -9,14 +9,14 @@ _ENDING = (signal.SIGINT, signal.SIGTERM)
 
 
 def leave_at_once() -> None:
-    """Until `begun`, both end the process in one line: there is nothing yet that could be kept."""
+    """Make Ctrl-C and SIGTERM end the process in one line until `begun`: there is no work yet to save."""
     for number in _ENDING:
         if signal.getsignal(number) is not signal.SIG_IGN:  # as a shell sets it in the background
             signal.signal(number, _leave)
 
 
 def begun() -> None:
-    """Make both a KeyboardInterrupt from here on, because work could be under way that is to be kept."""
+    """Make both signals a KeyboardInterrupt from here on, because work could be under way that is to be saved."""
     for number in _ENDING:
         if signal.getsignal(number) is _leave:
             signal.signal(number, signal.default_int_handler)

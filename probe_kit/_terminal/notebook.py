@@ -9,12 +9,12 @@ from typing import Any
 from probe_kit._system.escaping import without_places
 
 PROGRESS_MARK = "probe-kit-progress"
-"""CSS class of a progress bar, so that a tool that stores notebooks can remove the bars."""
+"""The CSS class of a progress bar, so that a tool that stores notebooks can remove the bars."""
 _REDRAW_S = 0.2
 
 
 def facts_html(title: str, facts: Mapping[str, str], note: str = "") -> str:
-    """A bold title, a line per fact, and a note below; legible on light and dark pages."""
+    """Return a bold title, a line per fact, and a note below; legible on light and dark pages."""
     lines = "".join(
         f'<tr><td style="text-align:left;opacity:.65">{_safe(name)}</td>'
         f'<td style="text-align:left">{_safe(value)}</td></tr>'
@@ -26,7 +26,7 @@ def facts_html(title: str, facts: Mapping[str, str], note: str = "") -> str:
 
 
 def rows_html(title: str, columns: Sequence[str], rows: Iterable[Sequence[object]], note: str = "") -> str:
-    """A bold title over a table with a heading per column, and a note below."""
+    """Return a bold title over a table with a heading per column, and a note below."""
     head = "".join(f'<th style="text-align:left">{_safe(name)}</th>' for name in columns)
     body = "".join(
         "<tr>" + "".join(f'<td style="text-align:left">{_safe(str(value))}</td>' for value in row) + "</tr>"
@@ -37,12 +37,12 @@ def rows_html(title: str, columns: Sequence[str], rows: Iterable[Sequence[object
 
 
 def _safe(text: str) -> str:
-    """Escape for HTML, without the places of this machine: notebooks are sent to others."""
+    """Escape for HTML, and leave out the folders of this machine: notebooks are sent to others."""
     return escape(without_places(text))
 
 
 def notebook_progress(label: str) -> Callable[..., None] | None:
-    """A callback (done, total, …) that draws one progress bar below the cell; None outside notebooks."""
+    """Return a callback (done, total, …) that draws one progress bar below the cell; None outside notebooks."""
     return _Bar(label) if _in_notebook() else None
 
 
@@ -56,7 +56,7 @@ def _in_notebook() -> bool:
 
 
 class _Bar:
-    """Plain HTML that is replaced in place, which every front end can do; drawn at the first call."""
+    """Plain HTML that is replaced in place, which every front end supports; drawn at the first call."""
 
     def __init__(self, label: str) -> None:
         self._label = label

@@ -17,9 +17,9 @@ from probe_kit.errors import UsageError
 from probe_kit.scene_names import SceneName
 
 speed_option = partial(typer.Option, rich_help_panel="Speed and hardware")
-"""Declares an option in the panel of options that change no number."""
+"""A constructor of options in the panel of options that change no number."""
 further_option = partial(typer.Option, rich_help_panel="Further settings")
-"""Declares an option that is seldom needed, in no panel of its own."""
+"""A constructor of options that are seldom needed, in the panel of further settings."""
 _weights_option = partial(typer.Option, rich_help_panel="Model weights")
 _resuming_option = partial(typer.Option, rich_help_panel="Resuming")
 
@@ -31,7 +31,7 @@ class Names(tuple[str, ...]):
 
     @classmethod
     def parse(cls, text: str | Self) -> Self:
-        """The parts of `text`; a default that is no text is returned as it is."""
+        """Return the parts of `text`; a default that is no text is returned as it is."""
         return cls(split(text) or ()) if isinstance(text, str) else text
 
     def __str__(self) -> str:
@@ -40,18 +40,18 @@ class Names(tuple[str, ...]):
 
 
 def read_categories(text: str | Names) -> Names:
-    """Categories by slug or title, in any case: `Living World` is `living-world`."""
+    """Return categories by slug or title, in any case: `Living World` is `living-world`."""
     return Names("-".join(name.lower().split()) for name in Names.parse(text))
 
 
 LISTED: Any = {"parser": Names.parse, "metavar": "A,B,…"}
-"""Keywords of `typer.Option` for comma-separated names."""
+"""The keywords of `typer.Option` for comma-separated names."""
 NAMED: Any = LISTED | {"parser": read_categories}
-"""The same for categories."""
+"""The keywords of `typer.Option` for comma-separated categories."""
 
 
 def check_no_others(typed: Mapping[str, object], what: str = "labels of your own") -> None:
-    """Raise UsageError for an option that does not go with `what`. typed: whether each option was typed."""
+    """Raise UsageError for an option that does not go with `what`, from whether each option was typed."""
     if wrong := [name for name, value in typed.items() if value]:
         raise UsageError(f"{wrong[0]} is not for {what}; leave it out")
 
@@ -62,7 +62,7 @@ def choices(names: Collection[object]) -> str:
 
 
 def one_of(names: Collection[str]) -> Callable[[str], str]:
-    """A parser for the names of a registry; others end the command with exit code 2 and the list of names."""
+    """Return a parser for the names of a registry; others end the command with exit code 2 and the list."""
 
     def parse(text: str) -> str:
         return _checked(text, names)
@@ -71,7 +71,10 @@ def one_of(names: Collection[str]) -> Callable[[str], str]:
 
 
 def some_of(names: Collection[str], none: str | None = None) -> Callable[[str | Names], Names]:
-    """A parser for comma-separated `names`; none: a word for the empty selection. An option's default is kept."""
+    """Return a parser for comma-separated `names`, which keeps a default that is `Names` as it is.
+
+    The word `none` stands for the empty selection; without such a word an empty selection is refused.
+    """
 
     def parse(text: str | Names) -> Names:
         if isinstance(text, Names):
@@ -93,7 +96,7 @@ def _checked(name: str, choices: Collection[str]) -> str:
 
 
 def read_size(text: str) -> tuple[int, int]:
-    """(width, height) in pixels of WIDTHxHEIGHT. Raises UsageError for another form."""
+    """Return (width, height) in pixels from WIDTHxHEIGHT. Raises UsageError for another form."""
     width, height = map(whole_number, text.partition("x")[::2])
     if width is None or height is None:
         raise UsageError(f"picture size {text!r} is not WIDTHxHEIGHT, such as 224x224")

@@ -1,4 +1,4 @@
-"""Tables in LaTeX: booktabs rules, five heat colours, and no tabular wider than its line."""
+"""Tables in LaTeX: booktabs rules, five heat colors, and no tabular wider than its line."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -33,13 +33,13 @@ _SPECIAL = {character: f"\\{character}" for character in "&%$#_{}"} | {
     **{letter: f"$\\{name}$" for letter, name in _GREEK.items()},
 }
 MOST_COLUMNS = 13
-"""Of a tabular; a wider table is printed as several below each other, each with the names of the rows."""
+"""The most columns of a tabular; a wider table becomes several, one below the other, each with the row names."""
 _FITTED = r"\resizebox{\ifdim\width>\linewidth\linewidth\else\width\fi}{!}{%"
-"""Before a tabular: one that is wider than its line becomes as wide as it."""
+"""The command before a tabular: one that is wider than its line becomes as wide as it."""
 
 
 def _preamble(tables: Sequence[Content]) -> str:
-    """Return the packages that the tables need as a comment, and their colours."""
+    """Return the packages that the tables need as a comment, and their colors."""
     coloured = any(_css(cell) for table in tables for row in table.rows for cell in row.cells)
     needs = r"% needs: \usepackage{booktabs} \usepackage{graphicx}" + r" \usepackage[table]{xcolor}" * coloured
     colours = [rf"\definecolor{{{name}}}{{HTML}}{{{rgb}}}" for _, name, rgb in HEAT] if coloured else []
@@ -47,7 +47,7 @@ def _preamble(tables: Sequence[Content]) -> str:
 
 
 def render(tables: Sequence[Content], sentences: Sequence[str] = (), notes: Sequence[str] = ()) -> str:
-    """Return the tables behind their preamble, each with a label of its own; sentences and notes as comments."""
+    """Return the tables behind their preamble, each with its own label; sentences and notes are comments."""
     texts: list[str] = []
     labels: dict[str, int] = {}
     for table in tables:
@@ -127,13 +127,13 @@ def _tabular(table: Content) -> list[str]:
 
 
 def _css(cell: Cell) -> str:
-    """Return the commands around a cell as Styler has them."""
+    """Return the commands around a cell as Styler spells them."""
     heat = [] if cell.heat is None else [f"cellcolor:{{{heat_name(cell.heat)}}}"]
     return ";".join([*heat, *["textcolor:{red}--rwrap"] * cell.alarm])
 
 
 def heat_name(value: float) -> str:
-    """Return the name of the colour of a share or ratio."""
+    """Return the name of the color of a share or ratio."""
     return next(name for bound, name, _ in HEAT if value < bound)
 
 

@@ -28,7 +28,7 @@ def _table(table: Content) -> str:
 
 
 def _cell(cell: Cell) -> str:
-    """Return a cell; Markdown has no colour that renders everywhere, so that red is a sign and bold type."""
+    """Return a cell; Markdown has no color that renders everywhere, so that red is a sign and bold type."""
     safe = markdown_safe(cell.text)
     return f"🔴 **{safe}**" if cell.alarm else safe
 
