@@ -128,7 +128,7 @@ def extract(
     probe-kit extract --model pi0 --categories color,shape --dry-run
     probe-kit extract --model pi0 --checkpoint DIR --dataset FOLDER --episodes 0:5 --select every:5
     probe-kit extract --model pi0 --checkpoint DIR --env kitchen:Kitchen --captured-calls 8
-    """
+    """  # noqa: D301 - click reads the \b
     settings = ExtractSettings.of_command(typed, None if config is None else read_config(config, typed))
     if print_config:
         print_json(settings.config())

@@ -301,7 +301,7 @@ def show_dataset(
     \b
     probe-kit dataset show FOLDER
     probe-kit dataset show FOLDER --model pi0 --checkpoint DIR --camera base=observation.images.top
-    """
+    """  # noqa: D301 - click reads the \b
     from rich.table import Table
 
     from probe_kit.extract.extraction import load

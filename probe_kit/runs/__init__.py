@@ -1,4 +1,4 @@
-"""Runs: where they lie, their records and arrays, and how these are written, read, verified and exported.
+"""Runs: where they are stored, their records and arrays, and how these are written, read, verified and exported.
 
 Reading needs neither a simulator nor a model.
 """

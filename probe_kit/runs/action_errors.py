@@ -22,8 +22,8 @@ class ActionErrors:
     """Predicted minus recorded actions, in the units of the data set.
 
     Attributes:
-        run: Of recordings.
-        names: (D,) of the numbers of an action.
+        run: A run on recordings.
+        names: (D,) names of the numbers of an action.
         errors: (E, C, S, D) by row, inference and step of the chunk, NaN where nothing was recorded.
         deviations: (D,) standard deviations of the recorded actions at the shown frames. In these deviations, the
             mean recorded action has an error of 1.
@@ -38,8 +38,9 @@ class ActionErrors:
     def by_number(self) -> "pd.DataFrame":
         """A line per number of an action: `number`, `deviation`, `bias`, `first` and `chunk`.
 
-        bias: mean error of the first action. first, chunk: root mean square error of the first action and of the
-        whole chunk. All three in recorded deviations, NaN for a number that never changes.
+        The column `bias` is the mean error of the first action. The columns `first` and `chunk` are the root mean
+        square errors of the first action and of the whole chunk. All three are in recorded deviations, NaN for a
+        number that never changes.
         """
         import pandas as pd
 
@@ -56,7 +57,7 @@ class ActionErrors:
 
     @property
     def by_frame(self) -> "pd.DataFrame":
-        """A line per shown frame: keys, `first` and `chunk`, root mean squares over all numbers that change."""
+        """A line per shown frame: keys, and root mean squares `first` and `chunk` over the numbers that change."""
         import pandas as pd
 
         rows, calls = np.nonzero(self._has_recorded_action)
@@ -86,27 +87,27 @@ class ActionErrors:
 
     @property
     def of_frames(self) -> tuple[Matrix, Matrix]:
-        """(E, C) root mean square errors of the first action and of the whole chunk, in recorded deviations."""
+        """The root mean square errors (E, C) of the first action and the whole chunk, in recorded deviations."""
         squares = self._scaled**2
         return np.sqrt(_mean(squares[:, :, 0], 2)), np.sqrt(_mean(squares, (2, 3)))
 
     @property
     def _scaled(self) -> Matrix:
-        """Errors in recorded deviations; numbers that never change are NaN."""
+        """The errors in recorded deviations; numbers that never change are NaN."""
         return np.asarray(self.errors / np.where(self.deviations > 0, self.deviations, np.nan))
 
     @property
     def _has_recorded_action(self) -> NDArray[np.bool_]:
-        """(E, C) whether an inference has a recorded action."""
+        """A mask (E, C) of the inferences that have a recorded action."""
         return np.asarray(np.isfinite(self.errors[:, :, 0]).any(axis=2))
 
 
 def compare_actions(run: RunReader) -> ActionErrors:
-    """The predicted actions of a run on recordings beside the recorded ones.
+    """Compare the predicted actions of a run on recordings with the recorded ones.
 
     Raises:
-        UsageError: For another run, or where the two are not the same numbers: another count, changes beside
-            positions, or values outside the statistics of the checkpoint.
+        UsageError: For a run of another kind, or where the two are not the same numbers: another count, changes on
+            one side and positions on the other, or values outside the statistics of the checkpoint.
     """
     if not run.recorded:
         raise UsageError(f"{run.location} has no recorded actions: it is not of recordings")
@@ -152,7 +153,7 @@ def action_error_table(errors: ActionErrors) -> Table:
 
 
 def why_not_compared(run: RunReader) -> str | None:
-    """Why predicted and recorded actions are not the same numbers; None if they are."""
+    """Return why predicted and recorded actions are not the same numbers; None if they are."""
     inputs = run.inputs
     if inputs is None or "action" not in inputs.kinds:
         return "the data set has no actions"
@@ -164,7 +165,7 @@ def why_not_compared(run: RunReader) -> str | None:
 
 
 def _mean(values: Matrix, axes: int | tuple[int, ...]) -> Matrix:
-    """The mean of the numbers among `values`; NaN, without a warning, where there are none."""
+    """Return the mean of the finite numbers among `values`; NaN, without a warning, where there are none."""
     finite = np.isfinite(values)
     count = finite.sum(axis=axes)
     total = np.where(finite, values, 0.0).sum(axis=axes)

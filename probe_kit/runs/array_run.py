@@ -28,14 +28,19 @@ class ArrayRun:
     """A run over features in memory, for activations that were not recorded by probe_kit.
 
     Attributes:
-        path: Folder for the probe results.
+        path: The folder for the probe results.
+        model: The model's name, which labels the run.
+        suite: The suite's name, from which the seeds of draws derive.
         episodes: One row per episode, with at least `episode_id`, `item_id`, `category`, `group_id`, `layout`,
             `side_correct`, `outcome` and `side_placed`.
         features: (E, D) per site and view, rows in the order of `episodes`.
+        weights_sha256: The hash of the model's weights; None if it is unknown.
         token_features: Per site and role (None for all tokens), (E, T, D) values and (E, T) mask. A site needs a
             pooled view too.
-        control_features: (E, D) by name, of controls of a label that never saw the model. Raises UsageError if an
-            array has another number of rows or dimensions.
+        control_features: (E, D) by name, of controls of a label that never saw the model.
+
+    Raises:
+        UsageError: If an array has another number of rows or dimensions.
     """
 
     path: Path
@@ -92,22 +97,22 @@ class ArrayRun:
 
     @property
     def ask(self) -> Mapping[str, Any] | None:
-        """The way in which its model was asked; None for one that acts."""
+        """The settings with which its model was asked; None for one that acts."""
         return self.settings.get("ask")
 
     @property
     def source(self) -> RunSource:
-        """The suite that it names."""
+        """The source that names its suite."""
         return RunSource("arrays", self.suite, f"it is made of arrays on {self.suite}")
 
     @property
     def seed_text(self) -> str:
-        """The suite, which sets its draws apart."""
+        """The suite's name, which makes its draws differ from those of other suites."""
         return self.suite
 
     @property
     def all_wordings(self) -> Self:
-        """The run itself: it has no wordings."""
+        """The run itself, which has no wordings."""
         return self
 
     @property
@@ -117,17 +122,17 @@ class ArrayRun:
 
     @property
     def planned_items(self) -> Mapping[str, str]:
-        """The items of its episodes."""
+        """The category of every item of its episodes, by item id."""
         return dict(zip(self.episodes["item_id"], self.episodes["category"], strict=True))
 
     @property
     def control_steps(self) -> NDArray[np.int64]:
-        """(E, 0): inferences in memory have no steps."""
+        """An array (E, 0): inferences in memory have no steps."""
         return np.zeros((len(self.episodes), 0), np.int64)
 
     @cached_property
     def settings_sha256(self) -> str:
-        """Hash of all features: other arrays are another run."""
+        """The hash of all features: other arrays are another run."""
         pooled = [[str(site), view, _sha256(array)] for (site, view), array in self.features.items()]
         tokens = [
             [str(site), f"tokens:{role}", _sha256(values), _sha256(mask)]
@@ -137,41 +142,41 @@ class ArrayRun:
         return sha256_json(sorted(pooled) + sorted(tokens) + sorted(controls))
 
     def reached(self, call: int) -> NDArray[np.bool_]:
-        """(E,) whether an episode has inference `call`: all have the only one."""
+        """Return for every episode (E,) whether it has inference `call`: all have the only one, 0."""
         return np.full(len(self.episodes), call == 0)
 
     @property
     def streams(self) -> Mapping[str, Stream]:
-        """Streams by name, as far as their sites are there."""
+        """The streams by name, as far as their sites have features."""
         return {name: self._stream(name) for name in dict.fromkeys(site.stream for site, _ in self.features)}
 
     def views(self, stream: str) -> Sequence[str]:
-        """Views of a stream."""
+        """Return the views of a stream."""
         return list(dict.fromkeys(view for site, view in self.features if site.stream == stream))
 
     def sites(self, stream: str) -> Sequence[Site]:
-        """Sites of a stream, in the order of `features`."""
+        """Return the sites of a stream, in the order of `features`."""
         return list(dict.fromkeys(site for site, _ in self.features if site.stream == stream))
 
     def column(self, site: Site, view: str) -> NDArray[np.float32]:
-        """(E, D) features of one site. Raises UnknownSiteError."""
+        """Return the features (E, D) of one site. Raises UnknownSiteError if there are none of the view."""
         if (site, view) not in self.features:
             raise UnknownSiteError(f"there are no features of {site}, view {view!r}")
         return self.features[site, view].astype(np.float32)
 
     def tokens(self, site: Site, role: str | None = None) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """(E, T, D) values and (E, T) mask of one site. Raises UnknownSiteError."""
+        """Return values (E, T, D) and mask (E, T) of one site. Raises UnknownSiteError if there are none."""
         if (site, role) not in self.token_features:
             raise UnknownSiteError(f"there are no tokens of {site}, role {role!r}")
         values, mask = self.token_features[site, role]
         return values.astype(np.float32), mask
 
     def token_mask(self, site: Site, role: str | None = None) -> NDArray[np.bool_]:
-        """(E, T) mask of one site. Raises UnknownSiteError."""
+        """Return the mask (E, T) of one site. Raises UnknownSiteError if there are no tokens of the role."""
         return self.tokens(site, role)[1]
 
     def iter_token_blocks(self, site: Site, role: str | None = None) -> Iterator["TokenBlock"]:
-        """All tokens of one site, as one block: they are in memory. Raises UnknownSiteError."""
+        """Yield all tokens of one site as one block, since they are in memory. Raises UnknownSiteError."""
         from probe_kit.runs.arrays import TokenBlock
 
         yield TokenBlock(0, *self.tokens(site, role))

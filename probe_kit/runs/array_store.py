@@ -1,4 +1,4 @@
-"""The objects of one folder of a run as Zarr has them: hashed as they are written, checked as they are read."""
+"""The objects of one folder of a run, for Zarr: hashed as they are written, checked as they are read."""
 
 import asyncio
 from collections.abc import AsyncIterator, Callable, Iterable, Mapping, Sequence
@@ -13,22 +13,26 @@ from probe_kit.runs.records import BLOCK_BYTES, Sum, block_digest, digest
 from probe_kit.runs.store import Location
 
 _BLOCK = 2 * BLOCK_BYTES
-"""Hex digits of the hash of one inner chunk, of which `Sum.blocks` is a row."""
+"""The hex digits of the hash of one inner chunk, of which `Sum.blocks` is a row."""
 
 _SPARE = 1 << 20
-"""Bytes that an object may have too many and is still read: a file that was made larger never takes all memory."""
+"""The bytes that an object may have too many and is still read: an enlarged file never takes all memory."""
 
 
 class ArrayStore(Store):
-    """The objects below `folder` that are known by their sums; whatever else lies there does not exist for it.
+    """The objects below `folder` that are known by their sums; any other object there does not exist for it.
 
-    written: the sums of what was written through it. shards: number of inner chunks in every object of a sharded
-    array, by the array's path, to be filled in before it is written.
+    A wrong or missing object raises RunDamagedError. Of a shard, only the parts that are read are checked. The
+    attribute `written` has the sums of what was written through the store. The attribute `shards` has the number
+    of inner chunks in every object of a sharded array, by the array's path; it is filled in before the array is
+    written.
 
     Args:
-        sums: By key; an object that is written is known from then on.
-        advice: What to do if the object of a key is wrong. A wrong or missing object raises RunDamagedError. Of a
-            shard, only the parts that are read are checked.
+        location: The run that holds the folder.
+        folder: The folder below which the keys lie, such as `data.zarr`.
+        sums: The sums by key; an object that is written is known from then on.
+        advice: A function of a key that returns what to do if its object is wrong. The default returns no advice.
+        read_only: Whether Zarr refuses to write.
     """
 
     supports_writes = supports_deletes = supports_listing = True
@@ -59,7 +63,7 @@ class ArrayStore(Store):
     async def get(
         self, key: str, prototype: BufferPrototype, byte_range: ByteRequest | None = None
     ) -> Buffer | None:
-        """One object or a part of it; None if it is not known. Raises RunDamagedError."""
+        """Return one object or a part of it; None if it is not known. Raises RunDamagedError."""
         if key not in self.sums:
             return None
         return prototype.buffer.from_bytes(await asyncio.to_thread(self._read, key, byte_range))
@@ -67,39 +71,39 @@ class ArrayStore(Store):
     async def get_partial_values(
         self, prototype: BufferPrototype, key_ranges: Iterable[tuple[str, ByteRequest | None]]
     ) -> list[Buffer | None]:
-        """Parts of several objects."""
+        """Return parts of several objects."""
         return list(await asyncio.gather(*(self.get(key, prototype, part) for key, part in key_ranges)))
 
     async def get_ranges(
         self, key: str, byte_ranges: Sequence[ByteRequest | None], *, prototype: BufferPrototype, **_: Any
     ) -> AsyncIterator[Sequence[tuple[int, Buffer | None]]]:
-        """Parts of one object, never merged: each of them has a hash, and two together have none."""
+        """Yield parts of one object, never merged: each of them has a hash, and two together have none."""
         parts = await self.get_partial_values(prototype, [(key, byte_range) for byte_range in byte_ranges])
         yield list(enumerate(parts))
 
     async def exists(self, key: str) -> bool:
-        """Whether there is such an object, wrong or not."""
+        """Whether there is an object of that key, wrong or not."""
         return key in self.sums and await asyncio.to_thread(self._location.exists, self._key(key))
 
     async def list(self) -> AsyncIterator[str]:
-        """Keys of all that is known."""
+        """Yield the keys of all known objects."""
         for key in [*self.sums]:
             yield key
 
     async def list_prefix(self, prefix: str) -> AsyncIterator[str]:
-        """Yield the keys that begin so."""
+        """Yield the known keys that begin with a prefix."""
         for key in [key for key in self.sums if key.startswith(prefix)]:
             yield key
 
     async def list_dir(self, prefix: str) -> AsyncIterator[str]:
-        """Names of what is known right in a folder."""
+        """Yield the names of known objects and folders directly in a folder."""
         inside = f"{prefix.rstrip('/')}/" if prefix.strip("/") else ""
         names = (key.removeprefix(inside).partition("/")[0] for key in self.sums if key.startswith(inside))
         for name in dict.fromkeys(names):
             yield name
 
     def _read(self, key: str, byte_range: ByteRequest | None) -> bytes:
-        """The bytes of an object or of a part. Raises RunDamagedError unless they are what was written."""
+        """Return the bytes of an object or of a part. Raises RunDamagedError unless they are as written."""
         stored = self.sums[key]
         try:
             if byte_range is None:
@@ -117,7 +121,7 @@ class ArrayStore(Store):
         return content
 
     def _index_problem(self, key: str, content: bytes) -> str | None:
-        """The fault in the index at the end of a shard; a whole one says where the parts lie."""
+        """Return the fault in the index at the end of a shard; of a whole index, keep the hashes of the parts."""
         blocks = self.sums[key].blocks
         digests = [blocks[start : start + _BLOCK] for start in range(0, len(blocks), _BLOCK)]
         if not digests or block_digest(content) != digests[-1]:
@@ -155,7 +159,7 @@ class ArrayStore(Store):
 
 
 def _range_of(byte_range: ByteRequest, length: int) -> slice:
-    """The bytes of an object of this length that Zarr asks for."""
+    """Return the bytes that Zarr asks for, of an object of this length."""
     if isinstance(byte_range, RangeByteRequest):
         return slice(byte_range.start, byte_range.end)
     if isinstance(byte_range, OffsetByteRequest):

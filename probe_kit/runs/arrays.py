@@ -1,4 +1,4 @@
-"""The arrays of a run: shapes, chunks, codec, where the inner chunks of a shard lie, and the reading of rows.
+"""The arrays of a run: shapes, chunks, codec, where the inner chunks of a shard lie, and reading of rows.
 
 Arrays of tokens and of later inferences hold the bits of bfloat16 as uint16, because Zarr v3 has no bfloat16.
 Inputs of recorded frames lie beside the streams, one chunk per row of the plan:
@@ -38,20 +38,22 @@ from probe_kit.runs.folder import MOST_OBJECT_BYTES
 from probe_kit.runs.layout import CLASSES, INPUTS, LATER, MEAN_VIEW, TRUTHS, LaterViews, StoredStream
 
 ENTRY, CHECKSUM = 16, 4
-"""Bytes: offset and length of a chunk as two uint64, and the crc32c after all entries, in the
-index that Zarr writes at the end of every shard."""
+"""The bytes of offset and length of a chunk as two uint64, and of the crc32c after all entries.
+
+Both are in the index that Zarr writes at the end of every shard.
+"""
 _RESTORE = "Restore the run from a copy, or extract it again"
 _MOST_CHUNKS = 10_000_000
-"""Of an array: ten times `ROOM`. Metadata that claims more was made up; reading by it would fill all memory."""
+"""The most chunks of an array: ten times `ROOM`. Metadata that claims more was made up, to fill all memory."""
 _ONE_AT_A_TIME = Lock()
 _BLOSC_SIZE = slice(4, 8)
-"""Place of the size, unpacked, in the header of a chunk that blosc wrote."""
+"""The place of the unpacked size in the header of a chunk that blosc wrote."""
 _ABSENT = (1 << 64) - 1
-"""Offset and length of an inner chunk that was never written, as Zarr's sharding has it."""
+"""The offset and the length of an inner chunk that was never written, as Zarr's sharding stores them."""
 ROOM = 1_000_000
-"""Episodes that an array has room for; one chunk holds one episode, and no chunk exists before its episode."""
+"""The episodes an array has room for; one chunk holds one episode, and no chunk exists before its episode."""
 NOT_A_NUMBER = 0x7FC0
-"""Bits of bfloat16 where nothing was captured."""
+"""The bits of bfloat16 where nothing was captured."""
 # Zarr's default leaves out chunks that equal the fill value (and compares every chunk with it to find out), but
 # a reader must be able to tell an empty chunk from a lost one. Not stored in the array, so asked for each time.
 WRITE_ALL: ArrayConfigLike = {"write_empty_chunks": True}
@@ -63,10 +65,12 @@ def create_arrays(
 ) -> None:  # fmt: skip
     """Create every array with `ROOM` for episodes, so that metadata never changes; afterwards chunks are written.
 
-    Pooled rows: float32 (episode, call, [iteration,] layer, view, feature), one chunk per episode, NaN where
-    nothing was captured. Tokens: uint16, one shard per episode, inner chunks of one layer x 128 tokens. With
-    later_views `mean`, pooled rows hold the first inference alone, and `later` that view of the others: uint16
-    (episode, call, [iteration,] layer, feature), one chunk per episode, `NOT_A_NUMBER` where nothing was captured.
+    Pooled rows are float32 (episode, call, [iteration,] layer, view, feature), one chunk per episode, NaN where
+    nothing was captured. Tokens are uint16, one shard per episode, with inner chunks of one layer x 128 tokens.
+
+    With `mean` for `later_views`, pooled rows hold the first inference alone, and `later` that view of the others:
+    uint16 (episode, call, [iteration,] layer, feature), one chunk per episode, `NOT_A_NUMBER` where nothing was
+    captured.
     """
     root = zarr.open_group(store, mode="w-", zarr_format=3)
     full = calls if later_views == "all" else 1
@@ -99,7 +103,7 @@ def create_array(
     codec: str, dimensions: Sequence[str] | None = None, attributes: dict[str, Any] | None = None,
     shards: tuple[int, ...] | None = None,
 ) -> zarr.Array[Any]:  # fmt: skip
-    """Create one array of a run. codec: its name, see `codecs`."""
+    """Create one array of a run; `codecs` explains the names of `codec`."""
     return group.create_array(
         name, shape=shape, chunks=chunks, shards=shards, dtype=dtype, fill_value=fill_value,
         compressors=codecs(codec, np.dtype(dtype).itemsize), dimension_names=dimensions, attributes=attributes,
@@ -116,7 +120,7 @@ def write_row(store: Store, name: str, number: int, values: NDArray[Any]) -> Non
 
 
 def codecs(name: str, typesize: int) -> list[BytesBytesCodec]:
-    """Blosc, then a checksum. typesize: bytes of a number, which blosc shuffles before it compresses."""
+    """Return blosc, then a checksum; blosc shuffles numbers of `typesize` bytes before it compresses them."""
     if name == "none":
         return [Crc32cCodec()]
     fast = name == "fast"
@@ -143,7 +147,7 @@ def open_array(store: Store, name: str) -> zarr.Array[Any]:
 
 
 class BoundedBloscCodec(BloscCodec):
-    """Blosc that unpacks a chunk of the array's own size alone, whatever size the chunk declares."""
+    """A blosc codec that unpacks only to the size of the array's chunks, whatever size a chunk declares."""
 
     def _decode_sync(self, chunk_bytes: Buffer, chunk_spec: ArraySpec) -> Buffer:
         expected = math.prod(chunk_spec.shape) * chunk_spec.dtype.to_native_dtype().itemsize
@@ -158,7 +162,7 @@ register_codec("blosc", BoundedBloscCodec)  # chosen where `bounded_codecs` says
 
 @contextmanager
 def bounded_codecs() -> Iterator[None]:
-    """Give arrays that are opened inside codecs that unpack no more bytes than a chunk has."""
+    """Make arrays that are opened in the body unpack no more bytes than a chunk has."""
     # The configuration of zarr is one for all threads; another thread's end would set it back too early.
     name = f"{BoundedBloscCodec.__module__}.{BoundedBloscCodec.__qualname__}"
     with _ONE_AT_A_TIME, zarr.config.set({"codecs.blosc": name}):
@@ -166,7 +170,7 @@ def bounded_codecs() -> Iterator[None]:
 
 
 def check_bounds(array: zarr.Array[Any]) -> None:
-    """Raise RunDamagedError for an array that no run has: metadata of others may claim any shape and codec."""
+    """Raise RunDamagedError for an array that no run has: foreign metadata may claim any shape and codec."""
     assert isinstance(array.metadata, ArrayV3Metadata), "it was opened as one"
     codecs = list(array.metadata.codecs)
     while codecs:
@@ -186,12 +190,12 @@ def check_bounds(array: zarr.Array[Any]) -> None:
 
 
 def decode_bfloat16(bits: NDArray[np.uint16]) -> NDArray[np.float32]:
-    """uint16 bit patterns of bfloat16 to float32, exactly."""
+    """Convert bit patterns of bfloat16, as uint16, to float32, exactly."""
     return (bits.astype(np.uint32) << 16).view(np.float32)
 
 
 def encode_bfloat16(values: NDArray[np.float32]) -> NDArray[np.uint16]:
-    """float32 to the bits of bfloat16, to the nearest and half to even; NaN stays NaN."""
+    """Convert float32 to the bits of bfloat16, to the nearest and half to even; NaN stays NaN."""
     bits = np.ascontiguousarray(values, np.float32).view(np.uint32)
     # Half a unit of the kept bits, less one, plus the lowest kept bit: ties go to even. Wraps around for NaN only.
     rounded = (bits + (0x7FFF + ((bits >> 16) & 1))) >> 16
@@ -200,7 +204,7 @@ def encode_bfloat16(values: NDArray[np.float32]) -> NDArray[np.uint16]:
 
 
 def index_bytes(count: int) -> int:
-    """Length of the index of a shard of so many inner chunks."""
+    """Return the length of the index of a shard of `count` inner chunks."""
     return count * ENTRY + CHECKSUM
 
 
@@ -223,9 +227,9 @@ def inner_chunks(shard: bytes, count: int) -> list[slice]:
 
 Spans = Sequence[tuple[str, int, int]]
 _BLOCK_BYTES = 1 << 24
-"""Rows that are read in order come this many bytes at a time: beginning a request takes longer than reading."""
+"""The bytes of rows that are read at a time, in order: beginning a request takes longer than reading."""
 _DAMAGE = (ChunkNotFoundError, ValueError, RuntimeError)
-"""What Zarr and its codecs raise for missing and for changed bytes."""
+"""The errors of Zarr and its codecs for missing and for changed bytes."""
 
 
 @dataclass(frozen=True)
@@ -243,18 +247,18 @@ class Rows:
         return len(self.numbers)
 
     def __getitem__(self, position: int) -> NDArray[Any]:
-        """All of one episode."""
+        """Return all of one episode."""
         return self.read(position, ())
 
     def __iter__(self) -> Iterator[NDArray[Any]]:
-        """All of every episode, in order, as `between`."""
+        """Yield all of every episode, in order, as `between` does."""
         return self.between(0, len(self))
 
     def between(self, start: int, stop: int) -> Iterator[NDArray[Any]]:
-        """All of the episodes from `start` up to `stop`, in order; several are read at a time.
+        """Yield all of the episodes from `start` up to `stop`, in order; several are read at a time.
 
         Raises:
-            RunDamagedError: At a damaged one.
+            RunDamagedError: At a damaged episode, after those before it.
         """
         per_row = math.prod(self.array.shape[1:]) * self.array.dtype.itemsize
         size = max(1, _BLOCK_BYTES // max(1, per_row))
@@ -275,7 +279,7 @@ class Rows:
             yield from block
 
     def read(self, position: int, index: tuple[Any, ...]) -> NDArray[Any]:
-        """Part of one episode. Raises RunDamagedError if bytes are missing or fail their checksum."""
+        """Return a part of one episode. Raises RunDamagedError if bytes are missing or fail their checksum."""
         number = self.numbers[position]
         try:
             return np.asarray(self.array[(number, *index)])
@@ -288,9 +292,11 @@ class Rows:
 
 @dataclass(frozen=True)
 class TokenBlock:
-    """Tokens `start` up to `start + T` of one site: values (E, T, D) float32 and mask (E, T) bool.
+    """The tokens `start` up to `start + T` of one site. Values outside the mask are zero.
 
-    Values outside the mask are zero.
+    Attributes:
+        values: (E, T, D) float32.
+        mask: (E, T) bool.
     """
 
     start: int
@@ -299,7 +305,7 @@ class TokenBlock:
 
 
 def role_mask(spans: Sequence[Spans], tokens: int, role: str | None) -> NDArray[np.bool_]:
-    """(E, tokens) bool: positions of `role`, or of all but padding, from one sequence of spans per episode."""
+    """Return the mask (E, tokens) of the positions of `role`, or of all but padding, from an episode's spans each."""
     mask = np.zeros((len(spans), tokens), bool)
     for row, episode in enumerate(spans):
         for name, start, stop in episode:
@@ -308,7 +314,7 @@ def role_mask(spans: Sequence[Spans], tokens: int, role: str | None) -> NDArray[
 
 
 def token_blocks(rows: Rows, at: tuple[int, ...], mask: NDArray[np.bool_], block: int) -> Iterator[TokenBlock]:
-    """Blocks of `block` tokens at `at` (call, [iteration,] layer); a block that `mask` never touches is left out.
+    """Yield blocks of `block` tokens at `at` (call, [iteration,] layer); a block that `mask` lacks is left out.
 
     Reads only the inner chunks it needs, one block of all episodes at a time.
     """
@@ -328,11 +334,14 @@ def token_blocks(rows: Rows, at: tuple[int, ...], mask: NDArray[np.bool_], block
 
 
 _TYPES = {"columns": "float64", "pixels": "uint8"}
-"""All others are float32. Columns hold timestamps and indices, of which float32 has too few digits."""
+"""The types of the inputs that are not float32.
+
+Columns hold timestamps and indices, for which float32 has too few digits.
+"""
 
 
 def create_inputs(store: Store, calls: int, shapes: Mapping[str, list[int]], codec: str) -> None:
-    """Create the arrays. shapes: by kind, of one inference."""
+    """Create the arrays of inputs, from the shapes of one inference by kind."""
     group = zarr.open_group(store, mode="a", zarr_format=3).create_group(INPUTS)
     for name, shape in shapes.items():
         dtype = np.dtype(_TYPES.get(name, "float32"))
@@ -343,9 +352,10 @@ def create_inputs(store: Store, calls: int, shapes: Mapping[str, list[int]], cod
 class StoredInputs:
     """The inputs of the committed rows of a run, in their order.
 
-    kinds: that are stored. columns: names of the numbers of `columns`. names: of those of `state` and `action`.
-    truths: columns that are truth values, stored as 0 and 1. classes: by column of texts, the texts of which it
-    stores the position.
+    The attribute `kinds` has the kinds that are stored. The attribute `columns` has the names of the numbers of
+    the kind `columns`, and `names` those of `state` and `action`. The attribute `truths` has the columns of truth
+    values, stored as 0 and 1. The attribute `classes` has, by column of texts, the texts whose positions are
+    stored.
     """
 
     def __init__(self, store: Store, numbers: list[int], dataset: Mapping[str, Any]) -> None:
@@ -359,27 +369,27 @@ class StoredInputs:
         }
 
     def read(self, kind: str) -> NDArray[Any]:
-        """(E, C, …) of one kind. Raises KeyError for one that is not stored, RunDamagedError."""
+        """Return all inputs (E, C, …) of one kind. Raises KeyError for one that is not stored, RunDamagedError."""
         if kind not in self.kinds:
             raise KeyError(kind)
         rows = Rows(open_array(self._store, f"{INPUTS}/{kind}"), self._numbers)
         return np.stack(list(rows))
 
     def row(self, kind: str, position: int) -> NDArray[Any]:
-        """Return (C, …) of one kind of the row at a position. Raises KeyError as `read` does, RunDamagedError."""
+        """Return the inputs (C, …) of one kind of the row at a position. Raises as `read`."""
         if kind not in self.kinds:
             raise KeyError(kind)
         return Rows(open_array(self._store, f"{INPUTS}/{kind}"), self._numbers)[position]
 
     def column(self, name: str) -> NDArray[np.float64]:
-        """(E, C) one column of the data set. Raises KeyError."""
+        """Return one column (E, C) of the data set. Raises KeyError for one that is not stored."""
         if name not in self.columns:
             raise KeyError(name)
         values: NDArray[np.float64] = self.read("columns")[..., self.columns.index(name)]
         return values
 
     def cell(self, name: str, value: float) -> Cell:
-        """Return a number of a column as its source had it: a number, truth value or text; None if not finite."""
+        """Return a number of a column as its source had it: number, truth value or text; None if not finite."""
         if not np.isfinite(value):
             return None
         if texts := self.classes.get(name):

@@ -1,7 +1,7 @@
 """Reading of the column store: one pooled vector per episode, as probes need it.
 
-A row store answers "everything of one episode". Columns hold the same numbers the other way round; `seal`
-writes them. They are derived: safe to delete, and used only while their stamp matches the commits.
+A row store answers "everything of one episode". Columns hold the same numbers the other way round; `seal` writes
+them. They are derived: safe to delete, and used only while their stamp matches the commits.
 
     columns.zarr/<stamp>/<stream>/
         pooled            float32 (call, view, [iteration,] layer, episode, feature)
@@ -9,9 +9,9 @@ writes them. They are derived: safe to delete, and used only while their stamp m
         role              uint8 (call, episode, token), codes named by the attribute `roles`
     sealed/<stamp>.json   the hash of every object there, and of which run and commits they are
 
-Their key carries the stamp, so that processes that saw different commits never mix them.
-A seal says which episodes it was made of. It is older than a run that has more; one that names an episode which is
-not committed any more shows that the run lost it.
+Their key carries the stamp, so that processes that saw different commits never mix them. A seal says which
+episodes it was made of. It is older than a run that has more; one that names an episode which is not committed any
+more shows that the run lost it.
 """
 
 from collections.abc import Mapping
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 
 METADATA = "zarr.json"
-"""Name of the metadata of a group or array in Zarr v3."""
+"""The name of the metadata of a group or array in Zarr v3."""
 
 
 class Seal(Record):
@@ -53,8 +53,12 @@ class Seal(Record):
 class Columns:
     """The sealed columns of a run.
 
+    The attribute `advice` says what to do if they are damaged.
+
     Args:
-        sums: Of every object in their folder. advice: what to do if they are damaged.
+        location: The run that holds them.
+        folder: The folder of the columns in the run, from `columns_folder`.
+        sums: The sums of every object in the folder, by key.
     """
 
     def __init__(self, location: Location, folder: str, sums: Mapping[str, Sum]) -> None:
@@ -71,11 +75,11 @@ class Columns:
         return ArrayStore(self._location, self.folder, self.sums, lambda _key: self.advice, read_only=True)
 
     def array(self, name: str) -> "zarr.Array[Any]":
-        """One array, such as `backbone/pooled`."""
+        """Open one array, such as `backbone/pooled`."""
         return open_array(self.store, name)
 
     def read(self, name: str, index: tuple[int, ...], site: Site) -> NDArray[Any]:
-        """(E, D) one column of the array `name` as stored; site: for the message. Raises RunDamagedError."""
+        """Return one column (E, D) of the array `name` as stored; errors name `site`. Raises RunDamagedError."""
         array = self.array(name)
         try:
             return np.asarray(array[index])
@@ -85,7 +89,7 @@ class Columns:
             ) from error
 
     def xarray(self, stream: str) -> "xr.DataArray":
-        """The pooled columns of one stream, read when they are used."""
+        """Return the pooled columns of one stream, which are read when they are used."""
         import xarray as xr
 
         other_arrays = ("role", LATER)  # which may have other numbers of calls
@@ -98,11 +102,11 @@ class Columns:
 
 
 def find_columns(root: Root, commits: Mapping[int, Commit]) -> Columns | None:
-    """The columns of a run if they were sealed from exactly these commits.
+    """Return the columns of a run if they were sealed from exactly these commits, None otherwise.
 
     Raises:
-        RunDamagedError: If what was noted of them when they were sealed was changed, or names commits that are
-            gone or others, or if a part of the columns is gone.
+        RunDamagedError: If the seal was changed, or names commits that are gone or others, or if a part of the
+            columns is gone.
     """
     location, stamp = root.location, stamp_of(commits)
     seal = next((seal for seal in _read_seals(root, commits) if seal.stamp == stamp), None)
@@ -127,14 +131,14 @@ def seal_key(stamp: str) -> str:
 
 
 def write_seal(root: Root, commits: Mapping[int, Commit], sums: Mapping[str, Sum]) -> None:
-    """Note the hashes of the columns, and the episodes they are of, which makes them count."""
+    """Store the hashes of the columns, and the episodes they are made of, from which on the columns count."""
     seal = Seal(run=root.identity, stamp=stamp_of(commits), episodes=sorted(commits), objects=dict(sums))
     # `write`: the same commits are sealed once more after their columns were deleted.
     root.location.write(seal_key(seal.stamp), seal.to_bytes())
 
 
 def _read_seals(root: Root, commits: Mapping[int, Commit]) -> list[Seal]:
-    """All seals, each checked."""
+    """Return all seals, each checked."""
     seals = []
     advice = f"Delete it; `probe-kit run verify {root.location} --seal` builds the columns again"
     for _, key, raw in named_by_hash(root.location, SEALED):
@@ -151,13 +155,13 @@ def _read_seals(root: Root, commits: Mapping[int, Commit]) -> list[Seal]:
 
 
 def _metadata(root: Root) -> set[str]:
-    """Keys of the metadata that columns always have."""
+    """Return the keys of the metadata that columns always have."""
     arrays = [f"{stream}/{kind}" for stream in root.streams for kind in root.vector_kinds]
     return {METADATA, *(f"{array}/{METADATA}" for array in arrays)}
 
 
 def _check_lost(root: Root, commits: Mapping[int, Commit], seal: Seal, name: str, advice: str) -> None:
-    """Raise RunDamagedError if a seal was made of commits that are gone, or are others by now."""
+    """Raise RunDamagedError if a seal was made of commits that are gone, or that are others by now."""
     absent = [number for number in seal.episodes if number not in commits]
     if lost := [number for number in absent if not root.location.exists(commit_key(number))]:
         raise RunDamagedError(

@@ -25,22 +25,24 @@ from probe_kit.runs.store import Location
 
 _NUMBERED = re.compile(r"([0-9]{8})\.json")
 Span = Annotated[tuple[str, int, int], Field(strict=False)]
-"""Role, first token, and the token behind the last one."""
+"""The role, the first token, and the token behind the last one."""
 
 
 class Commit(Record):
     """One finished episode.
 
     Attributes:
-        plan: Hash of the record that planned it.
-        outcome: Columns of `Run.episodes`.
+        run: The identity of the run.
+        episode: The number of the episode in the run.
+        plan: The hash of the record that planned the episode.
+        outcome: The columns of `Run.episodes`.
         roles: Spans of tokens per captured inference and stream.
-        control_steps: Of every inference.
-        provenance: Name of the record in `provenance/`.
-        objects: By key in `data.zarr` and in the run.
-        pictures: As `objects`.
+        control_steps: The control step of every inference.
+        provenance: The name of the record in `provenance/`.
+        objects: The sums of the episode's objects, by key in `data.zarr`.
+        pictures: The sums of the episode's pictures, by key in the run.
         lens_margins: The logit lens of an answer by letter, left minus right per layer.
-        frames: Number of frames in its picture, where it holds all of the episode.
+        frames: The number of frames in its picture, where it holds all of the episode.
     """
 
     kind: ClassVar[str] = "commit"
@@ -71,17 +73,17 @@ class Failure(Record):
 
 
 def write_commit(location: Location, commit: Commit) -> bool:
-    """Make an episode count; False if another writer was first."""
+    """Make an episode count; return False if another writer was first."""
     return location.create(commit_key(commit.episode), commit.to_bytes())
 
 
 def commit_key(number: int) -> str:
-    """The key of the commit of episode `number`."""
+    """Return the key of the commit of episode `number`."""
     return f"{COMMITS}/{number:08d}.json"
 
 
 def numbered(location: Location, folder: str) -> Iterator[tuple[int, str, bytes]]:
-    """Number, key and content of the objects `<eight digits>.json` in `folder`.
+    """Yield number, key and content of the objects `<eight digits>.json` in `folder`.
 
     Other names are ignored, such as those that file managers give to copies.
     """
@@ -91,14 +93,15 @@ def numbered(location: Location, folder: str) -> Iterator[tuple[int, str, bytes]
 
 
 def read_commits(root: Root, checked: Mapping[int, Commit] | None = None) -> dict[int, Commit]:
-    """All commits by episode number, each checked, and against the sizes of the objects it names.
+    """Return all commits by episode number, each checked, also against the sizes of the objects it names.
 
     Args:
+        root: The root of the run.
         checked: Commits that were read and checked before; these are not read again.
 
     Raises:
-        RunDamagedError: Naming the first commit that was changed or belongs elsewhere, or the first object that is
-            missing or has another size.
+        RunDamagedError: For the first commit that was changed or belongs elsewhere, or the first object that is
+            missing or has another size. The message names it.
     """
     unread = _unread(root.location, checked) if checked else numbered(root.location, COMMITS)
     commits = {number: read_commit(root, number, key, raw) for number, key, raw in unread}
@@ -108,7 +111,7 @@ def read_commits(root: Root, checked: Mapping[int, Commit] | None = None) -> dic
 
 
 def _unread(location: Location, checked: Mapping[int, Commit]) -> Iterator[tuple[int, str, bytes]]:
-    """Number, key and content of the commits that are not among the `checked` ones."""
+    """Yield number, key and content of the commits that are not among the `checked` ones."""
     for key in location.keys(COMMITS):
         name = _NUMBERED.fullmatch(key.rpartition("/")[2])
         if name and int(name[1]) not in checked:
@@ -116,7 +119,7 @@ def _unread(location: Location, checked: Mapping[int, Commit]) -> Iterator[tuple
 
 
 def read_commit(root: Root, number: int, key: str, raw: bytes) -> Commit:
-    """One commit. Raises RunDamagedError if it was changed, or belongs to another episode or run."""
+    """Return one commit. Raises RunDamagedError if it was changed, or belongs to another episode or run."""
     name = f"{root.location}/{key}"
     planned = root.planned.get(number)
     if planned is None:
@@ -135,7 +138,7 @@ def read_commit(root: Root, number: int, key: str, raw: bytes) -> Commit:
 
 
 def _problems(root: Root, commit: Commit) -> Iterator[str]:
-    """Contents of a commit that no commit of this run can have."""
+    """Yield the contents of a commit that no commit of this run can have."""
     if not isinstance(commit.outcome.get("outcome"), str):
         yield "says no outcome"
     # Fewer is no fault: an episode that ends early has fewer inferences than the run captures.
@@ -160,7 +163,7 @@ def _problems(root: Root, commit: Commit) -> Iterator[str]:
 
 
 def _control_step_problem(commit: Commit) -> str | None:
-    """The fault in the control steps of the inferences: they rise, and none lies behind the end."""
+    """Return the fault in the control steps of the inferences: they rise, and none lies behind the end."""
     # They say at which action an inference was made: a wrong one would move it in time, silently.
     steps, ended = commit.control_steps, commit.outcome.get("steps")
     last = ended if type(ended) is int else None
@@ -173,7 +176,7 @@ def _control_step_problem(commit: Commit) -> str | None:
 
 
 def object_key(array: str, number: int, axes: int) -> str:
-    """The key of episode `number` in `data.zarr`: a chunk holds all of one episode."""
+    """Return the key of episode `number` in `data.zarr`: a chunk holds all of one episode."""
     return f"{array}/c/{number}{'/0' * (axes - 1)}"
 
 
@@ -183,17 +186,17 @@ def _is_picture(key: str) -> bool:
 
 
 def redo(number: int) -> str:
-    """The remedy for a damaged episode."""
+    """Return the remedy for a damaged episode."""
     return f"Delete {commit_key(number)} and run the same `probe-kit extract` again to redo the episode"
 
 
 def redo_picture(number: int) -> str:
-    """The remedy for a damaged picture of an episode."""
+    """Return the remedy for a damaged picture of an episode."""
     return f"No number comes from it; to have it again: {redo(number)[0].lower()}{redo(number)[1:]}"
 
 
 def size_problems(root: Root, commits: Mapping[int, Commit]) -> Iterator[str]:
-    """Objects of episodes that are missing or have another size, without reading them."""
+    """Yield the objects of episodes that are missing or have another size, without reading them."""
     sizes = root.location.sizes(DATA, (key for commit in commits.values() for key in commit.objects))
     for number, commit in commits.items():
         for key, expected in commit.objects.items():
@@ -205,7 +208,7 @@ def size_problems(root: Root, commits: Mapping[int, Commit]) -> Iterator[str]:
 
 
 def stamp_of(commits: Mapping[int, Commit]) -> str:
-    """Hash of all commits, by which derived files name their source."""
+    """Return the hash of all commits, by which derived files name their source."""
     return sha256_json([[number, commits[number].hash] for number in sorted(commits)])
 
 
@@ -213,7 +216,14 @@ def stamp_of(commits: Mapping[int, Commit]) -> str:
 
 
 def write_failure(root: Root, number: int, reason: str, traceback: str = "") -> None:
-    """Record why an episode was given up. traceback: of its error, empty if its process died."""
+    """Record why an episode was given up.
+
+    Args:
+        root: The root of the run.
+        number: The episode's number in the run.
+        reason: The reason in words.
+        traceback: The traceback of its error; empty if its process died.
+    """
     failure = Failure(
         run=root.identity,
         episode=number,
@@ -225,17 +235,17 @@ def write_failure(root: Root, number: int, reason: str, traceback: str = "") -> 
 
 
 def _printable(text: str) -> str:
-    """The text without half characters, which names of files may hold."""
+    """Return the text without half characters, which names of files may hold."""
     return text.encode(errors="backslashreplace").decode()
 
 
 def failure_key(number: int) -> str:
-    """The key of the failure of episode `number`."""
+    """Return the key of the failure of episode `number`."""
     return f"{FAILED}/{number:08d}.json"
 
 
 def read_failures(root: Root) -> dict[str, str]:
-    """Reason by episode id of every episode that was given up. Raises RunDamagedError."""
+    """Return the reason by episode id of every episode that was given up. Raises RunDamagedError."""
     advice = "Remove it; the same `probe-kit extract` tries the episode again"
     reasons = {}
     for number, key, raw in numbered(root.location, FAILED):
@@ -258,8 +268,8 @@ class Seconds:
     """Wall-clock seconds that one episode took.
 
     Attributes:
-        inference: Of the model's calls; of a call for several observations, its share.
-        simulation: Of setting up, simulating and drawing.
+        inference: The seconds of the model's calls; a call for several observations counts with its share.
+        simulation: The seconds of setting up, simulating and drawing.
     """
 
     inference: float = 0.0
@@ -280,12 +290,12 @@ class SecondsRecord(Record):
 
 
 def seconds_key(number: int) -> str:
-    """The key of the seconds of episode `number`."""
+    """Return the key of the seconds of episode `number`."""
     return f"{TIMES}/{number:08d}.json"
 
 
 def write_seconds(root: Root, number: int, seconds: Seconds) -> None:
-    """Store them; those of an earlier try of the episode are replaced."""
+    """Store the seconds of an episode; those of an earlier try are replaced."""
     record = SecondsRecord(
         run=root.identity,
         episode=number,

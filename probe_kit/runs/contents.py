@@ -39,8 +39,9 @@ class StoredObject:
     """An object with a known hash.
 
     Attributes:
+        key: Its key in the run.
         advice: The remedy if it is damaged.
-        owner: The episode it belongs to, for messages.
+        owner: The episode it belongs to, as messages name it; empty for none.
         optional: Whether it may be missing, as in a copy without activations.
     """
 
@@ -51,7 +52,7 @@ class StoredObject:
     optional: bool = False
 
     def problem(self, size: int | None) -> str | None:
-        """The fault in an object of this size, None for one that is missing."""
+        """Return the fault in the object of size `size` (None if it is missing), and None if there is no fault."""
         if size is None and self.optional:
             return None
         words = self.stored_sum.size_problem(size)
@@ -59,7 +60,7 @@ class StoredObject:
 
 
 def record_keys(root: Root, commits: Mapping[int, Commit], columns: Columns | None) -> Iterator[str]:
-    """Keys of the records of a run, which carry their own hash."""
+    """Yield the keys of the records of a run, which carry their own hash."""
     yield from (RUN_FILE, LABEL_FILE, LEFT_OUT_FILE)
     yield from (plan_key(record) for record in range(len(root.stored_plan.extents)))
     for number, commit in commits.items():
@@ -76,7 +77,7 @@ def record_keys(root: Root, commits: Mapping[int, Commit], columns: Columns | No
 
 
 def stored_objects(root: Root, commits: Mapping[int, Commit], columns: Columns | None) -> Iterator[StoredObject]:
-    """All objects whose hash a record holds. Results with a damaged head are left out."""
+    """Yield all objects whose hash a record holds. Results with a damaged head are left out."""
     for key, expected in root.card.objects.items():
         yield StoredObject(key, expected, RESTORE)
     pictures = {folder for folder in ILLUSTRATIONS if root.location.keys(folder)}
@@ -107,7 +108,7 @@ def _of_result(root: Root, home: str, key: str) -> Iterator[StoredObject]:
 
 
 def sizes_of(location: Location, objects: Iterable[StoredObject]) -> dict[str, int]:
-    """Bytes of the objects that exist, with one listing per folder of the run."""
+    """Return the bytes of the objects that exist, with one listing per folder of the run."""
     folders: dict[str, list[str]] = {}
     for stored in objects:
         folder, _, key = stored.key.partition("/")
@@ -122,17 +123,16 @@ def sizes_of(location: Location, objects: Iterable[StoredObject]) -> dict[str, i
 def stray_keys(
     root: Root, commits: Mapping[int, Commit], columns: Columns | None, objects: Iterable[StoredObject]
 ) -> list[str]:
-    """Keys of all objects that no record leads to, such as copies made by hand; nothing reads them.
+    """Return the keys of all objects that no record leads to, such as copies made by hand; nothing reads them.
 
-    Args:
-        objects: Those of `stored_objects`.
+    The `objects` are those of `stored_objects`.
     """
     expected = {*record_keys(root, commits, columns), *(stored.key for stored in objects)}
     return [key for key in root.location.keys("") if key not in expected and not _expected(key)]
 
 
 def _expected(key: str) -> bool:
-    """Whether it is a picture, or work in progress: episodes without a commit, sweeps that are not finished."""
+    """Whether an object is a picture, or unfinished work: episodes without a commit, sweeps that still run."""
     top, _, below = key.partition("/")
     return (
         top in ILLUSTRATIONS
@@ -157,17 +157,20 @@ def copy_run(
 
     The copy holds plan, outcomes, trajectories, probes, interventions and certificates, byte for byte: every table
     can be made of it. Its identity, stamp and settings are those of the run. `column` and `tokens` raise
-    ActivationsLeftOutError, and nothing can be added to it.
+    ActivationsLeftOutError, and nothing can be added to it. The copy appears whole or not at all.
 
     Args:
+        path: The folder or address of the run.
+        out: The folder or address of the copy.
         pictures: Copy frames and videos too.
+        allow_partial: Accept an unfinished run.
         directions: Copy the weights of probes, without which `ProbeResults.direction` raises RunDamagedError.
-        trajectories: Copy what happened step by step, without which only the rule `disc` judges the last step. The
-            copy appears whole or not at all.
+        trajectories: Copy what happened step by step, without which only the rule `disc` judges the last step.
 
     Raises:
         UsageError: If anything lies at `out`.
-        DiskSpaceError: And what `open_run` raises.
+        DiskSpaceError: If the disk of `out` takes no more.
+        ProbeKitError: As `open_run` raises it.
     """
     run, target = open_run(path, allow_partial), locate(out)
     # `root.arrays` has the inputs of recordings besides the streams: states and small pictures are left out too.
@@ -190,7 +193,7 @@ def copy_run(
 
 
 def _copied_keys(run: Run, arrays: Collection[str], pictures: bool, directions: bool) -> Iterator[str]:
-    """The keys of all objects of a copy but its root, in order. arrays: those that are left out."""
+    """Yield the keys of all objects of a copy but its root, in order; `arrays` are those that are left out."""
     commits = {commit.episode: commit for commit in run.commits()}
     objects = (stored.key for stored in stored_objects(run.root, commits, None))
     for key in sorted({*record_keys(run.root, commits, None), *objects} - {RUN_FILE, LEFT_OUT_FILE}):

@@ -26,7 +26,7 @@ SUFFIXES = (".safetensors", ".npz")
 SAE_WEIGHTS, SAE_SETTINGS, DECODER = "sae_weights.safetensors", "cfg.json", "W_dec"
 Space = Literal["raw", "standardised"]
 _SITE_KEYS = ("site", "hook_name")
-"""Where `cfg.json` may name the site: ours, and the one that SAELens writes."""
+"""The keys by which `cfg.json` may name the site: ours, and the one that SAELens writes."""
 
 
 @dataclass(frozen=True)
@@ -34,11 +34,11 @@ class FileDirection:
     """Vectors of a file in the raw space of a site.
 
     Attributes:
-        name: As conditions are called, with a hash of the vectors.
+        name: The name in conditions, which contains a hash of the vectors.
         vectors: (K, D) float64.
-        site: Empty where the file does not say.
-        role: As `site`.
-        weights: As `site`. Hash of those that it was found in.
+        site: The site that the file names; empty where it names none.
+        role: The role of the tokens; empty where the file names none.
+        weights: The hash of the weights that the direction was found in; empty where the file names none.
     """
 
     name: str
@@ -49,7 +49,7 @@ class FileDirection:
 
     @property
     def basis(self) -> NDArray[np.float32]:
-        """Return (K, D) orthonormal rows that span the vectors, by a QR decomposition."""
+        """The orthonormal rows (K, D) that span the vectors, by a QR decomposition."""
         return np.asarray(np.linalg.qr(self.vectors.T)[0].T, np.float32)
 
     def check(self, site: str, width: int, weights: str | None) -> None:
@@ -105,7 +105,13 @@ def read_direction(text: str) -> FileDirection:
 def write_directions(
     path: Path, vectors: Mapping[str, NDArray[Any]], about: Mapping[str, Mapping[str, str]]
 ) -> None:
-    """Write directions as `read_direction` reads them. about: site, role, space and weights by name."""
+    """Write directions as `read_direction` reads them.
+
+    Args:
+        path: A file with an ending of `SUFFIXES`.
+        vectors: (D,) or (K, D) by name; stored as float32.
+        about: The entry of each direction, by name: site, role, space and hash of the weights.
+    """
     check_direction_file(path)
     arrays = {name: np.ascontiguousarray(values, np.float32) for name, values in vectors.items()}
     if path.suffix == ".safetensors":

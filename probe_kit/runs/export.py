@@ -32,7 +32,7 @@ from probe_kit.runs.thumbnails import decode_frames, read_sheet
 from probe_kit.version import __version__
 
 SUMS = "SHA256SUMS"
-"""The hashes of all other files of a folder."""
+"""The file with the hashes of all other files of a folder."""
 
 
 def export_run(
@@ -46,7 +46,7 @@ def export_run(
     dtype: SaeDtype = "bfloat16",
     seed: int = 0,
 ) -> Path:
-    """Write the run at `path` to `out`, whole or not at all, with sha256 of every file; returns `out`.
+    """Write the run at `path` to `out`, whole or not at all, with sha256 of every file, and return `out`.
 
     h5: `<stream>/pooled`, `<stream>/later`, `<stream>/tokens`, and a dataset per column under `episodes`.
     safetensors: the same with a dot, the last two true bfloat16; episodes in the metadata. Axes of both are
@@ -56,15 +56,25 @@ def export_run(
     Three formats hold the vectors that `sites` and `view` choose, see `choose`. parquet: a row per vector with
     episode, group, inference, frame, site, view, role and token. directions: a vector per category, view and site,
     see `write_class_means`; a .safetensors or .npz. sae: a folder with a memory map (N, D) per site in a drawn
-    order, an index, and the scale of every site. Default are all sites, and all pooled views in Parquet, `mean` in
-    matrices.
-
-    Raises UsageError for another format, an option that a format does not have, or a file that exists;
-    UnknownSiteError, MissingExtraError, RunDamagedError, DiskSpaceError.
+    order, an index, and the scale of every site.
 
     Args:
-        dtype: Of `sae` alone.
-        seed: As `dtype`.
+        path: The folder or address of the run.
+        style: The format.
+        out: The file or folder to be written.
+        allow_partial: Accept an unfinished run.
+        sites: Names, beginnings or patterns of sites for the formats of vectors. None: all sites.
+        view: The view for the formats of vectors. None: all pooled views in Parquet and directions, `mean` in
+            matrices.
+        dtype: The numbers of `sae`, which alone has this option.
+        seed: The seed of the order of `sae`, which alone has this option.
+
+    Raises:
+        UsageError: For another format, an option that a format does not have, or a file that exists.
+        UnknownSiteError: For a site or view that is not stored.
+        MissingExtraError: Without a library that the format needs.
+        RunDamagedError: For damaged bytes.
+        DiskSpaceError: If the disk takes no more.
     """
     check_format(style)
     if style not in OF_VECTORS and (sites is not None or view is not None):
@@ -106,7 +116,7 @@ def check_format(style: str) -> None:
 
 
 def _about(run: Run, choices: Sequence[StreamChoice]) -> str:
-    """JSON of what vectors were made of: sites and views, the run's settings, and what it was made with."""
+    """Return as JSON the origin of vectors: sites and views, the run's settings, and what made the run."""
     return json.dumps(
         {
             "probe_kit": __version__,
@@ -136,7 +146,7 @@ def _digest(path: Path) -> str:
 
 
 def _arrays(run: Run) -> Iterator[tuple[str, str, Rows]]:
-    """Stream, kind and rows of every array of the run."""
+    """Yield stream, kind and rows of every array of the run."""
     tokens: tuple[ArrayKind, ...] = ("tokens",) if run.settings["tokens"] == "all" else ()
     for stream in run.streams:
         for kind in (*run.root.vector_kinds, *tokens):
@@ -150,7 +160,7 @@ def _episodes(run: Run) -> dict[str, list[Any]]:
 
 
 def write_h5(run: Run, out: Path) -> None:
-    """A dataset per array, and one per column of the episodes."""
+    """Write a dataset per array, and one per column of the episodes."""
     import h5py  # loads its C library, which only this format needs
 
     with out.open("w+b", buffering=0) as raw:
@@ -180,7 +190,7 @@ def _fill(file: Any, run: Run, safe: "_SafeFile") -> None:
 
 
 class _SafeFile(io.RawIOBase):
-    """A file that tells the HDF5 library of no failed write and keeps the error.
+    """A file that hides failed writes from the HDF5 library and keeps the error.
 
     The library crashes the process when it closes a file that it could not write, as on a full disk.
     """
@@ -230,7 +240,7 @@ class _SafeFile(io.RawIOBase):
 
 
 def write_safetensors(run: Run, out: Path) -> None:
-    """A tensor per array; settings, episodes and names of views in the metadata."""
+    """Write a tensor per array; settings, episodes and names of views are in the metadata."""
     header: dict[str, Any] = {
         "__metadata__": {
             "settings": json.dumps(run.settings),
@@ -252,7 +262,7 @@ def write_safetensors(run: Run, out: Path) -> None:
 
 
 def _write_header(file: BinaryIO, header: dict[str, Any]) -> None:
-    """Length, then JSON padded to eight bytes, as the format wants it."""
+    """Write the length, then JSON padded to eight bytes, as the format requires."""
     text = json.dumps(header).encode()
     text += b" " * (-len(text) % 8)
     file.write(len(text).to_bytes(8, "little") + text)
@@ -263,18 +273,22 @@ def _write_header(file: BinaryIO, header: dict[str, Any]) -> None:
 
 CAMERA = "observation.images.scene"
 EPISODES = "probe_kit_episodes.csv"
-"""In `meta`: a row per episode of the data set with all that the run says of it; lerobot does not read it."""
+"""A file in `meta`: a row per episode of the data set with all that the run says of it; lerobot ignores it."""
 _STATE = [*STATE["tool"], "opening"]
 
 
 @same_scheduling()
 def write_lerobot(run: Run, folder: Path) -> None:
-    """The data set in `folder`: an episode of T steps has T rows, each with what the policy did next.
+    """Write the data set in `folder`: an episode of T steps has T rows, each with what the policy did next.
 
     `observation.state` is the measured tool, x, y, z, roll, pitch, yaw in metres and radians, and the opening of
     the gripper; `action` is the commanded action. The frame behind the last action is left out.
 
-    Raises UsageError for a run without all frames, NoTrajectoryError, MissingExtraError, and RunDamagedError.
+    Raises:
+        UsageError: For a run without all frames.
+        NoTrajectoryError: For a run without trajectories.
+        MissingExtraError: Without a library of the extra `datasets`.
+        RunDamagedError: For damaged bytes.
     """
     for needed in ("datasets", "av"):
         require(needed, "datasets")
@@ -314,10 +328,11 @@ def _features(shape: tuple[int, ...]) -> dict[str, Any]:
 
 
 def _filmed_episodes(run: Run) -> Iterator[tuple[dict[str, Any], SmallFrames]]:
-    """The row and the frames of every episode: one before the first action, one behind each.
+    """Yield the row and the frames of every episode: one before the first action, one behind each.
 
     Raises:
-        UsageError: Before the first if an episode was played without `--frames all`, or its frames were deleted.
+        UsageError: Before the first row, if an episode was played without `--frames all`. Also if its frames were
+            deleted.
     """
     rows = run.episodes.to_dict("records")
     for commit in run.commits():
@@ -334,7 +349,7 @@ def _filmed_episodes(run: Run) -> Iterator[tuple[dict[str, Any], SmallFrames]]:
 
 
 def _control_rate(run: Run) -> float:
-    """Actions per second of the run's scene. Raises UsageError for a run without a scene."""
+    """Return the actions per second of the run's scene. Raises UsageError for a run without a scene."""
     scene = run.settings.get("scene")
     if scene is None:
         raise UsageError(f"{run.location} was not played in a scene")
@@ -347,8 +362,11 @@ def _control_rate(run: Run) -> float:
 def write_class_means(run: Run, choices: Sequence[StreamChoice], file: Path) -> None:
     """Write half the difference of the means of left and right, per category, view and site, of all episodes.
 
-    In raw features, so that a coefficient of 2 goes from one mean to the other. Equal means are left out. Raises
-    UsageError for a run without sides, for views of tokens, and where no means differ.
+    The vectors are in raw features, so that a coefficient of 2 goes from one mean to the other. Equal means are
+    left out.
+
+    Raises:
+        UsageError: For a run without sides, for views of tokens, and where no means differ.
     """
     check_sides(run, "an export of directions")
     episodes = run.episodes
@@ -385,9 +403,9 @@ WHOLE: dict[ExportFormat, Callable[[Run, Path], None]] = {
     "safetensors": write_safetensors,
     LEROBOT: write_lerobot,
 }
-"""Formats that hold all that was stored."""
+"""The formats that hold all that was stored."""
 SAE: ExportFormat = "sae"
 DIRECTIONS: ExportFormat = "directions"
 OF_VECTORS: tuple[ExportFormat, ...] = ("parquet", SAE, DIRECTIONS)
-"""Formats that hold chosen vectors."""
+"""The formats that hold chosen vectors."""
 FORMATS: tuple[ExportFormat, ...] = (*WHOLE, *OF_VECTORS)

@@ -24,13 +24,13 @@ from probe_kit.runs.run import Run
 TOKENS: Final = "tokens"
 """The view that has a vector per token; `tokens:ROLE` has those of one role."""
 POOLED = -1
-"""In place of a token's position."""
+"""The number in place of a token's position for pooled views."""
 _MEAN_OF = "mean:"
 
 
 @dataclass(frozen=True)
 class StreamChoice:
-    """Sites of one stream, and the views of them: pooled ones, or one of tokens."""
+    """The chosen sites of one stream, and their views: pooled ones, or one of tokens."""
 
     stored: StoredStream
     sites: tuple[Site, ...]
@@ -44,12 +44,13 @@ class StreamChoice:
 
 @dataclass(frozen=True)
 class Block:
-    """n vectors of every site of a choice, at one captured inference of one episode.
+    """The n vectors of every site of a choice, at one captured inference of one episode.
 
     Attributes:
         position: The episode's place in `Run.episodes`.
+        inference: The number of the captured inference, from 0.
         tokens: (n,) positions, `POOLED` for pooled views.
-        roles: (n,) of the tokens; empty for `mean` and `last`, whose tokens play several.
+        roles: (n,) roles of the tokens; empty for `mean` and `last`, whose tokens play several.
         values: (S, n, D) float32.
     """
 
@@ -63,15 +64,16 @@ class Block:
 
 
 def choose(run: Run, sites: Sequence[str] | None, view: str | None) -> tuple[StreamChoice, ...]:
-    """The part of a run that is asked for.
+    """Return the part of a run that is asked for. Streams without the view are left out unless they are named.
 
     Args:
+        run: A run with activations.
         sites: Names, their beginnings (`backbone`, `expert.03`) or patterns (`expert.*@9`); None for all.
-        view: A pooled view, `tokens` or `tokens:ROLE`; None for all pooled views. Streams without the view are
-            left out unless they are named.
+        view: A pooled view, `tokens` or `tokens:ROLE`; None for all pooled views.
 
     Raises:
         UnknownSiteError: For a site or view that is not stored.
+        UsageError: If `sites` is empty.
     """
     for pattern in sites or ():
         if not any(_matches(site, [pattern]) for stream in run.streams for site in run.sites(stream)):
@@ -101,7 +103,7 @@ def choose(run: Run, sites: Sequence[str] | None, view: str | None) -> tuple[Str
 
 
 def blocks(run: Run, choices: Sequence[StreamChoice]) -> Iterator[Block]:
-    """All vectors, episode by episode and inference by inference. Raises RunDamagedError for damaged bytes."""
+    """Yield all vectors, episode by episode and inference by inference. Raises RunDamagedError."""
     rows: dict[str, dict[ArrayKind, Rows]] = {}
     for choice in choices:
         kinds: tuple[ArrayKind, ...] = (TOKENS,) if is_tokens(choice.views[0]) else run.root.vector_kinds
@@ -115,7 +117,7 @@ def blocks(run: Run, choices: Sequence[StreamChoice]) -> Iterator[Block]:
 
 
 def count_vectors(run: Run, choice: StreamChoice) -> int:
-    """Vectors of each site, over all views. Reads no activations."""
+    """Count the vectors of each site, over all views. Reads no activations."""
     total = 0
     for commit in run.commits():
         for inference, spans in enumerate(commit.roles):
@@ -133,7 +135,7 @@ def is_tokens(view: str) -> bool:
 
 
 def chosen_tokens(spans: Spans, view: str) -> tuple[NDArray[np.int32], tuple[str, ...]]:
-    """(n,) positions and roles of the tokens of a view, `tokens` or `tokens:ROLE`; padding is in none."""
+    """Return positions (n,) and roles of the tokens of a view, `tokens` or `tokens:ROLE`; padding is in none."""
     wanted_role = view.partition(":")[2]
     tokens = [
         (position, role)
@@ -152,7 +154,7 @@ def _matches(site: Site, patterns: Sequence[str]) -> bool:
 
 
 def _views(run: Run, stream: str, view: str | None) -> tuple[str, ...]:
-    """The views of a stream that are meant; none if it lacks them."""
+    """Return the views of a stream that are asked for; none if it lacks them."""
     pooled = run.views(stream)
     if view is None:
         return pooled
@@ -218,11 +220,11 @@ def _token_blocks(rows: Rows, choice: StreamChoice, position: int, spans: Sequen
 
 
 KEYS = ("episode_id", "item_id", "group_id", "category", "layout", "side_correct", "outcome", "source_episode")
-"""Columns of the episodes that say where a vector is from; a run has some of them."""
+"""The columns of the episodes that say where a vector is from; a run has some of them."""
 NUMBERS = ("source_episode",)
-"""Of these, whole numbers; the others are texts."""
+"""The columns among `KEYS` with whole numbers; the others are texts."""
 ABOUT = "probe_kit"
-"""Key under which a Parquet file holds what it was made of."""
+"""The key under which a Parquet file holds what it was made of."""
 
 
 class Origins:
@@ -241,14 +243,21 @@ class Origins:
 
     @property
     def fields(self) -> list[tuple[str, Any]]:
-        """Names and types of the columns."""
+        """The names and types of the columns."""
         pa = self.pa
         keys = [(name, pa.int64() if name in NUMBERS else pa.string()) for name in self.keys]
         numbers = [("inference", pa.int32()), (self.step, pa.int32())]
         return [*keys, *numbers, ("role", pa.string()), ("token", pa.int32())]
 
     def columns(self, positions: Any, inferences: Any, tokens: Any, roles: Any) -> dict[str, Any]:
-        """The columns of n vectors. positions, inferences, tokens: (n,) as in `Block`. roles: (n,)."""
+        """Return the columns of n vectors, by name.
+
+        Args:
+            positions: (n,) places of the episodes in `Run.episodes`.
+            inferences: (n,) numbers of the captured inferences.
+            tokens: (n,) positions of the tokens, `POOLED` for pooled views.
+            roles: (n,) roles of the tokens.
+        """
         pa = self.pa
         columns = {name: self._cells[name].take(pa.array(positions)) for name in self.keys}
         columns["inference"] = pa.array(inferences, pa.int32())
@@ -269,7 +278,7 @@ class Origins:
 
 
 def write_parquet(run: Run, choices: Sequence[StreamChoice], out: Path, about: str) -> None:
-    """One file; a row group per episode, inference and stream. about: stored as metadata."""
+    """Write one file with a row group per episode, inference and stream; `about` is stored as metadata."""
     pa, pq = require("pyarrow", "export"), require("pyarrow.parquet", "export")
     origins, text = Origins(run), pa.string()
     fields = [*origins.fields, ("site", text), ("view", text), ("vector", pa.list_(pa.float32()))]
@@ -280,7 +289,7 @@ def write_parquet(run: Run, choices: Sequence[StreamChoice], out: Path, about: s
 
 
 def _table(block: Block, origins: Origins, schema: Any) -> Any:
-    """The vectors of a block as rows, site by site."""
+    """Return the vectors of a block as rows, site by site."""
     pa = origins.pa
     sites, count, width = block.values.shape
     rows = np.full(count, block.position), np.full(count, block.inference)
@@ -300,17 +309,28 @@ def _table(block: Block, origins: Origins, schema: Any) -> Any:
 INDEX = "index.parquet"
 SCALES = "scales.json"
 _READ_AT_ONCE, _INDEXED_AT_ONCE = 1 << 12, 1 << 18
-"""Rows of a matrix, and of its index. They bound memory: 4,096 rows of 4,096 float32 are 64 MB."""
+"""The rows of a matrix, and of its index, that are read at once.
+
+They bound memory: 4,096 rows of 4,096 float32 are 64 MB.
+"""
 
 
 def write_sae(
     run: Run, choices: Sequence[StreamChoice], folder: Path, about: str, dtype: SaeDtype, seed: int
 ) -> None:
-    """`<stream>/<site>.npy` (N, D) in one drawn order per stream, `<stream>/index.parquet`, and `scales.json`.
+    """Write `<stream>/<site>.npy` (N, D) in one drawn order per stream, `<stream>/index.parquet`, `scales.json`.
+
+    In `scales.json`, `scale` is the factor by which the mean squared norm of the rows of a site becomes D. Stored
+    rows are not multiplied by it.
 
     Args:
-        dtype: The bits of bfloat16 are stored as uint16, because numpy has no such type. `scale` is the factor by
-            which the mean squared norm of the rows of a site becomes D; stored rows are not multiplied by it.
+        run: The run that holds the vectors.
+        choices: The sites, and one view per stream.
+        folder: A folder that does not exist yet.
+        about: The origin of the vectors as a JSON object, which becomes an entry of `scales.json`.
+        dtype: The numbers of the matrices. The bits of bfloat16 are stored as uint16, because numpy has no such
+            type.
+        seed: The seed of the drawn orders.
 
     Raises:
         UsageError: For a value that float16 cannot hold.
@@ -335,10 +355,18 @@ def write_sae(
 def _write_matrices(
     run: Run, choice: StreamChoice, folder: Path, dtype: np.dtype[Any], order: NDArray[np.intp]
 ) -> tuple[NDArray[np.int32], list[str], dict[Site, Path]]:
-    """Fill a file per site in one pass over the run. order: (N,) row of every vector.
+    """Fill a file per site in one pass over the run.
+
+    Args:
+        run: The run that holds the vectors.
+        choice: The sites and views of one stream.
+        folder: The folder of the stream.
+        dtype: The stored type, float16 or uint16.
+        order: (N,) row of every vector.
 
     Returns:
-        (4, N) position, inference, token and role of every row, as in `Block`, names of the roles, and files.
+        Rows (4, N) of position, inference, token and role, as in `Block`; the names of the roles; the files by
+        site.
     """
     count = count_vectors(run, choice)
     files = {site: folder / f"{site}.npy" for site in choice.sites}
@@ -366,7 +394,7 @@ def _write_matrices(
 
 
 def _reserve(file: Path) -> None:
-    """Give a file its blocks now: on a full disk, writing into a mapped file would end the process by SIGBUS."""
+    """Allocate the blocks of a file: on a full disk, writing into a mapped one would end the process by SIGBUS."""
     reserve = getattr(os, "posix_fallocate", None)
     if reserve is not None:
         with file.open("r+b") as opened:
@@ -385,7 +413,7 @@ def _as_stored(values: NDArray[np.float32], dtype: np.dtype[Any], site: Site, ru
 
 
 def _scale(file: Path) -> dict[str, float]:
-    """The mean squared norm of stored rows, and the factor that makes it D."""
+    """Return the mean squared norm of stored rows, and the factor by which it becomes D."""
     stored = np.load(file, mmap_mode="r")
     total = 0.0
     for start in range(0, len(stored), _READ_AT_ONCE):
@@ -397,7 +425,7 @@ def _scale(file: Path) -> dict[str, float]:
 
 
 def _write_index(run: Run, rows: NDArray[np.int32], roles: list[str], out: Path) -> None:
-    """Row i of the index is of row i of every matrix of the stream."""
+    """Write the index, whose row i describes row i of every matrix of the stream."""
     pa, pq = require("pyarrow", "export"), require("pyarrow.parquet", "export")
     origins, names = Origins(run), np.array(roles)
     schema = pa.schema(origins.fields)

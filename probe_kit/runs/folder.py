@@ -22,15 +22,18 @@ from probe_kit.runs.layout import COLUMNS, DATA, RUN_FILE
 MOST_RECORD_BYTES, MOST_OBJECT_BYTES = 256 << 20, 4 << 30
 """The largest record, and the largest other object, that is read at once.
 
-Far above what runs have. They keep a file that was made up, such as a sparse one, from taking all memory.
+Both are far above what runs have. They keep a file that was made up, such as a sparse one, from taking all memory.
 """
 
 
 def check_size(key: str, size: int, where: object, most: int | None = None) -> None:
-    """Raise RunDamagedError, before it is read, for an object that is larger than any that probe_kit writes.
+    """Raise RunDamagedError for an object, before it is read, that is larger than any that probe_kit writes.
 
     Args:
-        most: Bytes that it may have, where that is known.
+        key: The object's key in the run.
+        size: The object's size in bytes.
+        where: The run, for the message.
+        most: The most bytes that it may have, where that is known. None: the limit of its kind of object.
     """
     if most is None:
         most = MOST_RECORD_BYTES if key.endswith(".json") else MOST_OBJECT_BYTES
@@ -42,19 +45,19 @@ def check_size(key: str, size: int, where: object, most: int | None = None) -> N
 
 
 DRAFT = ".tmp"
-"""Ending of an object without its final name yet."""
+"""The ending of an object without its final name yet."""
 _DRAFTS = ("*.tmp", "*/*.tmp", f"{DATA}/**/*.tmp", f"{COLUMNS}/**/*.tmp")
-"""Patterns of what a killed process leaves: objects without their final name."""
+"""The patterns of what a killed process leaves: objects without their final name."""
 _PIECE = 1 << 20
-"""Bytes that are hashed at a time: they stay in the processor's cache."""
+"""The bytes that are hashed at a time: they stay in the processor's cache."""
 _TRIES = 5
-"""Times that a file is written whose folder another process clears or removes meanwhile."""
+"""The times that a file is written whose folder another process clears or removes meanwhile."""
 _FLUSHERS = 16
-"""Files that are flushed at once, so that the file system writes its journal once for many."""
+"""The files that are flushed at once, so that the file system writes its journal once for many."""
 
 
 class Folder:
-    """A folder on a file system that knows hard links and `flock`. `str()` gives what the user called it.
+    """A folder on a file system with hard links and `flock`; `str()` returns the path as the user typed it.
 
     Its methods are the contract of a location, which `store.Bucket` keeps too.
     """
@@ -67,12 +70,12 @@ class Folder:
 
     @property
     def name(self) -> str:
-        """The last part: what the run is called."""
+        """The last part of the path: the name of the run."""
         return self._path.resolve().name
 
     @property
     def path(self) -> Path:
-        """The folder as the user typed it. Raises UsageError in an object store, where there is none."""
+        """The folder as the user typed it. An object store has none and raises UsageError."""
         return self._path
 
     @property
@@ -81,19 +84,21 @@ class Folder:
         return str(self._path.resolve())
 
     def path_of_export(self, name: str) -> Path:
-        """Default path of a file that is made from the run: next to the folder."""
+        """Return the default path of a file that is made from the run: next to the folder."""
         return self._path.resolve().parent / name if self._path.name in ("", "..") else self._path.with_name(name)
 
     def free_bytes(self) -> int:
-        """Return the free space of the disk where the folder lies or will lie; None where it has no bound."""
+        """Return the free bytes of the disk where the folder lies or will lie; None where there is no bound."""
         existing = next(p for p in (self._path, *self._path.resolve().parents) if p.exists())
         return shutil.disk_usage(existing).free
 
     @contextmanager
     def explained_errors(self) -> Iterator[None]:
-        """Errors in the body that come from what is below (a full disk, a network) say what to do.
+        """Replace errors of the layer below (a full disk, a network) in the body by errors that say what to do.
 
-        Raises DiskSpaceError or StoreError in place of the system's error.
+        Raises:
+            DiskSpaceError: In place of the system's error, if the disk takes no more.
+            StoreError: In place of the error of an object store.
         """
         try:
             yield
@@ -113,7 +118,7 @@ class Folder:
         return _inside(key) and (self._path / key).is_file()
 
     def read(self, key: str, part: slice | None = None, most: int | None = None) -> bytes:
-        """All of one object, or a part of its bytes. most: see `check_size`. Raises FileNotFoundError."""
+        """Return one object, or a part of its bytes; `check_size` explains `most`. Raises FileNotFoundError."""
         path = self._object(key)
         if part is None:
             check_size(key, path.stat().st_size, self, most)
@@ -123,9 +128,10 @@ class Folder:
             return file.read(part.stop - part.start)
 
     def pieces(self, key: str) -> Iterator[memoryview]:
-        """One object from its beginning to its end; a piece is good until the next one is asked for.
+        """Yield one object from its beginning to its end; a piece is valid until the next one is asked for.
 
-        Raises FileNotFoundError.
+        Raises:
+            FileNotFoundError: If there is no such object.
         """
         buffer = memoryview(bytearray(_PIECE))  # again and again: it stays in the processor's cache
         with self._object(key).open("rb", buffering=0) as file:
@@ -133,11 +139,11 @@ class Folder:
                 yield buffer[:length]
 
     def open(self, key: str) -> BinaryIO:
-        """One object as a file with random access. Raises FileNotFoundError."""
+        """Open one object as a file with random access. Raises FileNotFoundError."""
         return self._object(key).open("rb")
 
     def read_all(self, folder: str, suffix: str) -> dict[str, bytes]:
-        """The objects right in `folder` whose name ends so, by name, in order."""
+        """Return the objects directly in `folder` whose name ends in `suffix`, by name, in order."""
         contents = {}
         for path in sorted((self._path / folder).glob(f"*{suffix}")):
             with suppress(FileNotFoundError):  # no plain file, or removed since: seals and failures come and go
@@ -145,12 +151,12 @@ class Folder:
         return contents
 
     def keys(self, folder: str) -> list[str]:
-        """The objects anywhere below `folder`, in order."""
+        """Return the keys of the objects anywhere below `folder`, in order."""
         below = (self._path / folder).rglob("*")
         return sorted(path.relative_to(self._path).as_posix() for path in below if path.is_file())
 
     def sizes(self, folder: str, keys: Iterable[str]) -> dict[str, int]:
-        """Bytes of the objects `keys` below `folder`, as far as they exist."""
+        """Return the bytes of the objects `keys` below `folder`, as far as they exist."""
         paths = {key: self._path / folder / key for key in keys if _inside(key)}
         return {key: path.stat().st_size for key, path in paths.items() if path.is_file()}
 
@@ -160,7 +166,10 @@ class Folder:
             list(threads.map(_flush, [self._path / key for key in keys]))
 
     def create(self, key: str, content: bytes) -> bool:
-        """Write an object unless it exists; True if this call wrote it. Complete or not at all, and durable."""
+        """Write an object unless it exists; return whether this call wrote it.
+
+        The object is complete or absent, and durable.
+        """
         try:
             self._put(key, content, os.link)  # which only one process can
         except FileExistsError:
@@ -196,9 +205,9 @@ class Folder:
         shutil.rmtree(self._path / folder, ignore_errors=True)
 
     def _object(self, key: str) -> Path:
-        """The path of an object. Raises FileNotFoundError for what is no plain file, or not in the folder.
+        """Return the path of an object. Raises FileNotFoundError for what is no plain file, or not in the folder.
 
-        Records of others may name a device, a pipe, which never ends, or a file outside the run.
+        Foreign records may name a device, a pipe, which never ends, or a file outside the run.
         """
         path = self._path / key
         if not (_inside(key) and path.is_file()):
@@ -206,7 +215,7 @@ class Folder:
         return path
 
     def _inner(self, key: str) -> Path:
-        """The path to write or remove. Raises RunDamagedError for a key that leads out of the folder."""
+        """Return the path to write or remove. Raises RunDamagedError for a key that leads out of the folder."""
         if not _inside(key):
             raise RunDamagedError(
                 f"{self}: a record of this run names {key!r}, which leads out of its folder; probe_kit writes no "
@@ -218,10 +227,11 @@ class Folder:
 
     @contextmanager
     def locked(self, clear: Callable[[], None]) -> Iterator[None]:
-        """Lock the run while the body runs. A process that is alone first calls `clear` to remove leftovers.
+        """Lock the run while the body runs.
 
-        Every process that works holds a shared lock, as an apparent leftover may be another process's work. The
-        last one to finish removes what others left that were killed meanwhile.
+        A process that is alone first calls `clear` to remove leftovers. Every process that works holds a shared
+        lock, as an apparent leftover may be another process's work. The last one to finish removes what others
+        left that were killed meanwhile.
         """
         with (self._path / RUN_FILE).open("rb") as file:
             if _alone(file):
@@ -259,7 +269,7 @@ def _inside(key: str) -> bool:
 
 
 def _alone(file: IO[bytes]) -> bool:
-    """Hold the lock alone, if no other process holds it."""
+    """Lock the file exclusively if no other process holds a lock on it, and return whether it is locked so."""
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -277,7 +287,7 @@ def _flush(path: Path) -> None:
 
 @contextmanager
 def _draft(path: Path, content: bytes, durable: bool = True) -> Iterator[Path]:
-    """A file of this content in the folder of `path`, already on the disk if durable; gone afterwards."""
+    """Yield a file of this content in the folder of `path`, already on the disk if durable; gone afterwards."""
     draft = path.with_name(f"{secrets.token_hex(8)}.tmp")
     # Who may read a run is a matter of the umask; tempfile would keep it from the others of a group.
     handle = os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)

@@ -33,24 +33,24 @@ from pydantic.dataclasses import dataclass
 from probe_kit.hooks.contract.sites import QUANTITIES, Part, Site, Stream
 
 SCHEMA_VERSION = 6
-"""The only one that is written and read."""
+"""The only schema version that is written and read."""
 TOKEN_BLOCK = 128
-"""Tokens per inner chunk, the least that one role of one layer is read by; stored tokens are padded to it."""
+"""The tokens per inner chunk, the least that one role of one layer is read by; stored tokens are padded to it."""
 RUN_FILE, PLANS, CERTIFICATE_FILE = "run.json", "plan", "certificate.json"
 LABEL_FILE, TIMES, LEFT_OUT_FILE = "label.json", "times", "left-out.json"
 COMMITS, FAILED, DATA, COLUMNS, VIDEOS = "commits", "failed", "data.zarr", "columns.zarr", "videos"
 FRAMES, CERTIFICATES, SEALED, PROBES, PROVENANCE = "frames", "certificates", "sealed", "probes", "provenance"
 PROBE_DIRECTIONS = "directions.npz"
-"""Of the files of a probe result, the weights: nine tenths of its bytes."""
+"""The file of a probe result with the weights: nine tenths of its bytes."""
 INTERVENTIONS, DIAGNOSES = "interventions", "diagnoses"
 TRAJECTORY, TRAJECTORY_AXES = "trajectory", 3
 """The array of what happened in episodes, beside those of streams; an episode that did not act has no object."""
 FIRST_FRAME = "first_frame_sha256"
-"""The column of episodes by which runs are known to have begun with the same pictures."""
+"""The column of episodes that shows whether runs began with the same pictures."""
 TRUTHS = "truth"
-"""Among the names of inputs: columns that are truth values."""
+"""An entry of the names of inputs: the columns that are truth values."""
 CLASSES = "classes."
-"""Among the names of inputs, in front of a column's name: the texts whose positions the column holds."""
+"""A prefix of a column's name among the names of inputs: the entry has the texts that the column indexes."""
 INPUTS = "inputs"
 """The group of arrays that hold what a run on recordings showed: state, actions, small pictures."""
 ILLUSTRATIONS = (FRAMES, VIDEOS)
@@ -59,40 +59,43 @@ Codec = Literal["zstd", "fast", "none"]
 CODECS: tuple[Codec, ...] = get_args(Codec)
 Tokens = Literal["pooled", "all"]
 AskTokens = Literal["none", "pooled", "all"]
-"""What is stored of the streams: nothing, the pooled views, or these and every token."""
+"""The stored part of the streams: nothing, the pooled views, or these and every token."""
 LaterViews = Literal["all", "mean"]
-"""Pooled views that are stored of the inferences after the first."""
+"""The pooled views that are stored of the inferences after the first."""
 MEAN_VIEW, LATER = "mean", "later"
 """The view that later inferences keep with `mean`, and the array that holds it."""
 VectorKind = Literal["pooled", "later"]
 ArrayKind = Literal["pooled", "later", "tokens"]
-"""Arrays of a stream: those with a vector per view, and all."""
+"""The arrays of a stream: those with a vector per view, and all."""
 VideoChoice = Literal["none", "first", "all"]
-"""Episodes of which a GIF is stored."""
+"""The episodes of which a GIF is stored."""
 FrameChoice = Literal["ends", "all", "none"]
-"""Frames of an episode of which a small copy is stored."""
+"""The frames of an episode of which a small copy is stored."""
 FRAME_COLUMNS = 8
-"""Frames to a row of the picture that holds them."""
+"""The frames in a row of the picture that holds them."""
 MOST_FRAMES = FRAME_COLUMNS * 68
-"""In one picture: a WebP may not exceed 16,383 pixels a side, and a frame of a film is 240 high."""
+"""The most frames in one picture: a WebP has at most 16,383 pixels a side, and a frame of a film is 240 high."""
 ExportFormat = Literal["h5", "safetensors", "lerobot", "parquet", "sae", "directions"]
 DIRECTION_FILES: dict[ExportFormat, str] = {"directions": "directions.safetensors"}
-"""Endings of exports that are not called as their format."""
+"""The default file names of exports whose ending is not the name of their format."""
 SaeDtype = Literal["bfloat16", "float16"]
 """The numbers in a memory map to train sparse autoencoders on."""
 ONCE, AT_END = "success_once", "success_at_end"
-"""Columns of episodes: whether `success` was true after any action, and after the last one."""
+"""The columns of episodes with whether `success` was true after any action, and after the last one."""
 CAPTURE_ONLY = "capture_only"
-"""Outcome of an episode whose model was captured and did not act: there is no success rate."""
+"""The outcome of an episode whose model was captured and did not act: there is no success rate."""
 DATASET = "dataset"
 """The part of a run's settings that says which recordings it was made of; scene runs have `suite` and `scene`."""
 
 ENVIRONMENT = "environment"
-"""The same of a run in an environment of the user's own."""
+"""The part of a run's settings that says in which environment of the user's own it was played."""
 RECORDED_EPISODES = "recorded_episodes"
-"""How many episodes the data set of a run has, among `recording` of its settings."""
+"""The entry of `recording` in the settings with the number of episodes of the run's data set."""
 OTHER_ACTIONS = "other_actions"
-"""Of a selection of recordings: why predicted and recorded actions are not compared; None where they are."""
+"""The entry of a selection of recordings that says why predicted and recorded actions are not compared.
+
+It is None where they are compared.
+"""
 
 
 def stored_inputs_of(settings: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -115,10 +118,10 @@ _Names = Annotated[tuple[str, ...], AfterValidator(check_distinct)]
 
 @dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class StoredStream:
-    """The storage of one stream, also as `run.json` has it.
+    """The storage of one stream, also as `run.json` holds it.
 
     Attributes:
-        tokens: Sequence length T as the model packs it.
+        tokens: The sequence length T as the model packs it.
         views: The pooled views V, in storage order.
     """
 
@@ -136,7 +139,7 @@ class StoredStream:
 
     @classmethod
     def of(cls, stream: Stream, tokens: int, views: tuple[str, ...]) -> "StoredStream":
-        """A declared stream, stored."""
+        """Return the storage of a declared stream."""
         declared = {part.name: getattr(stream, part.name) for part in fields(Stream) if part.init}
         declared.pop("heads")  # which is not stored
         return cls(**declared, tokens=tokens, views=views)
@@ -150,37 +153,37 @@ class StoredStream:
 
     @property
     def lead(self) -> tuple[int, ...]:
-        """Axes before the token or view axis: (L,) or (I, L)."""
+        """The axes before the token or view axis: (L,) or (I, L)."""
         return (self.layers,) if self.iterations is None else (self.iterations, self.layers)
 
     @property
     def dimensions(self) -> tuple[str, ...]:
-        """Names of `lead`."""
+        """The names of the axes `lead`."""
         return ("layer",) if self.iterations is None else ("iteration", "layer")
 
     @property
     def token_block(self) -> int:
-        """Tokens per inner chunk."""
+        """The tokens per inner chunk."""
         return min(TOKEN_BLOCK, self.tokens)
 
     @property
     def stored_tokens(self) -> int:
-        """T rounded up to whole blocks; the rest is zeros."""
+        """The sequence length T rounded up to whole blocks; tokens beyond T are zeros."""
         return -(-self.tokens // self.token_block) * self.token_block
 
     def at(self, site: Site) -> tuple[int, ...]:
-        """Index of `site` in the lead axes."""
+        """Return the index of `site` in the lead axes."""
         return (site.layer,) if site.iteration is None else (site.iteration, site.layer)
 
     def arrays(self, with_tokens: bool, later_views: str = "all") -> dict[str, int]:
-        """Number of axes of every array in `data.zarr` that holds this stream."""
+        """Return the number of axes of every array in `data.zarr` that holds this stream."""
         axes = 2 + len(self.lead) + 2  # episode and call before, token or view and feature behind
         kinds = {"pooled": axes, **({"tokens": axes} if with_tokens else {})}
         later = {LATER: axes - 1} if later_views == MEAN_VIEW else {}
         return {f"{self.name}/{kind}": count for kind, count in (kinds | later).items()}
 
     def raw_bytes(self, with_tokens: bool, calls: int = 1, later_views: LaterViews = "all") -> int:
-        """Uncompressed bytes of the captured inferences of an episode."""
+        """Return the uncompressed bytes of the captured inferences of an episode."""
         cells = int(np.prod(self.lead)) * self.width
         per_call = cells * len(self.views) * 4 + (cells * self.tokens * 2 if with_tokens else 0)
         return per_call * calls if later_views == "all" else per_call + cells * 2 * (calls - 1)

@@ -32,16 +32,16 @@ _NUMBER, _CONTENT = "episode", "content_blake2b"
 
 @dataclass(frozen=True)
 class Row:
-    """One row of a plan, whatever its source: an episode of a scene, a stretch of a recording, a picture.
+    """A row of a plan, whatever its source: an episode of a scene, a stretch of a recording, a picture.
 
     Attributes:
         index: Its number in the run, where its objects lie. In a run that grew, numbers are not in the plan's
             order.
         columns: The row as flat columns, of which every source has `episode_id`, `item_id`, `category`,
             `group_id`, `instruction` and `policy_seed`.
-        content: What the source's player plays.
-        frames: Recorded frames that the inferences see; None where every inference sees what the actions before it
-            led to.
+        content: The content that the source's player plays.
+        frames: Recorded frames that the inferences see. None: every inference sees the result of the actions
+            before it.
     """
 
     index: int
@@ -51,12 +51,12 @@ class Row:
 
     @property
     def episode_id(self) -> str:
-        """Its id, the same in every selection."""
+        """The row's id, the same in every selection."""
         return str(self.columns["episode_id"])
 
     @property
     def category(self) -> str:
-        """The category that tables group it by."""
+        """The category by which tables group the row."""
         return str(self.columns["category"])
 
     @property
@@ -70,15 +70,15 @@ class Row:
         return int(self.columns["policy_seed"])
 
     def control_step(self, call: int, executed: int) -> int:
-        """The step that inference `call` sees: a recorded frame, or as many actions as were executed before."""
+        """Return the step that inference `call` sees: a recorded frame, or the actions executed before it."""
         return executed if self.frames is None else self.frames[call]
 
     def noise_of(self, call: int) -> int:
-        """The number that the seed of inference `call` is derived from, whichever other frames were chosen."""
+        """Return the number from which the seed of inference `call` derives, whatever other frames were chosen."""
         return call if self.frames is None else self.frames[call]
 
     def to_json(self) -> dict[str, Any]:
-        """The row as flat columns."""
+        """Return the row as flat columns, with its number."""
         return {_NUMBER: self.index, **self.columns}
 
 
@@ -87,12 +87,12 @@ class Plan:
     """All rows of a run in order, and how their streams are stored.
 
     Attributes:
-        bytes: Of their activations.
+        bytes: The bytes of their activations.
         identity: The part of a run's identity that says where observations come from.
-        selection: What was selected, as it stands among a run's settings; no part of its identity.
-        name_parts: What the default name of a run depends on beside its identity.
-        suite_parent: Of a suite that was selected of another one, the hash of that.
-        decoder: What makes pictures of stored videos here, with its version.
+        selection: The selected items as they stand among a run's settings; no part of its identity.
+        name_parts: The values beside its identity on which the default name of a run depends.
+        suite_parent: The content hash of the suite that a suite was selected from; None for a whole suite.
+        decoder: The decoder of stored videos on this machine, with its version; None without videos.
     """
 
     episodes: tuple[Row, ...]
@@ -110,17 +110,17 @@ class Plan:
         return [row.to_json() for row in self.episodes]
 
     def numbered(self, numbers: Mapping[str, int]) -> Self:
-        """The same rows, in the same order, with the numbers that a run has for their ids."""
+        """Return the same rows, in the same order, with the numbers that a run has for their ids."""
         rows = tuple(replace(row, index=numbers[row.episode_id]) for row in self.episodes)
         return replace(self, episodes=rows)
 
     def only(self, episodes: Iterable[Row]) -> Self:
-        """A plan of these rows alone, with their share of the bytes."""
+        """Return a plan of these rows alone, with their share of the bytes."""
         rows = tuple(episodes)
         return replace(self, episodes=rows, bytes=self.bytes * len(rows) // max(1, len(self.episodes)))
 
     def episode(self, number: int) -> Row:
-        """The row that has this number. Raises KeyError."""
+        """Return the row that has this number. Raises KeyError."""
         return self._by_number[number]
 
     @cached_property
@@ -129,7 +129,7 @@ class Plan:
 
     @property
     def sites(self) -> int:
-        """Number of captured sites per inference."""
+        """The number of captured sites per inference."""
         return sum(len(stream.stream.sites()) for stream in self.streams)
 
 
@@ -198,7 +198,12 @@ class StoredRow(TypedDict):
 
 
 class PlanRecord(Record):
-    """One selection. tokens: T by stream, where pooled views alone are stored. order: of all episodes so far."""
+    """The record of one selection.
+
+    Attributes:
+        tokens: The sequence length T by stream, where pooled views alone are stored.
+        order: The numbers of all episodes so far, in the plan's order.
+    """
 
     kind: ClassVar[str] = "plan"
     run: str
@@ -216,10 +221,11 @@ class StoredPlan:
 
     Attributes:
         rows: The episodes in order.
-        selection: Of the newest record, see `PlanRecord`. extents: planned episodes after each record.
-        suite_parent: As `selection`.
-        tokens: As `selection`.
-        hashes: Of the records, which the commits of their episodes name.
+        selection: The selection of the newest record.
+        suite_parent: The suite's parent in the newest record, see `Plan`.
+        tokens: The sequence length T by stream in the newest record, see `PlanRecord`.
+        extents: The number of planned episodes after each record.
+        hashes: The hashes of the records, which the commits of their episodes name.
     """
 
     rows: Sequence[RowColumns] = ()
@@ -230,12 +236,12 @@ class StoredPlan:
     hashes: tuple[str, ...] = ()
 
     def hash_of(self, number: int) -> str:
-        """Hash of the record that added the episode of this number."""
+        """Return the hash of the record that added the episode of this number."""
         return self.hashes[bisect_right(self.extents, number)]
 
 
 def plan_key(record: int) -> str:
-    """The key of the plan record of this number; 0 is the first selection."""
+    """Return the key of the plan record of this number; 0 is the first selection."""
     return f"{PLANS}/{record:08d}.json"
 
 
@@ -245,11 +251,12 @@ def count_plans(location: Location) -> int:
 
 
 def read_plans(location: Location, run: str, columns: Iterable[str]) -> StoredPlan:
-    """All plan records together; without any rows for a run that has none yet.
+    """Return all plan records together; without any rows for a run that has none yet.
 
     Args:
-        run: Its identity.
-        columns: Those that every row has.
+        location: The run.
+        run: The identity of the run.
+        columns: The columns that every row has.
 
     Raises:
         RunDamagedError: If a record is missing, was changed, or belongs elsewhere.
@@ -278,7 +285,7 @@ def read_plans(location: Location, run: str, columns: Iterable[str]) -> StoredPl
 def _check_rows(
     record: PlanRecord, before: int, by_number: Mapping[int, RowColumns], columns: Iterable[str], name: str
 ) -> None:
-    """Raise RunDamagedError unless new rows have all columns and numbers from `before` on, and all a place."""
+    """Raise RunDamagedError unless new rows have all columns, and numbers from `before` on without a gap."""
     if lacking := [column for row in record.episodes for column in columns if column not in row]:
         raise RunDamagedError(f"{name} has an episode without {lacking[0]}. {RESTORE}")
     numbers = [row["episode"] for row in record.episodes]
@@ -289,9 +296,9 @@ def _check_rows(
 
 
 def while_growing[Result](location: Location, read: Callable[[], Result]) -> Result:
-    """The result of `read`, called again if the run grew meanwhile: parts of two states do not fit together.
+    """Return the result of `read`, which is called again if the run grew meanwhile; errors are those of `read`.
 
-    Raises what `read` raises.
+    The parts of two states do not fit together.
     """
     while True:
         before = count_plans(location)
@@ -308,7 +315,7 @@ def while_growing[Result](location: Location, read: Callable[[], Result]) -> Res
 def further_rows(
     stored: Sequence[RowColumns], requested: Sequence[RowColumns], location: Location
 ) -> list[RowColumns]:
-    """The rows of a plan that the stored one lacks; none if the stored one holds them all.
+    """Return the rows of a plan that the stored one lacks; none if the stored one holds them all.
 
     Raises:
         SettingsMismatchError: If both plan one episode differently, or if each has some that the other lacks.
@@ -346,7 +353,7 @@ def _check_equal(was: RowColumns, now: RowColumns, location: Location) -> None:
 
 
 def _counted(rows: Sequence[RowColumns]) -> str:
-    """Items by category, and the wordings they are asked in."""
+    """Return the number of items by category in words, and the wordings they are asked in."""
     items = {row["item_id"]: row["category"] for row in rows}
     counts = ", ".join(f"{name} {count}" for name, count in sorted(Counter(items.values()).items()))
     wordings = ", ".join(dict.fromkeys(row["wording"] for row in rows if "wording" in row))

@@ -35,7 +35,7 @@ DECISIVE = (
     "decoder",
     *(f"versions.{name}" for name in ("probe-kit", *_LIBRARIES[:3], "pybullet")),  # torch, lerobot, transformers
 )
-"""What changes numbers. Cores, workers and threads, the interpreter and the writer's libraries do not."""
+"""The parts that change numbers. Cores, workers and threads, the interpreter and the writer's libraries do not."""
 
 
 def provenance_here(device: str = "cpu", dtype: str | None = None) -> dict[str, Any]:
@@ -53,7 +53,7 @@ def provenance_here(device: str = "cpu", dtype: str | None = None) -> dict[str, 
 
 
 def _gpu_name(device: str) -> str | None:
-    """None where the GPUs are elsewhere: the planning process has none, and each worker names its own."""
+    """Return the GPU's name; None in a planning process without a GPU, whose workers name their own."""
     import torch
 
     return torch.cuda.get_device_name(device) if torch.cuda.is_available() else None
@@ -68,7 +68,7 @@ def _version(library: str) -> str | None:
 
 @cache
 def code_sha256() -> str:
-    """Hash of probe_kit's own source files."""
+    """Return the hash of probe_kit's own source files."""
     root = Path(probe_kit.version.__file__).parent
     files = sorted(root.rglob("*.py"))
     return sha256_json(
@@ -86,18 +86,18 @@ class ProvenanceRecord(Record):
 
 
 def name_of(provenance: Provenance) -> str:
-    """The name by which commits refer to it."""
+    """Return the name by which commits refer to a provenance."""
     return sha256_json(provenance)[:NAME_DIGITS]
 
 
 def keep_provenance(location: Location, provenance: Provenance) -> None:
-    """Store it in the run, unless another process did."""
+    """Store a provenance in the run, unless another process did."""
     record = ProvenanceRecord.model_validate(dict(provenance))
     location.create(f"{PROVENANCE}/{name_of(provenance)}.json", record.to_bytes())
 
 
 def read_provenances(root: Root) -> dict[str, Provenance]:
-    """Every provenance of a run by its name. Raises RunDamagedError for one of another content."""
+    """Return every provenance of a run by its name. Raises RunDamagedError for one of another content."""
     provenances: dict[str, Provenance] = {}
     for name, key, raw in named_by_hash(root.location, PROVENANCE):
         where = f"{root.location}/{key}"
@@ -118,7 +118,7 @@ def check_provenances(stored: Mapping[str, Provenance], names: Iterable[str], lo
 
 
 def differences(provenances: Iterable[Provenance]) -> tuple[str, ...]:
-    """The decisive parts that are not the same in all of them, such as `versions.torch`."""
+    """Return the decisive parts that are not the same in all provenances, such as `versions.torch`."""
     decisive = [_decisive(provenance) for provenance in provenances]
     return tuple(part for part in DECISIVE if len({parts[part] for parts in decisive}) > 1)
 
@@ -129,7 +129,7 @@ def _decisive(provenance: Provenance) -> dict[str, Any]:
 
 
 def check_other_provenance(stored: Iterable[Provenance], current: Provenance, where: str) -> None:
-    """Raise SettingsMismatchError naming what differs here from what made the episodes of a run so far."""
+    """Raise SettingsMismatchError naming the decisive parts here that differ from those of stored episodes."""
     for former in stored:
         if different := differences([former, current]):
             was, now = _decisive(former), _decisive(current)
@@ -147,11 +147,15 @@ def check_other_provenance(stored: Iterable[Provenance], current: Provenance, wh
 
 
 INPUT_CHECK = "input_check"
-"""Entry of a certificate: by input, the last thing that changed with it at the first inference of a process."""
+"""An entry of a certificate: by input, the last thing that changed with it at the first inference of a process."""
 
 
 class Certificate(Record):
-    """The record of one process. provenance: name of its record in `provenance/`."""
+    """The record of one process.
+
+    Attributes:
+        provenance: The name of its provenance in `provenance/`.
+    """
 
     model_config = ConfigDict(extra="allow")
     kind: ClassVar[str] = "certificate"
@@ -189,7 +193,7 @@ def write_certificate(root: Root, parts: Mapping[str, Any], provenance: Provenan
 
 
 def read_certificate(root: Root) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-    """Contents of the first process's record, and of the records of all.
+    """Return the content of the first process's record, and those of the records of all processes.
 
     Raises:
         RunDamagedError: If one is missing, was changed, or is another run's.
@@ -212,13 +216,13 @@ def read_certificate(root: Root) -> tuple[dict[str, Any], list[dict[str, Any]]]:
 
 
 def _repeats(first: dict[str, Any], record: dict[str, Any]) -> bool:
-    """Whether the certificate is this process's record, and the provenance that the record names."""
+    """Whether the certificate is this process's record with the provenance that the record names."""
     provenance = {part: value for part, value in first.items() if part not in record}
     same = all(first.get(part) == value for part, value in record.items())
     return same and name_of(provenance) == record["provenance"]
 
 
 def certificate_keys(location: Location) -> list[str]:
-    """Keys of all certificates."""
+    """Return the keys of all certificates."""
     records = [key for key in location.keys(CERTIFICATES) if is_hash_name(key.rpartition("/")[2])]
     return [CERTIFICATE_FILE, *records]

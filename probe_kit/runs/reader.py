@@ -1,4 +1,4 @@
-"""`RunReader`: a run, stored or in memory, as probes, tables and interventions take it; and its checks."""
+"""`RunReader`, a run, stored or in memory, as probes, tables and interventions read it; and its checks."""
 
 from typing import TYPE_CHECKING
 
@@ -21,7 +21,7 @@ SIDE = "side_correct"
 
 
 type RunReader = Run | ArrayRun
-"""A finished or growing run, as `open_run` gives it, or one of arrays in memory: what probes and tables read."""
+"""A finished or growing run from `open_run`, or one of arrays in memory: what probes and tables read."""
 
 
 # -- checks ------------------------------------------------------------------------------------------------------
@@ -33,12 +33,12 @@ def full_name(label: str, random_weights: bool, captured_only: bool = False) -> 
 
 
 def origin_of(run: RunReader) -> Origin:
-    """Return files and choices that the run was made of; none where it does not say."""
+    """Return files and choices that the run was made of; an empty origin where none is recorded."""
     return run.origins[0] if run.origins else Origin()
 
 
 def check_sides(run: RunReader, purpose: str) -> None:
-    """Raise UsageError for a run without sides. purpose: what is not possible without them, in a word."""
+    """Raise UsageError for a run without sides; the message says that `purpose` is not possible without them."""
     if SIDE not in run.episodes:
         raise UsageError(
             f"{run.location} has no column {SIDE}: {run.source.words}. There are no sides, so {purpose} is not "
@@ -58,7 +58,7 @@ def check_several_wordings(episodes: "pd.DataFrame") -> None:
 
 
 def check_call(run: RunReader, call: int) -> None:
-    """Raise UsageError if no such inference was captured, and for a run that does not keep them apart."""
+    """Raise UsageError if no such inference was captured, and for a run that does not store them separately."""
     captured = run.captured_calls
     if call and not 0 < call < captured:
         raise UsageError(
@@ -68,5 +68,5 @@ def check_call(run: RunReader, call: int) -> None:
 
 
 def reached_calls(run: RunReader) -> NDArray[np.bool_]:
-    """(E, C) whether an episode has a captured inference."""
+    """Return whether each episode has each captured inference, as a mask (E, C)."""
     return np.stack([run.reached(call) for call in range(run.captured_calls)], axis=1)

@@ -26,20 +26,23 @@ from probe_kit.runs.store import Location
 HASH = "blake2b"
 """The part of a record that holds its hash, named as the hash is computed."""
 DIGEST_BYTES, BLOCK_BYTES = 32, 8
-"""Of a record or object, and of one inner chunk, of which a commit has one per layer and 128 tokens."""
+"""The bytes of the hash of a record or object, and of one inner chunk.
+
+A commit has one hash of a chunk per layer and 128 tokens.
+"""
 _HEX, _BLOCK_HEX = 2 * DIGEST_BYTES, 2 * BLOCK_BYTES
 _HEXADECIMAL = frozenset("0123456789abcdef")
 NAME_DIGITS = 16
-"""Digits of a hash by which a record or a derived folder is called."""
+"""The digits of a hash by which a record or a derived folder is named."""
 _HASH_NAME = re.compile(rf"[0-9a-f]{{{NAME_DIGITS}}}\.json")
 RESTORE = "Restore it from a copy, or extract the run again"
 
 
 class Sum(NamedTuple):
-    """Length in bytes of an object, and the blake2b of them as 64 hex digits.
+    """The length of an object in bytes, and the blake2b of these bytes as 64 hex digits.
 
     Attributes:
-        blocks: Of a shard, 16 hex digits per inner chunk in the order of its index, then those of the index; so
+        blocks: For a shard, 16 hex digits per inner chunk in the order of its index, then those of the index; so
             that a part can be checked without reading the others. Empty for everything else.
     """
 
@@ -57,20 +60,20 @@ class Sum(NamedTuple):
         return list(self) if self.blocks else [self.length, self.digest]
 
     def size_problem(self, size: int | None) -> str | None:
-        """The fault in an object of this size, in words; None if there is none. size: None if it is missing."""
+        """Return the fault in an object of `size` bytes (None if it is missing), in words; None without one."""
         if size is None:
             return "is missing"
         return None if size == self.length else f"has {size} bytes; {self.length} were written"
 
     def problem(self, content: bytes) -> str | None:
-        """The difference between this sum and that of `content`, in words; None if there is none."""
+        """Return the difference between this sum and that of `content`, in words; None if there is none."""
         if problem := self.size_problem(len(content)):
             return problem
         return None if digest(content) == self.digest else "has other bytes than were written"
 
 
 def parse_sum(values: Any) -> Sum:
-    """The sum that `Sum.to_json` stored. Raises ValueError for anything else."""
+    """Return the sum that `Sum.to_json` stored. Raises ValueError for anything else."""
     match values:
         case [int(length), str(known)] | [int(length), str(known), str()] if type(length) is int and length >= 0:
             blocks = "".join(values[2:])
@@ -81,11 +84,11 @@ def parse_sum(values: Any) -> Sum:
 
 
 Sums = dict[str, Annotated[Sum, BeforeValidator(parse_sum), PlainSerializer(Sum.to_json)]]
-"""Length and hash of objects by key, as a record holds them."""
+"""The lengths and hashes of objects by key, as a record holds them."""
 
 
 class Record(BaseModel):
-    """One JSON object of a run. Reading checks type and value of its parts, and refuses unknown ones."""
+    """A JSON object of a run. Reading checks type and value of its parts, and refuses unknown ones."""
 
     # strict: pydantic would otherwise read "3" as 3 and 1 as True.
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True, ser_json_inf_nan="constants")
@@ -104,17 +107,21 @@ class Record(BaseModel):
         return self.model_dump(mode="json", exclude_unset=True)
 
     def to_bytes(self) -> bytes:
-        """The record as it is stored."""
+        """Return the record as it is stored."""
         return as_record(self.content)
 
     @classmethod
     def parse(cls, raw: bytes, name: str, advice: str, /, **expected: object) -> Self:
-        """The record in these bytes. Raises RunDamagedError if it was changed, or belongs elsewhere.
+        """Return the record in these bytes.
 
         Args:
-            name: The place and the remedy, for the message.
-            advice: As `name`.
+            raw: The stored bytes.
+            name: The place of the record, for the message.
+            advice: The remedy, for the message.
             **expected: Values by part, such as the run's identity.
+
+        Raises:
+            RunDamagedError: If the record was changed, or belongs elsewhere.
         """
         content = read_record(raw, name, advice)
         carried = content.pop(HASH)
@@ -134,7 +141,7 @@ class Record(BaseModel):
 
     @classmethod
     def read(cls, location: Location, key: str, advice: str, /, **expected: object) -> Self:
-        """The record at `key`. Raises RunDamagedError if it is missing, was changed, or belongs elsewhere."""
+        """Return the record at `key`. Raises RunDamagedError if it is missing, changed, or belongs elsewhere."""
         name = f"{location}/{key}"
         try:
             raw = location.read(key)
@@ -144,24 +151,24 @@ class Record(BaseModel):
 
 
 def is_hash_name(name: str) -> bool:
-    """Whether an object is called by the first digits of a hash, as `<digits>.json`; copies have other names."""
+    """Whether an object is named by the first digits of a hash, as `<digits>.json`; copies have other names."""
     return bool(_HASH_NAME.fullmatch(name))
 
 
 def named_by_hash(location: Location, folder: str) -> Iterator[tuple[str, str, bytes]]:
-    """Digits, key and content of the objects in `folder` that are called by the first digits of a hash."""
+    """Yield digits, key and content of the objects in `folder` that are named by the first digits of a hash."""
     for name, raw in location.read_all(folder, ".json").items():
         if is_hash_name(name):
             yield name.removesuffix(".json"), f"{folder}/{name}", raw
 
 
 def digest(content: bytes) -> str:
-    """blake2b of `content`, 64 hex digits; `b2sum --length 256` prints the same."""
+    """Return the blake2b of `content` as 64 hex digits; `b2sum --length 256` prints the same."""
     return blake2b(content, digest_size=DIGEST_BYTES).hexdigest()
 
 
 def digest_of(pieces: Iterable[bytes | memoryview], most: int | None = None) -> tuple[int, str]:
-    """Length and blake2b of these pieces together, or of their beginning beyond `most` bytes."""
+    """Return length and blake2b of these pieces together, or of their beginning beyond `most` bytes."""
     running, length = blake2b(digest_size=DIGEST_BYTES), 0
     for piece in pieces:
         running.update(piece)
@@ -172,31 +179,35 @@ def digest_of(pieces: Iterable[bytes | memoryview], most: int | None = None) -> 
 
 
 def block_digest(content: bytes) -> str:
-    """A short one, 16 hex digits, for parts of an object."""
+    """Return a short blake2b, 16 hex digits, for parts of an object."""
     return blake2b(content, digest_size=BLOCK_BYTES).hexdigest()
 
 
 def canonical(content: Mapping[str, Any]) -> bytes:
-    """The spelling that is hashed: keys sorted, no spaces, ASCII."""
+    """Return the spelling of a JSON object that is hashed: keys sorted, no spaces, ASCII."""
     return json.dumps(content, sort_keys=True, separators=(",", ":"), allow_nan=False).encode()
 
 
 def as_json(content: Mapping[str, Any]) -> bytes:
-    """JSON as it is written in a run: keys sorted, a line each."""
+    """Return JSON as it is written in a run: keys sorted, a line each."""
     return json.dumps(content, sort_keys=True, indent=1, allow_nan=False).encode()
 
 
 def as_record(content: Mapping[str, Any]) -> bytes:
-    """JSON that carries the hash of its other values."""
+    """Return JSON that carries the hash of its other values."""
     return as_json({**content, HASH: digest(canonical(content))})
 
 
 def read_record(raw: bytes, name: str, advice: str) -> dict[str, Any]:
-    """The content of a record, with its hash. Raises RunDamagedError unless the hash is that of the values.
+    """Return the content of a record, with its hash.
 
     Args:
-        name: The place and the remedy, for the message.
-        advice: As `name`.
+        raw: The stored bytes.
+        name: The place of the record, for the message.
+        advice: The remedy, for the message.
+
+    Raises:
+        RunDamagedError: Unless the hash is that of the values.
     """
     content = read_plain(raw, name, advice)
     carried = content.pop(HASH, None)
@@ -210,9 +221,9 @@ def read_record(raw: bytes, name: str, advice: str) -> dict[str, Any]:
 
 
 def read_plain(raw: bytes, name: str, advice: str) -> dict[str, Any]:
-    """The object of JSON in these bytes. Raises RunDamagedError if it is none, or names a key twice.
+    """Return the JSON object in these bytes. Raises RunDamagedError if it is none, or names a key twice.
 
-    Of bytes that carry no hash; their sum lies elsewhere.
+    The bytes carry no hash; their sum is stored elsewhere.
     """
     try:
         content = parse_strict_json(raw)

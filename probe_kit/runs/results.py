@@ -29,17 +29,17 @@ from probe_kit.runs.root import find_root
 from probe_kit.runs.store import Location
 
 BUNDLES = (PROBES, INTERVENTIONS, DIAGNOSES)
-"""Where bundles may lie in a run."""
+"""The folders of a run that hold bundles."""
 _MAKERS = {PROBES: "train", INTERVENTIONS: "intervene", DIAGNOSES: "diagnose"}
 HEAD, TIMES, PARTIAL = "settings.json", "times.json", ".partial"
 _KEY = re.compile(r"[0-9a-f]{12}")
-"""Form of a key: the first digits of the hash of the settings of a result."""
+"""The form of a key: the first digits of the hash of the settings of a result."""
 _SHORT = 8
-"""Digits of its hash in the name of a file that replaces another."""
+"""The digits of its hash in the name of a file that replaces another."""
 
 
 def _parse_file(values: Any) -> tuple[str, Sum]:
-    """The actual name and the sum of a file, as a head stores them. Raises ValueError for anything else."""
+    """Return the actual name and the sum of a file, as a head stores them. Raises ValueError for anything else."""
     match values:
         case [str(actual), *known]:
             return actual, parse_sum(known)
@@ -51,7 +51,11 @@ def _file_json(file: tuple[str, Sum]) -> list[str | int]:
 
 
 class Head(Record):
-    """`settings.json`. files: actual name, length and hash by name. Producers add parts of their own."""
+    """The record `settings.json`. Producers add parts of their own.
+
+    Attributes:
+        files: The actual name, length and hash of every file, by name.
+    """
 
     model_config = ConfigDict(extra="allow")
     kind: ClassVar[str] = "head"
@@ -62,7 +66,7 @@ class Head(Record):
 
 
 class Times(Record):
-    """`times.json`: times of events by name, UTC in ISO 8601."""
+    """The record `times.json`: times of events by name, UTC in ISO 8601."""
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, str]
@@ -73,11 +77,11 @@ class Times(Record):
 
 @dataclass(frozen=True)
 class Bundle:
-    """One bundle, its head checked; files are checked when they are read.
+    """A bundle whose head is checked; files are checked when they are read.
 
     Attributes:
-        head: Settings of the producer.
-        times: Times of its events by name (UTC, ISO 8601).
+        head: The settings of the producer.
+        times: The times of the producer's events by name (UTC, ISO 8601).
         files: By the name asked for, the name that counts now and the sum of it.
     """
 
@@ -90,15 +94,15 @@ class Bundle:
 
     @property
     def folder(self) -> str:
-        """Its folder in the run."""
+        """The bundle's folder in the run."""
         return f"{self.home}/{self.key}"
 
     def has(self, name: str) -> bool:
-        """Whether it has a file of this name."""
+        """Whether the bundle has a file of this name."""
         return name in self.files
 
     def read(self, name: str) -> bytes:
-        """One file. Raises RunDamagedError if it is missing or was changed."""
+        """Return the content of one file. Raises RunDamagedError if it is missing or was changed."""
         try:
             content = self.location.read(self._location_of(name))
         except FileNotFoundError:
@@ -108,7 +112,7 @@ class Bundle:
         return content
 
     def open(self, name: str) -> BinaryIO:
-        """One file to be read here and there; see `check`."""
+        """Open one file for random access; `check` compares it with its hash."""
         try:
             return self.location.open(self._location_of(name))
         except FileNotFoundError:
@@ -129,7 +133,7 @@ class Bundle:
         return f"{self.folder}/{self.files[name][0]}"
 
     def read_json(self, name: str) -> dict[str, Any]:
-        """One file that holds a JSON object, in which numbers may be NaN. Raises RunDamagedError."""
+        """Return the JSON object in one file, in which numbers may be NaN. Raises RunDamagedError."""
         try:
             content = parse_json(self.read(name))
         except ValueError as error:
@@ -162,12 +166,15 @@ def write_bundle(
     files: Mapping[str, bytes] = {},
     times: Mapping[str, str] = {},
 ) -> None:
-    """Store a bundle, or change one: files that are not given stay as they are.
+    """Store a bundle, or change one. Leftovers of killed processes in its folder are removed.
 
     Args:
-        head: Replace the former ones; of the head without the parts that are kept here (`key`, `run`, `files`).
-            What killed processes left in its folder is removed.
-        times: As `head`.
+        location: The run, or the folder of arrays in memory.
+        home: The folder of bundles, one of `BUNDLES`.
+        key: The key of the bundle.
+        head: The head without the parts that are added here (`key`, `run`, `files`). It replaces the former one.
+        files: The contents by name; former files that are not given stay as they are.
+        times: The times of events by name (UTC, ISO 8601), which replace the former ones.
     """
     with location.tended(f"{home}/{key}"):
         folder, run = f"{home}/{key}", _identity(location)
@@ -193,7 +200,7 @@ def write_bundle(
 
 
 def tidy_bundle(location: Location, home: str, key: str) -> None:
-    """Remove what killed processes left of a bundle that is complete: files and folders that never counted."""
+    """Remove what killed processes left of a complete bundle: files and folders that never counted."""
     with location.tended(f"{home}/{key}"):
         location.remove(f"{home}/.{key}{PARTIAL}")
 
@@ -204,7 +211,7 @@ def _renamed(name: str, content_sum: Sum) -> str:
 
 
 def read_bundle(location: Location, home: str, key: str) -> Bundle:
-    """The bundle `key`. Raises RunDamagedError if its head or times are missing, changed, or of another run."""
+    """Return the bundle `key`. Raises RunDamagedError if head or times are missing, changed, or of another run."""
     return _read_bundle(location, home, key, _identity(location))
 
 
@@ -224,7 +231,7 @@ def _read_bundle(location: Location, home: str, key: str, run: str | None) -> Bu
 
 
 def bundle_keys(location: Location, home: str) -> list[str]:
-    """Keys of the bundles that should be there: folders of that form, but for those that are being filled."""
+    """Return the keys of the bundles that should exist: folders of that form, except those being filled."""
     parts = [key.split("/") for key in location.keys(home)]
     names = dict.fromkeys(path[1] for path in parts if len(path) > 2)
     complete = {path[1] for path in parts if path[2:] == [HEAD]}
@@ -241,7 +248,7 @@ def unfinished_bundles(location: Location, home: str) -> dict[str, int]:
 
 
 def complete_key(key: str, stored: Collection[str], location: Location, kind: str) -> str:
-    """The stored key that `key` is, or begins. kind: what is stored, in the plural, for messages.
+    """Return the stored key that equals or begins with `key`; errors name what is stored by `kind`, in the plural.
 
     Raises:
         UsageError: If there is none, or if there are several.
@@ -258,13 +265,13 @@ def complete_key(key: str, stored: Collection[str], location: Location, kind: st
 
 
 def read_bundles(location: Location, home: str) -> dict[str, Bundle]:
-    """Every bundle of a run by key. Raises RunDamagedError for the first that is damaged."""
+    """Return every bundle of a run by key. Raises RunDamagedError for the first that is damaged."""
     run = _identity(location)
     return {key: _read_bundle(location, home, key, run) for key in bundle_keys(location, home)}
 
 
 def _identity(location: Location) -> str | None:
-    """The identity of the run; None for one that nothing protects.
+    """Return the identity of the run; None where there is no run.
 
     Bundles may also lie where there is no run, beside arrays in memory.
     """
@@ -273,12 +280,12 @@ def _identity(location: Location) -> str | None:
 
 
 def advice_for(folder: str) -> str:
-    """The remedy for a damaged result."""
+    """Return the remedy for a damaged result."""
     return f"Remove {folder} and run the same `probe-kit {_MAKERS[folder.partition('/')[0]]}` again"
 
 
 def fields_problem(record: type, names: Collection[str]) -> str:
-    """Return in what stored arrays are not the fields of a dataclass, for a message; empty if they are.
+    """Return how stored arrays differ from the fields of a dataclass, for a message; empty if they do not.
 
     Fields with a default may be absent.
     """
@@ -300,8 +307,8 @@ class Pieces:
     """The content of `<home>/.<key>.partial/` until the bundle `key` is complete.
 
     Attributes:
-        stamp: Hash of the commits that the work reads.
-        redo: What to do about a damaged piece, for the message.
+        stamp: The hash of the commits that the work reads.
+        redo: The remedy for a damaged piece, for the message.
     """
 
     run: Location
@@ -315,11 +322,12 @@ class Pieces:
         return cls(run, f"{home}/.{key}{PARTIAL}", stamp, redo)
 
     def read(self, name: str, record: type) -> dict[str, NDArray[Any]] | None:
-        """The arrays of one piece, or None if the work did not get that far.
+        """Return the arrays of one piece, or None if the work did not get that far.
 
         Args:
-            record: The dataclass whose fields they are; of several records, each has its name and a slash in
-                front.
+            name: The name of the piece.
+            record: The dataclass whose fields they are. The arrays of several records have the record's name and a
+                slash in front.
 
         Raises:
             RunDamagedError: If they were changed, are another piece's or of other commits, or have the fields of
@@ -358,7 +366,7 @@ class Pieces:
         self.run.remove(self.folder)
 
     def _bound(self, content: bytes, name: str) -> bytes:
-        """Hash of the file and of what it is, _HEX bytes."""
+        """Return the hash of the file and of its name and commits, `_HEX` bytes."""
         return digest(f"{self._key(name)} {self.stamp} ".encode() + content).encode()
 
     def _key(self, name: str) -> str:

@@ -73,11 +73,15 @@ _OF_RECORDINGS = ("instruction", "content_blake2b", "source_episode", "first_fra
 _OF_ENVIRONMENTS = ("instruction", "env_episode", "env_seed")
 """The columns that every planned row of a source has."""
 _CHUNKS = "/c/"
-"""Between the name of an array and the position of a chunk in a key of Zarr v3."""
+"""The part between the name of an array and the position of a chunk in a key of Zarr v3."""
 
 
 class Card(Record):
-    """`run.json`. objects: metadata of the arrays."""
+    """The record `run.json`.
+
+    Attributes:
+        objects: The sums of the metadata of the arrays.
+    """
 
     kind: ClassVar[str] = "card"
     schema_version: int
@@ -89,7 +93,7 @@ class Card(Record):
     @field_validator("streams", mode="before")
     @classmethod
     def _with_one_token(cls, streams: Any) -> Any:
-        """Streams have one token where a selection decides their number."""
+        """Give streams one token where a selection decides their number."""
         return [{"tokens": 1, **stream} if isinstance(stream, dict) else stream for stream in streams]
 
     @field_validator("streams")
@@ -107,11 +111,13 @@ class Card(Record):
 
 
 class LeftOut(Record):
-    """`left-out.json`, only in a copy without activations, where objects are missing on purpose.
+    """The record `left-out.json`, only in a copy without activations, where objects are missing on purpose.
+
+    Commits still hold the hash of every object.
 
     Attributes:
-        arrays: Those of `data.zarr` whose objects were not copied; also `directions.npz` where the weights of
-            probes were not. Commits still hold the hash of every object.
+        arrays: The arrays of `data.zarr` whose objects were not copied; also `directions.npz` where the weights of
+            probes were not.
     """
 
     kind: ClassVar[str] = "note of what was left out"
@@ -127,10 +133,7 @@ def is_left_out(key: str, arrays: Iterable[str]) -> bool:
 
 @dataclass(frozen=True)
 class Root:
-    """`run.json`, checked, and the plan that goes with it.
-
-    own_settings: those of the card, without the parts that a selection decides. identity: hash of the card.
-    """
+    """The record `run.json`, checked, and the plan that goes with it."""
 
     location: Location
     card: Card
@@ -152,7 +155,7 @@ class Root:
 
     @property
     def own_settings(self) -> dict[str, Any]:
-        """The settings of the card."""
+        """The settings of the card, without the parts that a selection decides."""
         return cast("dict[str, Any]", self.card.settings)
 
     def check_continuable(self) -> None:
@@ -162,14 +165,14 @@ class Root:
 
     @cached_property
     def left_out(self) -> frozenset[str]:
-        """The arrays that this run, if it is such a copy, was copied without. Raises RunDamagedError."""
+        """The arrays that a copy without activations lacks; empty for any other run. Raises RunDamagedError."""
         if not self.location.exists(LEFT_OUT_FILE):
             return frozenset()
         advice = "Make the copy again, with `probe-kit run copy`"
         return frozenset(LeftOut.read(self.location, LEFT_OUT_FILE, advice, run=self.identity).arrays)
 
     def refuse_left_out(self, why: str) -> NoReturn:
-        """Raise ActivationsLeftOutError. why: what is not possible, in words."""
+        """Raise ActivationsLeftOutError; `why` says what is not possible, in words."""
         raise ActivationsLeftOutError(
             f"{self.location} is a copy without its activations ({', '.join(sorted(self.left_out))}): {why}. Use "
             "the run that it was copied from"
@@ -218,7 +221,7 @@ class Root:
         """The storage of every stream, by name.
 
         Raises:
-            RunDamagedError: If the plan lacks the number of tokens of one.
+            RunDamagedError: If the plan lacks the number of tokens of a stream.
         """
         tokens = self.stored_plan.tokens
         selected = self.own_streams if self.own_settings["tokens"] != "all" else ()
@@ -233,12 +236,12 @@ class Root:
 
     @cached_property
     def planned(self) -> dict[int, RowColumns]:
-        """The same by number."""
+        """The planned episodes by number."""
         return {episode["episode"]: episode for episode in self.plan}
 
     @cached_property
     def arrays(self) -> dict[str, int]:
-        """Arrays of `data.zarr` in which every episode has one object, and how many axes each has."""
+        """The arrays of `data.zarr` in which every episode has one object, with the number of axes of each."""
         with_tokens = self.own_settings["tokens"] == "all"
         streams = self.own_streams.values()
         arrays = {
@@ -254,17 +257,17 @@ class Root:
 
     @property
     def later_views(self) -> LaterViews:
-        """Pooled views that are stored of the inferences after the first."""
+        """The pooled views that are stored of the inferences after the first."""
         return "mean" if self.own_settings.get("later_views") == MEAN_VIEW else "all"
 
     @property
     def vector_kinds(self) -> tuple[VectorKind, ...]:
-        """Arrays of every stream that hold vectors of views."""
+        """The arrays of every stream that hold vectors of views."""
         return ("pooled",) if self.later_views == "all" else ("pooled", "later")
 
 
 def new_card(settings: Mapping[str, Any], streams: Iterable[StoredStream], objects: Mapping[str, bytes]) -> Card:
-    """The card of a run that begins with these arrays' metadata."""
+    """Return the card of a run that begins with these arrays' metadata."""
     return Card(
         schema_version=SCHEMA_VERSION,
         settings=cast("_Settings", dict(settings)),
@@ -275,7 +278,7 @@ def new_card(settings: Mapping[str, Any], streams: Iterable[StoredStream], objec
 
 
 def read_root(location: Location) -> Root:
-    """The root of the run that lies at `location`.
+    """Return the root of the run at `location`.
 
     Raises:
         RunNotFoundError: If there is no run.
@@ -288,7 +291,10 @@ def read_root(location: Location) -> Root:
 
 
 def find_continuable(location: Location) -> Root | None:
-    """Return the root as `find_root`. Raises ActivationsLeftOutError for a copy, to which nothing can be added."""
+    """Return the root as `find_root` does. Raises ActivationsLeftOutError for a copy without activations.
+
+    Nothing can be added to such a copy.
+    """
     root = find_root(location)
     if root is not None:
         root.check_continuable()
@@ -296,7 +302,7 @@ def find_continuable(location: Location) -> Root | None:
 
 
 def find_root(location: Location) -> Root | None:
-    """The root of the run that lies at `location`, None if there is no run. Raises RunDamagedError."""
+    """Return the root of the run at `location`, None if there is no run. Raises RunDamagedError."""
     name = f"{location}/{RUN_FILE}"
     try:
         raw = location.read(RUN_FILE)
@@ -325,7 +331,7 @@ LONGEST_LABEL = 200
 
 
 class Label(Record):
-    """`label.json`: the label, and the identity of the run that it belongs to."""
+    """The record `label.json`: the label, and the identity of the run that it belongs to."""
 
     kind: ClassVar[str] = "label"
     run: str
@@ -333,10 +339,7 @@ class Label(Record):
 
 
 def label_run(path: Path | str | Location, label: str) -> None:
-    """Give the run at `path` another label; nothing else of it changes.
-
-    Args:
-        label: 1 to 200 printable characters.
+    """Give the run at `path` another label of 1 to 200 printable characters; nothing else of it changes.
 
     Raises:
         UsageError: For another label.
@@ -349,12 +352,12 @@ def label_run(path: Path | str | Location, label: str) -> None:
 
 
 def check_label(label: str) -> None:
-    """Raise UsageError unless tables can call a run so."""
+    """Raise UsageError unless the label is allowed in tables."""
     if not (label.isprintable() and 0 < len(label) <= LONGEST_LABEL):
         raise UsageError(f"label is {label[:LONGEST_LABEL]!r}; expected 1 to {LONGEST_LABEL} printable characters")
 
 
 def read_label(root: Root) -> str:
-    """The label of a run. Raises RunDamagedError if its record is missing, was changed, or is of another run."""
+    """Return a run's label. Raises RunDamagedError if its record is missing, changed, or of another run."""
     advice = f"Write it anew: `probe-kit run show {root.location} --label LABEL`"
     return Label.read(root.location, LABEL_FILE, advice, run=root.identity).label

@@ -76,22 +76,24 @@ if TYPE_CHECKING:
 
 
 _OUTCOME = ("outcome", "side_placed", "seconds_inference", "seconds_simulation")
-"""Columns of every episode behind those of its plan, and so of a table of no episodes too."""
+"""The columns of every episode behind those of its plan, and so of a table of no episodes too."""
 
 
 class NotSealedWarning(UserWarning):
-    """A column was read from rows, which gives the same numbers slowly."""
+    """A warning that a column was read from rows, which gives the same numbers slowly."""
 
 
 def open_run(path: Path | str | Location, allow_partial: bool = False) -> "Run":
     """Open the run in folder `path`, or at a URL such as `s3://bucket/prefix/run` (extra `remote`).
 
     Args:
-        allow_partial: Open it also if episodes of the plan are missing or failed; `episodes` then lists fewer.
+        path: The folder or the URL.
+        allow_partial: Open the run even if episodes of the plan are missing or failed; `episodes` then lists
+            fewer.
 
     Raises:
-        RunNotFoundError: If it is none.
-        RunIncompleteError: If it is unfinished.
+        RunNotFoundError: If there is no run.
+        RunIncompleteError: If the run is unfinished.
         RunDamagedError: If its schema is another one, a committed object is missing, or plan, metadata or any
             record is not what was written.
     """
@@ -109,7 +111,7 @@ def open_run(path: Path | str | Location, allow_partial: bool = False) -> "Run":
 
 
 def read_run(location: Location) -> "Run":
-    """The run at `location`, its plan and its commits read together, finished or not. Raises as `open_run`."""
+    """Return the run at `location`, finished or not; plan and commits are read together. Raises as `open_run`."""
 
     def read() -> Run:
         run = Run(location)
@@ -122,11 +124,12 @@ def read_run(location: Location) -> "Run":
 class Run:
     """A stored run. Rows of every array follow `episodes`, which lists the committed ones in plan order.
 
+    The attribute `wording` is the only one whose episodes are shown, None for all; see `in_wording`. The attribute
+    `item_ids` has the only items whose episodes are shown, None for all; see `only`.
+
     Attributes:
-        rule: By which outcomes are given, see `under`; `disc` at the last step is what was stored. wording: the
-            only one whose episodes are shown, None for all; see `in_wording`. item_ids: the only items whose
-            episodes are shown, None for all; see `only`.
-        last_steps: As `rule`.
+        rule: The rule that gives outcomes, see `under`; `disc` at the last step is what was stored.
+        last_steps: The number of control steps at the end that the rule judges.
     """
 
     rule: str = DEFAULT_RULE
@@ -153,8 +156,8 @@ class Run:
     def check_records(self) -> None:
         """Raise RunDamagedError if a record of the run is not what was written, or names a commit that is gone.
 
-        Of label, commits, seconds, provenance, certificates, seal and failures; results stored with the run are
-        checked when read.
+        Checks label, commits, seconds, provenance, certificates, seal and failures; results stored with the run
+        are checked when read.
         """
         _ = self.label, self._seconds, self.failed, self.provenances, self.columns
         if self._commits:
@@ -202,7 +205,7 @@ class Run:
 
     @cached_property
     def label(self) -> str:
-        """The name of the run in tables and legends: the model and what sets it apart, or as it was named.
+        """The name of the run in tables and legends: a label that was given, or the model and what sets it apart.
 
         It may be changed, see `label_run`.
 
@@ -213,7 +216,7 @@ class Run:
 
     @property
     def weights_sha256(self) -> str | None:
-        """Hash of the weights that acted; None for a scripted run."""
+        """The hash of the weights that acted; None for a scripted run."""
         return cast("str | None", self.settings["weights_sha256"])
 
     @property
@@ -223,34 +226,34 @@ class Run:
 
     @property
     def capture_only(self) -> bool:
-        """Whether its model was captured and did not act: it has activations and no success rate."""
+        """Whether the model was captured and did not act: the run has activations and no success rate."""
         return bool(self.settings.get("capture_only"))
 
     @property
     def ask(self) -> Mapping[str, Any] | None:
-        """The way in which its model was asked; None for one that acts."""
+        """The settings with which its model was asked; None for one that acts."""
         return self.settings.get("ask")
 
     @cached_property
     def source(self) -> RunSource:
-        """The observations that it is made of: their kind, and the name that identifies them."""
+        """The observations that the run is made of: their kind, and the name that identifies them."""
         return RunSource.of(self.settings)
 
     @property
     def recorded(self) -> bool:
-        """Whether it was made of recordings: there are no sides, no outcomes and no scene."""
+        """Whether the run was made of recordings: there are no sides, no outcomes and no scene."""
         return DATASET in self.settings
 
     @property
     def in_own_environment(self) -> bool:
-        """Whether its episodes were played in an environment of the user's own: there are no sides."""
+        """Whether the episodes were played in an environment of the user's own: there are no sides."""
         return ENVIRONMENT in self.settings
 
     @property
     def suite(self) -> str:
-        """Identity of the suite that was run, `name@version#hash`.
+        """The identity of the suite that was run, `name@version#hash`.
 
-        Of recordings it is the data set's `name#hash`, of an environment of the user's own its `name@revision`.
+        For recordings it is the data set's `name#hash`, for an environment of the user's own its `name@revision`.
         """
         return self.source.name
 
@@ -278,15 +281,12 @@ class Run:
 
     @property
     def suite_parent(self) -> str | None:
-        """Content hash of the suite that `suite` was selected from.
-
-        None for a whole suite.
-        """
+        """The content hash of the suite that `suite` was selected from; None for a whole suite."""
         return self.root.stored_plan.suite_parent
 
     @cached_property
     def items(self) -> pd.DataFrame:
-        """One row per planned item, played or not: `item_id`, `category`, `group_id`, `pair_id`, `content_sha256`.
+        """A row per planned item, played or not: `item_id`, `category`, `group_id`, `pair_id`, `content_sha256`.
 
         Items of two runs are the same where `item_id` and `content_sha256` are equal. The hash is that of
         `suite.Item.content_sha256`, None in runs that show no suite. Two wordings of an item are one row.
@@ -304,9 +304,9 @@ class Run:
     def certificate(self) -> dict[str, Any]:
         """The record of what was loaded and checked: the first process's, then what every process measured.
 
-        `processes` are the records of all of them, `hooks_on_equals_hooks_off` whether in each the actions or
-        answers with and without capture have one hash, `mixed` what changes numbers and was not the same for all
-        episodes.
+        The entry `processes` has the records of all processes. The entry `hooks_on_equals_hooks_off` says whether
+        in each process the actions or answers with and without capture have one hash. The entry `mixed` has what
+        changes numbers and was not the same for all episodes.
         """
         first, processes = self._certificates
         certificate = dict(first)
@@ -322,7 +322,7 @@ class Run:
 
     @cached_property
     def origins(self) -> tuple[Origin, ...]:
-        """Origins of the processes that played it, the first process's first; empty before the first episode."""
+        """The origins of the processes that played it, the first process first; empty before the first episode."""
         if not self._commits:
             return ()
         certificate, processes = self._certificates
@@ -334,10 +334,10 @@ class Run:
 
     @cached_property
     def provenances(self) -> dict[str, Provenance]:
-        """Device and versions that committed episodes were made with, by the name commits call them.
+        """The device and versions that made committed episodes, by the name in commits.
 
         Raises:
-            RunDamagedError: If a commit names one that is not there.
+            RunDamagedError: If a commit names a provenance that is not stored.
         """
         stored = read_provenances(self.root)
         names = sorted({commit.provenance for commit in self.commits()})
@@ -357,10 +357,9 @@ class Run:
         return tuple(self.settings.get("wordings", {}).get("names", ()))
 
     def in_wording(self, wording: str | None = None) -> "Run":
-        """The same run with the episodes of one wording only, as probes and success rates take it.
+        """Return the same run with the episodes of one wording only, as probes and success rates need it.
 
-        Args:
-            wording: None for the first; a run in the items' own words is returned as it is.
+        Without a name this is the first wording; a run in the items' own words is then returned as it is.
 
         Raises:
             UsageError: For a wording that was not asked.
@@ -381,14 +380,14 @@ class Run:
         return self if self.wording is None else self._showing(None, self.item_ids)
 
     def only(self, categories: Sequence[str] | None = None, items: int | None = None) -> "Run":
-        """The same run with the first items of some categories only, in the order of the plan.
+        """Return the same run with the first items of some categories only, in the order of the plan.
 
         A run of more items thereby serves where fewer are wanted: seeds depend on the run's seed and the item
         alone. Probes are fitted to the episodes that are shown, and stored with the run under a key of their own.
 
         Args:
-            categories: Slugs, all by default.
-            items: Per category, all by default.
+            categories: Slugs of categories; None for all.
+            items: The number of items per category; None for all.
 
         Raises:
             UnknownCategoryError: For a category the run lacks.
@@ -404,7 +403,7 @@ class Run:
         return Run(self.location, wording, item_ids).under(self.rule, self.last_steps)
 
     def grown(self) -> "Run":
-        """The same run with the episodes that were committed since; only their commits are read."""
+        """Return the same run with the episodes that were committed since; only their commits are read."""
 
         def read() -> Run:
             run = self._showing(self.wording, self.item_ids)
@@ -419,7 +418,7 @@ class Run:
         return read_commits(self.root)
 
     def commits(self) -> list[Commit]:
-        """The commit of every episode, in the order of `episodes`."""
+        """Return the commit of every episode, in the order of `episodes`."""
         return [self._commits[number] for number in self._numbers]
 
     @cached_property
@@ -428,27 +427,27 @@ class Run:
 
     @cached_property
     def stamp(self) -> str:
-        """Hash of all commits: what derived files were made from."""
+        """The hash of all commits, by which derived files name their source."""
         return stamp_of(self._commits)
 
     @cached_property
     def failed(self) -> dict[str, str]:
-        """Episodes that were given up, with the reason."""
+        """The reason of every episode that was given up, by its id."""
         return read_failures(self.root)
 
     @cached_property
     def planned(self) -> int:
-        """Episodes the plan has, committed or not."""
+        """The number of episodes in the plan, committed or not."""
         return len(self._plan)
 
     @cached_property
     def planned_ids(self) -> frozenset[str]:
-        """Ids of all planned episodes, shown or not."""
+        """The ids of all planned episodes, shown or not."""
         return frozenset(str(row["episode_id"]) for row in self.root.plan)
 
     @cached_property
     def planned_items(self) -> Mapping[str, str]:
-        """Category of every item of the plan by its id, whatever is shown of the run: its suite has them all."""
+        """The category of every item of the plan by its id, whatever is shown of the run: its suite has all."""
         return {str(row["item_id"]): str(row["category"]) for row in self.root.plan}
 
     @cached_property
@@ -462,7 +461,7 @@ class Run:
 
     @cached_property
     def _columns_rows(self) -> NDArray[np.intp] | slice:
-        """The rows of the columns, which hold every committed episode, that are those of `episodes`."""
+        """The rows of `episodes` among those of the columns, which hold every committed episode."""
         if self.wording is None and self.item_ids is None:
             return slice(None)
         # In the order in which `seal` wrote them, which is that of the whole plan.
@@ -471,11 +470,12 @@ class Run:
 
     @cached_property
     def episodes(self) -> pd.DataFrame:
-        """One row per committed episode: the plan's columns, then the outcome's, then how long it took.
+        """The committed episodes, one per row: the plan's columns, then the outcome's, then how long it took.
 
-        `seconds_inference` and `seconds_simulation` are wall-clock seconds: of the model's calls (of a call for
-        several observations its share), and of setting up, simulating and drawing. NaN where the folder
-        `times` was deleted. They differ between runs of one identity.
+        `seconds_inference` and `seconds_simulation` are wall-clock seconds. The first are those of the model's
+        calls; a call for several observations counts with its share. The second are those of setting up,
+        simulating and drawing. Both are NaN where the folder `times` was deleted. They differ between runs of one
+        identity.
         """
         plan = self.root.planned
         rows = [
@@ -495,12 +495,12 @@ class Run:
 
     @cached_property
     def control_steps(self) -> NDArray[np.int64]:
-        """(E, N) int64: the control step at which each inference of an episode was made, -1 behind its last one.
+        """The control step (E, N) int64 at which each inference of an episode was made, -1 behind its last one.
 
-        A control step is one executed action; an inference at step 4 saw the state after four actions. Of
-        recordings it is the number of the frame in its episode. N: most
-        inferences of an episode; 0 for scripts. Captured inference `call` is column `call`. An episode in which
-        nothing moves (`ask`, or without acting) has one inference, at step 0.
+        N is the largest number of inferences of an episode; 0 for scripts. Captured inference `call` is column
+        `call`. A control step is one executed action; an inference at step 4 saw the state after four actions. For
+        recordings it is the number of the frame in its episode. An episode in which nothing moves (`ask`, or
+        without acting) has one inference, at step 0.
         """
         stored = [commit.control_steps for commit in self.commits()]
         steps = np.full(
@@ -512,10 +512,10 @@ class Run:
 
     @cached_property
     def lens_margins(self) -> NDArray[np.float64] | None:
-        """(E, L) of the logit lens: logit of the letter for left minus that for right, at every layer.
+        """The logit lens (E, L): the logit of the letter for left minus that for right, at every layer.
 
-        Of questions that are answered by letter, with left named first. The last layer gives the model's answer.
-        None for every other run; NaN for episodes without one.
+        It exists for questions that are answered by letter, with left named first. The last layer gives the
+        model's answer. None for every other run; NaN for episodes without one.
         """
         stored = [commit.lens_margins or [] for commit in self.commits()]
         layers = max(map(len, stored), default=0)
@@ -529,7 +529,7 @@ class Run:
     def has_trajectories(self) -> bool:
         """Whether episodes keep what happened in them step by step.
 
-        Runs made before it was stored do not, nor those whose model did not act, nor copies without it.
+        Runs made before it was stored do not, nor runs whose model did not act, nor copies without it.
         """
         if TRAJECTORY in self.root.left_out or not self.root.has_trajectories:
             return False
@@ -563,20 +563,23 @@ class Run:
         return self.trajectories[self._position(episode)]
 
     def judged(self, rule: str, last_steps: int = 1) -> pd.DataFrame:
-        """A row per episode with the fields of `Judgement`: what an outcome rule says of it.
-
-        Raises UsageError for an unknown rule, NoTrajectoryError.
+        """Return a row per episode with the fields of `Judgement`: what an outcome rule says of it.
 
         Args:
             rule: A name of `probe_kit.env.scoring.RULES`.
-            last_steps: Control steps at the end that count; the released evaluation averages over 11.
+            last_steps: The number of control steps at the end that count; the released evaluation averages over
+                11.
+
+        Raises:
+            UsageError: For an unknown rule.
+            NoTrajectoryError: If the run keeps no trajectories.
         """
         if last_steps == 1:
             return self._watched[0][check_rule(rule)].copy()
         return judged(self.trajectories, self.episodes["side_correct"], self.settings["scene"], rule, last_steps)
 
     def under(self, rule: str, last_steps: int = 1) -> "Run":
-        """The same run with its outcomes by another rule, for tables and figures; see `judged`."""
+        """Return the same run with its outcomes by another rule, for tables and figures; see `judged`."""
         if (check_rule(rule), last_steps) == (self.rule, self.last_steps):
             return self
         judged = copy(self)  # shares what was read; of the cache only `episodes` depends on the rule
@@ -586,11 +589,7 @@ class Run:
 
     @cached_property
     def behaviour(self) -> pd.DataFrame:
-        """A row per episode: its id, then what hand and cube did, see `probe_kit.env.scoring.Behaviour`.
-
-        Raises:
-            NoTrajectoryError: If the run keeps no trajectories.
-        """
+        """A row per episode: its id, then what hand and cube did, see `probe_kit.env.scoring.Behaviour`."""
         return (
             self._watched[1].assign(episode_id=self.episodes["episode_id"]).set_index("episode_id").reset_index()
         )
@@ -600,12 +599,12 @@ class Run:
         return watch(self.trajectories, self.episodes["side_correct"], self.settings["scene"])
 
     def instruction_ids(self, episode: str | int) -> tuple[int, ...] | None:
-        """The instruction of one episode as the policy was delivered it; None where nothing was stored."""
+        """Return the token ids of one episode's instruction as the policy received it; None if none are stored."""
         ids = self.commits()[self._position(episode)].instruction_ids
         return None if ids is None else tuple(ids)
 
     def _position(self, episode: str | int) -> int:
-        """Row in `episodes`. Raises UsageError."""
+        """Return the row in `episodes`. Raises UsageError for an unknown episode."""
         names = self.episodes["episode_id"].tolist()
         if isinstance(episode, str) and episode in names:
             return names.index(episode)
@@ -632,7 +631,7 @@ class Run:
         return self._streams[stream]
 
     def views(self, stream: str, call: int = 0) -> tuple[str, ...]:
-        """Pooled views of one stream that are stored of captured inference `call`."""
+        """Return the pooled views of one stream that are stored of captured inference `call`."""
         return (MEAN_VIEW,) if self._keeps_mean_of(call) else self.stored(stream).views
 
     def _keeps_mean_of(self, call: int) -> bool:
@@ -640,16 +639,16 @@ class Run:
         return call > 0 and self.root.later_views == MEAN_VIEW
 
     def sites(self, stream: str) -> list[Site]:
-        """All sites of one stream."""
+        """Return all sites of one stream."""
         return self.stored(stream).stream.sites()
 
     @property
     def captured_calls(self) -> int:
-        """Inferences captured per episode, from the first on; episodes that ended early have fewer."""
+        """The number of captured inferences per episode, from the first on; episodes that end early have fewer."""
         return int(self.settings["captured_calls"])
 
     def reached(self, call: int) -> NDArray[np.bool_]:
-        """(E,) whether an episode got as far as captured inference `call`."""
+        """Return for every episode (E,) whether it got as far as captured inference `call`."""
         return np.array([len(commit.roles) > call for commit in self.commits()], bool)
 
     def _check(self, site: Site, call: int) -> StoredStream:
@@ -669,13 +668,15 @@ class Run:
     # -- pooled ----------------------------------------------------------------------------------------
 
     def column(self, site: Site, view: str = "mean", call: int = 0) -> NDArray[np.float32]:
-        """(E, D) float32: one pooled view of one site at one captured inference, a row per episode.
+        """Return one pooled view of one site at one captured inference, (E, D) float32, a row per episode.
 
-        NaN in the rows of episodes that ended before inference `call`; see `reached`. With `--later-views mean`,
+        The rows of episodes that ended before inference `call` are NaN; see `reached`. With `--later-views mean`,
         inferences after the first have the view `mean` alone, rounded to bfloat16.
 
-        Raises UnknownSiteError, RunDamagedError if stored bytes are missing or fail their checksum, or
-        ActivationsLeftOutError in a copy without activations.
+        Raises:
+            UnknownSiteError: For a site, view or inference that is not stored.
+            RunDamagedError: If stored bytes are missing or fail their checksum.
+            ActivationsLeftOutError: In a copy without activations.
         """
         stored = self._check(site, call)
         if self.columns is None and f"{site.stream}/pooled" in self.root.left_out:
@@ -712,7 +713,7 @@ class Run:
         return find_columns(self.root, self._commits)
 
     def rows(self, stream: str, kind: ArrayKind = "pooled") -> Rows:
-        """The stored rows of the committed episodes: all that was captured in one episode at a time.
+        """Return the stored rows of the committed episodes: all that was captured in one episode at a time.
 
         Raises:
             ActivationsLeftOutError: In a copy without activations.
@@ -723,24 +724,24 @@ class Run:
 
     @property
     def data(self) -> ArrayStore:
-        """The arrays of the committed episodes as Zarr reads them; every object is checked as it is read."""
+        """The arrays of the committed episodes as a store of Zarr; every object is checked as it is read."""
         return ArrayStore(self.location, DATA, self._sums, self._advice, read_only=True)
 
     @cached_property
     def _sums(self) -> dict[str, Sum]:
-        """Sums of all objects of `data.zarr`, by key: metadata, and those that commits name."""
+        """The sums of all objects of `data.zarr`, by key: metadata, and those that commits name."""
         sums = dict(self.root.metadata)
         for commit in self._commits.values():
             sums |= commit.objects
         return sums
 
     def _advice(self, key: str) -> str:
-        """The remedy for a damaged object of `data.zarr`."""
+        """Return the remedy for a damaged object of `data.zarr`."""
         of = next((number for number, commit in self._commits.items() if key in commit.objects), None)
         return RESTORE if of is None else redo(of)
 
     def _committed_rows(self, stream: str, kind: VectorKind) -> NDArray[Any]:
-        """(E, S, [I,] L, [V,] D) rows of the committed episodes, read once per array."""
+        """Return the rows (E, S, [I,] L, [V,] D) of the committed episodes, read once per array."""
         if (stream, kind) not in self._kept_rows:
             rows = self.rows(stream, kind)
             self._kept_rows[stream, kind] = np.stack([rows[position] for position in range(len(rows))])
@@ -751,11 +752,10 @@ class Run:
         return {}
 
     def xarray(self) -> "xr.Dataset":
-        """The pooled arrays with labelled views and episodes; dimensions of a stream carry its name.
+        """Return the pooled arrays with labelled views and episodes; dimensions of a stream carry its name.
 
-        With `--later-views mean` they hold the first inference alone; `column` reads the others.
-
-        Values of a sealed run are read when they are used, not before.
+        With `--later-views mean` they hold the first inference alone; `column` reads the others. Values of a
+        sealed run are read when they are used, not before.
         """
         import xarray as xr
 
@@ -778,7 +778,7 @@ class Run:
     def tokens(
         self, site: Site, role: str | None = None, call: int = 0
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """(E, T, D) float32 values and (E, T) bool mask of one site; the mask chooses `role`, or all but padding.
+        """Return values (E, T, D) float32 and mask (E, T) bool of one site, of `role` or of all but padding.
 
         Values outside the mask are zero. For large runs use `iter_token_blocks`, which holds one block.
 
@@ -792,7 +792,7 @@ class Run:
         return values, mask
 
     def token_mask(self, site: Site, role: str | None = None, call: int = 0) -> NDArray[np.bool_]:
-        """(E, T) bool: the positions of `role` at one site, or of all tokens but padding; see `tokens`."""
+        """Return the mask (E, T) of the positions of `role`, or of all tokens but padding; see `tokens`."""
         stored = self._check(site, call)
         if self.settings["tokens"] != "all":
             raise UnknownSiteError(f"{self.location} stores pooled views only; extract with --tokens all")
@@ -805,7 +805,7 @@ class Run:
         return mask
 
     def iter_token_blocks(self, site: Site, role: str | None = None, call: int = 0) -> Iterator[TokenBlock]:
-        """The tokens of one site, at most 128 positions of all episodes at a time; see `tokens`.
+        """Yield the tokens of one site, at most 128 positions of all episodes at a time; see `tokens`.
 
         Only blocks that hold a token of `role` are read.
         """
@@ -815,9 +815,9 @@ class Run:
         return token_blocks(rows, (call, *stored.at(site)), mask, stored.token_block)
 
     def gram(self, site: Site, role: str | None = None, call: int = 0) -> NDArray[np.float64]:
-        """(E, E) float64 linear kernel: products of tokens at equal positions, summed, over sqrt(n_i n_j).
+        """Return a linear kernel (E, E) float64: products of tokens at equal positions, summed, by sqrt(n_i n_j).
 
-        n is an episode's number of chosen tokens, so that longer instructions do not weigh more.
+        n is an episode's number of chosen tokens, so that longer instructions have no larger weight.
         """
         kernel = np.zeros((len(self._numbers), len(self._numbers)))
         counts = np.zeros(len(self._numbers))

@@ -19,10 +19,8 @@ def is_run(folder: Path) -> bool:
 def runs_in(folder: Path, deep: bool = True) -> list[Path]:
     """Return the runs below `folder`, finished or not, in the order of their paths; empty without any.
 
-    A run holds no other.
-
-    Args:
-        deep: At any depth, else directly below, which is quick in a large folder.
+    A run holds no other run. With `deep`, folders at any depth are searched; else only those directly below, which
+    is quick in a large folder.
     """
     if not deep:
         return [path.parent for path in sorted(folder.glob(f"*/{RUN_FILE}"))] if folder.is_dir() else []
@@ -48,7 +46,7 @@ def find_runs(folder: Path) -> list[Path]:
 
 
 MOST = 12
-"""Runs of a folder that a message names."""
+"""The most runs of a folder that a message names."""
 
 
 def what_to_open(address: str) -> str:
@@ -82,7 +80,7 @@ def check_if_full(parts: Mapping[str, int], location: Location) -> None:
 
 
 def in_units(size: float) -> str:
-    """Bytes in the unit in which they are at least one: `3.2 GB`, `17 B`."""
+    """Return bytes in the unit in which they are at least one: `3.2 GB`, `17 B`."""
     for unit, name in _UNITS:
         if size >= unit:
             return f"{size / unit:,.1f} {name}"

@@ -14,23 +14,23 @@ if TYPE_CHECKING:
 
 
 ORIGIN = "origin"
-"""Entry of a certificate."""
+"""The entry of a certificate that holds the origin of its process."""
 SUITE = "suite"
 OF_SCENE = "scene."
-"""Beginning of the name of a file that a field of the scene gives."""
+"""The beginning of the name of a file that a field of the scene gives."""
 
 
 @dataclass(frozen=True)
 class Origin:
-    """Files and choices of one process that played episodes of a run; none is part of the run's identity.
+    """The files and choices of one process that played episodes of a run; none is part of the run's identity.
 
     Attributes:
-        files: Absolute, by field of the source's settings, such as `suite`, `folder` or `scene.background`.
-        checkpoint: Absolute folder, hub id, or a word of the family; empty if unknown.
-        options: Of the family, as they were passed, files and folders absolute.
-        random_weights: Whether random weights were requested, which a file that calls its weights random is not.
-        weights_seed: Of requested random weights.
-        repositories: Commits of further repositories of the hub, by name, which a repetition reads again.
+        files: Absolute paths by field of the source's settings, such as `suite`, `folder` or `scene.background`.
+        checkpoint: An absolute folder, a hub id, or a word of the family; empty if unknown.
+        options: The options of the family as they were passed, files and folders absolute.
+        random_weights: Whether random weights were requested. A file that calls its weights random is no request.
+        weights_seed: The seed of requested random weights.
+        repositories: The commits of further repositories of the hub, by name, which a repetition reads again.
     """
 
     files: Mapping[str, str] = field(default_factory=dict)
@@ -60,7 +60,7 @@ class Origin:
         }
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain values."""
+        """Return the origin as plain values."""
         return asdict(self)
 
 
@@ -69,10 +69,10 @@ class RunSource:
     """The observations that a run is made of.
 
     Attributes:
-        kind: Of the source's settings, such as `scene` or `lerobot`; `arrays` for a run that probe_kit did not
-            play.
-        name: With what identifies it, such as `NAME@VERSION#HASH` of a suite.
-        words: What the run did with it.
+        kind: The kind of the source's settings, such as `scene` or `lerobot`; `arrays` for a run that probe_kit
+            did not play.
+        name: The name with what identifies it, such as `NAME@VERSION#HASH` of a suite.
+        words: A clause that says what the run did with the source.
     """
 
     kind: str
@@ -81,7 +81,7 @@ class RunSource:
 
     @property
     def subject(self) -> str:
-        """The things that its model was shown, in a word; of a source of your own its kind."""
+        """The things that its model was shown, in a word; for a source of your own its kind."""
         return {"scene": "scenes", "lerobot": "recordings", "env": "environments"}.get(self.kind, self.kind)
 
     @classmethod
@@ -102,16 +102,18 @@ class RunSource:
 def select_items(
     items: "pd.DataFrame", categories: Sequence[str] | None, per_category: int | None, where: str
 ) -> list[str]:
-    """Ids of the first items of some categories, in the order of the plan.
+    """Return the ids of the first items of some categories, in the order of the plan.
 
     Args:
-        items: As `Run.items`.
-        categories: Slugs, all by default.
+        items: The table `Run.items`.
+        categories: Slugs of categories; None for all.
+        per_category: The number of items per category; None for all.
         where: The run, for messages.
 
     Raises:
-        UnknownCategoryError: See `Run.only`.
-        UsageError: See `Run.only`.
+        UnknownCategoryError: For a category the run lacks.
+        UsageError: For no category. Also for a number that is not positive, exceeds what a category has, or would
+            separate role-exchanged twins.
     """
     categories_of_run = list(dict.fromkeys(items["category"].astype(str)))
     selected = categories_of_run if categories is None else check_categories(categories, categories_of_run)

@@ -39,23 +39,25 @@ __all__ = [
 
 
 READERS = 32
-"""Small objects that are read side by side, because each of them takes a round trip. A choice, not measured."""
+"""The small objects that are read at once, because each of them takes a round trip. A choice, not measured."""
 PATIENCE = timedelta(seconds=60)
 """The time for repeating a request; the last try may then take its own time, 30 s unless AWS_TIMEOUT says so."""
 LONGEST_PAUSE = 5.0
-"""Seconds between two requests of the same thing."""
+"""The seconds between two requests of the same thing."""
 _QUICK = timedelta(seconds=5)
-"""`PATIENCE` with a store that never answered."""
+"""The time of `PATIENCE` with a store that never answered."""
 _NO_BUCKET = "NoSuchBucket"
 _METADATA_SERVICES = ("169.254.169.254", "169.254.170.2", "metadata.google.internal")
-"""Services of cloud machines, where a client looks last for credentials."""
+"""The services of cloud machines, where a client looks last for credentials."""
 
 
 class Bucket:
     """A prefix of a bucket. Endpoint and credentials come from the environment, such as AWS_ACCESS_KEY_ID.
 
-    Raises MissingExtraError without obstore, UsageError for a URL without bucket or name, StoreError if the store
-    cannot be reached or refuses.
+    Raises:
+        MissingExtraError: Without obstore.
+        UsageError: For a URL without bucket or name.
+        StoreError: If the store cannot be reached or refuses.
     """
 
     def __init__(self, url: str) -> None:
@@ -71,12 +73,12 @@ class Bucket:
 
     @property
     def name(self) -> str:
-        """After the last slash."""
+        """The part of the URL after the last slash."""
         return self._url.rpartition("/")[2]
 
     @property
     def path(self) -> Path:
-        """Raises UsageError."""
+        """A path that does not exist: reading it raises UsageError."""
         raise UsageError(f"{self} lies in an object store and has no folder; read it through `open_run`")
 
     @property
@@ -89,7 +91,7 @@ class Bucket:
         return Path(name)
 
     def free_bytes(self) -> None:
-        """No bound."""
+        """Return None: an object store has no bound."""
 
     # -- requests --------------------------------------------------------------------------------------
 
@@ -102,9 +104,9 @@ class Bucket:
         return store
 
     def _answer[T](self, request: Callable[["ObjectStore"], T]) -> T:
-        """Return the answer to a request, in our words.
+        """Return the answer to a request, or raise an error in our words.
 
-        Repeated are all requests that break off or get no answer, also a conditional put and a deletion: each of
+        All requests that break off or get no answer are repeated, also a conditional put and a deletion: each of
         them may be done twice.
         """
         from obstore.exceptions import GenericError
@@ -128,7 +130,7 @@ class Bucket:
 
     @contextmanager
     def explained_errors(self) -> Iterator[None]:
-        """Whatever obstore says."""
+        """Replace every error of obstore in the body by a StoreError that says what to do."""
         from obstore.exceptions import BaseError
 
         try:
@@ -141,7 +143,7 @@ class Bucket:
             raise self._refused(error) from error
 
     def _refused(self, error: Exception) -> StoreError:
-        """The error of the store, with the remedy."""
+        """Return the error of the store, with the remedy."""
         why = str(error).split("\n\nDebug source", maxsplit=1)[0]
         advice = (
             "Check the bucket, the network, and what the environment says of endpoint and credentials "
@@ -160,7 +162,7 @@ class Bucket:
     # -- objects ---------------------------------------------------------------------------------------
 
     def exists(self, key: str) -> bool:
-        """See `Folder.exists`: a request for the head of the object."""
+        """Implement `Folder.exists` by a request for the head of the object."""
         import obstore
 
         try:
@@ -170,7 +172,7 @@ class Bucket:
         return True
 
     def read(self, key: str, part: slice | None = None, most: int | None = None) -> bytes:
-        """See `Folder.read`: one request."""
+        """Implement `Folder.read` by one request."""
         import obstore
 
         def content(objects: Any) -> bytes:
@@ -183,15 +185,15 @@ class Bucket:
         return self._answer(content)
 
     def pieces(self, key: str) -> Iterator[bytes]:
-        """See `Folder.pieces`: the whole object is the only one."""
+        """Implement `Folder.pieces`: the whole object is the only piece."""
         yield self.read(key)
 
     def open(self, key: str) -> BinaryIO:
-        """See `Folder.open`: all of it is fetched at once."""
+        """Implement `Folder.open`: all of the object is fetched at once."""
         return BytesIO(self.read(key))
 
     def read_all(self, folder: str, suffix: str) -> dict[str, bytes]:
-        """See `Folder.read_all`: a listing, then requests side by side. What is gone by then is left out."""
+        """Implement `Folder.read_all` by a listing and concurrent requests. What is gone by then is left out."""
         names = [key.removeprefix(f"{folder}/") for key in self.keys(folder)]
         names = [name for name in names if name.endswith(suffix) and "/" not in name]
         with ThreadPoolExecutor(READERS) as readers:
@@ -199,18 +201,18 @@ class Bucket:
             return {name: raw for name, raw in zip(names, contents, strict=True) if raw is not None}
 
     def _read_if_there(self, key: str) -> bytes | None:
-        """None for what was removed since it was listed: seals and failures come and go."""
+        """Return the object, None if it was removed since it was listed: seals and failures come and go."""
         try:
             return self.read(key)
         except FileNotFoundError:
             return None
 
     def keys(self, folder: str) -> list[str]:
-        """See `Folder.keys`; read from a listing."""
+        """Implement `Folder.keys` by a listing."""
         return sorted(self._listing(folder))
 
     def sizes(self, folder: str, keys: Iterable[str]) -> dict[str, int]:
-        """See `Folder.sizes`; read from a listing."""
+        """Implement `Folder.sizes` by a listing."""
         listing = self._listing(folder)
         return {key: listing[f"{folder}/{key}"] for key in keys if f"{folder}/{key}" in listing}
 
@@ -222,14 +224,14 @@ class Bucket:
         )
 
     def flush(self, keys: Iterable[str]) -> None:
-        """A put that was answered is durable."""
+        """Do nothing: a put that was answered is durable."""
 
     def create(self, key: str, content: bytes) -> bool:
-        """See `Folder.create`: a put that fails where the key exists."""
+        """Implement `Folder.create` by a put that fails where the key exists."""
         return self._put(key, content, "create")
 
     def write(self, key: str, content: bytes, durable: bool = True) -> None:  # noqa: ARG002 - always
-        """See `Folder.write`: a put, which is durable in any case."""
+        """Implement `Folder.write` by a put, which is durable in any case."""
         self._put(key, content, "overwrite")
 
     def _put(self, key: str, content: bytes, mode: Literal["create", "overwrite"]) -> bool:
@@ -247,11 +249,11 @@ class Bucket:
         return self._answer(put)
 
     def delete(self, key: str) -> None:
-        """See `Folder.delete`: one request."""
+        """Implement `Folder.delete` by one request."""
         self._delete([key])
 
     def remove(self, folder: str) -> None:
-        """See `Folder.remove`: a listing, then bulk deletions."""
+        """Implement `Folder.remove` by a listing, then bulk deletions."""
         self._delete(self.keys(folder))
 
     def _delete(self, keys: list[str]) -> None:
@@ -264,18 +266,18 @@ class Bucket:
 
     @contextmanager
     def locked(self, clear: Callable[[], None]) -> Iterator[None]:
-        """Nothing is locked."""
+        """Call `clear` and run the body: an object store has no locks."""
         clear()
         yield
 
     @contextmanager
     def tended(self, folder: str) -> Iterator[None]:  # noqa: ARG002 - an object store holds no drafts
-        """No lock: files of other content have other names, and the last head counts."""
+        """Run the body without a lock: files of other content have other names, and the last head counts."""
         yield
 
 
 def pauses_for(time_to_repeat: timedelta) -> Iterator[float]:
-    """Seconds to wait before every further try, doubling up to `LONGEST_PAUSE`, until the time is over."""
+    """Yield the seconds to wait before every further try, doubling up to `LONGEST_PAUSE`, until time is over."""
     pause, end = 0.1, time.monotonic() + time_to_repeat.total_seconds()
     while time.monotonic() + pause <= end:
         yield pause
@@ -304,8 +306,11 @@ def check_exclusive(location: Location, key: str) -> None:
 def begin(location: Location, objects: Mapping[str, bytes], last: str) -> None:
     """Begin with these objects, created one after another; `last`, one of them, never appears without all others.
 
-    A killed beginning is continued by the next one. If another process is first, its objects stay. Raises
-    SettingsMismatchError if something else is there.
+    A killed beginning is continued by the next one. If another process is first, its objects stay.
+
+    Raises:
+        SettingsMismatchError: If something else is there.
+        StoreError: If the store ignores conditional puts.
     """
     present = {key for key in location.keys("") if not key.endswith(DRAFT)}
     if (strange := sorted(present - set(objects))) and last not in present:
@@ -326,11 +331,11 @@ def begin(location: Location, objects: Mapping[str, bytes], last: str) -> None:
 
 
 def locate(where: str | Path | Location) -> Location:
-    """The location at a folder or a URL such as `s3://bucket/prefix/run`.
+    """Return the location at a folder or a URL such as `s3://bucket/prefix/run`.
 
     Raises:
         MissingExtraError: For a URL without the extra `remote`.
-        UsageError: For one of another kind.
+        UsageError: For a URL of another kind.
     """
     if isinstance(where, Location):
         return where

@@ -1,7 +1,7 @@
 """Small frames of an episode as one picture: the first and last one (2 kB), or all of them (4 kB each).
 
-They illustrate: no number depends on them. The commit of their episode names the picture with its hash, because
-who looks at a report believes what it shows. All pictures may be deleted, not single ones.
+They illustrate: no number depends on them. The commit of their episode names the picture with its hash, because a
+reader of a report believes what it shows. All pictures may be deleted, not single ones.
 """
 
 from collections.abc import Mapping
@@ -26,21 +26,22 @@ if TYPE_CHECKING:
     import pandas as pd
 
 _LARGEST_SHEET = 16_383
-"""Pixels of the longer side, as WebP has them."""
+"""The most pixels of the longer side, a limit of WebP."""
 _CODING: dict[FrameChoice, dict[str, int]] = {
     "ends": {"quality": 85, "method": 4},
     "all": {"quality": 80, "method": 0},
 }
-"""Method 2 would save a fifth of the bytes of a sheet, and take twice the time."""
+"""The settings of the WebP encoder; method 2 would save a fifth of a sheet's bytes, and take twice the time."""
 
 
 @dataclass(frozen=True)
 class FrameSheet:
-    """The stored picture of an episode. content: the WebP.
+    """The stored picture of an episode.
 
     Attributes:
-        count: How many frames it holds, one before the first action and one behind each. None in a picture of the
-            first and last frame.
+        content: The WebP.
+        count: The number of frames it holds, one before the first action and one behind each. None in a picture of
+            the first and last frame.
     """
 
     content: bytes
@@ -49,11 +50,13 @@ class FrameSheet:
 
 @dataclass(frozen=True)
 class EpisodeFrames:
-    """The frames of an episode as a reader is shown them. content: one WebP of `count` frames.
+    """The frames of an episode as a reader is shown them.
 
     Attributes:
-        kind: The first and the last one, one before the first action and one behind each, or one per inference.
-        cameras: How many pictures stand side by side in a frame, from the first camera on.
+        content: One WebP of `count` frames.
+        kind: `ends`: the first and the last one. `all`: one before the first action and one behind each.
+            `inferences`: one per inference.
+        cameras: The number of pictures side by side in a frame, from the first camera on.
     """
 
     content: bytes
@@ -88,12 +91,12 @@ def episode_frames(run: RunReader, position: int) -> EpisodeFrames | None:
 
 
 def count_ends(episode: "Mapping[Any, Any] | pd.Series[Any]") -> int:
-    """Return how many frames a picture of the first and last one holds: a model that did not act has no last."""
+    """Return how many frames a picture of the first and last one holds: without acting there is no last one."""
     return 1 if "parse" in episode or episode["outcome"] == CAPTURE_ONLY else 2
 
 
 def as_thumbnail(frames: SmallFrames, choice: FrameChoice = "ends") -> bytes:
-    """The frames as one WebP, `FRAME_COLUMNS` to a row; black behind the last one."""
+    """Return the frames as one WebP, `FRAME_COLUMNS` to a row; black behind the last one."""
     columns = min(len(frames), FRAME_COLUMNS)
     blank = [np.zeros_like(frames[0])] * (-len(frames) % columns)
     full = [*frames, *blank]
@@ -104,7 +107,7 @@ def as_thumbnail(frames: SmallFrames, choice: FrameChoice = "ends") -> bytes:
 
 
 def decode_frames(content: bytes, count: int) -> SmallFrames:
-    """The `count` frames of a picture that `as_thumbnail` made."""
+    """Return the `count` frames of a picture that `as_thumbnail` made."""
     columns = min(count, FRAME_COLUMNS)
     rows = -(-count // columns)
     pixels = np.asarray(
@@ -118,10 +121,10 @@ def decode_frames(content: bytes, count: int) -> SmallFrames:
 
 
 def read_thumbnail(run: Path | Location, number: int) -> bytes | None:
-    """A WebP of episode `number`, first frame left and last frame right; None if the run keeps none.
+    """Return a WebP of episode `number`, first frame left and last frame right; None if the run keeps none.
 
     Raises:
-        RunDamagedError: As `read_sheet`.
+        RunDamagedError: For a picture that was changed, or is lost alone.
     """
     sheet = read_sheet(run, number)
     if sheet is None or sheet.count is None:
@@ -131,9 +134,9 @@ def read_thumbnail(run: Path | Location, number: int) -> bytes | None:
 
 
 def read_sheet(run: Path | Location, number: int) -> FrameSheet | None:
-    """The picture of episode `number` as it is stored; None if the run keeps none.
+    """Return the picture of episode `number` as it is stored; None if the run keeps none.
 
-    Pictures of arrays that are no run are bound to nothing.
+    Pictures of arrays that are no run have no hash to be checked against.
 
     Raises:
         RunDamagedError: If it is not the one that was stored when the episode was committed, or is lost alone.

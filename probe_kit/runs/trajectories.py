@@ -1,9 +1,9 @@
-"""Trajectories in a run, and the outcomes and behaviour that are computed of them.
+"""Trajectories in a run, and the outcomes and behavior that are computed from them.
 
     data.zarr/trajectory   float32 (episode, frame, channel); frames behind the end of an episode are not numbers
 
-One array beside the streams, one chunk per episode, named in the episode's commit. Frames and channels are
-those of `probe_kit.env.scoring.Trajectory`.
+One array beside the streams, one chunk per episode, named in the episode's commit. Frames and channels are those
+of `probe_kit.env.scoring.Trajectory`.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -25,7 +25,7 @@ from probe_kit.suite.items import Side, other_side
 
 
 def create_trajectories(store: Store, frames: int, codec: str) -> None:
-    """Create the array: `frames` is one more than an episode has actions at most."""
+    """Create the array, with `frames` one more than an episode has actions at most."""
     group = zarr.open_group(store, mode="a", zarr_format=3)
     length, names = len(CHANNELS), ("episode", "frame", "channel")
     create_array(
@@ -38,9 +38,12 @@ class Trajectories:
     """The trajectories of the committed episodes of a run, in their order.
 
     Args:
-        rows: Of the array `trajectory`.
-        steps: How many actions every committed episode had.
-        where: The run's name. Raises RunDamagedError if other channels are stored than those that are read today.
+        rows: The rows of the array `trajectory`.
+        steps: The number of actions of every committed episode.
+        where: The run's name, for messages.
+
+    Raises:
+        RunDamagedError: If other channels are stored than those that are read today.
     """
 
     def __init__(self, rows: Rows, steps: Sequence[int], where: str) -> None:
@@ -56,7 +59,7 @@ class Trajectories:
         return len(self._steps)
 
     def __getitem__(self, position: int) -> Trajectory:
-        """Return that of one episode. Raises RunDamagedError if stored bytes are missing, changed or too few."""
+        """Return one episode's trajectory. Raises RunDamagedError if its bytes are missing, changed or too few."""
         return self._trajectory(self._rows[position], self._steps[position])
 
     def __iter__(self) -> Iterator[Trajectory]:
@@ -75,7 +78,7 @@ class Trajectories:
 def judged(
     trajectories: Iterable[Trajectory], sides: Iterable[Side], scene: Mapping[str, Any], rule: str, last_steps: int
 ) -> pd.DataFrame:
-    """A row per episode with the fields of `Judgement`; scene: `SceneSpec.to_json()`. Raises UsageError."""
+    """Return a row per episode with the fields of `Judgement`, from `SceneSpec.to_json()`. Raises UsageError."""
     by = rule_of(rule, scene)
     rows = [
         judge(trajectory, by, side, last_steps, scene["max_steps"])
@@ -85,7 +88,7 @@ def judged(
 
 
 def with_outcomes(episodes: pd.DataFrame, verdicts: pd.DataFrame) -> pd.DataFrame:
-    """Episodes with their outcome, and all that follows from it, as judged; and the shares of the judged steps."""
+    """Return episodes with their outcome as judged, what follows from it, and the shares of the judged steps."""
     outcome = verdicts["outcome"]
     placed = [
         "none" if zone == "oob" else side if zone == "correct" else other_side(side)
@@ -104,12 +107,14 @@ def with_outcomes(episodes: pd.DataFrame, verdicts: pd.DataFrame) -> pd.DataFram
 def watch(
     trajectories: Iterable[Trajectory], sides: Iterable[Side], scene: Mapping[str, Any]
 ) -> tuple[dict[str, pd.DataFrame], pd.DataFrame]:
-    """`Judgement` by rule, at the last step, and `Behaviour` of all episodes.
+    """Return `Judgement` by rule, at the last step, and `Behaviour` of all episodes.
 
-    In one reading of the trajectories, which takes longer than every judgement of them.
+    Both come from one reading of the trajectories, which takes longer than every judgement of them.
 
     Args:
-        scene: `SceneSpec.to_json()`.
+        trajectories: One trajectory per episode.
+        sides: The correct side of every episode.
+        scene: The scene as `SceneSpec.to_json()`.
     """
     default = SceneSpec()  # scenes without these fields have the default ones
     half = scene.get("scoring_side", default.scoring_side) / 2 + scene.get("box_margin", default.box_margin)

@@ -35,16 +35,16 @@ from probe_kit.runs.run import Run, read_run
 from probe_kit.runs.store import Location, locate
 
 EPISODES_PER_CHUNK = 1024
-"""A column of no more episodes is one object, which one request reads."""
+"""The episodes of one object: a column of no more episodes is one object, which one request reads."""
 SLAB_BYTES = 1 << 30
-"""Bytes that are held in memory at a time; all rows are read once more for every further slab."""
+"""The bytes that are held in memory at a time; all rows are read once more for every further slab."""
 
 
 def seal(path: Path | str | Location) -> bool:
-    """Write the columns of the run at `path` unless they are up to date; True if this call wrote them.
+    """Write the columns of the run at `path` unless they are up to date; return whether this call wrote them.
 
-    Same commits give the same bytes. A crash leaves the old columns or none. Processes that seal one folder at
-    once take turns, and all but the first find it done.
+    Equal commits give equal bytes. A crash leaves the old columns or none. Processes that seal one folder at once
+    take turns, and all but the first find it done.
     """
     location = Run(locate(path)).location
     with location.locked(lambda: None), location.tended(DATA):  # a folder that is never exchanged
@@ -101,7 +101,7 @@ def _write_vectors(run: "Run", name: str, kind: VectorKind, group: zarr.Group) -
 
 
 def _lead(stored: StoredStream, rows: Rows, kind: VectorKind) -> tuple[int, ...]:
-    """Axes of the columns before episode and feature."""
+    """Return the axes of the columns before episode and feature."""
     views = (len(stored.views),) if kind == "pooled" else ()
     return (rows.array.shape[1], *views, *stored.lead)
 
@@ -109,7 +109,7 @@ def _lead(stored: StoredStream, rows: Rows, kind: VectorKind) -> tuple[int, ...]
 def columns_of_rows(
     run: "Run", name: str, kind: VectorKind
 ) -> Iterator[tuple[tuple[Any, ...], NDArray[np.float32 | np.uint16]]]:
-    """Every chunk of the columns of a stream as its rows have it: where it belongs, and (E, D) values."""
+    """Yield every chunk of the columns of a stream as its rows give it: its index, and values (E, D)."""
     stored, rows = run.stored(name), run.rows(name, kind)
     episodes, size = len(rows), rows.array.dtype.itemsize
     cells = list(np.ndindex(_lead(stored, rows, kind)))
@@ -144,14 +144,14 @@ def _write_roles(run: "Run", name: str, group: zarr.Group) -> None:
 
 
 _READERS = min(8, max(4, os.cpu_count() or 1))
-"""Objects that are read and hashed at once: both let other threads work."""
+"""The objects that are read and hashed at once: both let other threads work."""
 _BATCH = 256
-"""Objects that are handed to the threads at a time."""
+"""The objects that are handed to the threads at a time."""
 _RESULT_READERS = (
     "probe_kit.train.results.inventory:readers_of_results",
     "probe_kit.intervene.inventory:readers_of_results",
 )
-"""Functions that give a reader per stored result of a run. They lie in folders above."""
+"""The functions that give a reader per stored result of a run. They lie in folders above."""
 
 
 @dataclass(frozen=True)
@@ -159,13 +159,15 @@ class Audit:
     """The result of a verification.
 
     Attributes:
-        committed: episodes.
-        planned: As `committed`.
+        committed: The number of committed episodes.
+        planned: The number of planned episodes.
+        failed: The number of episodes that were given up.
         sealed: Whether columns belong to these commits.
         deep: Whether every byte was read, not only sizes.
         problems: One sentence each.
-        strays: Objects that belong to no part of the run and that nothing reads, such as copies made by hand.
-        left_out: Arrays that the run, a copy, was made without.
+        strays: The keys of objects that belong to no part of the run and that nothing reads, such as copies made
+            by hand.
+        left_out: The arrays that the run, a copy, was made without.
     """
 
     path: str
@@ -190,10 +192,10 @@ class Audit:
 
 
 def verify_run(path: Path | str | Location, deep: bool = False) -> Audit:
-    """Compare a run with its records.
+    """Compare a run with its records. Problems are collected, not raised.
 
-    Records, the sizes of all objects, and their owners; with `deep` every byte, columns against rows, and every
-    reader of the run and of its stored results. Problems are collected, not raised.
+    Compares records, the sizes of all objects, and their owners; with `deep` every byte, columns against rows, and
+    every reader of the run and of its stored results.
 
     Raises:
         RunNotFoundError: If there is no run at `path`.
@@ -270,7 +272,7 @@ def _check_records(root: Root, commits: Mapping[int, Commit]) -> None:
 
 
 def _content_problems(location: Location, objects: Iterable[StoredObject]) -> Iterator[str]:
-    """Objects with other bytes than were written, in the order of `objects`. Other sizes were named before."""
+    """Yield objects with other bytes than were written, in the order of `objects`; sizes were checked before."""
 
     def problem(stored: StoredObject) -> str | None:
         try:
@@ -287,7 +289,7 @@ def _content_problems(location: Location, objects: Iterable[StoredObject]) -> It
 
 
 def _differences(run: Run) -> Iterator[str]:
-    """Columns that are not what the rows give, and what cannot be read."""
+    """Yield columns that differ from what the rows give, and what cannot be read."""
     columns = run.columns
     assert columns is not None
     for stream in run.streams:
@@ -303,7 +305,7 @@ def _differences(run: Run) -> Iterator[str]:
 
 
 def _reading_problems(run: Run) -> Iterator[str]:
-    """The complaints of all readers of a run and of the results that are stored with it."""
+    """Yield the complaints of all readers of a run and of the results that are stored with it."""
     yield from _complaints(run.check_records)
     yield from _complaints(lambda: (run.episodes, run.items, run.failed))
     if not run.commits():
@@ -331,7 +333,7 @@ def _read_first(run: Run, name: str) -> None:
 
 
 def _complaints(reader: Callable[[], object]) -> Iterator[str]:
-    """The error of a reader, if it raises one. A library that is not installed is none of the run's."""
+    """Yield the error of a reader, if it raises one; a library that is not installed is no error of the run."""
     try:
         reader()
     except MissingExtraError:

@@ -59,8 +59,12 @@ from probe_kit.runs.trajectories import create_trajectories
 def growth_words(location: Location, plan: Plan) -> str:
     """Return how the run at `location` grows by a plan, in a line; empty for no run, and where nothing changes.
 
-    Names the probes and interventions that are then of former episodes. Raises as `further_rows`,
-    ActivationsLeftOutError for a copy without activations, and RunDamagedError if the stored run was changed.
+    The line names the probes and interventions that are then of former episodes.
+
+    Raises:
+        SettingsMismatchError: As `further_rows` raises it.
+        ActivationsLeftOutError: For a copy without activations.
+        RunDamagedError: If the stored run was changed.
     """
     root = find_continuable(location)
     if root is None or not root.plan:
@@ -88,7 +92,7 @@ def check_other_settings(stored: dict[str, Any], requested: dict[str, Any], wher
 
 
 def flat_settings(value: Any, prefix: str = "") -> dict[str, Any]:
-    """Settings by their path, such as `scene.light_level`."""
+    """Return settings by their path, such as `scene.light_level`."""
     if not isinstance(value, Mapping):
         return {prefix: value}
     return {
@@ -106,12 +110,13 @@ class EpisodeRecord:
         arrays: By kind (`pooled`, `tokens`, `later`) and stream, each shaped like its row in the store.
         roles: Per captured inference and stream, the spans of roles.
         trajectory: (T + 1, C) float32 frames.
-        instruction_ids: The instruction as the policy was delivered it.
-        pictures: Encoded, by key in the run. frames: how many one of them holds, if it holds all of the episode.
-        control_steps: Of every inference, how many actions of the episode came before it; rising.
-        seconds: What the episode took, which no hash of the run covers.
-        inputs: What was shown of recordings, by kind.
-        lens_margins: Of an answer by letter, left minus right at every layer.
+        instruction_ids: The token ids of the instruction as the policy received it.
+        pictures: Encoded pictures, by key in the run.
+        control_steps: For every inference, how many actions of the episode came before it; rising.
+        seconds: The seconds that the episode took, which no hash of the run covers.
+        frames: The number of frames in one of the pictures, if that holds all of the episode.
+        inputs: The inputs of recordings that were shown, by kind.
+        lens_margins: The logit lens of an answer by letter, left minus right at every layer.
     """
 
     planned: Row
@@ -129,17 +134,23 @@ class EpisodeRecord:
 
 
 class RunWriter:
-    """Creates a run, continues the one that is there, or lets it grow; any number of processes may do so at once.
+    """A writer that creates a run, continues the one that is there, or lets it grow.
+
+    Any number of processes may do so at once.
 
     Args:
-        plan: Episodes to play. Those that the run lacks are appended to its plan; `self.plan` has the run's
+        location: The place of the run.
+        plan: The episodes to play. Those that the run lacks are appended to its plan; `self.plan` has the run's
             numbers.
-        settings: Without what a selection decides.
-        provenance: Of this process, by default of one that computes on the CPU.
-        label: What tables call a run that begins here, by default the model's name; one that is there keeps its
-            own, see `label_run`. Raises SettingsMismatchError if the location holds a run with other settings,
-            episodes that `plan` lacks while it lacks others, or anything else, and RunDamagedError if what it
-            holds was changed.
+        settings: The settings without what a selection decides.
+        provenance: The provenance of this process, by default of one that computes on the CPU.
+        label: The name in tables of a run that begins here, by default the model's name. A run that is there keeps
+            its own, see `label_run`.
+
+    Raises:
+        SettingsMismatchError: If the location holds a run with other settings, episodes that `plan` lacks while
+            the run lacks others, or anything else.
+        RunDamagedError: If what the location holds was changed.
     """
 
     def __init__(
@@ -159,7 +170,7 @@ class RunWriter:
 
     @property
     def streams(self) -> list[StoredStream]:
-        """The storage of the streams in the run, which may have room for longer sequences than this plan needs."""
+        """The storage of the streams in the run, which may have room for longer sequences than the plan needs."""
         return [self.root.streams[stream.name] for stream in self.plan.streams]
 
     @property
@@ -167,7 +178,7 @@ class RunWriter:
         return bool(self.settings["tokens"] == "all")
 
     def _beginning(self) -> dict[str, bytes]:
-        """Every object that a run of these settings has before its first plan, the same for every selection."""
+        """Return every object that a run of these settings has before its first plan, whatever the selection."""
         arrays: dict[str, Buffer] = {}
         store = MemoryStore(arrays)
         create_arrays(
@@ -186,7 +197,7 @@ class RunWriter:
         return {**objects, LABEL_FILE: label.to_bytes(), RUN_FILE: card.to_bytes()}
 
     def _continued(self) -> Root:
-        """The root of the run that is there, whose plan now holds the one of this writer."""
+        """Return the root of the run that is there, whose plan now holds the one of this writer."""
         root = read_root(self.location)
         root.check_continuable()
         check_other_settings(root.own_settings, self.settings, str(self.location))
@@ -202,7 +213,7 @@ class RunWriter:
         return not root.plan or bool(further_rows(root.plan, self.plan.columns, self.location))
 
     def _grown(self) -> Root:
-        """The root, once the run plans all of this writer's episodes."""
+        """Return the root, once the run plans all of this writer's episodes."""
         root = read_root(self.location)
         while self._lacks(root):
             self.location.create(plan_key(len(root.stored_plan.extents)), self._record(root).to_bytes())
@@ -226,7 +237,7 @@ class RunWriter:
                 )
 
     def _record(self, root: Root) -> PlanRecord:
-        """The plan record that adds to the run's plan those episodes of this writer's that it lacks."""
+        """Return the plan record that adds to the run's plan those episodes of this writer's that it lacks."""
         rows, before = self.plan.columns, root.stored_plan
         numbers = {row["episode_id"]: row["episode"] for row in before.rows}
         added = [row for row in rows if row["episode_id"] not in numbers]
@@ -245,7 +256,7 @@ class RunWriter:
 
     @contextmanager
     def owned(self) -> Iterator[None]:
-        """Work on the run while the body runs; failures of earlier attempts are forgotten."""
+        """Work on the run while the body runs; failures of earlier attempts are removed."""
         with self.location.locked(lambda: self.location.remove(FAILED)):
             yield
 
@@ -259,11 +270,10 @@ class RunWriter:
             yield
 
     def begin(self, allow_mixed: bool = False) -> None:
-        """Say in the run who is going to play in it.
+        """Store in the run the provenance of this process, which will play in it.
 
         Raises:
-            SettingsMismatchError: If episodes were played where numbers come out otherwise, unless that is
-                allowed.
+            SettingsMismatchError: If episodes were played where numbers come out otherwise, unless `allow_mixed`.
         """
         if not allow_mixed:
             stored = read_provenances(self.root).values()
@@ -276,7 +286,7 @@ class RunWriter:
             self._begun = True
 
     def remaining(self) -> list[int]:
-        """Numbers of the episodes that are not committed; objects of the committed ones are checked."""
+        """Return the numbers of the episodes that are not committed; objects of the committed ones are checked."""
         committed = while_growing(self.location, lambda: read_commits(read_root(self.location)))
         return [episode.index for episode in self.plan.episodes if episode.index not in committed]
 
@@ -309,7 +319,7 @@ class RunWriter:
                 self.location.write(key, self._write_objects(episode).to_bytes())
 
     def _write_objects(self, episode: EpisodeRecord) -> Commit:
-        """Everything of an episode but its commit, which is returned."""
+        """Write everything of an episode but its commit, and return the commit."""
         planned = episode.planned
         store = ArrayStore(self.location, DATA, self.root.metadata)
         for kind, by_stream in episode.arrays.items():
@@ -346,7 +356,7 @@ class RunWriter:
         return Commit.model_validate({**parts, **stored})
 
     def write_certificate(self, certificate: dict[str, Any]) -> None:
-        """Record what was loaded and checked by this process, once; the whole of it stays from the first one."""
+        """Record what this process loaded and checked, once; the certificate of the first process stays whole."""
         if not self._certified:
             write_certificate(self.root, certificate, self.provenance)
             self._certified = True
