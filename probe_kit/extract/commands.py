@@ -1,4 +1,4 @@
-"""`probe-kit extract` and `probe-kit ask`."""
+"""The commands `probe-kit extract` and `probe-kit ask`."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -31,7 +31,7 @@ class Sizes(tuple[tuple[int, int], ...]):
 
     @classmethod
     def parse(cls, text: "str | Sizes") -> "Sizes":
-        """The sizes of `text`, each WIDTHxHEIGHT; a default that is no text is returned as it is."""
+        """Return the sizes of `text`, each WIDTHxHEIGHT; a default that is no text is returned as it is."""
         if not isinstance(text, str):
             return text
         return cls(map(read_size, several("--picture-size", text)))
@@ -42,7 +42,7 @@ class Sizes(tuple[tuple[int, int], ...]):
 
 
 def several(option: str, text: str | Names) -> Names:
-    """The parts of a comma-separated option. Raises UsageError for none."""
+    """Return the parts of a comma-separated option. Raises UsageError for none."""
     parts = Names.parse(text)
     if not parts:
         raise UsageError(f"{option} is empty; name at least one")
@@ -105,7 +105,7 @@ PrintConfig = Annotated[bool, typer.Option("--print-config", help="Print the set
 
 
 LARGE = 64 * 10**9
-"""Bytes above which a run is begun with --yes only."""
+"""The bytes above which a run is begun with --yes only."""
 
 
 @command_with(*ExtractSettings.option_models())
@@ -187,7 +187,7 @@ def print_plan(extraction: "Extraction", location: "Location") -> None:
 
 
 def _weights(extraction: "Extraction") -> str:
-    """Memory and download of a model whose size is known."""
+    """Return memory and download of a model whose size is known."""
     from probe_kit.extract.sizes import weights_needed
 
     model: Any = getattr(extraction.controller, "model", None)
@@ -196,7 +196,7 @@ def _weights(extraction: "Extraction") -> str:
 
 
 def _units(settings: "Settings") -> str:
-    """The units that actions get, of a family whose checkpoints have several."""
+    """Return the units that actions get, of a family whose checkpoints have several."""
     from probe_kit.hooks.registry import get_family
 
     family, model = get_family(settings.model.family), settings.model
@@ -204,7 +204,7 @@ def _units(settings: "Settings") -> str:
 
 
 def _acts(identity: Mapping[str, Any], subject: str) -> str:
-    """Return why a model does not act. subject: of the source."""
+    """Return why a model does not act on a source of this subject; empty for one that acts."""
     reasons = {"recordings": "recorded frames are shown", "pictures": "pictures are shown"}
     reason = reasons.get(subject, "only captured, once per episode")
     return f"no: {reason}; no success rate" if identity.get("capture_only") else ""
@@ -225,7 +225,7 @@ def _describe(stored: Any) -> str:
 
 
 def print_sufficiency(extraction: "Extraction") -> None:
-    """Print what the plan is enough for, before any work; too few items in yellow."""
+    """Print which analyses the plan has enough items for, before any work; too few items in yellow."""
     from rich.table import Table
 
     from probe_kit.suite.sufficiency import GROUPS_FOR_PROBES, Smallest, sufficiencies
@@ -262,7 +262,7 @@ def check_size(extraction: "Extraction", location: "Location", agreed: bool) -> 
 
 
 def _next_command(run: "Run") -> str:
-    """Return the command that reads the run: its targets, its probes where it has groups enough, else success."""
+    """Return the command that reads the run: its targets, its probes if it has groups enough, else success."""
     from probe_kit.suite.sufficiency import probe_command
 
     if run.streams and run.inputs is not None:
@@ -272,7 +272,7 @@ def _next_command(run: "Run") -> str:
 
 
 def print_input_notes(run: "Run") -> None:
-    """Say which inputs did not change the first output, in yellow."""
+    """Print which inputs did not change the first output, in yellow."""
     from probe_kit.runs.provenance import input_notes
 
     for note in input_notes(run.certificate):
@@ -297,7 +297,7 @@ def _print_outcomes(run: "Run") -> None:
 
 
 OWN_SCENE = frozenset(SceneOptions.model_fields) - {"scene"} | {"wordings"}
-"""Fields of a scene that questions leave as they are."""
+"""The fields of a scene that questions leave as they are."""
 
 
 @command_with(*AskSettings.option_models(), offers=lambda name: name not in OWN_SCENE)
@@ -347,7 +347,7 @@ def ask(
 
 
 def _print_answers(runs: "Sequence[Run]") -> None:
-    """Print how each run went, what to look at, and what to do next."""
+    """Print the outcomes of each run, its folder, and the next command."""
     import pandas as pd
 
     from probe_kit.runs.reader import SIDE

@@ -1,7 +1,7 @@
 """Files of settings for `extract --config`: written by `--print-config`, or those of a run.
 
-A run records where it had its checkpoint, the files of its source and those of the model's options. They are
-searched for there, unless an option beside `--config` gives another one.
+A run records where it had its checkpoint, the files of its source and those of the model's options. They are read
+from there, unless an option beside `--config` gives another one.
 """
 
 from collections.abc import Collection, Mapping
@@ -29,7 +29,12 @@ if TYPE_CHECKING:
 
 
 def origin_of_process(settings: Settings, card: Mapping[str, Any]) -> Origin:
-    """Return the origin of a process that plays with some settings. card: of its model; empty for a script."""
+    """Return the origin of a process that plays with some settings.
+
+    Args:
+        settings: The settings of the run.
+        card: The card of its model as JSON; empty for a script.
+    """
     model, checkpoint = settings.model, str(card.get("checkpoint") or "")
     return Origin(
         files={name: _absolute(path) for name, path in settings.source.files().items()},
@@ -48,9 +53,10 @@ def _absolute(path: Path | str) -> str:
 def read_config(
     path: Path, typed: Mapping[str, Any] = MappingProxyType({}), asks: bool = False
 ) -> Mapping[str, Any]:
-    """Settings by part, from a file of `--print-config`, or from a run that its folder or `run.json` names.
+    """Return settings by part, from a file of `--print-config`, or from a run that its folder or `run.json` names.
 
     Args:
+        path: The file, the folder of a run, or its `run.json`.
         typed: Values of a command line by parameter; what they replace is not searched for.
         asks: Whether the run is one of `probe-kit ask`.
 
@@ -64,7 +70,7 @@ def read_config(
 
 
 def _of_run(folder: Path, typed: Mapping[str, Any], asks: bool) -> Mapping[str, Any]:
-    """The settings of a run, with its checkpoint and its files where the run had them."""
+    """Return the settings of a run, with its checkpoint and its files where the run had them."""
     from probe_kit.runs.run import open_run
 
     run = open_run(folder, allow_partial=True)
@@ -82,7 +88,7 @@ def _of_run(folder: Path, typed: Mapping[str, Any], asks: bool) -> Mapping[str, 
 
 
 def _model_of_run(run: "Run", model: Mapping[str, Any], typed: Mapping[str, Any]) -> dict[str, Any]:
-    """The settings of a run's model as values. Raises UsageError for files that are gone and not typed."""
+    """Return the settings of a run's model as values. Raises UsageError for files that are gone and not typed."""
     origin, checkpoint = origin_of(run), model["checkpoint"]
     if typed.get("model") not in (None, model["family"]):
         return dict(model)
@@ -99,7 +105,7 @@ def _model_of_run(run: "Run", model: Mapping[str, Any], typed: Mapping[str, Any]
 
 
 def _typed_or_stored_source(run: "Run", typed: Mapping[str, Any]) -> dict[str, Any]:
-    """The part `source` of a run's settings; empty where a command line names one of another kind."""
+    """Return the part `source` of a run's settings; empty where a command line names one of another kind."""
     kind = kind_of(run.settings[CONFIG]["source"])
     if kinds_typed(typed).keys() - {kind}:
         return {}
@@ -108,11 +114,12 @@ def _typed_or_stored_source(run: "Run", typed: Mapping[str, Any]) -> dict[str, A
 
 
 def source_of_run(run: "Run", replaced: Collection[str], flags: Mapping[str, str]) -> dict[str, Any]:
-    """The settings of a run's source as values, with its files where the run had them.
+    """Return the settings of a run's source as values, with its files where the run had them.
 
     Args:
-        replaced: Fields that are given anew.
-        flags: Options of a command that give fields.
+        run: The run whose source is opened again.
+        replaced: The fields that are given anew.
+        flags: The options of a command that give fields, by field.
 
     Raises:
         UsageError: For a run without its settings, and for files that are gone.
@@ -132,7 +139,7 @@ def source_of_run(run: "Run", replaced: Collection[str], flags: Mapping[str, str
 
 
 def _check_there(run: "Run", field: str, path: Path, flag: str | None) -> None:
-    """Raise UsageError for a file that is gone. flag: the option that gives another one."""
+    """Raise UsageError for a file that is gone; `flag` is the option that gives another one, None without."""
     if not path.exists():
         again = f"Give it with {flag}" if flag else "Put it there again"
         raise UsageError(f"{run.location} was made of {path}, its {field}, which is not here any more. {again}")
@@ -145,7 +152,7 @@ _PANEL = "Source that was moved"
 
 
 def _options(kind: "type[SourceSettings]") -> dict[str, FieldOption]:
-    """The options that give a moved part of this kind of source, by field."""
+    """Return the options that give a moved part of this kind of source, by field."""
     options = kind.command_options()
     return {field: options[field] for field in kind.moves}
 
@@ -168,7 +175,7 @@ MovedOptions = _moved_options()
 def moved_of(run: "Run", typed: Mapping[str, Any]) -> dict[str, Any]:
     """Return the parts of a run's source that typed parameters give anew, by field.
 
-    Other parameters are passed over.
+    Other parameters are ignored.
 
     Raises:
         UsageError: For a part that only another kind of source has.
@@ -187,9 +194,9 @@ def moved_of(run: "Run", typed: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def source_again(run: "Run", moved: Mapping[str, Any]) -> "SourceSettings":
-    """Return the settings of a run's source, to show its observations again. moved: parts given anew, by field.
+    """Return the settings of a run's source, to show its observations again; errors are those of `source_of_run`.
 
-    Raises what `source_of_run` raises.
+    The parts of `moved`, by field, take the place of the stored ones.
     """
     kind = kind_of(run.settings[CONFIG]["source"]) if CONFIG in run.settings else None
     flags = {} if kind is None else {field: option.flag for field, option in _options(kind).items()}

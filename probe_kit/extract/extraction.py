@@ -1,4 +1,4 @@
-"""Extraction from top to bottom: settings, source, checks, model, plan; workers play; the run is sealed."""
+"""Extraction from settings to a run: source, checks, model and plan; then workers play, and the run is sealed."""
 
 import json
 import os
@@ -45,12 +45,12 @@ if TYPE_CHECKING:
 
 
 CheckCameras = Callable[[Sequence[str]], object]
-"""Called with the names of the model's cameras that get a picture; raises UsageError."""
+"""A function that gets the names of the model's cameras that get a picture, and raises UsageError."""
 Progress = Callable[[int, int, str], None]
 # If this many episodes were given up and none succeeded, something is wrong with all of them.
 HOPELESS = 3
 _OF_THE_CHECKPOINT = ("dtype", "execute", "random_weights", "captured_calls")
-"""Settings whose value the loaded model may decide."""
+"""The settings whose value the loaded model may decide."""
 
 
 @dataclass(frozen=True)
@@ -58,12 +58,12 @@ class Extraction:
     """A prepared extraction, ready to run: the source is open, the model is loaded and the plan is made.
 
     Attributes:
-        source: As the model is shown it.
-        card: The part of the identity that the loaded model decides. controller: None if the model is loaded again
-            by workers elsewhere.
-        calibration: What chose the batch, None if it was not requested or is left to workers.
-        declared: Whose sizes the streams have where no model was loaded and the run has no name yet; empty where
-            one was.
+        source: The source as the model is shown it.
+        card: The part of the identity that the loaded model decides.
+        controller: The controller of the loaded model. None: workers elsewhere load the model again.
+        calibration: The measurement that chose the batch; None if it was not requested or is left to workers.
+        declared: The origin of the sizes of the streams where no model was loaded and the run has no name yet;
+            empty where a model was loaded.
     """
 
     settings: Settings
@@ -75,28 +75,28 @@ class Extraction:
     declared: str = ""
 
     def identity(self) -> dict[str, Any]:
-        """Everything that decides the numbers of an episode: neither which are selected, nor machine and label.
+        """Return everything that decides the numbers of an episode, without selection, machine and label.
 
         Runs with equal identity have equal numbers in the episodes that both have.
         """
         return {**self.settings.identity(), **self.card, **self.plan.identity}
 
     def provenance(self) -> dict[str, Any]:
-        """The provenance of a process that plays with these settings here; with the decoder of recorded videos."""
+        """Return the provenance of a process that plays with these settings here, with its video decoder."""
         dtype: str | None = self.card.get("dtype")
         decoder = {} if self.plan.decoder is None else {"decoder": self.plan.decoder}
         return provenance_here(self.settings.machine.device, dtype) | decoder
 
     def writer(self, location: Location) -> RunWriter:
-        """A writer of the run at `location`, which it begins or continues.
+        """Return a writer of the run at `location`, which it begins or continues.
 
         Raises:
-            SettingsMismatchError: If other settings are there.
+            SettingsMismatchError: If the location holds a run with other settings.
         """
         return RunWriter(location, self.plan, self.identity(), self.provenance(), run_label(self.settings))
 
     def default_name(self) -> str:
-        """Folder name that repeats for the same settings, so that the same command finds its run again.
+        """Return a folder name that repeats for the same settings, so that the same command finds its run again.
 
         A command with more items finds it too; one with other categories, wordings or another suite does not.
         """
@@ -105,23 +105,29 @@ class Extraction:
         return self.settings.folder_name("…" if self.declared else sha256_json(hashed)[:8])
 
     def worker(self, writer: RunWriter, episodes: int) -> Worker:
-        """A worker of this process, which plays so many episodes at most with the model that is loaded."""
+        """Return a worker of this process, which plays at most `episodes` episodes with the loaded model."""
         assert self.controller is not None
         return Worker(writer, self.settings, self.controller, self.source, episodes)
 
     def run(self, out: Path | str | Location, force: bool = False, progress: Progress | None = None) -> Run:
         """Play and commit every episode of the plan that is not committed yet, seal the run and open it.
 
-        A run that lacks episodes of the plan grows by them. One that has more than these stays as it is.
-
-        Raises SettingsMismatchError or DiskSpaceError before anything is written, StoreError if `out` lies in an
-        object store that cannot be used, as one that ignores conditional puts, EpisodesFailedError at the end if
-        episodes were given up, and whatever is wrong with all episodes at once. Committed episodes stay; the same
-        call resumes after them.
+        A run that lacks episodes of the plan grows by them. One that has more than these stays as it is. Committed
+        episodes stay; the same call resumes after them. An error that concerns all episodes at once is raised as
+        it is.
 
         Args:
+            out: The folder or URL of the run.
+            force: Start even if the disk seems too small.
             progress: Called with (episodes done, episodes planned, outcome of the last one); by default a bar in a
                 notebook, nothing elsewhere.
+
+        Raises:
+            UsageError: If the extraction was planned without its model.
+            SettingsMismatchError: Before anything is written, if `out` holds a run with other settings.
+            DiskSpaceError: Before anything is written, if the disk is too small.
+            StoreError: If `out` lies in an object store that cannot be used, as one that ignores conditional puts.
+            EpisodesFailedError: At the end, if episodes were given up.
         """
         location = locate(out)
         if self.declared:
@@ -143,9 +149,11 @@ class Extraction:
         return open_run(location)
 
     def further_plan(self, location: Location) -> Plan:
-        """The plan of the episodes that the run at `location` does not plan yet: all of them where there is none.
+        """Return the plan of the episodes that the run at `location` does not plan yet; all if there is none.
 
-        Raises SettingsMismatchError if the run there cannot grow by this plan, and RunDamagedError.
+        Raises:
+            SettingsMismatchError: If the run there cannot grow by this plan.
+            RunDamagedError: If the run there was changed.
         """
         root = find_continuable(location)
         if root is None:
@@ -183,18 +191,26 @@ def load(
 ) -> Extraction:
     """Open the source, load the model and plan the rows.
 
-    Raises UsageError for a policy of another family or with other weights than the settings name, and what these
-    raise: UnknownModelError, UnknownCategoryError, SuiteError, RecordingError, OwnEnvironmentError, WeightsError …
-
     Args:
+        settings: The settings of the run.
         rehearsed: Whether the source was tried before.
-        location: Where it will be written, if that is known, so that it is looked at before the model is loaded.
+        location: The place of the run, if it is known, so that it is checked before the model is loaded.
         model: The policy or answer model of these settings, if it is loaded already; it may be one of your own,
             and several runs can share it.
         fetch: False makes the plan of the streams that the model's family declares: without weights, network or
             GPU. A family that declares none is loaded.
-        check_cameras: Called once they are known, before weights are loaded where the checkpoint's files say it,
-            and again of the loaded model.
+        check_cameras: Called once the cameras are known, before weights are loaded where the checkpoint's files
+            name them, and again with those of the loaded model.
+
+    Raises:
+        UsageError: For a policy of another family or with other weights than the settings name.
+        UnknownModelError: For an unknown family.
+        UnknownCategoryError: For a category that the suite lacks.
+        SuiteError: For a suite that cannot be used.
+        RecordingError: For recordings that cannot be used.
+        OwnEnvironmentError: For an environment that breaks its contract.
+        WeightsError: For weights that do not fit.
+        ProbeKitError: For any other fault of settings, source or model.
     """
     settings, source = open_checked(settings, location, model is not None, fetch)
     task = task_of(settings)
@@ -228,11 +244,15 @@ def load(
 def open_checked(
     settings: Settings, location: Location | None = None, loaded: bool = False, fetch: bool = True
 ) -> tuple[Settings, Source[Any]]:
-    """The settings with what protocol and source decide, and the open source; all is checked that needs no model.
+    """Return the settings with what protocol and source decide, and the open source. Raises as `load`.
+
+    All is checked that needs no model.
 
     Args:
-        loaded: The model is there already, and may be one that no name leads to.
-        fetch: See `Family.check`. Raises as `load`.
+        settings: The settings of the run.
+        location: The place of the run, if it is known.
+        loaded: Whether the model is loaded already; it may be one that no name leads to.
+        fetch: False reads no file that would have to be downloaded, see `Family.check`.
     """
     task = task_of(settings)
     check_meaningless(settings)
@@ -271,10 +291,13 @@ def check_model(settings: Settings, fetch: bool = True) -> None:
     """Refuse a model, option, device or checkpoint that cannot be used; imports no torch.
 
     Args:
-        fetch: See `Family.check`.
+        settings: The settings of the run.
+        fetch: False reads no file that would have to be downloaded, see `Family.check`.
 
     Raises:
-        UnknownModelError: And what `Family.check` raises.
+        UnknownModelError: For an unknown family.
+        MissingExtraError: For workers on a Ray cluster without Ray.
+        ProbeKitError: As `Family.check` raises it.
     """
     if settings.machine.ray is not None and find_spec("ray") is None:
         raise MissingExtraError(f"--ray needs ray, which is not installed; `{install_command('ray')}`")
@@ -307,12 +330,12 @@ def _check_writable(location: Location) -> None:
 
 
 def _check_other_run(settings: Settings, source: Source[Any], location: Location) -> None:
-    """Raise SettingsMismatchError for a place where a run lies that has other settings or cannot grow so.
+    """Raise SettingsMismatchError for a location that holds a run with other settings, or one that cannot grow so.
 
     Only what is known without the model is compared; the writer compares all of it.
 
     Raises:
-        RunDamagedError: If what lies there was changed.
+        RunDamagedError: If the run at the location was changed.
     """
     early = source.known_early()
     with location.explained_errors():
@@ -329,10 +352,10 @@ def _check_other_run(settings: Settings, source: Source[Any], location: Location
 
 
 def _selects_only(settings: Settings, location: Location | None) -> bool:
-    """Whether nothing but the items themselves is asked of the suite.
+    """Whether only the chosen items of the suite are needed.
 
-    Names of runs that are known before they are played hold the hash of the whole suite, and so does a run that is
-    there; questions name objects of all its items.
+    Names of runs that are known before they are played hold the hash of the whole suite, and so does an existing
+    run; questions name objects of all its items.
     """
     if task_of(settings).names_all_items:
         return False
@@ -353,7 +376,7 @@ def _plan(
     streams: Iterable[StoredStream],
     execute: int,
 ) -> Plan:
-    """The plan of rows that store these streams. execute: actions per inference, 0 where none are predicted."""
+    """Return the plan of rows that store these streams, with `execute` actions per inference, 0 for none."""
     capture, streams = settings.capture, tuple(streams)
     size = sum(stream.raw_bytes(capture.tokens == "all", capture.calls, capture.later_views) for stream in streams)
     return Plan(
@@ -372,12 +395,16 @@ def _plan(
 
 
 def play(prepared: Extraction, writer: RunWriter, numbers: list[int]) -> Generator[Event]:
-    """Play episodes where the settings say; yields `Done` of each, or `Failed` once it is given up.
+    """Play episodes where the settings say; yield `Done` of each, or `Failed` once it is given up.
 
-    In this process with the model that is loaded, else in workers with one of their own, to which only episode
-    numbers are sent. An episode that fails, or is lost with its worker, is tried once more.
-    Raises what a worker raises, WorkerDiedError if workers die before they begin, MissingExtraError without Ray,
-    and UsageError if no cluster answers.
+    They are played in this process with the loaded model, else in workers that load their own, to which only
+    episode numbers are sent. An episode that fails, or is lost with its worker, is tried once more.
+
+    Raises:
+        WorkerDiedError: If workers die before they begin.
+        MissingExtraError: Without Ray.
+        UsageError: If no Ray cluster answers.
+        ProbeKitError: As a worker raises it.
     """
     queue = TaskQueue(((number, number) for number in numbers), "episode")
     settings = prepared.settings
@@ -398,7 +425,9 @@ def play(prepared: Extraction, writer: RunWriter, numbers: list[int]) -> Generat
 def play_episodes(
     setup: tuple[Settings, str], take: Callable[[], int | None], report: Callable[[Event], None]
 ) -> None:
-    """The work of a worker elsewhere: load the model, then play what is handed out of a run, which is held.
+    """Do the work of a worker elsewhere: load the model, then play the episodes that are handed out.
+
+    The run is held meanwhile.
 
     Raises:
         SettingsMismatchError: If this machine has other settings or gives other numbers than those before it.
@@ -434,7 +463,7 @@ def _pool(settings: Settings, run: str) -> Pool:
 
 
 def _gpus(settings: Settings, resources: Mapping[str, Any]) -> list[int]:
-    """The GPUs of each actor: as many actors as GPUs, or as the settings say."""
+    """Return the GPUs of each actor: as many actors as GPUs, or as the settings say."""
     gpus = int(resources.get("GPU", 0)) if settings.machine.device.startswith("cuda") else 0
     return [1 if gpus else 0] * (settings.machine.workers or max(1, gpus))
 
@@ -460,17 +489,23 @@ def prepare(
     fetch: bool = True,
     check_cameras: CheckCameras | None = None,
 ) -> Extraction:
-    """Find the suite, load the model and plan the episodes.
+    """Find the suite, load the model and plan the episodes. Raises as `load`.
 
     Args:
-        out: Where it will be written, if that is known; what is wrong there is then said before the model is
+        settings: The settings of the run.
+        out: The folder or URL of the run, if it is known; what is wrong there is then said before the model is
             loaded.
         model: The policy or answer model of these settings, if it is loaded already; several runs can share it.
             Workers load their own.
         fetch: False plans with the streams that the family declares, without weights, network or GPU; such an
             extraction cannot be run.
-        check_cameras: Called with the cameras that get a picture, see `load`. Raises what these raise:
-            UnknownModelError, UnknownCategoryError, SuiteError, WeightsError …
+        check_cameras: Called with the cameras that get a picture, see `load`.
+
+    Raises:
+        UnknownModelError: For an unknown family.
+        UnknownCategoryError: For a category that the suite lacks.
+        SuiteError: For a suite that cannot be used.
+        WeightsError: For weights that do not fit.
     """
     location = None if out is None else locate(out)
     load_with = partial(load, location=location, model=model, fetch=fetch, check_cameras=check_cameras)
@@ -496,11 +531,15 @@ def ask_run(settings: AskSettings, out: Path | str, progress: Progress | None = 
 def prepare_asks(
     settings: Sequence[AskSettings], outs: Sequence[Path | str | Location | None], fetch: bool = True
 ) -> Iterator[Extraction]:
-    """Several runs of one model, which is loaded once; each is prepared when its turn comes.
+    """Yield several runs of one model, which is loaded once; each is prepared when its turn comes.
+
+    Faults of any of them that are known without the model are raised before the first is prepared. Raises as
+    `prepare`.
 
     Args:
-        fetch: As of `prepare`. What is wrong with any of them, as far as it is known without the model, is said
-            before the first. Raises what `prepare` raises.
+        settings: The settings of every run; the model of the first one is loaded.
+        outs: The folder or URL of every run, None where it is not known yet.
+        fetch: False plans without weights, see `prepare`.
     """
     for one_run, out in zip(settings, outs, strict=True):
         open_checked(one_run, None if out is None else locate(out), fetch=fetch)

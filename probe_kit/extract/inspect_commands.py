@@ -95,7 +95,7 @@ def _print_words(name: str | None, run: str | None, as_json: bool) -> None:
 
 
 def _listed(rows: list[dict[str, Any]]) -> Text:
-    """A line per model, its description cut behind a word where the console ends."""
+    """Return a line per model, its description cut behind a word where the console ends."""
     lines = [(row["model"], row["does"], _in_a_word(row["ready"]), row["description"]) for row in rows]
     lines = [("model", "does", "ready", "what it is"), *lines]
     widths = [max(len(line[column]) for line in lines) for column in range(3)]
@@ -112,7 +112,7 @@ def _in_a_word(ready: str) -> str:
 
 
 def _ready(family: "Family") -> str:
-    """Say if a family can be run here. A third party's family may be wrong about itself, and only about itself."""
+    """Say whether a family can be run here; a third party's family may be wrong, but only about itself."""
     try:
         lacking = family.missing()
     except (ImportError, ValueError, TypeError, AttributeError, OSError) as error:

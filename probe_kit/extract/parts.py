@@ -1,4 +1,4 @@
-"""Parts of the settings of a run: model, capture, task, machine. A field says by its part whether it is identity.
+"""Parts of the settings of a run: model, capture, task, machine. The part of a field says if it is identity.
 
 `capture` and `task` are identity as they are; `model` and the source (in `sources/`) are by what they lead to, a
 hash of weights and a list of rows; `machine` never is. A field is declared here once: its annotation holds the
@@ -34,12 +34,12 @@ control_option = partial(typer.Option, rich_help_panel="Controls")
 
 
 def option_of(annotated: Any) -> Any:
-    """The option of an alias in `_terminal.options`, for a field of another type than its texts."""
+    """Return the option of an alias in `_terminal.options`, for a field of another type than its texts."""
     return annotated.__metadata__[0]
 
 
 def count_or(word: str, option: str) -> Callable[[Any], Any]:
-    """A parser of a whole number or `word`. Raises UsageError for anything else."""
+    """Return a parser of a whole number or `word`, which raises UsageError for anything else."""
 
     def parse(text: Any) -> Any:
         number = whole_number(str(text))
@@ -51,7 +51,7 @@ def count_or(word: str, option: str) -> Callable[[Any], Any]:
 
 
 def read_options(value: Any) -> Any:
-    """KEY=VALUE texts as a dictionary, and a dictionary as it is."""
+    """Return KEY=VALUE texts as a dictionary, and a dictionary as it is."""
     return read_pairs(value) if isinstance(value, Sequence) and not isinstance(value, str) else dict(value or {})
 
 
@@ -79,7 +79,7 @@ SCRIPTED: Mapping[str, str] = {
     "expert-mirrored": "scripted: knows the answer and puts the cube on the other picture",
     "idle": "scripted: does nothing; what a rule gives it is owed to no answer",
 }
-"""Policies without a network, which stand in place of a family, and what each does."""
+"""The policies without a network, which take the place of a family, and what each does."""
 
 
 class ModelSettings(Part):
@@ -87,10 +87,11 @@ class ModelSettings(Part):
 
     Attributes:
         family: A name of `probe-kit models`, or a script.
-        checkpoint: Folder or hub id; None for the family's default.
-        options: What only some families have, such as `unnorm_key`.
-        weights_seed: Of an untrained network's weights.
-        dtype: Of the weights; None for the checkpoint's.
+        checkpoint: A folder or hub id; None for the family's default.
+        options: Options of the family, such as `unnorm_key`.
+        random_weights: Whether the weights are untrained, as a control.
+        weights_seed: The seed of untrained weights.
+        dtype: The data type of the weights; None for the checkpoint's.
     """
 
     family: Annotated[str, option_of(common.ModelName)]
@@ -118,9 +119,10 @@ class Capture(Part):
 
     Attributes:
         tokens: `pooled` stores pooled views only, `all` also every token.
-        captured_calls: Inferences captured per episode, from the first on; `all` is as many as an episode can
-            have, once the model is loaded. later_views: `mean` stores of the inferences after the first the view
-            `mean` alone, in bfloat16.
+        captured_calls: The number of inferences captured per episode, from the first on; `all` is as many as an
+            episode can have, once the model is loaded.
+        later_views: `mean` stores of the inferences after the first the view `mean` alone, in bfloat16.
+        codec: The compression of stored activations.
     """
 
     tokens: Annotated[
@@ -158,7 +160,7 @@ class Capture(Part):
 
     @property
     def calls(self) -> int:
-        """Inferences captured per episode. Raises UsageError for `all`, which has no number yet."""
+        """The number of inferences captured per episode. Raises UsageError for `all`, which has no number yet."""
         if self.captured_calls == "all":
             raise UsageError("captured_calls is 'all', which has no number before the model is loaded")
         return self.captured_calls
@@ -185,7 +187,7 @@ class AskCapture(Part):
 
 
 def _edit(value: Any) -> Any:
-    """An edit from what a file has of it."""
+    """Return an edit from its entry in a file; one that is an edit is returned as it is."""
     if not isinstance(value, Mapping):
         return value
     sites = tuple(Site.parse(site) for site in value.get("sites", ()))
@@ -202,12 +204,14 @@ class ActTask(Part):
     """The task of a policy: to act, or to be captured only.
 
     Attributes:
-        protocol: A published one, such as `act2answer`: what is not chosen is as it has it, see `protocols`.
-            execute: actions per inference; None for the policy's own.
-        rotation: What reaches the controller as the rotation of an action, see `ProtocolRow`; None for the
-            protocol's, or its angles as they are.
-        capture_only: Capture the first inference of every episode and do not act.
-        edits: What is changed in the streams at every inference; vectors: their directions and sources, by hash.
+        protocol: A published protocol, such as `act2answer`, which decides what is not chosen, see `protocols`.
+            None for no protocol.
+        execute: The number of actions executed per inference; None for the policy's own.
+        rotation: The form in which the rotation of an action reaches the controller, see `ProtocolRow`; None for
+            the protocol's, or its angles as they are.
+        capture_only: Whether the first inference of every episode is captured and the policy does not act.
+        edits: The changes of the streams at every inference.
+        vectors: The directions and sources of the edits, by hash.
     """
 
     protocol: Annotated[
@@ -256,13 +260,15 @@ class AskTask(Part):
     """The task of a model that answers: prompt, picture and object.
 
     Attributes:
-        protocol: A published one, whose scene takes the place of the default one; it decides nothing else of a
-            question.
+        protocol: A published protocol, whose scene takes the place of the default one; it decides nothing else of
+            a question.
         prompt: A template, or its name or file.
-        picture: `frame` shows the first frame of the episode, `side-by-side` its two pictures on grey, `none`
+        picture: `frame` shows the first frame of the episode, `side-by-side` its two pictures on gray, `none`
             nothing.
-        query: The object that is asked for, see `QUERIES`. Raises UsageError for an absent object with a prompt
-            that takes no no.
+        query: The object that is asked for, see `QUERIES`.
+
+    Raises:
+        UsageError: For an absent object with a prompt to which "no" is no answer.
     """
 
     execute: ClassVar[None] = None
@@ -303,18 +309,21 @@ class AskTask(Part):
 
 
 class Machine(Part):
-    """Settings that change no stored number: how fast a run comes, and the pictures that are stored for people.
+    """Settings that change no stored number: the speed of a run, and the pictures that are stored for people.
 
     Attributes:
         frames: `ends` stores small copies of the first and last frame of every episode, `all` of every frame,
             `none` none.
-        env_workers: Processes that simulate and draw; None for two per observation of a batch, 0 for this process.
-        workers: Processes with a model each, one per GPU where there are several; 0 for this process. ray: address
-            of a Ray cluster, or `auto`; the workers then run there.
-        inference_limit: Seconds that one call of the model may take in a worker, which is ended then; its episodes
-            are tried once more and given up by name. None for no limit.
+        env_workers: The number of processes that simulate and draw; None for two per observation of a batch, 0 for
+            this process.
+        workers: The number of processes with a model each, one per GPU where there are several; 0 for this
+            process.
+        ray: The address of a Ray cluster, or `auto`; the workers then run there. None for this machine.
+        inference_limit: The seconds that one call of the model may take in a worker. A worker that takes longer is
+            ended; its episodes are tried once more, and given up by name. None for no limit.
         allow_mixed: Continue a run whose episodes were made on another kind of device or with other versions; the
             run is then marked as mixed wherever tables name it.
+        accept_ignored_inputs: Accept a model that neither another picture nor another instruction changes.
     """
 
     device: common.Device = "cpu"
@@ -342,7 +351,7 @@ class Machine(Part):
     ] = False
 
     def model_post_init(self, _: Any) -> None:
-        """Raise UsageError for a limit in a process that nothing can end."""
+        """Raise UsageError for a limit without a worker process that could be ended."""
         if self.inference_limit is not None and not self.elsewhere:
             raise UsageError(
                 f"--inference-limit {self.inference_limit:g} needs a process that can be ended: add --workers 1, "
@@ -351,7 +360,7 @@ class Machine(Part):
 
     @property
     def observations(self) -> int:
-        """Observations per call of the model. Raises UsageError for `auto`, which has no number yet."""
+        """The observations per call of the model. Raises UsageError for `auto`, which has no number yet."""
         batch = getattr(self, "batch", 1)
         if not isinstance(batch, int):
             raise UsageError(f"batch is {batch!r}, which has no number before it is measured")
@@ -359,18 +368,18 @@ class Machine(Part):
 
     @property
     def elsewhere(self) -> bool:
-        """Whether other processes than this one hold the model."""
+        """Whether processes other than this one hold the model."""
         return bool(self.workers or self.ray)
 
 
 class ActMachine(Machine):
-    """The same of a model that acts.
+    """The machine settings of a model that acts.
 
     Attributes:
-        batch: Observations per call of the model. With 1, bytes repeat exactly; with more, up to float rounding.
-            `auto` chooses batch and env_workers by a measurement of some seconds, see `calibration`; None is
-            `auto` for a policy on a GPU without a number of env_workers, and else 1.
-        video: GIF of the first episode, of all, or none.
+        batch: The number of observations per call of the model. With 1, bytes repeat exactly; with more, up to
+            float rounding. `auto` chooses batch and env_workers by a measurement of some seconds, see
+            `calibration`. None is `auto` for a policy on a GPU without a number of env_workers, and else 1.
+        video: The episodes of which a GIF is stored: the first, all, or none.
         accept_units: Play or show states that lie far outside the checkpoint's statistics.
     """
 
@@ -397,7 +406,11 @@ class ActMachine(Machine):
 
 
 class AskMachine(Machine):
-    """The same of a model that answers. batch: questions per call of the model."""
+    """The machine settings of a model that answers.
+
+    Attributes:
+        batch: The number of questions per call of the model.
+    """
 
     batch: Annotated[
         int,
@@ -415,7 +428,7 @@ def _plain_scene(scene: Any) -> dict[str, Any]:
 
 
 def _scene(value: Any) -> Any:
-    """A scene from what a file has of it; one that is a scene is returned as it is."""
+    """Return a scene from its entry in a file; one that is a scene is returned as it is."""
     from probe_kit.env import SceneSpec
 
     return value if isinstance(value, SceneSpec) else TypeAdapter(SceneSpec).validate_python(value)

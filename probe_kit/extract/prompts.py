@@ -28,7 +28,7 @@ from probe_kit.suite.items import other_side
 
 Query = Literal["target", "distractor", "absent"]
 Picture = Literal["frame", "side-by-side", "none"]
-"""What a question shows: the first frame, the two pictures on grey, or nothing."""
+"""The picture of a question: the first frame, the two pictures on gray, or nothing."""
 QUERIES: Mapping[Query, str] = {
     "target": "the object of the instruction",
     "distractor": "the other picture's: right is the other side",
@@ -39,24 +39,29 @@ _MOST_NAMED = 3
 
 @dataclass(frozen=True)
 class Phrase:
-    """The words for an object. article: "the", or empty for a name that has none."""
+    """The words for an object.
+
+    Attributes:
+        text: The words without an article.
+        article: The article "the", or empty for a name that has none.
+    """
 
     text: str
     article: str
 
     @classmethod
     def of(cls, item: Item) -> "Phrase":
-        """The object of an item's instruction."""
+        """Return the object of an item's instruction."""
         return cls(item.object_phrase, "the" if item.object_article == "the" else "")
 
     @property
     def with_article(self) -> str:
-        """The phrase as it stands in a sentence."""
+        """The phrase as it is written in a sentence."""
         return f"{self.article} {self.text}".strip()
 
 
 def phrases(suite: Suite, query: Query, seed: int = 0) -> dict[str, Phrase]:
-    """Return the phrase that is asked for by item; the same in both layouts, and the same for the same seed.
+    """Return by item the phrase that is asked for; the same in both layouts, and the same for the same seed.
 
     Other objects are those of the whole suite, so that a phrase does not depend on the number of items asked for.
 
@@ -88,7 +93,7 @@ _WHY: Mapping[Query, str] = {
 
 
 def _distractor(item: Item, items: Sequence[Item], _seed: int) -> Phrase | None:
-    """The phrase of the item that asks for the other picture: the role-exchanged twin, or any other."""
+    """Return the phrase of the item that asks for the other picture: the role-exchanged twin, or any other."""
     naming = [other for other in items if other.target_concept == item.distractor_concept]
     twins = [other for other in naming if other.group_id == item.group_id]
     if twins or naming:
@@ -100,7 +105,7 @@ def _distractor(item: Item, items: Sequence[Item], _seed: int) -> Phrase | None:
 
 
 def _absent(item: Item, items: Sequence[Item], seed: int) -> Phrase | None:
-    """A phrase of the category whose concept is in neither picture.
+    """Return a phrase of the category whose concept is in neither picture.
 
     Comparisons, such as "less smiling person", hold of some picture of every pair of their kind: where a category
     has both kinds, an item gets a phrase of its own kind only.
@@ -123,10 +128,10 @@ def _absent(item: Item, items: Sequence[Item], seed: int) -> Phrase | None:
 
 
 Order = Literal["original", "swapped"]
-"""Which side is named first: left, or right."""
+"""The side that is named first: left (`original`), or right (`swapped`)."""
 ORDERS: tuple[Order, Order] = ("original", "swapped")
 SIDE_TOKENS, LETTER_TOKENS = 24, 8
-"""Tokens that an answer in words, and one by letter, may have."""
+"""The tokens that an answer in words, and one by letter, may have."""
 _PLACES = re.compile(r"\{(\w*)\}")
 _FILLED = re.compile(r"\bthe \{object\}|\{object\}|\{A\}|\{B\}")
 _LETTERED = re.compile(r"\bA\b[^\w{}]*\{A\}.*\bB\b[^\w{}]*\{B\}", re.DOTALL)
@@ -135,10 +140,14 @@ _YES_OR_NO = re.compile(r"\byes or no\b", re.IGNORECASE)
 
 @dataclass(frozen=True)
 class Template:
-    """A prompt with its places still open. Raises UsageError for places it cannot have.
+    """A prompt whose places are still open.
 
     Attributes:
-        name: What runs and tables call it.
+        name: The name in runs and tables.
+        text: The words with places such as `{object}`.
+
+    Raises:
+        UsageError: For places that a prompt cannot have.
     """
 
     name: str
@@ -163,12 +172,12 @@ class Template:
 
     @cached_property
     def sha256(self) -> str:
-        """The hash of the text, places and all."""
+        """The hash of the text, including its places."""
         return sha256_text(self.text)
 
     @property
     def is_instruction(self) -> bool:
-        """Whether it has the instruction that policies get, and asks for no object."""
+        """Whether the prompt is the instruction that policies get, and asks for no object."""
         return "{instruction}" in self.text
 
     @property
@@ -183,7 +192,7 @@ class Template:
 
     @property
     def yes_or_no(self) -> bool:
-        """Whether it first asks if the object is there, so that "no" is an answer."""
+        """Whether the prompt first asks if the object is visible, so that "no" is an answer."""
         return _YES_OR_NO.search(self.text) is not None
 
     @property
@@ -192,7 +201,7 @@ class Template:
         return LETTER_TOKENS if self.lettered else SIDE_TOKENS
 
     def render(self, phrase: Phrase, order: Order = "original", instruction: str = "") -> str:
-        """The question about an object, with the sides named in this order. instruction: of the episode."""
+        """Return the question about an object, with the sides in this order and the episode's instruction."""
         if self.is_instruction:
             return self.text.replace("{instruction}", instruction)
         first, second = sides(order)
@@ -201,7 +210,7 @@ class Template:
 
 
 def sides(order: Order) -> tuple[Side, Side]:
-    """The side that is named first and the one that is named second."""
+    """Return the side that is named first and the one that is named second."""
     first: Side = "left" if order == "original" else "right"
     return first, other_side(first)
 
@@ -214,11 +223,11 @@ INSTRUCTION = Template("instruction", "{instruction}")
 TEMPLATES: Mapping[str, Template] = MappingProxyType(
     {template.name: template for template in (SEEN, P1, P2, INSTRUCTION)}
 )
-"""Those of the paper, and the instruction, by name."""
+"""The templates of the paper, and the instruction, by name."""
 
 
 def find_template(name: str) -> Template:
-    """A template of `TEMPLATES`, or the one in a text file, called after it.
+    """Return a template of `TEMPLATES`, or the one in a text file, named after the file.
 
     Raises:
         UsageError: If it is neither, or if the file's places are not those of a prompt.
@@ -244,11 +253,13 @@ def find_template(name: str) -> Template:
 
 GREY = (128, 128, 128)
 MARGIN = 0.05
-"""Of the width, at every edge and between the pictures."""
+"""The share of the width at every edge and between the pictures."""
 
 
 def side_by_side(episode: Episode, shape: tuple[int, int]) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8 of `shape`: left and right picture of the episode, as large as fits and equally large.
+    """Return left and right picture of the episode on gray, (H, W, 3) uint8 of `shape`.
+
+    Both are equally large, as large as fits.
 
     Raises:
         SuiteError: For a picture that is missing or damaged.

@@ -16,12 +16,12 @@ if TYPE_CHECKING:
     from probe_kit.hooks.family import Family
 
 SCENES: Mapping[str, str] = {ACT2ANSWER: "act2answer"}
-"""Scene preset by protocol."""
+"""The scene preset by protocol."""
 _OF_ACTING = ("execute", "rotation")
 
 
 def protocol_scene(protocol: str | None, name: str | None = None, **changes: Any) -> "SceneSpec":
-    """The preset `name`, else the protocol's, else the default one, with fields replaced.
+    """Return the preset `name`, else the protocol's, else the default one, with fields replaced.
 
     Raises:
         UsageError: For an unknown protocol.
@@ -64,9 +64,9 @@ def check_protocol(name: str) -> None:
 def protocol_identity(model: ModelSettings, task: ActTask, source: SourceSettings) -> dict[str, Any]:
     """Return what a run stores of the protocol it follows, under `protocol`; empty without one.
 
-    variant: which of several checkpoints of the protocol it is, where it has several for the model.
-    differs_from_default: what the protocol has and what is the default here, by setting. deviations: what the
-    protocol has and what the run has. unmatched: what cannot be done here.
+    The entry `variant` names the checkpoint of the protocol, where it has several for the model. The entry
+    `differs_from_default` has, by setting, the value of the protocol and the default here. The entry `deviations`
+    has the values of the protocol and of the run. The entry `unmatched` lists what cannot be done here.
     """
     if task.protocol is None or "protocol" in source.refuses:
         return {}
@@ -89,7 +89,7 @@ def protocol_identity(model: ModelSettings, task: ActTask, source: SourceSetting
 
 
 def protocol_row(model: ModelSettings, protocol: str | None) -> ProtocolRow | None:
-    """The protocol's row of a model and checkpoint; None without a protocol, and for scripts.
+    """Return the protocol's row of a model and checkpoint; None without a protocol, and for scripts.
 
     With another checkpoint than the protocol's, and with None, it is the row of the model's first.
 
@@ -117,7 +117,7 @@ def _family(model: str) -> "Family | None":
 
 
 def _used(model: ModelSettings, task: ActTask, scene: "SceneSpec") -> dict[str, str]:
-    """The values that the run is made with, under the names of `ProtocolRow.settings`."""
+    """Return the values that the run is made with, under the names of `ProtocolRow.settings`."""
     used = {f"-M {name}": _portable_value(as_text(value)) for name, value in model.options.items()}
     plain = {
         "checkpoint": model.checkpoint, "execute": task.execute, "rotation": task.rotation, "dtype": model.dtype,
@@ -127,12 +127,12 @@ def _used(model: ModelSettings, task: ActTask, scene: "SceneSpec") -> dict[str, 
 
 
 def _portable_value(value: str) -> str:
-    """Files and folders by their last name: where they lie on this machine is no part of a run."""
+    """Return the last name of a file or folder: its place on this machine is no part of a run."""
     return Path(value).name if is_here(value) else value
 
 
 def _defaults(model: str, row: ProtocolRow) -> dict[str, str]:
-    """The values of the same settings without a protocol, in the words of `probe-kit models`."""
+    """Return the values of the same settings without a protocol, in the words of `probe-kit models`."""
     from probe_kit.hooks.registry import find_family
 
     family = find_family(model)

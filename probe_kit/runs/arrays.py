@@ -305,7 +305,7 @@ class TokenBlock:
 
 
 def role_mask(spans: Sequence[Spans], tokens: int, role: str | None) -> NDArray[np.bool_]:
-    """Return the mask (E, tokens) of the positions of `role`, or of all but padding, from an episode's spans each."""
+    """Return the mask (E, tokens) of the positions of `role`, or of all but padding; `spans` is per episode."""
     mask = np.zeros((len(spans), tokens), bool)
     for row, episode in enumerate(spans):
         for name, start, stop in episode:

@@ -815,9 +815,10 @@ class Run:
         return token_blocks(rows, (call, *stored.at(site)), mask, stored.token_block)
 
     def gram(self, site: Site, role: str | None = None, call: int = 0) -> NDArray[np.float64]:
-        """Return a linear kernel (E, E) float64: products of tokens at equal positions, summed, by sqrt(n_i n_j).
+        """Return a linear kernel (E, E) float64 over the tokens of one site.
 
-        n is an episode's number of chosen tokens, so that longer instructions have no larger weight.
+        An entry is the sum of the products of tokens at equal positions, divided by sqrt(n_i n_j). n is an
+        episode's number of chosen tokens, so that longer instructions have no larger weight.
         """
         kernel = np.zeros((len(self._numbers), len(self._numbers)))
         counts = np.zeros(len(self._numbers))

@@ -2,7 +2,7 @@
 
 Every question is asked with the left side named first and, where the prompt can be turned round, once more with
 the right side named first. Each time the answer is both spoken and forced: greedy text, and the logits of the
-admissible answers where they stand.
+admissible answers at its beginning.
 """
 
 from collections.abc import Mapping, Sequence
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 
 ANSWERED = "answered"
-"""Outcome of a question that has no right answer."""
+"""The outcome of a question that has no right answer."""
 NO_OBJECT = Phrase("", "")
 """The phrase of a question that is the instruction itself."""
 
@@ -46,25 +46,31 @@ NO_OBJECT = Phrase("", "")
 Form = tuple[str, Mapping[str, Said]]
 """A forced choice in words: the beginning of the answer, and its admissible continuations by meaning."""
 Forced = tuple[dict[Said, float], float, bool]
-"""Logits of the admissible answers, one row: by what each says, their share, and whether rounding decides."""
+"""The logits of one row's admissible answers by what each says, their share, and whether rounding decides."""
 
 
 def _form(begun: str, lead: str) -> Form:
-    """Left, right or center behind `begun`, with `lead` in front of each."""
+    """Return the form left, right or center behind `begun`, with `lead` in front of each."""
     return begun, {f"{lead}left": "left", f"{lead}right": "right", f"{lead}center": "center"}
 
 
 class AnswerController(ModelController["AnswerModel", "Prompt"]):
-    """Asks an answer model, and captures the first inference of every episode unless nothing is stored.
+    """A controller that asks an answer model.
 
-    identity: `begun` is how the answer had begun where sides were forced in words.
-    Raises UsageError if an item has no phrase for what is asked, or an option is none behind this prompt.
+    It captures the first inference of every episode unless nothing is stored. The entry `begun` of its identity is
+    the beginning of the answer where sides were forced in words.
+
+    Raises:
+        UsageError: If an item has no phrase for what is asked, or an option is none behind this prompt.
     """
 
     outputs = "answers"
 
     def __init__(self, model: "AnswerModel", source: Source[Any], settings: AskSettings) -> None:
-        """source: its suite, if it has one, names objects and sides; a question of another is the instruction."""
+        """Prepare questions about a source; if it has a suite, the suite names objects and sides.
+
+        A question about another source is the instruction.
+        """
         suite = source.suite
         blank = source.example(min(source.instructions))
         self.model, self._settings, self.template = model, settings, settings.task.prompt
@@ -81,7 +87,7 @@ class AnswerController(ModelController["AnswerModel", "Prompt"]):
             self.identity["begun"] = self._form[0]
 
     def infer(self, turns: Sequence[Turn]) -> list[Inference]:
-        """Per turn the columns of its outcome; nothing is executed."""
+        """Return the columns of the outcome of every turn; nothing is executed."""
         with self._acting():
             return [Inference(None, columns=columns) for columns in self._answer_turns(turns)]
 
@@ -113,7 +119,7 @@ class AnswerController(ModelController["AnswerModel", "Prompt"]):
         ]
 
     def instruction_ids(self, instruction: str) -> tuple[int, ...] | None:
-        """The ids of the words around a picture, where the prompt is the instruction; None for a question."""
+        """Return the ids of the words around a picture, if the prompt is the instruction; None for a question."""
         return super().instruction_ids(instruction) if self.template.is_instruction else None
 
     def _try_inputs(self, question: "Prompt") -> None:
@@ -142,7 +148,7 @@ class AnswerController(ModelController["AnswerModel", "Prompt"]):
     def _questions(
         self, observations: Sequence[Observation], objects: Sequence[Phrase], order: Order
     ) -> list["Prompt"]:
-        """The questions as the answer is spoken; the logits of the options are those of how it begins."""
+        """Return the questions for spoken answers; the logits of their options are those of its beginning."""
         from probe_kit.hooks import Prompt
 
         pictured = self._settings.task.picture != "none"
@@ -158,7 +164,7 @@ class AnswerController(ModelController["AnswerModel", "Prompt"]):
         ]
 
     def _spoken_options(self, order: Order) -> dict[str, Said]:
-        """The meaning of an answer by its beginning."""
+        """Return the meaning of an answer by its beginning."""
         lead = self.model.lead
         if not self.template.lettered:
             return {f"{lead}Yes": "yes", f"{lead}No": "no"}
@@ -176,7 +182,7 @@ class AnswerController(ModelController["AnswerModel", "Prompt"]):
         )
 
     def _forced(self, questions: Sequence["Prompt"], reading: "Reading", order: Order) -> list[Forced]:
-        """The choice between the admissible answers; one in words takes a prefill of its own."""
+        """Return the choice between the admissible answers; one in words takes a prefill of its own."""
         meaning: Mapping[str, Said] = self._spoken_options(order)
         if self._form is not None:
             begun, meaning = self._form
@@ -198,7 +204,7 @@ class AnswerController(ModelController["AnswerModel", "Prompt"]):
         ]
 
     def _find_lens_stream(self) -> StoredStream | None:
-        """The stored stream whose last position chooses the letter; None for a model without an unembedding."""
+        """Return the stored stream whose last position chooses the letter; None without an unembedding."""
         if self.model.unembedding is None:
             return None
         stored = {stream.name: stream for stream in self.streams if "last" in stream.views}
@@ -257,7 +263,7 @@ class AnswerController(ModelController["AnswerModel", "Prompt"]):
         }
 
     def _statement(self, question: str, text: str, forced: Forced) -> dict[str, Any]:
-        """The columns of an answer that is neither right nor wrong; yes and no where the prompt asks for them."""
+        """Return the columns of an answer without right and wrong; yes and no if the prompt asks for them."""
         columns = {"outcome": ANSWERED if text.strip() else "oob", "answer": text, "question": question}
         if not self.template.yes_or_no:
             return columns
@@ -270,7 +276,7 @@ class AnswerController(ModelController["AnswerModel", "Prompt"]):
         }
 
     def _sizes(self, questions: Sequence["Prompt"]) -> list[dict[str, int]]:
-        """The length of each prompt; its last position can lie outside the backbone's stream."""
+        """Return the length of each prompt; its last position can lie outside the backbone's stream."""
         # Without `whole_prompt` the last position is the stream `answer`, and missing in the backbone's roles.
         backbone = next(name for name, stream in self.model.streams.items() if stream.part == "backbone")
         rows, after = self.model.asked_roles(questions)[backbone], int(not self.model.whole_prompt)
@@ -291,7 +297,7 @@ class AnswerController(ModelController["AnswerModel", "Prompt"]):
         return self._questions([blank] * len(objects), objects, "original")
 
     def _streams(self, blank: Observation) -> list[StoredStream]:
-        """At the longest prompt; a prompt without a picture has no view of one."""
+        """Return the streams at the longest prompt; a prompt without a picture has no view of one."""
         roles = self.model.asked_roles(self._blank_questions(blank))
         played = {name: {span.role for row in rows for span in row.spans} for name, rows in roles.items()}
         names = {
@@ -301,10 +307,9 @@ class AnswerController(ModelController["AnswerModel", "Prompt"]):
         return stored_streams(self.model, roles, names)
 
     def _choose_form(self, blank: Observation) -> Form | None:
-        """The first form in which the sides differ in their first token; None where options are letters or yes.
+        """Return the first form in which the sides differ in their first token; None for letters or yes.
 
-        One question about a blank picture is asked: what is wrong with prompt and options is said before any
-        episode.
+        One question about a blank picture is asked: faults of prompt and options are raised before any episode.
 
         Raises:
             UsageError: As `AnswerModel.read` does.

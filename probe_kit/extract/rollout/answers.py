@@ -54,7 +54,7 @@ _DENIED_LABEL = re.compile(
     r"\b(wrong|incorrect|false)((?:\s+(?:one|side|picture|image|tile|option|answer|choice|letter))?)\s*:",
     re.IGNORECASE,
 )
-"""In front of what is denied: its colon ends no clause."""
+"""A label in front of what is denied: its colon ends no clause."""
 _NO_DENIAL = re.compile(
     r"\b(?:no\s+(?:doubt|problem|question|worries)|without\s+(?:a\s+|any\s+)?doubt|not\s+only)\b", re.IGNORECASE
 )
@@ -68,13 +68,13 @@ _RIGHT_IS_NO_SIDE = re.compile(
     r"|\b(?:seems|looks|sounds)\s+right\b",
     re.IGNORECASE,
 )
-"""Praise, truth and adverbs."""
+"""Uses of "right" as praise, truth and adverbs."""
 _RIGHT_MAY_BE_A_SIDE = re.compile(
     r"\b(?:it|this|which|answer)\s+is\s+right\b(?!\s+(?:side|picture|image|tile))|\bright\s+one\b", re.IGNORECASE
 )
-"""Truth or a side: it names no side, and beside the other side nothing is clear."""
+"""Uses of "right" as truth or a side: it names no side, and beside the other side nothing is clear."""
 _PRAISE = re.compile(r"\s*right\s*[,:!.]", re.IGNORECASE)
-"""In front of a side; in front of a letter it may be the side."""
+"""Praise in front of a side; in front of a letter it may be the side."""
 _LEFT_IS_NO_SIDE = re.compile(
     r"\b(?:has|have|had)\s+left\b|\bnothing\s+left\b|\bleft\s+(?:over(?!\s+(?:the\s+)?right)|out|behind)\b",
     re.IGNORECASE,
@@ -102,7 +102,10 @@ class Mentions:
 
 
 def mentions_of(text: str) -> Mentions:
-    """All of a text, clause by clause: a denial reaches to the end of its clause. Questions are left out."""
+    """Return all mentions of a text, clause by clause: a denial reaches to the end of its clause.
+
+    Questions are left out.
+    """
     mentions = Mentions()
     for clause in _clauses(text):
         mentions.has_unclear_right |= bool(_RIGHT_MAY_BE_A_SIDE.search(_blanked(_RIGHT_IS_NO_SIDE, clause)))
@@ -130,7 +133,10 @@ def _sides(clause: str) -> Iterator[tuple[Named, bool]]:
 
 
 def _letters(clause: str) -> Iterator[tuple[str, bool]]:
-    """Upper case alone; `A` in front of a noun is an article if it begins a clause without another letter."""
+    """Yield upper-case letters and whether each is denied.
+
+    `A` in front of a noun is an article if it begins a clause without another letter.
+    """
     letters = list(_LETTER.finditer(clause))
     is_alone = all(match[1] == "A" for match in letters)
     for match in letters:
@@ -146,7 +152,7 @@ def _is_denied(clause: str, match: re.Match[str]) -> bool:
 
 
 def _blanked(pattern: re.Pattern[str], text: str) -> str:
-    """The text with spaces where the pattern is found, so that positions stay."""
+    """Return the text with spaces where the pattern matches, so that positions stay."""
     return pattern.sub(lambda match: " " * len(match[0]), text)
 
 
@@ -155,7 +161,10 @@ def _blanked(pattern: re.Pattern[str], text: str) -> str:
 
 Said = Literal["left", "right", "center", "yes", "no", "none"]
 Tier = Literal["strict", "clause"]
-"""strict: the whole text is an option or a side. clause: one was found among other words."""
+"""The certainty of a reading.
+
+`strict`: the whole text is an option or a side. `clause`: one was found among other words.
+"""
 
 _THOUGHT = re.compile(r"<think>.*?</think>", re.DOTALL)
 _SPECIAL = re.compile(r"<\|[^<>|]*\|>|</?(?:s|bos|eos|pad|unk|end_of_turn|start_of_turn|loc\d+)>")
@@ -186,7 +195,7 @@ _NO = re.compile(
     re.IGNORECASE,
 )
 _NOT_THAT = re.compile(r"\bnot\s+that\b", re.IGNORECASE)
-"""It's not that I can't see it: two denials."""
+"""A phrase of two denials, as in "It's not that I can't see it"."""
 _REFUSAL = re.compile(
     r"\b(?:sorry|cannot|can\s+not|can't|unable|not\s+sure|unsure|don't\s+know|do\s+not\s+know|not\s+able|unclear"
     r"|not\s+certain|uncertain|impossible)\b",
@@ -196,7 +205,12 @@ _REFUSAL = re.compile(
 
 @dataclass(frozen=True)
 class Answer:
-    """An answer as it was read. rule: as the outcome of an episode records it. tier: None for no meaning."""
+    """An answer as it was read.
+
+    Attributes:
+        rule: The rule that decided, as the outcome of an episode records it.
+        tier: The certainty of the reading; None for no meaning.
+    """
 
     meaning: Said
     rule: str
@@ -225,7 +239,10 @@ def read_answer(text: str, template: Template, order: Order = "original") -> Ans
 
 
 def _stripped(text: str) -> str:
-    """Without thoughts, special tokens, markup, reasons and spaces around it; nothing of an unfinished thought."""
+    """Return a text without thoughts, special tokens, markup, reasons and outer spaces.
+
+    Nothing of an unfinished thought remains.
+    """
     plain = _SPECIAL.sub("", _THOUGHT.sub("", unicodedata.normalize("NFKC", text))).partition("<think>")[0]
     plain = _BRACKETED.sub(r"\1:", plain)
     plain = _MARKUP.sub(" ", _INVISIBLE.sub("", plain).replace("\u2019", "'"))
@@ -267,7 +284,7 @@ def _by_clauses(plain: str, options: Mapping[str, Side]) -> Answer:
 
 
 def _by_letter(mentions: Mentions, options: Mapping[str, Side]) -> Answer | None:
-    """The option that is named; None where the text has no letter."""
+    """Return the option that is named; None where the text has no letter."""
     if len(mentions.letters) > 1 or mentions.letters & mentions.denied_letters:
         return Answer("none", "several sides")
     if mentions.letters:
@@ -291,7 +308,7 @@ Placed = Literal["left", "right", "none"]
 
 
 def side_said(meaning: Said) -> Placed:
-    """The side an answer puts the object on; none for everything else it may say."""
+    """Return the side an answer puts the object on; none for everything else it may say."""
     return meaning if meaning in ("left", "right") else "none"
 
 
@@ -303,7 +320,7 @@ def side_expected(query: Query, side_correct: Side) -> Side | None:
 
 
 def outcome_of(meaning: Said, expected: Side | None) -> Outcome:
-    """Judge an answer. Where nothing of the name is there, right is no and every place is wrong."""
+    """Judge an answer. Where neither picture shows the object, "no" is correct and every place is wrong."""
     if expected is None:
         return "correct" if meaning == "no" else "oob" if meaning == "none" else "wrong"
     if meaning not in ("left", "right"):
@@ -320,17 +337,17 @@ def likeliest(logits: Mapping[Said, float]) -> Said:
 
 @dataclass(frozen=True)
 class Choice:
-    """Logits of the admissible answers, by what each says, in one or two orders of the sides.
+    """The logits of the admissible answers, by what each says, in one or two orders of the sides.
 
     Attributes:
-        passes: As read with left named first and, where the prompt can be turned round, with right named first.
+        passes: The logits with left named first and, where the prompt can be turned round, with right named first.
     """
 
     passes: Sequence[Mapping[Said, float]]
 
     @property
     def margins(self) -> list[float]:
-        """Per pass left minus right; for an object that is not there, no minus yes."""
+        """The margin of every pass: left minus right; for an object that is not visible, no minus yes."""
         return [logits["left"] - logits["right"] if "left" in logits else logits["no"] - logits["yes"]
                 for logits in self.passes]  # fmt: skip
 
@@ -361,13 +378,15 @@ class Choice:
 def letter_margins(
     model: "AnswerModel", residuals: NDArray[np.float32], letters: NDArray[Any], margin: float
 ) -> list[float]:
-    """The logit lens: the letter for left minus that for right, by the model's own norm and head, at every layer.
+    """Return the logit lens at every layer: the letter for left minus that for right, by the model's norm and head.
+
+    One layer is computed at a time, so that no batch changes a number.
 
     Args:
+        model: A model with an unembedding.
         residuals: (L, D) float32 of the position that chooses the letter.
         letters: (2,) token ids, left and right.
-        margin: The same of the model's own answer, which the last layer must give but for rounding. One layer at a
-            time, so that no batch changes a number.
+        margin: The margin of the model's own answer, which the last layer must give up to rounding.
 
     Raises:
         CaptureError: If the last layer gives another margin.

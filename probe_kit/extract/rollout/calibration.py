@@ -1,7 +1,7 @@
-"""`--batch auto`: measures batch sizes and numbers of simulating processes for some seconds before a run.
+"""The measurement of `--batch auto`: batch sizes and simulating processes, for some seconds before a run.
 
-It decides how fast a run comes and nothing that is stored, but for the float rounding of batches; a family of
-which batching changes more says so on its card and is never given more than the card allows.
+It decides the speed of a run and nothing that is stored, except for the float rounding of batches. A family whose
+numbers batching changes more says so on its card and never gets more than the card allows.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -25,15 +25,15 @@ from probe_kit.runs.plan import Row
 
 # These are choices, not measurements: they decide how long a run takes, and no number of it.
 LARGEST = 64
-"""Observations per call that are tried at most."""
+"""The most observations per call that are tried."""
 BUDGET_S = 30.0
-"""Seconds after which no larger batch is tried."""
+"""The seconds after which no larger batch is tried."""
 ENOUGH = 0.95
-"""Share of the best rate with which a smaller batch is preferred: it needs less memory and fewer simulators."""
+"""The share of the best rate at which a smaller batch is preferred: it needs less memory and fewer simulators."""
 GAIN = 1.1
-"""A batch that brings less than this over the half of it ends the search."""
+"""The least gain in rate over half the batch; a batch that brings less ends the search."""
 TURNS = 3
-"""Inferences' worth of actions that a simulator is timed over, if its episode lasts so long."""
+"""The inferences' worth of actions over which a simulator is timed, if its episode lasts so long."""
 
 
 @dataclass(frozen=True)
@@ -41,12 +41,12 @@ class Calibration:
     """A measurement, and the batch that it led to.
 
     Attributes:
-        inference: Seconds of one call of the model, by batch.
-        turn: Seconds in which one simulator carries out the actions of one inference and draws the next picture,
+        inference: The seconds of one call of the model, by batch.
+        turn: The seconds in which one simulator executes the actions of one inference and draws the next picture,
             its share of setting up an episode included.
-        batch: chosen.
-        env_workers: As `batch`.
-        waits: Share of the time in which the model is expected to wait for simulators.
+        batch: The chosen number of observations per call.
+        env_workers: The chosen number of simulating processes; 0 for this process.
+        waits: The share of the time in which the model is expected to wait for simulators.
     """
 
     inference: Mapping[int, float]
@@ -72,12 +72,12 @@ class Calibration:
 def calibrated(
     settings: ExtractSettings, controller: PolicyController, source: Source[Any], rows: Sequence[Row]
 ) -> tuple[ExtractSettings, Calibration]:
-    """`settings` with a batch and simulating processes chosen for this machine, and what led to them.
+    """Return `settings` with a batch and simulating processes chosen for this machine, and the measurement.
 
-    Takes BUDGET_S or a little more.
+    Takes `BUDGET_S` or a little more.
 
     Raises:
-        UsageError: For settings that choose either by themselves.
+        UsageError: For settings that choose the simulating processes themselves.
     """
     if settings.machine.env_workers is not None:
         raise UsageError("--batch auto chooses batch and simulating processes: leave out --env-workers")
@@ -95,7 +95,7 @@ def largest_batch(of_card: int | None, episodes: int) -> int:
 
 
 def inference_times(infer: Callable[[int], object], most: int) -> dict[int, float]:
-    """Seconds per call by batch, 1, 2, 4 … up to `most`, as long as they bring more and the budget lasts.
+    """Return seconds per call by batch, 1, 2, 4 … up to `most`, while they bring more and the budget lasts.
 
     A batch that exceeds the memory ends the search; with a single observation that is an error.
     """
@@ -120,7 +120,7 @@ def inference_times(infer: Callable[[int], object], most: int) -> dict[int, floa
 
 
 def choose(inference: Mapping[int, float], turn: float, cores: int) -> Calibration:
-    """The smallest batch near the best rate, where one group of simulators works while the model infers.
+    """Return the smallest batch near the best rate, where one group of simulators works while the model infers.
 
     A core is left to the model. With one core in all, processes bring nothing and everything stays in this one.
     """
@@ -130,7 +130,7 @@ def choose(inference: Mapping[int, float], turn: float, cores: int) -> Calibrati
         return turn * -(-batch // hands)  # a group takes as many turns one after another as its fullest core
 
     def rate(batch: int) -> float:
-        """Observations per second: the slower of model and simulators sets the pace, since they alternate."""
+        """Return observations per second: the slower of model and simulators, which alternate, sets the pace."""
         seconds = inference[batch]
         return batch / (max(seconds, simulating(batch)) if cores > 1 else seconds + batch * turn)
 
@@ -152,7 +152,7 @@ def _infer(controller: PolicyController, example: Observation, batch: int) -> No
 
 
 def _turn(settings: ExtractSettings, controller: PolicyController, source: Source[Any], row: Row) -> float:
-    """Seconds per inference that a simulator takes, with zero actions; setting up counts once per episode."""
+    """Return a simulator's seconds per inference, with zero actions; setting up counts once per episode."""
     player = source.play(Played())()
     try:
         setting_up = _seconds(lambda: player.begin(row, False))

@@ -26,15 +26,19 @@ if TYPE_CHECKING:
 class EpisodeBuffers:
     """Everything captured in one episode, shaped like its rows in the store.
 
-    pooled: (S, *lead, V, D) float32 per stream, NaN where nothing was captured. tokens: (S, *lead, T, D) uint16
-    bits of bfloat16 per stream, zero where there is no token; empty if only views are stored. later: (S - 1,
-    *lead, D) uint16 bits of bfloat16 per stream, the view `mean` of the inferences after the first; empty unless
-    they keep that view alone, and pooled then holds the first one. roles: per captured inference and stream, the
-    spans of roles. lens_margins: of a question that is answered by letter, see `letter_margins`; None for all
-    else.
+    The attributes are these. `pooled`: (S, *lead, V, D) float32 per stream, NaN where nothing was captured.
+    `tokens`: (S, *lead, T, D) uint16 bits of bfloat16 per stream, zero where there is no token; empty if only
+    views are stored. `later`: (S - 1, *lead, D) uint16 bits of bfloat16 per stream, the view `mean` of the
+    inferences after the first. It is empty unless they keep that view alone, and `pooled` then holds the first
+    one. `roles`: per captured inference and stream, the spans of roles. `lens_margins`: the logit lens of a
+    question that is answered by letter, see `letter_margins`; None for any other.
 
     Args:
-        pinned: Page-locked memory, into which a GPU copies while it computes on.
+        streams: The storage of the streams.
+        calls: The number S of captured inferences.
+        with_tokens: Whether every token is stored.
+        pinned: Whether memory is page-locked, so that a GPU copies into it while it computes on.
+        later_views: `mean` keeps of the inferences after the first the view `mean` alone.
     """
 
     def __init__(
@@ -60,7 +64,7 @@ class EpisodeBuffers:
         self.clear()
 
     def clear(self) -> None:
-        """Forget the episode."""
+        """Make the buffers empty for the next episode."""
         self.roles: list[dict[str, list[tuple[str, int, int]]]] = []
         self.lens_margins: list[float] | None = None
         for pooled in self.pooled.values():
@@ -71,7 +75,7 @@ class EpisodeBuffers:
             later.fill(NOT_A_NUMBER)
 
     def record(self, planned: Row, outcome: Mapping[str, Any], **fields: Any) -> EpisodeRecord:
-        """The part of the episode that the run stores. fields: of an `EpisodeRecord`."""
+        """Return the part of the episode that the run stores; `fields` are others of an `EpisodeRecord`."""
         arrays: dict[str, Mapping[str, NDArray[Any]]] = {
             "pooled": self.pooled, "tokens": self.tokens, LATER: self.later,
         }  # fmt: skip
@@ -86,7 +90,7 @@ class EpisodeBuffers:
         )
 
     def keep_pooled(self, stream: str, values: "Tensor") -> None:
-        """Copy (sites, V, D) of the last inference begun, or what is stored of it."""
+        """Copy the rows (sites, V, D) of the last inference begun, or what is stored of them."""
         import torch
 
         call = len(self.roles) - 1
@@ -98,7 +102,7 @@ class EpisodeBuffers:
             self._copy(values, self.pooled[stream][call])
 
     def keep_tokens(self, stream: str, bits: "Tensor") -> None:
-        """Copy (*lead, T, D) int16 bit patterns of the last inference begun; behind them come zeros.
+        """Copy int16 bit patterns (*lead, T, D) of the last inference begun; behind them come zeros.
 
         The zeros are added on the device: a copy into part of a row goes through memory that is not locked, and
         the model would wait for it.
@@ -123,12 +127,14 @@ class EpisodeBuffers:
 
 
 def copy_aside(source: "Tensor", target: "Tensor") -> Any:
-    """Copy to host memory while the device computes; returns the event of its completion, None on a CPU.
+    """Copy to host memory while the device computes; return the event of its completion, None on a CPU.
+
+    The copy goes through a stream of its own, which begins when the source is computed. The source's memory is not
+    used again before the copy is complete.
 
     Args:
-        target: Contiguous, and page-locked where the source lies on a GPU. The copy goes through a stream of its
-            own, which begins when the source is computed; the source's memory is not used again before the copy is
-            through.
+        source: The tensor on the device.
+        target: The contiguous tensor in host memory, page-locked where the source lies on a GPU.
     """
     import torch
 
@@ -147,7 +153,7 @@ def copy_aside(source: "Tensor", target: "Tensor") -> Any:
 
 @cache
 def _side_stream(device: "torch.device") -> "torch.cuda.Stream":
-    """One per device: copies of several episodes queue there, behind each other and beside the model."""
+    """Return one stream per device: copies of several episodes queue in it one by one, beside the model."""
     import torch
 
     return torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
@@ -165,18 +171,22 @@ def _memory(shape: tuple[int, ...], dtype: DTypeLike, pinned: bool) -> NDArray[A
 
 
 FEWEST_FOR_THREADS = 10_000_000
-"""Parameters below which a second thread costs more than it brings: ten times the time on a busy machine."""
+"""The parameters below which a second thread costs more than it brings: ten times the time on a busy machine."""
 
 RolesByStream = Mapping[str, "Sequence[Roles]"]
 
 
 class Capturer:
-    """Hands the activations of an inference to the buffers of its episodes.
+    """A capturer that hands the activations of an inference to the buffers of its episodes.
+
+    The attribute `fires` has the counts of the last capture. The attribute `check` has the hashes of the first
+    outputs with and without hooks.
 
     Args:
-        streams: What is stored.
-        outputs: What comes out of an inference, in a word. fires: counts of the last capture. check: hashes of the
-            first outputs with and without hooks.
+        model: The model whose sites are captured.
+        streams: The storage of the streams.
+        with_tokens: Whether every token is stored.
+        outputs: The name of what an inference returns, in a word.
     """
 
     def __init__(self, model: "Model", streams: Sequence[StoredStream], with_tokens: bool, outputs: str) -> None:
@@ -195,11 +205,15 @@ class Capturer:
         """Return the result of `infer`, whose activations are kept for the rows that have buffers.
 
         Args:
-            output_of: The numbers that a capture must not change.
-            around: What is done to the model at every inference.
+            infer: A function that makes the inference.
+            output_of: A function that returns the numbers that a capture must not change.
+            roles: Per stream, the roles of every row of the batch.
+            buffers: The buffers by row of the batch; rows without buffers are not captured.
+            around: A context manager that changes the model at every inference, such as edits.
 
         Raises:
-            CaptureChangedActionError: As `_prove_harmless` does, and what `capture` raises.
+            CaptureChangedActionError: If the first capture of this process changes a number of the output.
+            CaptureError: As `capture` raises it.
         """
         from probe_kit.hooks import capture
         from probe_kit.hooks.contract.roles import prepare_pool
@@ -231,7 +245,7 @@ class Capturer:
         captured: NDArray[np.float32],
         around: Callable[[], AbstractContextManager[None]],
     ) -> None:
-        """Once per process: the same inference without hooks gives the same outputs, bit for bit."""
+        """Check once per process that the same inference without hooks gives the same outputs, bit for bit."""
 
         def without_hooks() -> NDArray[np.float32]:
             with around():
@@ -281,10 +295,12 @@ class Capturer:
 def stored_streams(
     model: "Model", roles: RolesByStream, role_names: Mapping[str, Sequence[str]] | None = None
 ) -> list[StoredStream]:
-    """The streams of a model at the longest of these sequences, with a view per role.
+    """Return the storage of a model's streams at the longest of these sequences, with a view per role.
 
     Args:
-        role_names: Per stream, those that are viewed; by default all that the model declares.
+        model: The model whose streams are stored.
+        roles: Per stream, the roles of every sequence.
+        role_names: Per stream, the roles that get a view; None for all that the model declares.
     """
     names = model.role_names if role_names is None else role_names
     return [
@@ -301,7 +317,7 @@ def _sha256(outputs: NDArray[np.float32]) -> str:
 
 
 def _pool_rows(activation: "Tensor", roles: "Sequence[Roles]", views: Sequence[str]) -> "Tensor":
-    """(B, V, D) float32 from (B, T, D), on its device."""
+    """Return the views (B, V, D) float32 of activations (B, T, D), on their device."""
     import torch
 
     from probe_kit.hooks import pool

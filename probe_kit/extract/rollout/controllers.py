@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 Reach = Literal["output", "last layer", "nothing", "not the output", "not tested"]
 """The last thing on the way to the output that changed with an input; "not the output" where no layer was read."""
 MOST_TEXTS = 32
-"""Other instructions that are searched for one with as many tokens; each of them is tokenised."""
+"""The most other instructions that are searched for one with as many tokens; each of them is tokenized."""
 Ids = Callable[[str], tuple[int, ...] | None]
 
 
@@ -57,11 +57,13 @@ def check_inputs[Question](
     """Return, by input, how far a change of it came.
 
     Args:
-        infer: One inference, always with the same seed.
-        variants: By input, observations or prompts that differ from the clean one in it alone; the first that the
-            model takes is used, and none leaves the input untested.
+        model: The model whose last residual is captured.
+        infer: A function that makes one inference, always with the same seed, and returns its output.
+        clean: The unchanged observation or prompt.
+        variants: By input, observations or prompts that differ from the clean one in it alone. The first that the
+            model accepts is used; if it accepts none, the input is untested.
         last: The last residual before the output; None where no site may be captured.
-        around: What the run does to the model at every inference.
+        around: A context manager that changes the model at every inference as the run does.
     """
     if not variants:
         return {}
@@ -114,9 +116,10 @@ def varied(
     """Return, by input, observations that differ from a clean one in it alone, the best first.
 
     Args:
+        clean: The unchanged observation.
         texts: Other instructions.
-        ids: The tokens of a text, None if unknown.
-        absent: Inputs that the model has not.
+        ids: A function that returns the tokens of a text, None if they are unknown.
+        absent: The inputs that the model lacks.
     """
     variants = {PICTURE: _without_picture(clean), INSTRUCTION: _with_other_words(clean, texts, ids)}
     return {name: observations for name, observations in variants.items() if name not in absent}
@@ -130,7 +133,7 @@ def _without_picture(clean: Observation) -> Iterator[Observation]:
 
 
 def _with_other_words(clean: Observation, texts: Iterable[str], ids: Ids) -> Iterator[Observation]:
-    """Other instructions, then the words in reverse; those of as many tokens first.
+    """Yield observations with other instructions, then with the words in reverse; those of as many tokens first.
 
     A model that reads no word still notices how many there are.
     """
@@ -167,27 +170,28 @@ def check_not_ignored(reaches: Mapping[str, Reach], model: str) -> None:
 
 
 _TURN = slice(3, 6)
-"""Roll, pitch and yaw among the seven numbers of an action."""
+"""The place of roll, pitch and yaw among the seven numbers of an action."""
 _GRIPPER_OPEN = 0.5
-"""The number of an open gripper is 1, of a closed one 0."""
+"""The bound between a closed gripper, which is 0, and an open one, which is 1."""
 
 
 def executed_actions(
     chunks: Sequence[NDArray[np.float32]], execute: int, exponent: float | None, rotation: Rotation = PLAIN
 ) -> NDArray[np.float32]:
-    """(n, 7) float32: what is executed after the newest of an episode's chunks (chunk, 7), oldest first.
+    """Return the actions (n, 7) float32 that are executed after the newest chunk of an episode, oldest first.
 
     Args:
-        execute: Actions of its head.
-        exponent: Of `ensemble`, which makes one action of all chunks; None to take the head.
-        rotation: See `ProtocolRow.rotation`.
+        chunks: (chunk, 7) of the episode's inferences so far, oldest first.
+        execute: The number of actions from the head of the newest chunk.
+        exponent: The exponent of `ensemble`, which makes one action of all chunks; None to execute the head.
+        rotation: The form in which a rotation reaches the controller, see `ProtocolRow.rotation`.
     """
     actions = chunks[-1][:execute] if exponent is None else ensemble(chunks, exponent)[None]
     return actions if rotation == PLAIN else with_rotation_vectors(actions)
 
 
 def with_rotation_vectors(actions: NDArray[np.float32]) -> NDArray[np.float32]:
-    """A copy of actions (n, 7) with axis times angle, in radians, in place of roll, pitch and yaw.
+    """Return a copy of actions (n, 7) with axis times angle, in radians, in place of roll, pitch and yaw.
 
     Axis and angle are those of R = Rz(yaw) Ry(pitch) Rx(roll), as `euler2axangle` of transforms3d gives them. The
     released evaluation converts so, and its controller reads the three numbers as Euler angles.
@@ -198,7 +202,7 @@ def with_rotation_vectors(actions: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def ensemble(chunks: Sequence[NDArray[np.float32]], exponent: float) -> NDArray[np.float32]:
-    """(7,) float32: the action for this step, from the chunks (chunk, 7) of an episode's inferences, oldest first.
+    """Return the action (7,) float32 for this step, from the chunks (chunk, 7) of an episode, oldest first.
 
     There is an inference per step, so a chunk made n steps ago contributes its n-th action, and one that is too
     old not at all. Weights grow by e^exponent from each chunk to the next; the gripper is open or closed by their
@@ -216,9 +220,8 @@ def ensemble(chunks: Sequence[NDArray[np.float32]], exponent: float) -> NDArray[
 def count_lost_words(pack: Callable[[str], Sequence[int] | None], instruction: str) -> int:
     """Count the words at the end of an instruction that do not reach the network, because its prompt is cut.
 
-    Args:
-        pack: The ids that the network is delivered, None if unknown. A word is lost if they stay the same without
-            it.
+    A word is lost if the ids stay the same without it. The function `pack` returns the ids that the network
+    receives, None if they are unknown.
     """
     ids, words = pack(instruction), instruction.split()
     lost = 0
@@ -243,12 +246,13 @@ def count_lost_words(pack: Callable[[str], Sequence[int] | None], instruction: s
 
 @dataclass(frozen=True)
 class Turn:
-    """One inference that is due.
+    """An inference that is due.
 
     Attributes:
-        call: How many inferences of the row came before.
-        buffers: Where the activations of the first calls go. past: chunks of the inferences before, oldest first,
-            which the controller keeps where a policy averages them.
+        call: The number of inferences of the row that came before.
+        buffers: The buffers for the activations of the first calls.
+        past: The chunks of the inferences before, oldest first, which the controller keeps where a policy averages
+            them.
     """
 
     observation: Observation
@@ -258,7 +262,7 @@ class Turn:
     past: list[NDArray[np.float32]] = field(default_factory=list)
 
     def derived_seed(self, of: str) -> int:
-        """The seed of this inference for `of`."""
+        """Return the seed of this inference for the purpose `of`."""
         return derive_seed(self.row.policy_seed, of, self.row.noise_of(self.call))
 
 
@@ -268,8 +272,8 @@ class Inference:
 
     Attributes:
         actions: (n, D) float32 to execute, n >= 1; None ends the episode.
-        flagged: Whether it put out no valid action; None if that is unknown.
-        columns: Of the episode's outcome.
+        flagged: Whether the policy put out no valid action; None if that is unknown.
+        columns: Columns of the episode's outcome.
     """
 
     actions: NDArray[np.float32] | None
@@ -278,13 +282,14 @@ class Inference:
 
 
 class Controller(ABC):
-    """A task: act, capture or ask.
+    """The controller of a task: act, capture or ask.
 
     Attributes:
         identity: The part of a run's identity that the loaded model decides.
-        script: For the player, None if the controller infers.
-        execute: Actions per inference, 0 for none.
-        threads: Of its network, None for torch's choice.
+        streams: The storage of the captured streams; empty if nothing is captured.
+        script: The name of the script for the player, None if the controller infers.
+        execute: The number of actions per inference, 0 for none.
+        threads: The number of threads of its network, None for torch's choice.
         on_gpu: Whether activations come from a GPU.
     """
 
@@ -297,10 +302,10 @@ class Controller(ABC):
 
     @abstractmethod
     def infer(self, turns: Sequence[Turn]) -> list[Inference]:
-        """One call of the model about all of these turns."""
+        """Call the model once about all of these turns, and return an inference per turn."""
 
     def instruction_ids(self, instruction: str) -> tuple[int, ...] | None:
-        """The ids that the network is delivered as this instruction; None if it reads none or cannot say."""
+        """Return the ids that the network receives as this instruction; None if it reads none or cannot say."""
         del instruction
         return None
 
@@ -310,7 +315,7 @@ class Controller(ABC):
 
 
 class ScriptedController(Controller):
-    """A script plays by itself, looks at nothing and leaves no activations."""
+    """A controller of a script, which plays by itself, looks at nothing and leaves no activations."""
 
     execute = 1
 
@@ -319,7 +324,7 @@ class ScriptedController(Controller):
         self.streams, self.script = [], name
 
     def infer(self, turns: Sequence[Turn]) -> list[Inference]:
-        """Never asked: a scripted player plays to the end by itself."""
+        """Raise AssertionError: a scripted player plays to the end by itself."""
         raise AssertionError(f"a scripted player asked for {len(turns)} actions")
 
 
@@ -327,7 +332,7 @@ class ModelController[Loaded: "Model", Question](Controller):
     """A model that infers: its capture, its part of a run's identity, and what it certifies.
 
     Attributes:
-        outputs: Of an inference, in a word.
+        outputs: The name of what an inference returns, in a word.
     """
 
     outputs: ClassVar[str]
@@ -349,7 +354,7 @@ class ModelController[Loaded: "Model", Question](Controller):
         }
 
     def certificate(self) -> dict[str, Any]:
-        """The model's card, fire counts of the last capture, and what capture and input check proved."""
+        """Return the model's card, fire counts of the last capture, and what capture and input check proved."""
         return {
             "policy": self.model.card.to_json(),
             "fires_per_inference": self._capturer.fires,
@@ -358,7 +363,7 @@ class ModelController[Loaded: "Model", Question](Controller):
         }
 
     def instruction_ids(self, instruction: str) -> tuple[int, ...] | None:
-        """The ids that the model's own packing makes of it, frames around it included."""
+        """Return the ids that the model's own packing makes of an instruction, frames around it included."""
         if instruction not in self._instruction_ids:
             with self._acting():
                 self._instruction_ids[instruction] = self._ids_of(instruction)
@@ -378,7 +383,7 @@ class ModelController[Loaded: "Model", Question](Controller):
         variants: Mapping[str, Iterable[Question]],
         around: Callable[[Question], AbstractContextManager[None]] = lambda _: nullcontext(),
     ) -> None:
-        """Note how far changes of an inference's inputs come. Raises IgnoredInputsError if none comes anywhere."""
+        """Record how far changes of an inference's inputs come. Raises IgnoredInputsError if none does."""
         # A run that stores nothing hooks nothing: its model may have no layer that can be captured.
         last = self.model.sites()[-1] if self.streams else None
         self._input_check = check_inputs(self.model, infer, clean, variants, last, around)
@@ -387,16 +392,16 @@ class ModelController[Loaded: "Model", Question](Controller):
 
 
 class PolicyController(ModelController["Policy", Observation]):
-    """Infers, executes the head of the chunk, and captures the first inferences of every episode.
+    """A controller that infers, executes the head of the chunk, and captures an episode's first inferences.
 
-    In the checkpoint's own units where the source asks for them; where nothing is executed, the whole chunk goes
-    back to the player. With `capture_only` in a scene, it infers and captures once per episode.
+    Actions are in the checkpoint's own units where the source asks for them; where nothing is executed, the whole
+    chunk goes back to the player. With `capture_only` in a scene, it infers and captures once per episode.
     """
 
     outputs = "actions"
 
     def __init__(self, policy: "Policy", source: Source[Any], settings: ExtractSettings) -> None:
-        """source: as the policy is shown it. Raises UsageError for more actions than a chunk has."""
+        """Prepare a policy for a source as it is shown that. Raises UsageError for more actions than a chunk has."""
         task, card, self._source = settings.task, policy.card, source
         with while_acting(settings.model.family, card.checkpoint):
             # Of all instructions: the store makes room for the longest prompt.
@@ -413,9 +418,9 @@ class PolicyController(ModelController["Policy", Observation]):
         self._edit_log: list[dict[str, Any]] = []
 
     def infer(self, turns: Sequence[Turn]) -> list[Inference]:
-        """Per turn the first `execute` actions of a fresh chunk, from one call of the policy.
+        """Return per turn the first `execute` actions of a fresh chunk, from one call of the policy.
 
-        Where the policy's card asks for it, one action averaged over the plans of this and earlier chunks.
+        Where the policy's card asks for it, this is one action averaged over the plans of this and earlier chunks.
         """
         with self._acting():
             if self._input_check is None:
@@ -431,7 +436,7 @@ class PolicyController(ModelController["Policy", Observation]):
         ]
 
     def _captured(self, turns: Sequence[Turn]) -> NDArray[np.float32]:
-        """(B, chunk, D) of one call, whose activations are kept for the turns that are captured."""
+        """Return the chunks (B, chunk, D) of one call, with activations kept for the turns that are captured."""
         observations = copied([turn.observation for turn in turns])
         seeds = [turn.derived_seed("inference") for turn in turns]
         captured = {row: turn.buffers for row, turn in enumerate(turns) if turn.call < self.captured_calls}
@@ -447,7 +452,7 @@ class PolicyController(ModelController["Policy", Observation]):
         )
 
     def _chunks(self, turns: Sequence[Turn], seeds: Sequence[int]) -> NDArray[np.float32]:
-        """(B, chunk, D): a copy of the policy's answer, which it cannot change later."""
+        """Return the chunks (B, chunk, D), a copy of the policy's answer, which it cannot change later."""
         chunks = self._called([turn.observation for turn in turns], seeds)
         if self._source.own_units:
             check_predictions(chunks, len(turns))
@@ -473,7 +478,7 @@ class PolicyController(ModelController["Policy", Observation]):
         self._check_inputs(infer, observation, variants, lambda changed: self._edited([changed]))
 
     def run_preflight(self, observations: Sequence[Observation], seeds: Sequence[int]) -> None:
-        """One inference of which nothing is kept: what another one will take."""
+        """Make one inference of which nothing is kept, to measure what another one will take."""
         with self._acting():
             self._called(observations, seeds)
 
@@ -490,13 +495,13 @@ class PolicyController(ModelController["Policy", Observation]):
         return executed_actions(chunks, self.execute, exponent, self.rotation)
 
     def certificate(self) -> dict[str, Any]:
-        """The certificate of every model, with the rotation that reached the controller of the arm, and edits."""
+        """Return the certificate of every model, with the rotation that reached the arm's controller, and edits."""
         rotation = {} if self.capture_only or self._source.own_units else {"rotation": self.rotation}
         return {**super().certificate(), **rotation, **({"edits": self._edit_log} if self._edits else {})}
 
     @contextmanager
     def _edited(self, observations: Sequence[Observation]) -> Iterator[None]:
-        """The edits of this run, for one inference; the certificate shows what the last one did."""
+        """Apply the edits of this run for one inference; the certificate shows what the last one did."""
         if not self._edits:
             yield
             return
@@ -508,7 +513,7 @@ class PolicyController(ModelController["Policy", Observation]):
 
 
 def _own_flags(flagged: object, count: int) -> NDArray[np.bool_] | None:
-    """(count,): a copy of what a policy flags in its last call. Raises PolicyFailedError for anything else."""
+    """Return a copy (count,) of what a policy flags in its last call. Raises PolicyFailedError."""
     if flagged is None:
         return None
     if not isinstance(flagged, np.ndarray) or flagged.shape != (count,) or flagged.dtype != np.bool_:

@@ -1,6 +1,6 @@
-"""Tasks: what a model does with the observations of a source. It acts or is captured, or answers questions.
+"""Tasks: a policy acts or is captured on the observations of a source; an answer model answers questions.
 
-A task knows no particular source, and keeps nothing: all that is chosen is in the settings.
+A task knows no particular source, and has no state: all choices are in the settings.
 """
 
 from collections.abc import Callable, Iterable
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 Fitted = tuple[Settings, Source[Any], Controller, Calibration | None]
-"""Settings and source as the model is shown them, what plays, and what chose a batch that was left open."""
+"""The settings and source as the model is shown them, the controller, and the calibration of a batch left open."""
 
 
 def task_of(settings: Settings) -> Any:
@@ -80,7 +80,7 @@ _CAPTURE_REFUSES = ("captured_calls", "execute", "rotation", "video")
 
 
 class _Task:
-    """The parts of a task that only one of them has.
+    """The defaults of methods that only one of the tasks implements.
 
     Attributes:
         names_all_items: Whether it needs the whole suite besides the chosen items, for the names of other objects.
@@ -108,7 +108,7 @@ class _Task:
 
 
 class Act(_Task):
-    """A policy acts, or is captured once per row; a script acts and has no activations."""
+    """The task in which a policy acts, or is captured once per row; a script acts and has no activations."""
 
     def check_meaningless(self, settings: ExtractSettings) -> None:
         """Raise UsageError for what a script, or a policy that does not act, has no use for."""
@@ -132,7 +132,7 @@ class Act(_Task):
             family.check_acting(settings.model.checkpoint, settings.model.options)
 
     def texts(self, settings: ExtractSettings, source: Source[Any]) -> Iterable[str]:
-        """Return the instructions of a scene; those of others are said together with cameras and state."""
+        """Return the instructions of a scene; those of other sources are checked with cameras and state."""
         return () if settings.source.command else source.instructions
 
     def early_checks(
@@ -156,7 +156,7 @@ class Act(_Task):
         return [check_instructions, *(() if inputs is None else source.early_checks(*inputs, checkpoint))]
 
     def declared_cameras(self, settings: ExtractSettings) -> tuple[str, ...] | None:
-        """Return those of a checkpoint in lerobot's layout, else those of the model without its weights."""
+        """Return the cameras of a checkpoint in lerobot's layout, else those of the model without its weights."""
         from probe_kit.hooks.registry import get_family
 
         model, family = settings.model, get_family(settings.model.family)
@@ -175,7 +175,7 @@ class Act(_Task):
         return settings.with_every_call(settings.task.execute or sizes.execute)
 
     def load(self, settings: ExtractSettings) -> "Policy | None":
-        """Load the policy, with what its protocol decides. Raises what `load_policy` raises."""
+        """Load the policy, with what its protocol decides. Raises as `load_policy`."""
         from probe_kit.hooks import load_policy
 
         return None if settings.model.family in SCRIPTED else load_of(load_policy, settings.followed())
@@ -202,7 +202,7 @@ class Act(_Task):
     def fit(self, settings: ExtractSettings, source: Source[Any], model: "Policy | None") -> Fitted:
         """Show the source to a policy, count its inferences, and choose its batch where that was requested.
 
-        Raises what does not fit.
+        Raises an error for whatever does not fit.
         """
         if settings.model.family in SCRIPTED:
             return settings, source, ScriptedController(settings.model.family), None
@@ -222,7 +222,7 @@ class Act(_Task):
 
 
 def _declared_inputs(family: "Family", settings: ExtractSettings) -> tuple[tuple[str, ...], int | None] | None:
-    """Cameras and numbers of the state that a checkpoint in lerobot's layout declares; None where none is here."""
+    """Return cameras and numbers of the state that a checkpoint in lerobot's layout declares; None without one."""
     folder = family.folder_here(settings.model.checkpoint, settings.model.options)
     try:
         inputs = parse_json(read_regular(folder / CONFIG_FILE))["input_features"]
@@ -267,7 +267,7 @@ def check_reachable(settings: ExtractSettings, card: "ModelCard", source: Source
 
 
 class Ask(_Task):
-    """A model answers one question a row, and its first inference may be captured."""
+    """The task in which a model answers one question per row; its first inference may be captured."""
 
     names_all_items = True  # an object that is asked for may be that of any item
 

@@ -1,4 +1,4 @@
-"""A worker plays its episodes and commits them: players alternate with the model, one thread writes."""
+"""A worker that plays its episodes and commits them: players alternate with the model, one thread writes."""
 
 import tempfile
 from collections import deque
@@ -49,12 +49,13 @@ class Playing:
 
     Attributes:
         ahead: Whether the player began it by itself, when the one before it ended.
-        observation: The one that waits for an inference, None while the player simulates.
-        control_steps: Actions before each inference so far. steps: actions so far.
-        seconds: Of inference.
-        flagged: Inferences without a valid action, None where the policy cannot tell.
+        observation: The observation that waits for an inference, None while the player simulates.
+        control_steps: The number of actions before each inference so far.
+        steps: The number of actions so far.
+        seconds: The seconds of inference so far.
+        flagged: The number of inferences without a valid action, None where the policy cannot tell.
         past: The chunks so far, for policies that average them.
-        columns: Of the outcome.
+        columns: Columns of the outcome.
     """
 
     planned: Row
@@ -71,12 +72,12 @@ class Playing:
     columns: Mapping[str, Any] = field(default_factory=dict)
 
     def turn(self) -> Turn:
-        """The inference that is due."""
+        """Return the inference that is due."""
         assert self.observation is not None
         return Turn(self.observation, self.planned, len(self.control_steps), self.buffers, self.past)
 
     def outcome(self, ending: Ending) -> dict[str, Any]:
-        """The outcome, with the counts of flagged steps, where the policy can tell, and of lost words."""
+        """Return the outcome, with the counts of flagged steps, where the policy can tell, and of lost words."""
         counts = {} if self.flagged is None else {
             "inferences": len(self.control_steps), "flagged_steps": self.flagged,
         }  # fmt: skip
@@ -89,9 +90,10 @@ Ended = tuple[Playing, Ending]
 
 
 class EpisodeSlot:
-    """One place in a batch: a player and the episode on it, if any.
+    """A place in a batch: a player and the episode on it, if any.
 
-    following: the row that its player starts when the episode ends, while the model infers for others.
+    The attribute `following` is the row that its player starts when the episode ends, while the model infers for
+    others.
     """
 
     def __init__(self, player: AskablePlayer) -> None:
@@ -101,12 +103,17 @@ class EpisodeSlot:
 
 
 class EpisodeLoop:
-    """Plays episode after episode on two groups of players.
+    """A loop that plays episode after episode on two groups of players.
+
+    All slots of a group take their turn in one call of the policy; a slot whose episode ends begins the next one
+    at once.
 
     Args:
+        players: The players of both groups.
+        controller: The controller that infers.
         free: Empty buffers.
-        next_episode: What to play next, None for nothing. All slots of a group take their turn in one call of the
-            policy; a slot whose episode ends begins the next one at once.
+        next_episode: A function that returns the next row to play, None for nothing.
+        film: A function that says whether a row is filmed.
     """
 
     def __init__(
@@ -119,7 +126,7 @@ class EpisodeLoop:
         self._next_episode, self._film = next_episode, film
 
     def __iter__(self) -> Iterator[Ended | Failed]:
-        """Episodes in the order they end."""
+        """Yield episodes in the order in which they end."""
         for group in self._groups:
             for slot in group:
                 self._begin_next(slot)
@@ -130,7 +137,10 @@ class EpisodeLoop:
                 yield from self._infer(group)
 
     def _begin_next(self, slot: EpisodeSlot, *, ended: bool = False) -> None:
-        """ended: whether the player came to an end by itself, and so began what follows if it knew of any."""
+        """Begin the next episode, if any.
+
+        With `ended`, the player came to an end by itself, and so began the following row if it knew of one.
+        """
         begun = ended and slot.following is not None
         planned, slot.following, slot.playing = slot.following or self._next_episode(), None, None
         if planned is not None:
